@@ -12,8 +12,6 @@ from pathlib import Path
 import pytest
 import yaml
 
-from paramclient import read_file
-
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parent.parent
@@ -106,30 +104,6 @@ def test_runs(name: str, tmp_path: Path) -> None:
     assert "\x1b" not in printed
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments", "line"),
-    [
-        ("read_one", ["sim:ardupilot", "RTL_ALT"], "RTL_ALT = 1500 "),
-        (
-            "set_and_prove",
-            ["sim:ardupilot", "RTL_ALT", "1234.7"],
-            "RTL_ALT = 1234 (adjusted from 1234.7)",
-        ),
-        ("offline", ["sim:ardupilot"], "1/1 ardupilot 1382 params"),
-        ("test_your_program", ["sim:px4?system=7"], "changed: ['MPC_XY_VEL_MAX', "),
-    ],
-)
-def test_takes_a_link(name: str, arguments: list[str], line: str, tmp_path: Path) -> None:
-    assert line in run(EXAMPLES / f"{name}.py", *arguments, cache=tmp_path)
-
-
-def test_pytest_finds_the_tests_of_your_program(tmp_path: Path) -> None:
-    example = EXAMPLES / "test_your_program.py"
-    plugins = ["-p", "no:cacheprovider", "-p", "pytest_paramclient"]
-    assert "4 passed" in run("-m", "pytest", *plugins, example, cache=tmp_path)
-    assert not (tmp_path / "paramclient").exists(), "the tests used the user's cache"
-
-
 def test_the_check_of_parameter_files_finds_what_does_not_fit(tmp_path: Path) -> None:
     """The commands of the workflow, as GitHub would run them, on files of which one has a mistyped name."""
     text = (EXAMPLES / "check-parameters.yml").read_text(encoding="utf-8")
@@ -155,44 +129,6 @@ def test_the_check_of_parameter_files_finds_what_does_not_fit(tmp_path: Path) ->
     first, second = done.stdout.split("== parameters/ardupilot/b.param\n")
     assert re.search(r"^MC_ROLL_P .* set$", first, re.MULTILINE)
     assert "not on this vehicle (did you mean RTL_ALT" in second
-
-
-@pytest.mark.parametrize("source", ["git+https://git.example/paramclient@1.0", ""])
-def test_the_check_of_parameter_files_installs_from_the_source_that_the_user_has_set(
-    source: str, tmp_path: Path
-) -> None:
-    text = (EXAMPLES / "check-parameters.yml").read_text(encoding="utf-8")
-    [step] = [
-        step
-        for step in yaml.safe_load(text)["jobs"]["check"]["steps"]
-        if "pip install" in step.get("run", "")
-    ]
-    assert step["env"] == {"PARAMCLIENT_SOURCE": "${{ vars.PARAMCLIENT_SOURCE }}"}
-    pip = tmp_path / "pip"
-    pip.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
-    pip.chmod(0o755)
-    done = subprocess.run(
-        ["bash", "-e", "-c", step["run"]],
-        env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "PARAMCLIENT_SOURCE": source},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        encoding="utf-8",
-        timeout=60,
-        check=False,
-    )
-    if source:
-        assert done.stdout.splitlines() == ["install", f"paramclient[cli] @ {source}"]
-    else:
-        assert done.returncode != 0
-        assert "PARAMCLIENT_SOURCE: Set this variable" in done.stderr
-
-
-def test_the_parameter_files_are_what_the_check_looks_at() -> None:
-    """Laid out as the workflow expects them, and each is read."""
-    files = [path for path in (EXAMPLES / "parameters").rglob("*") if path.is_file()]
-    assert {path.parent.name for path in files} == {"px4", "ardupilot"}
-    for path in files:
-        assert not read_file(path).notes
 
 
 def test_the_demo_ends_quietly_if_its_reader_ends() -> None:

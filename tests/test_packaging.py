@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import re
 import subprocess
 import sys
 import tarfile
-import tomllib
 import zipfile
 from email.message import Message
 from email.parser import Parser
@@ -64,12 +62,6 @@ def test_the_wheel_has_the_package_and_nothing_else(wheel: dict[str, bytes]) -> 
     assert "paramclient/service/page/index.html" in SERVED
 
 
-def test_the_wheel_has_the_licence(wheel: dict[str, bytes], metadata: Message) -> None:
-    (name,) = (name for name in wheel if name.endswith(".dist-info/licenses/LICENSE"))
-    assert wheel[name].startswith(b"MIT License")
-    assert metadata["License-Expression"] == "MIT"
-
-
 def test_the_command_is_an_entry_point(wheel: dict[str, bytes]) -> None:
     (name,) = (name for name in wheel if name.endswith(".dist-info/entry_points.txt"))
     assert "paramclient = paramclient.__main__:main" in wheel[name].decode()
@@ -118,16 +110,6 @@ def test_the_sdist_can_be_built_and_tested(sdist: set[str]) -> None:
     assert not {name for name in sdist if "__pycache__" in name or name.startswith((".venv", "docs/_build"))}
 
 
-def test_the_version_stands_in_one_place(metadata: Message) -> None:
-    assert metadata["Version"] == paramclient.__version__
-    written = [
-        name for name in SOURCES if paramclient.__version__ in (ROOT / name).read_text(encoding="utf-8")
-    ]
-    assert written == ["paramclient/version.py"]
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert project["dynamic"] == ["version"]
-
-
 def test_the_changelog_knows_the_version() -> None:
     text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.findall(r"^## \[([^]]+)\]", text, re.MULTILINE)[0] == paramclient.__version__
@@ -143,39 +125,6 @@ def test_the_dependencies_of_the_library_and_its_extras(metadata: Message) -> No
     assert command == {"cyclopts", "rich", "pyyaml"}
     assert serial == {"serialx"}
     assert metadata["Requires-Python"] == ">=3.11"
-
-
-def test_the_readme_is_the_description(metadata: Message) -> None:
-    assert metadata.get_payload() == (ROOT / "README.md").read_text(encoding="utf-8")
-
-
-def test_the_package_imports_its_modules_at_the_first_use_of_a_name() -> None:
-    """The names for type checkers are those that it finds at run time, and `import` alone loads none."""
-    tree = ast.parse(Path(paramclient.__file__).read_text(encoding="utf-8"))
-    typed = {
-        alias.name: node.module
-        for block in tree.body
-        if isinstance(block, ast.If)
-        for node in block.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
-    (homes,) = (
-        ast.literal_eval(node.value)
-        for node in tree.body
-        if isinstance(node, ast.AnnAssign) and ast.unparse(node.target) == "_HOMES" and node.value
-    )
-    assert {name: module for module, names in homes.items() for name in names} == typed
-    assert {*typed, "__version__"} == set(paramclient.__all__)
-    for name in paramclient.__all__:
-        assert getattr(paramclient, name) is not None
-    with pytest.raises(AttributeError, match="nothing"):
-        _ = paramclient.nothing  # type: ignore[attr-defined]
-    code = "import sys, paramclient; print(sorted(name for name in sys.modules if 'paramclient.' in name))"
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, encoding="utf-8", check=True, timeout=60
-    )
-    assert done.stdout == "['paramclient.version']\n"
 
 
 def test_make_uses_an_existing_environment_and_replaces_a_broken_one(tmp_path: Path) -> None:
