@@ -71,7 +71,7 @@ thread holds the interpreter. Other processes of the machine, such as the attack
 MEMORY: Final = 64.0
 """Limit in megabytes for the growth of the service's memory."""
 MEMORY_OF_COMPONENTS: Final = 80.0
-"""Limit in megabytes with the maximum number of components, by docs/internals/bounds.md."""
+"""Limit in megabytes with the maximum number of components."""
 LOG: Final = 10.0
 """Limit in kilobytes for the log."""
 ENDED: Final = 3.0
