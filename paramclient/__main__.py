@@ -23,10 +23,6 @@ def main() -> NoReturn:
     Exits with 130 after Ctrl-C, 143 after SIGTERM and 141 when the output's reader has closed it, like
     programs killed by these signals; `paramclient.cli.exit_codes` lists the other codes.
     """
-    if "_PARAMCLIENT_COMPLETE" in os.environ:
-        from paramclient.cli import completion  # imported here: all of it has 0.3 s
-
-        sys.exit(completion.main())
     if missing := [name for name in COMMAND_LIBRARIES if find_spec(name) is None]:
         print(
             f"paramclient: the command needs {' and '.join(missing)}: pip install 'paramclient[cli]'",

@@ -67,7 +67,7 @@ def command_line() -> App:
 
 def _shows_help(arguments: Sequence[str]) -> bool:
     """Return whether help is printed: with --help, and without a subcommand."""
-    is_group = len(arguments) == 1 and arguments[0] in ("cache", "fleet", "metadata", "signing")
+    is_group = len(arguments) == 1 and arguments[0] in ("cache", "metadata", "signing")
     return not arguments or is_group or any(word in _app.help_flags for word in arguments)
 
 
@@ -174,13 +174,10 @@ _app: Final = App(
 )
 _cache: Final = App(
     name="cache",
-    help="Show, add, remove or copy tables in the cache. Needs no link.",
+    help="Show, remove or copy tables in the cache. Needs no link.",
     help_epilogue=_examples(
         "cache list",
-        "cache history 1 MC_ROLL_P",
-        "cache add 1 quad.params",
         "cache path",
-        "cache name 1 tractor",
         "cache remove 1",
         "cache copy field.sqlite3 postgresql://me@office/fleet",
     ),
@@ -203,11 +200,6 @@ _metadata: Final = App(
         "metadata list",
         "metadata remove copter --firmware 4.6",
     ),
-)
-_fleet: Final = App(
-    name="fleet",
-    help="Compare the vehicles in the cache. Needs no link.",
-    help_epilogue=_examples("fleet diff BAT1_N_CELLS 'COM_ARM_*'", "fleet diff quad.params"),
 )
 
 
@@ -308,7 +300,6 @@ _add(
     arguments="WORD [WORD...]",
 )
 _add(_app, "search:info", "MC_ROLL_P", "rtl_alt --vehicle 1 --json")
-_app.command(_fleet)
 _add(
     _app,
     "save:save",
@@ -324,13 +315,6 @@ _add(
     "udpin:0.0.0.0:14550 quad.params --reboot --backup before.yaml",
     "udpin:0.0.0.0:14550 fleet.param --all --overlay 'own/{system}.param'",
     "sim:ardupilot copter.param",
-    arguments="URL FILE",
-)
-_add(
-    _app,
-    "apply:verify",
-    "udpin:0.0.0.0:14550 quad.params",
-    "udpin:0.0.0.0:14550 fleet.param --all --expect 5",
     arguments="URL FILE",
 )
 _add(
@@ -361,34 +345,12 @@ _add(
     "ardupilot --link udpin:127.0.0.1:0",
 )
 _app.command(_signing)
-_add(
-    _app,
-    "completion_install:install",
-    *("", "zsh"),
-    arguments="[SHELL]",
-    name="--install-completion",
-)
 _add(_signing, "signing:setup")
 _add(_signing, "signing:disable")
 _add(_metadata, "metadata_files:metadata_add")
 _add(_metadata, "metadata_files:metadata_list")
 _add(_metadata, "metadata_files:metadata_remove")
 _add(_cache, "offline:cache_list")
-_add(_cache, "history:history", arguments="VEHICLE [NAME...]")
-_add(
-    _cache,
-    "offline:cache_add",
-    *("1 quad.params", "uid:0002000000003331 before.yaml"),
-    arguments="VEHICLE FILE",
-)
 _add(_cache, "offline:cache_path")
-_add(_cache, "offline:cache_name", "4 tractor", "tractor --remove", arguments="VEHICLE [NICKNAME]")
 _add(_cache, "offline:cache_remove")
 _add(_cache, "offline:cache_copy")
-_add(
-    _fleet,
-    "fleet:fleet_diff",
-    "BAT1_N_CELLS 'COM_ARM_*'",
-    "quad.params --json",
-    arguments="NAME...|FILE",
-)

@@ -1,4 +1,4 @@
-"""The subcommands apply, verify and restore."""
+"""The subcommands apply and restore."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, TypeAlias, TypeVar
+from typing import Annotated, Final, TypeAlias, TypeVar
 
 import anyio
 import anyio.to_thread
@@ -20,12 +20,11 @@ from paramclient.cli.extended import (
     is_extended_link,
     is_extended_source,
     restore_extended,
-    verify_extended,
 )
 from paramclient.cli.file_output import described
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
 from paramclient.cli.options import Count, LinkOptions
-from paramclient.cli.output import print_document, printable, progress_bar, report, say
+from paramclient.cli.output import print_json, printable, progress_bar, report, say
 from paramclient.cli.restore_states import (
     StateToRestore,
     check_when_for_all,
@@ -36,16 +35,13 @@ from paramclient.cli.session import receiver_in_words
 from paramclient.cli.setup_results import (
     NamedVehicle,
     applied_code,
-    applied_doc,
-    interrupted_doc,
-    met_code,
+    applied_json,
+    interrupted_json,
     planned_code,
-    planned_doc,
+    planned_json,
     show_applied,
     show_interrupted,
     show_planned,
-    show_verified,
-    verified_doc,
 )
 from paramclient.cli.sources import is_file, read_rules
 from paramclient.cli.targets import (
@@ -67,10 +63,7 @@ from paramclient.provision import apply_all as apply_to_all
 from paramclient.provision import restore_all as restore_to_all
 from paramclient.provision.fleet import compare_states
 
-if TYPE_CHECKING:
-    from paramclient.documents.setup import SetUpDoc
-
-__all__ = ["apply", "restore", "verify"]
+__all__ = ["apply", "restore"]
 
 Include: TypeAlias = Annotated[tuple[str, ...], Parameter(show_default=False)]
 """Categories and globs of --include."""
@@ -196,63 +189,6 @@ async def apply(
                 before_writing=lambda _: found.check_only(),
             )
         return show.applied(show.by_vehicle(fleet.results), show.by_vehicle(fleet.errors))
-
-
-async def verify(
-    url: str,
-    file: str,
-    /,
-    *,
-    include: Include = (),
-    over: Annotated[str | None, Parameter(name="--overlay")] = None,
-    all_vehicles: AllVehicles = False,
-    expect: Count = None,
-    renames: str | None = None,
-    metadata: MetadataChoice = None,
-    full: bool = False,
-    extended: bool = False,
-    options: LinkOptions = _OPTIONS,
-) -> ExitCode:
-    """Compare a vehicle with a parameter file. Writes nothing.
-
-    Parameters that the file does not name are ignored, and parameters that `apply` leaves out may differ.
-    Exit code 0: the vehicle has all values of the file. Exit code 1: some values differ.
-
-    Args:
-        url: The link.
-        file: A parameter file; or a vehicle in the cache, as cache:VEHICLE.
-        include: Include a category that is left out by default, or a name or pattern, as with apply.
-        over: A file whose parameters replace and extend those of FILE, with {uid} or {system} in its name
-            for the vehicle's ids.
-        all_vehicles: Compare all vehicles on the link, concurrently.
-        expect: With --all, wait for this number of vehicles, and fail with fewer.
-        renames: A YAML file of names that firmware versions have changed. A parameter that the vehicle does
-            not have is looked up under its other name.
-        metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for the
-            ranges of values, and for parameters that take effect only after a reboot.
-        full: Also print parameters that have the wanted value or are left out.
-        extended: Use extended parameters (PARAM_EXT_*), such as those of a camera. Not needed with a file of
-            extended parameters.
-    """
-    if extended or is_extended_source(file):
-        if include or over or all_vehicles or renames or metadata:
-            raise UsageError(
-                f"{file} has extended parameters; --include, --overlay, --all, --renames and --metadata are "
-                "for plain ones"
-            )
-        return await verify_extended(url, file, options)
-    check_pattern("--overlay", over, all_vehicles=all_vehicles)
-    chosen = from_file(metadata)
-    rules = read_rules(renames)
-    values = Source(file, over, options, only=False)
-    await values.open()
-    async with targets(url, options, all_vehicles=all_vehicles, expect=expect, only=False) as found:
-        wanted = await values.wanted(found.vehicles)
-        info = await _described(found, metadata, chosen)
-        show = _Output(found, as_json=options.json, is_fleet=all_vehicles, full=full)
-        compared = verify_all(found.vehicles, wanted, include=include, info=info, renames=rules)
-        fleet = await _within(found, compared)
-        return show.verified(show.by_vehicle(fleet.results), show.by_vehicle(fleet.errors))
 
 
 async def restore(
@@ -478,7 +414,7 @@ class _Output:
             plans,
             errors,
             lambda: show_planned(plans, reboot=reboot, full=self._full),
-            planned_doc,
+            planned_json,
             lambda plan: planned_code(plan, skip_invalid=skip_invalid),
         )
 
@@ -490,16 +426,8 @@ class _Output:
             results,
             errors,
             lambda: show_applied(results, full=self._full, commands=self._commands),
-            applied_doc,
+            applied_json,
             applied_code,
-        )
-
-    def verified(
-        self, plans: Mapping[NamedVehicle, Plan], errors: Mapping[NamedVehicle, ParamClientError]
-    ) -> ExitCode:
-        """Print comparisons; return the exit code."""
-        return self._print(
-            plans, errors, lambda: show_verified(plans, full=self._full), verified_doc, met_code
         )
 
     def states(self, states: Mapping[Address, StateToRestore]) -> None:
@@ -543,7 +471,7 @@ class _Output:
             outcomes = {vehicle: list(each.values()) for vehicle, each in rows.items()}
             if self._as_json:
                 self._print_documents(
-                    [interrupted_doc(each, outcomes.get(each, [])) for each in self._vehicles.values()]
+                    [interrupted_json(each, outcomes.get(each, [])) for each in self._vehicles.values()]
                 )
             else:
                 show_interrupted(outcomes, self._commands)
@@ -554,7 +482,7 @@ class _Output:
         results: Mapping[NamedVehicle, Result],
         errors: Mapping[NamedVehicle, ParamClientError],
         show: Callable[[], None],
-        as_document: Callable[..., SetUpDoc],
+        as_document: Callable[..., object],
         code: Callable[[Result], ExitCode],
     ) -> ExitCode:
         """Print results and errors as tables or JSON; return the exit code.
@@ -575,12 +503,13 @@ class _Output:
         return max(codes, default=ExitCode.DONE)
 
     def _print_documents(
-        self, documents: Sequence[SetUpDoc], errors: Mapping[NamedVehicle, ParamClientError] | None = None
+        self, documents: Sequence[object], errors: Mapping[NamedVehicle, ParamClientError] | None = None
     ) -> None:
         if not self._is_fleet:
-            print_document(documents[0])
+            print_json(documents[0])
             return
-        from paramclient.documents.setup import FleetSetupDoc  # only here: loads pydantic
-
-        failed = {(vehicle.system, vehicle.component): error for vehicle, error in (errors or {}).items()}
-        print_document(FleetSetupDoc.of(documents, failed))
+        failed = [
+            {"system": vehicle.system, "component": vehicle.component, "error": str(error)}
+            for vehicle, error in (errors or {}).items()
+        ]
+        print_json({"vehicles": documents, "errors": failed})

@@ -13,9 +13,10 @@ from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import are_extended, diff_extended, is_extended_source
 from paramclient.cli.file_output import described, value_text
+from paramclient.cli.json_setup import DiffJson
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import Coloured, print_document, print_table, printable, say
+from paramclient.cli.output import Coloured, print_json, print_table, printable, say
 from paramclient.cli.sources import is_file, read_rules, resolve_all
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata
@@ -96,14 +97,8 @@ async def diff(
     outcome = compare(first, second, base=before, names=only or None, renames=rules)
     shown = [entry for entry in outcome.entries if everything or entry.is_shown]
     if options.json:
-        from paramclient.documents.diff import DiffDoc  # only here: loads pydantic
-
-        document = DiffDoc.of(
-            *(outcome, sides.left, sides.right, sides.base),
-            everything=everything,
-            has_defaults=has_defaults,
-        )
-        print_document(document)
+        shown_sides = (sides.left, sides.right, sides.base)
+        print_json(DiffJson.of(outcome, *shown_sides, everything=everything, has_defaults=has_defaults))
     else:
         if shown:
             _print(outcome, shown, sides)

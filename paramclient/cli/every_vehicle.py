@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import anyio
 
@@ -23,13 +23,10 @@ __all__ = [
     "check_all",
     "check_expected",
     "every_vehicle",
-    "failed_documents",
+    "failed_json",
     "report_failures",
     "run_on_all",
 ]
-
-if TYPE_CHECKING:
-    from paramclient.documents.setup import FailedVehicleDoc
 
 Worked = TypeVar("Worked")
 T = TypeVar("T")
@@ -121,16 +118,14 @@ def report_failures(done: Sequence[Done[CommandSession, T]]) -> int:
     return worst
 
 
-def failed_documents(done: Sequence[Done[CommandSession, T]]) -> list[FailedVehicleDoc]:
-    """Return the JSON documents of the vehicles on which the work failed."""
-    from paramclient.documents.setup import FailedVehicleDoc  # only here: loads pydantic
-
+def failed_json(done: Sequence[Done[CommandSession, T]]) -> list[dict[str, object]]:
+    """Return the JSON of the vehicles on which the work failed."""
     return [
-        FailedVehicleDoc(
-            system=each.vehicle.component.system,
-            component=each.vehicle.component.component,
-            error=str(each.error),
-        )
+        {
+            "system": each.vehicle.component.system,
+            "component": each.vehicle.component.component,
+            "error": str(each.error),
+        }
         for each in done
         if each.error is not None
     ]

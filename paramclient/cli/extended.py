@@ -81,7 +81,6 @@ __all__ = [
     "set_extended",
     "show_extended",
     "text_pairs",
-    "verify_extended",
     "watch_extended",
 ]
 
@@ -420,7 +419,7 @@ async def diff_extended(
     return ExitCode.DIFFERENT if different else ExitCode.DONE
 
 
-# apply, verify, restore
+# apply, restore
 
 
 async def apply_extended(
@@ -521,27 +520,6 @@ async def _write_set(
         in_file = _text(content.params[name])
         report(f"{name}: {session.label} has {actual}, and the file {in_file}")
     return code if result.complete else max(code, ExitCode.INCOMPLETE)
-
-
-async def verify_extended(url: str, file: str, options: LinkOptions) -> ExitCode:
-    """Compare the extended parameters of a component with a file. Writes nothing."""
-    content = await _source(file, options)
-    async with connect(url, options) as session:
-        plan = await verify_extended_set(session.component, content, timeout=session.deadline.left())
-        _report_impossible(session, plan, content)
-        if options.json:
-            from paramclient.documents.extended_output import ExtDiffDoc  # only here: loads pydantic
-
-            print_document(ExtDiffDoc.of(_plan_entries(plan), is_same=plan.is_met))
-        else:
-            _print_changes(plan)
-            equal = sum(
-                name in plan.current and param.same_value(plan.current[name])
-                for name, param in content.params.items()
-            )
-            source = content.source
-            say(printable(f"{session.label} has {equal} of {len(content.params)} values of {source}"))
-    return ExitCode.DONE if plan.is_met else ExitCode.DIFFERENT
 
 
 def history_extended(

@@ -7,7 +7,8 @@ from typing import Final
 
 from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.output import local_time, print_document, print_table, printable, say
+from paramclient.cli.json_output import SetJson
+from paramclient.cli.output import local_time, print_json, print_table, printable, say
 from paramclient.files import ParamFile
 from paramclient.files.param_file import address
 from paramclient.metadata import Metadata
@@ -52,10 +53,11 @@ def show_file(
                 known_defaults = {name: default_of(each[name], more.get(name)) for name in differing}
                 defaults.append({name: found for name, found in known_defaults.items() if found is not None})
     if json:
-        from paramclient.documents.paramset import FileDoc  # only here: loads pydantic
-
-        origins = [{name: each.source for name, each in of_set.items()} for of_set in defaults]
-        print_document(FileDoc.of(file, shown, origins))
+        components = [
+            SetJson.with_sources(each, {name: default.source.value for name, default in of_set.items()})
+            for each, of_set in zip(shown, defaults, strict=True)
+        ]
+        print_json({"file": file.source, "format": file.file_format.value, "components": components})
     else:
         for each, of_set in zip(shown, defaults, strict=True):
             _print_set(each, changed=changed)

@@ -12,8 +12,9 @@ from cyclopts.validators import Number
 from paramclient.cache import HistoryEntry, InterruptedSetup, ParamCache, SetupNotes, SnapshotSummary
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import history_extended
+from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson
 from paramclient.cli.options import CacheOptions, Id
-from paramclient.cli.output import local_time, print_document, print_table, say
+from paramclient.cli.output import local_time, print_json, print_table, say
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
 from paramclient.cli.sources import VehicleChoice, chosen_vehicle, tables_in
 from paramclient.cli.time_arguments import parse_time
@@ -117,9 +118,7 @@ def _print_entries(
     entries: Sequence[HistoryEntry], cut_off: Sequence[InterruptedSetup], options: CacheOptions
 ) -> None:
     if options.json:
-        from paramclient.documents.history import HistoryDoc  # only here: loads pydantic
-
-        print_document(HistoryDoc.of(entries, cut_off=cut_off))
+        print_json({"history": [HistoryLineJson.of(each) for each in entries]})
         return
     rows = [(entry.at, _entry_cells(entry)) for entry in entries]
     rows += [(note.at, _cut_off_cells(note)) for note in cut_off]
@@ -129,9 +128,7 @@ def _print_entries(
 
 def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> None:
     if options.json:
-        from paramclient.documents.history import SnapshotsDoc  # only here: loads pydantic
-
-        print_document(SnapshotsDoc.of(kept))
+        print_json({"snapshots": [SnapshotJson.of(each) for each in kept]})
         return
     if not kept:
         say("no snapshots: apply and restore store one before they write")

@@ -14,7 +14,7 @@ import anyio.to_thread
 from paramclient.cache import ParamCache
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import print_document, print_table, report
+from paramclient.cli.output import print_json, print_table, report
 from paramclient.errors import FileError, LinkError, ParamClientError
 from paramclient.files import read_file
 from paramclient.links import LinkKind, parse_link
@@ -62,9 +62,7 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS
             if not tables:
                 report(f"{each} has no parameters")
     if options.json:
-        from paramclient.documents.command_output import ImportDoc, ImportedDoc  # only here: loads pydantic
-
-        print_document(ImportDoc(tables=[ImportedDoc.of(str(log), table) for log, table in found]))
+        print_json({"tables": [_table_json(log, table) for log, table in found]})
     elif found:
         columns = ["file", "component", "autopilot", "params", "complete", "hash", "key"]
         print_table(columns, (_cells(*each) for each in found), right="params")
@@ -127,6 +125,20 @@ def cache_of_log(url: str) -> Iterator[ParamCache]:
     ):
         anyio.run(import_log, spec.host, cache)
         yield cache
+
+
+def _table_json(file: Path, table: ImportedTable) -> dict[str, object]:
+    return {
+        "file": str(file),
+        "key": table.key,
+        "system": table.system,
+        "component": table.component,
+        "autopilot": _autopilot(table),
+        "params": table.params,
+        "complete": table.complete,
+        "hash": hash_text(table.hash),
+        "notes": list(table.notes),
+    }
 
 
 def _cells(file: Path, table: ImportedTable) -> tuple[object, ...]:

@@ -8,8 +8,8 @@ from typing import Final
 from paramclient.cache import ParamCache
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import print_document, print_table, printable, say
-from paramclient.metadata import MetadataStore, VehicleKind, read_metadata
+from paramclient.cli.output import print_json, print_table, printable, say
+from paramclient.metadata import AddedMetadata, MetadataStore, VehicleKind, read_metadata
 from paramclient.metadata.added_files import AddedFiles
 from paramclient.model.wording import counted
 
@@ -39,9 +39,7 @@ def metadata_add(
     """
     added, metadata = _files(options).add(file, vehicle, firmware)
     if options.json:
-        from paramclient.documents.command_output import AddedMetadataDoc  # only here: loads pydantic
-
-        print_document(AddedMetadataDoc.of(added, len(metadata)))
+        print_json(_added_json(added, len(metadata)))
     else:
         say(printable(f"{counted(len(metadata), 'description')} from {file} for {added}"))
     return ExitCode.DONE
@@ -51,9 +49,7 @@ def metadata_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     """Print the metadata files that were added."""
     rows = [(each, len(read_metadata(each.path))) for each in _files(options)]
     if options.json:
-        from paramclient.documents.command_output import AddedMetadataDoc, AddedMetadataListDoc
-
-        print_document(AddedMetadataListDoc(metadata=[AddedMetadataDoc.of(*row) for row in rows]))
+        print_json({"metadata": [_added_json(*row) for row in rows]})
     elif rows:
         cells = ((each.kind, each.firmware or "any", count) for each, count in rows)
         print_table(["vehicle", "firmware", "descriptions"], cells, right="descriptions")
@@ -73,12 +69,15 @@ def metadata_remove(
     """
     removed = _files(options).remove(vehicle, firmware)
     if options.json:
-        from paramclient.documents.command_output import RemovedMetadataDoc  # only here: loads pydantic
-
-        print_document(RemovedMetadataDoc(vehicle=removed.kind, firmware=removed.firmware))
+        print_json({"vehicle": removed.kind, "firmware": removed.firmware})
     else:
         say(f"the metadata for {removed} was removed")
     return ExitCode.DONE
+
+
+def _added_json(added: AddedMetadata, count: int) -> dict[str, object]:
+    """Return the JSON of an added file with this number of descriptions."""
+    return {"vehicle": added.kind, "firmware": added.firmware, "descriptions": count}
 
 
 def _files(options: CacheOptions) -> AddedFiles:

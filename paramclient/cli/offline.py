@@ -1,4 +1,4 @@
-"""The subcommands show and cache (list, add, path, remove, copy), which need no link."""
+"""The subcommands show and cache (list, path, remove, copy), which need no link."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
 from paramclient.cache.database_url import is_address
@@ -14,6 +14,8 @@ from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in, r
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import is_extended_source, show_extended
 from paramclient.cli.file_output import show_file
+from paramclient.cli.json_cache import SummaryJson, TableJson
+from paramclient.cli.json_output import ParamJson
 from paramclient.cli.logs import cache_of_log
 from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
@@ -28,7 +30,7 @@ from paramclient.cli.output import (
     by_index,
     default_text,
     local_time,
-    print_document,
+    print_json,
     print_line,
     print_table,
     printable,
@@ -36,7 +38,7 @@ from paramclient.cli.output import (
     say,
 )
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
-from paramclient.cli.sources import VehicleChoice, choose, chosen_vehicle, is_file, open_file, tables_in
+from paramclient.cli.sources import VehicleChoice, chosen_vehicle, is_file, open_file, tables_in
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.metadata import Metadata, MetadataStore
 from paramclient.model.defaults import add_default, default_of
@@ -48,14 +50,9 @@ from paramclient.model.values import Param, format_value, type_name
 from paramclient.model.wording import counted
 from paramclient.provision.vehicle_params import left_out_note
 
-if TYPE_CHECKING:
-    from paramclient.documents.cached import CachedTableDoc
-
 __all__ = [
-    "cache_add",
     "cache_copy",
     "cache_list",
-    "cache_name",
     "cache_path",
     "cache_remove",
     "show",
@@ -118,17 +115,14 @@ def show(
     with _open(options) if not is_log or vehicle is None else cache_of_log(vehicle) as cache:
         summaries = _tables_to_show(cache, None if is_log else vehicle, component)
         extended_sizes = cache.ext_sizes()
-        nicknames = _names_by_key(cache)
         is_list = vehicle is None and len(summaries) > 1 and not options.json
         tables = [] if is_list else _load(cache, summaries)
         _check_known(cache, name_patterns, [name for table in tables for name in table.params])
     views = [_View.of(table, name_patterns, described, cache, changed=changed) for table in tables]
     if options.json:
-        from paramclient.documents.cached import CachedTablesDoc  # only here: loads pydantic
-
-        print_document(CachedTablesDoc(components=[view.document() for view in views]))
+        print_json({"components": [view.as_json() for view in views]})
     elif is_list:
-        _print_summaries(summaries, nicknames, extended_sizes)
+        _print_summaries(summaries, extended_sizes)
         say("paramclient show VEHICLE prints the table of one vehicle, by its system id or its key")
     elif not summaries:
         say(f"the cache {printable(cache.place)} is empty")
@@ -146,62 +140,14 @@ def show(
 def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     """List the tables in the cache, most recently received vehicles first."""
     with _open(options) as cache:
-        summaries, names, extended = cache.components(), _names_by_key(cache), cache.ext_sizes()
+        summaries, extended = cache.components(), cache.ext_sizes()
     if options.json:
-        from paramclient.documents.cached import CachedListDoc, CachedSummaryDoc  # only here: loads pydantic
-
-        components = [
-            CachedSummaryDoc.of(each, names.get(each.key), extended.get((each.key, each.component)))
-            for each in summaries
-        ]
-        print_document(CachedListDoc(path=cache.place, components=components))
+        components = [SummaryJson.of(each, extended.get((each.key, each.component))) for each in summaries]
+        print_json({"path": cache.place, "components": components})
     elif summaries:
-        _print_summaries(summaries, names, extended)
+        _print_summaries(summaries, extended)
     else:
         say(f"the cache {printable(cache.place)} is empty")
-    return ExitCode.DONE
-
-
-def cache_add(
-    vehicle: str,
-    file: Path,
-    /,
-    *,
-    component: Id = None,
-    force: bool = False,
-    options: CacheOptions = _DEFAULTS,
-) -> ExitCode:
-    """Make a parameter file the cached table of a vehicle, for example before using a slow link.
-
-    The table is marked with the file until the vehicle confirms or replaces it. If PX4's hash matches the
-    table when the vehicle is heard, nothing is downloaded; otherwise, and from a vehicle without a hash,
-    the next fetch downloads the table. A table that was received later than the file was written is not
-    replaced.
-
-    Args:
-        vehicle: A vehicle in the cache, or the one that the file names: 4 or 4/1, px4 or ardupilot, a
-            nickname, its hardware id (in full, or uid: and at least 6 digits), or its key.
-        file: The parameter file. Without types, those of the vehicle's previous table or of another one of
-            the same firmware are used.
-        component: The component. Default: the autopilot, or the only one of the file.
-        force: Replace a table that was received later.
-    """
-    params = choose(open_file(str(file)), component, None)
-    at = file.stat().st_mtime if params.at is None else params.at
-    with _open(options) as cache:
-        added = cache.add(params, vehicle, component=component, at=at, force=force)
-    for note in added.notes:
-        report(f"{file.name}: {note}")
-    if options.json:
-        from paramclient.documents.cached import AddedDoc  # only here: loads pydantic
-
-        print_document(AddedDoc.of(added, str(file)))
-    else:
-        crc = "" if added.hash is None else f"; hash {hash_text(added.hash)}"
-        print_line(
-            f"{counted(added.size, 'parameter')} of {file} are the cached table of "
-            f"{added.system}/{added.component} ({added.key}), values of {local_time(added.at)}{crc}"
-        )
     return ExitCode.DONE
 
 
@@ -210,9 +156,7 @@ def cache_path(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     with _open(options) as cache:
         path = cache.place
     if options.json:
-        from paramclient.documents.cached import PlaceDoc  # only here: loads pydantic
-
-        print_document(PlaceDoc(path=path))
+        print_json({"path": path})
     else:
         print_line(path)
     return ExitCode.DONE
@@ -230,43 +174,9 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
         key = tables_in(cache, vehicle, component)[0].key
         removed = cache.remove(key, component)
     if options.json:
-        from paramclient.documents.cached import RemovedDoc  # only here: loads pydantic
-
-        print_document(RemovedDoc(key=key, removed=removed))
+        print_json({"key": key, "removed": removed})
     else:
         print_line(f"removed {counted(removed, 'table')} of {key}")
-    return ExitCode.DONE
-
-
-def cache_name(
-    vehicle: str,
-    nickname: str | None = None,
-    /,
-    *,
-    remove: bool = False,
-    options: CacheOptions = _DEFAULTS,
-) -> ExitCode:
-    """Give a vehicle a nickname. Every subcommand accepts it, on links as --vehicle.
-
-    Nicknames are stored in a file beside the cache, on this computer only.
-
-    Args:
-        vehicle: A vehicle in the cache: 4 or 4/1, px4 or ardupilot, its current nickname, its hardware id (in
-            full, or uid: and at least 6 digits), or its key.
-        nickname: 1 to 32 letters, digits, _ and -, beginning with a letter. It replaces the previous
-            nickname.
-        remove: Remove its nickname.
-    """
-    if (nickname is None) is not remove:
-        raise UsageError("cache name takes a nickname, or --remove")
-    with _open(options) as cache:
-        key = cache.set_nickname(vehicle, nickname)
-    if options.json:
-        from paramclient.documents.cached import NicknameDoc  # only here: loads pydantic
-
-        print_document(NicknameDoc(key=key, nickname=nickname))
-    else:
-        print_line(f"{key} has no nickname now" if nickname is None else f"{nickname} is {key}")
     return ExitCode.DONE
 
 
@@ -292,9 +202,7 @@ def cache_copy(source: str, target: str, /, *, json: bool = False) -> ExitCode:
         done = old.copy_to(new, progress=show_progress)
         place = new.place
     if json:
-        from paramclient.documents.cached import CopiedDoc  # only here: loads pydantic
-
-        print_document(CopiedDoc(path=place, **asdict(done)))
+        print_json({"path": place, **asdict(done)})
     else:
         print_line(
             f"copied {counted(done.tables, 'table')} to {printable(place)}, {done.unchanged} were there "
@@ -404,25 +312,18 @@ class _View:
             params = {name: params[name] for name in differing}
         return [params[name] for name in self.names if name in params] if self.names else params.values()
 
-    def document(self) -> CachedTableDoc:
-        """Return the JSON document."""
-        from paramclient.documents.cached import CachedTableDoc  # only here: loads pydantic
-
-        return CachedTableDoc.of(self.table, self.params, self.metadata, whole=bool(self.names))
-
-
-def _names_by_key(cache: ParamCache) -> dict[str, str]:
-    """Return the nicknames of vehicles by key."""
-    return {key: nickname for nickname, key in cache.nicknames.items()}
+    def as_json(self) -> TableJson:
+        """Return the JSON object."""
+        metadata, whole = self.metadata, bool(self.names)
+        infos = {each.name: None if metadata is None else metadata.find(each.name) for each in self.params}
+        params = {each.name: ParamJson.of(each, infos[each.name], whole=whole) for each in self.params}
+        return TableJson.of(self.table, params)
 
 
-def _print_summaries(
-    summaries: Sequence[CachedSummary], names: Mapping[str, str], extended: Mapping[tuple[str, int], int]
-) -> None:
-    """Print a line for each table; with nickname and number of extended parameters if any table has one."""
+def _print_summaries(summaries: Sequence[CachedSummary], extended: Mapping[tuple[str, int], int]) -> None:
+    """Print a line for each table, with the number of extended parameters if any table has some."""
     rows = (
         (
-            *([names.get(each.key)] if names else []),
             f"{each.system}/{each.component}",
             autopilot_name(each.autopilot),
             each.size,
@@ -433,8 +334,8 @@ def _print_summaries(
         )
         for each in summaries
     )
-    columns = [*(["name"] if names else []), "component", "autopilot", "params"]
-    columns += [*(["extended"] if extended else []), "hash", "synced", "key"]
+    more = ["extended"] if extended else []
+    columns = ["component", "autopilot", "params", *more, "hash", "synced", "key"]
     print_table(columns, rows, right="params extended")
 
 

@@ -21,6 +21,7 @@ import anyio
 
 from paramclient.cli.block_characters import Piece, marks_for
 from paramclient.cli.download_strip import strip_lines
+from paramclient.cli.json_output import as_json
 from paramclient.model.values import Param, format_value
 from paramclient.protocol.params.fetch_result import Progress
 
@@ -41,6 +42,7 @@ __all__ = [
     "local_time",
     "milliseconds",
     "print_document",
+    "print_json",
     "print_line",
     "print_table",
     "printable",
@@ -139,6 +141,11 @@ def by_index(params: Iterable[Param]) -> list[Param]:
 def print_document(document: Document) -> None:
     """Print a document of `paramclient.documents` on one line, and flush."""
     print(json.dumps(document.as_json(), allow_nan=False), flush=True)
+
+
+def print_json(item: object) -> None:
+    """Print an object of `paramclient.cli.json_output`, or a mapping or list of them, on one line; flush."""
+    print(json.dumps(as_json(item), allow_nan=False), flush=True)
 
 
 # Tables and lines

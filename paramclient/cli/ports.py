@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.output import print_document, print_table, say
+from paramclient.cli.output import print_json, print_table, say
 from paramclient.links import SerialPort, list_ports
 
 __all__ = ["ports"]
@@ -19,15 +19,28 @@ def ports(*, json: bool = False) -> ExitCode:
     """
     found = list_ports()
     if json:
-        from paramclient.documents.command_output import PortDoc, PortsDoc  # only here: loads pydantic
-
-        print_document(PortsDoc(ports=[PortDoc.of(port) for port in found]))
+        print_json({"ports": [_port_json(port) for port in found]})
     elif found:
         columns = ["device", "autopilot", "product", "manufacturer", "usb id", "link"]
         print_table(columns, map(_port_cells, found))
     else:
         say("this computer has no serial ports")
     return ExitCode.DONE
+
+
+def _port_json(port: SerialPort) -> dict[str, object]:
+    return {
+        "device": port.device,
+        "by_id": port.by_id,
+        "link": port.link,
+        "autopilot": port.autopilot,
+        "vendor_id": _hex(port.vendor_id),
+        "product_id": _hex(port.product_id),
+        "manufacturer": port.manufacturer,
+        "product": port.product,
+        "serial_number": port.serial_number,
+        "interface": port.interface,
+    }
 
 
 def _port_cells(port: SerialPort) -> tuple[object, ...]:

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import Annotated, Final, Literal
 
 import anyio
 from cyclopts import Parameter
@@ -19,7 +19,7 @@ from paramclient.cli.every_vehicle import (
     check_all,
     check_expected,
     every_vehicle,
-    failed_documents,
+    failed_json,
     report_failures,
     run_on_all,
 )
@@ -31,6 +31,7 @@ from paramclient.cli.extended import (
     is_extended_session,
     watch_extended,
 )
+from paramclient.cli.json_output import FetchJson, ParamJson
 from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
     MetadataChoice,
@@ -44,7 +45,7 @@ from paramclient.cli.output import (
     by_index,
     default_text,
     milliseconds,
-    print_document,
+    print_json,
     print_table,
     printable,
     progress_bar,
@@ -64,9 +65,6 @@ from paramclient.model.values import Param, Trust, format_value, type_name
 from paramclient.model.wording import first_of
 from paramclient.protocol.params.fetch_result import FetchResult, Policy, Progress
 from paramclient.protocol.params.sampling import SAMPLE_SIZE, Sample
-
-if TYPE_CHECKING:
-    from paramclient.documents.command_output import FetchOutputDoc
 
 __all__ = ["fetch", "get", "watch"]
 
@@ -171,7 +169,7 @@ async def fetch(
     for note in fetched.notes:
         report(note)
     if options.json:
-        print_document(fetched.document())
+        print_json(fetched.as_json())
     else:
         if not changed:
             rows = ((*_cells(param), param.trust) for param in fetched.params)
@@ -233,9 +231,7 @@ async def get(
         params, errors, described = await _read(session, name_patterns, described, metadata)
         await session.report_others(has_all=True)
     if options.json:
-        from paramclient.documents.param import ReadOutputDoc  # only here: loads pydantic
-
-        print_document(ReadOutputDoc.of(params, described, errors))
+        print_json(_read_json(params, errors, described))
     elif params and described is None:
         print_table(_COLUMNS, map(_cells, params), right="value index")
     elif params and described is not None:
@@ -425,11 +421,9 @@ class _Fetched:
             f"{result.elapsed:.2f} s, {lost}{trip}{transferred}{crc}"
         )
 
-    def document(self) -> FetchOutputDoc:
-        """Return the JSON document."""
-        from paramclient.documents.command_output import FetchOutputDoc  # only here: loads pydantic
-
-        return FetchOutputDoc.of(
+    def as_json(self) -> FetchJson:
+        """Return the JSON object."""
+        return FetchJson.of(
             self.session.component,
             self.result,
             self.params,
@@ -462,10 +456,7 @@ def _show_fleet(
         for note in each.notes:
             report(f"{each.session.label}: {note}")
     if options.json:
-        from paramclient.documents.command_output import FleetFetchDoc  # only here: loads pydantic
-
-        documents = [each.document() for each in found]
-        print_document(FleetFetchDoc(vehicles=documents, errors=failed_documents(fleet)))
+        print_json({"vehicles": [each.as_json() for each in found], "errors": failed_json(fleet)})
     else:
         rows = (
             (address_text(each.session), *_cells(param), param.trust, *([default_text(param)] * changed))
@@ -541,6 +532,16 @@ async def _read(
     return params, errors, described
 
 
+def _read_json(
+    params: Iterable[Param], errors: Mapping[str, ParamClientError], described: Metadata | None
+) -> dict[str, object]:
+    """Return the JSON of parameters with all their metadata, and of errors by name."""
+    infos = {param.name: None if described is None else described.find(param.name) for param in params}
+    read = {param.name: ParamJson.of(param, infos[param.name], whole=True) for param in params}
+    failed = {name: str(error) for name, error in errors.items()}
+    return {"params": read, **({"errors": failed} if failed else {})}
+
+
 def _show_read(
     read: Sequence[Done[CommandSession, tuple[list[Param], dict[str, ParamClientError], Metadata | None]]],
     options: LinkOptions,
@@ -548,10 +549,15 @@ def _show_read(
     """Print the parameters of several vehicles, and the failures; return the exit code."""
     found = [(each.vehicle, *each.result) for each in read if each.result is not None]
     if options.json:
-        from paramclient.documents.command_output import FleetReadDoc  # only here: loads pydantic
-
-        vehicles = ((s.component, params, errors, known) for s, params, errors, known in found)
-        print_document(FleetReadDoc.of(vehicles, failed_documents(read)))
+        vehicles = [
+            {
+                "system": session.component.system,
+                "component": session.component.component,
+                **_read_json(params, errors, known),
+            }
+            for session, params, errors, known in found
+        ]
+        print_json({"vehicles": vehicles, "errors": failed_json(read)})
     else:
         is_described = any(described is not None for *_, described in found)
         no_meaning = ("", "") if is_described else ()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import anyio
 from cyclopts import Parameter
@@ -14,6 +14,7 @@ from cyclopts.validators import Number
 from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.default_sources import say_sources
 from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.json_output import VehicleJson, WriteJson
 from paramclient.cli.metadata import (
     MetadataChoice,
     from_file,
@@ -25,7 +26,7 @@ from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import (
     Coloured,
     by_index,
-    print_document,
+    print_json,
     print_table,
     printable,
     progress_bar,
@@ -48,16 +49,13 @@ from paramclient.errors import NoReply, ParamClientError, UsageError, VehicleErr
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import DefaultSource, default_of
 from paramclient.model.group_switches import is_group_switch
-from paramclient.model.notation import typed
+from paramclient.model.notation import typed, value_json
 from paramclient.model.patterns import is_pattern
 from paramclient.model.values import Param, format_value
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.protocol.params.write_batch import SetOutcome
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
-
-if TYPE_CHECKING:
-    from paramclient.documents.command_output import ResetOutputDoc
 
 __all__ = ["reset"]
 
@@ -273,25 +271,16 @@ class _ResetPlan:
         """Print the values that would be sent."""
         choice = self.choice
         if self.session.options.json:
-            from paramclient.documents.command_output import (  # only here: loads pydantic
-                ResetPlanDoc,
-                ResetValueDoc,
-            )
-            from paramclient.documents.receiver import ReceiverDoc
-
             values = [
-                ResetValueDoc.of(self.params[name], value, self._source(name))
+                {
+                    "name": name,
+                    "value": value_json(self.params[name].settable, self.params[name].type_number),
+                    "default": value_json(*typed(value, self.params[name].type_number)),
+                    "source": self._source(name).value,
+                }
                 for name, value in choice.values.items()
             ]
-            print_document(
-                ResetPlanDoc(
-                    vehicle=ReceiverDoc.of(self.session.component),
-                    values=values,
-                    unchanged=[*choice.unchanged],
-                    without_default=[*choice.without_default],
-                    read_only=[*self.read_only],
-                )
-            )
+            print_json({"vehicle": self._vehicle, "dry_run": True, "values": values, **self._unwritten})
             return
         rows: list[tuple[object, ...]] = [
             (name, self._before(name), self._default(name), f"default of {self._source(name)}")
@@ -311,7 +300,11 @@ class _ResetPlan:
     def print_outcomes(self, outcomes: Sequence[SetOutcome]) -> None:
         """Print the outcomes as a table or as JSON."""
         if self.session.options.json:
-            print_document(self._document(outcomes))
+            results = [
+                WriteJson.of(each, type_of(self.session, each), info_of(self.described, each.name))
+                for each in outcomes
+            ]
+            print_json({"vehicle": self._vehicle, "results": results, **self._unwritten})
             return
         rows: list[tuple[object, ...]] = []
         for outcome in outcomes:
@@ -339,23 +332,18 @@ class _ResetPlan:
             names = first_of(unknown, RESET_NAMES_MAX)
             report(f"not written, as their default is not known: {names}")
 
-    def _document(self, outcomes: Sequence[SetOutcome]) -> ResetOutputDoc:
-        from paramclient.documents.command_output import (  # only here: loads pydantic
-            ResetOutputDoc,
-            WriteOutputDoc,
-        )
-        from paramclient.documents.receiver import ReceiverDoc
+    @property
+    def _vehicle(self) -> VehicleJson:
+        return VehicleJson.of(self.session.component)
 
-        return ResetOutputDoc(
-            vehicle=ReceiverDoc.of(self.session.component),
-            results=[
-                WriteOutputDoc.of(each, type_of(self.session, each), info_of(self.described, each.name))
-                for each in outcomes
-            ],
-            unchanged=[*self.choice.unchanged],
-            without_default=[*self.choice.without_default],
-            read_only=[*self.read_only],
-        )
+    @property
+    def _unwritten(self) -> dict[str, object]:
+        """The JSON of the names that are not written."""
+        return {
+            "unchanged": [*self.choice.unchanged],
+            "without_default": [*self.choice.without_default],
+            "read_only": [*self.read_only],
+        }
 
     def _source(self, name: str) -> DefaultSource:
         """Return the origin of a default that is written."""

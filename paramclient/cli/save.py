@@ -24,7 +24,7 @@ from paramclient.cli.extended import is_extended_link, is_extended_source, save_
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets
 from paramclient.cli.offline import tables_of
 from paramclient.cli.options import CacheOptions, LinkOptions
-from paramclient.cli.output import print_document, printable, progress_bar, report, say
+from paramclient.cli.output import print_json, printable, progress_bar, report, say
 from paramclient.cli.session import CommandSession, connect
 from paramclient.cli.sources import check_link, choose, collect_confirmed, is_file, names_vehicle, open_file
 from paramclient.cli.targets import find_vehicles
@@ -291,10 +291,17 @@ def _by_file(pattern: str, sets: Sequence[ParamSet]) -> dict[Path, list[ParamSet
 
 def _show(files: Mapping[Path, Sequence[ParamSet]], file_format: FileFormat, *, as_json: bool) -> None:
     if as_json:
-        from paramclient.documents.command_output import SavedDoc, SavedFilesDoc  # only here: loads pydantic
-
-        documents = [SavedDoc.of(str(file), file_format, sets) for file, sets in files.items()]
-        print_document(documents[0] if len(documents) == 1 else SavedFilesDoc(files=documents))
+        written = [
+            {
+                "path": str(file),
+                "format": file_format.value,
+                "components": [
+                    {"system": each.system, "component": each.component, "params": len(each)} for each in sets
+                ],
+            }
+            for file, sets in files.items()
+        ]
+        print_json(written[0] if len(written) == 1 else {"files": written})
         return
     for file, sets in files.items():
         contents = ", ".join(f"{counted(len(each), 'parameter')} of {address(each)}" for each in sets)

@@ -11,6 +11,8 @@ from cyclopts.validators import Number
 
 from paramclient.cache import CachedComponent, HistoryEntry, ParamCache
 from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.json_cache import HistoryLineJson
+from paramclient.cli.json_output import InfoJson, ParamJson
 from paramclient.cli.metadata import (
     MetadataChoice,
     from_file,
@@ -19,13 +21,14 @@ from paramclient.cli.metadata import (
     print_descriptions,
 )
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import local_time, print_document, print_line, print_table, printable, report, say
+from paramclient.cli.output import local_time, print_json, print_line, print_table, printable, report, say
 from paramclient.cli.param_names import unmatched_text
 from paramclient.cli.sources import tables_in
 from paramclient.errors import NotInCache, UsageError
 from paramclient.metadata import Metadata, ParamInfo
 from paramclient.model.defaults import DefaultSource, default_of
 from paramclient.model.identity import autopilot_name, has_autopilot
+from paramclient.model.notation import time_text
 from paramclient.model.values import check_name, format_value, type_name
 from paramclient.model.wording import counted
 
@@ -71,10 +74,7 @@ def search(
     )
     names = [name for _, name in ranked[:limit]]
     if options.json:
-        from paramclient.documents.cached import FoundDoc, FoundParamDoc  # only here: loads pydantic
-
-        rows = [FoundParamDoc.of(name, found.info(name), found.having(name)) for name in names]
-        print_document(FoundDoc(results=rows))
+        print_json({"results": [found.as_json(name) for name in names]})
     elif names:
         print_table(["name", "value", "vehicle", "description"], map(found.cells, names), right="value")
         if len(ranked) > len(names):
@@ -123,9 +123,9 @@ def info(
             for each in tables
         }
     if options.json:
-        from paramclient.documents.cached import ParamInfoDoc  # only here: loads pydantic
-
-        print_document(ParamInfoDoc.of(spelled, described, tables, changes))
+        values = [_value_json(each, spelled, described, changes[each.key, each.component]) for each in tables]
+        known = None if described is None else InfoJson.of(described)
+        print_json({"name": spelled, "metadata": known, "vehicles": values})
         return ExitCode.DONE
     print_descriptions([spelled], Metadata.of([described] if described is not None else []))
     if described is None and found.undescribed:
@@ -177,6 +177,13 @@ class _Known:
         """Return the tables with this parameter."""
         return [table for table in self.tables if name in table.params]
 
+    def as_json(self, name: str) -> dict[str, object]:
+        """Return the JSON of a found parameter; `vehicles` are the keys of the vehicles that have it."""
+        described = self.info(name)
+        description = None if described is None else described.short_description or None
+        vehicles = [each.key for each in self.having(name)]
+        return {"name": name, "description": description, "vehicles": vehicles}
+
     def cells(self, name: str) -> tuple[object, ...]:
         """Return the row of a found parameter, with its value if that is the same on all vehicles."""
         tables = self.having(name)
@@ -201,6 +208,22 @@ def _rank(name: str, described: ParamInfo | None, lowered_words: Iterable[str]) 
     return next(
         (rank for rank, text in enumerate(places) if all(word in text for word in lowered_words)), None
     )
+
+
+def _value_json(
+    table: CachedComponent, name: str, described: ParamInfo | None, changes: Sequence[HistoryEntry]
+) -> dict[str, object]:
+    """Return the JSON of the cached value of one vehicle, with its last changes."""
+    default = None if described is None else described.default
+    return {
+        "key": table.key,
+        "system": table.system,
+        "component": table.component,
+        "autopilot": autopilot_name(table.autopilot),
+        "heard_at": time_text(table.heard_at[name]),
+        "param": ParamJson.of_table(table.params[name], described=default),
+        "changes": [HistoryLineJson.of(each) for each in changes],
+    }
 
 
 def _lines_of(

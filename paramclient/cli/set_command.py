@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import anyio
 from cyclopts import Parameter
@@ -27,6 +27,7 @@ from paramclient.cli.extended import (
     set_extended,
     text_pairs,
 )
+from paramclient.cli.json_output import VehicleJson, WriteJson
 from paramclient.cli.metadata import (
     MetadataChoice,
     from_file,
@@ -37,7 +38,7 @@ from paramclient.cli.metadata import (
     resolved,
 )
 from paramclient.cli.options import Count, LinkOptions
-from paramclient.cli.output import print_document, print_table, printable, report, say
+from paramclient.cli.output import print_json, print_table, printable, report, say
 from paramclient.cli.param_names import spelling
 from paramclient.cli.session import CommandSession, check_link_argument, connect, wait_for_firmware
 from paramclient.cli.write_outcomes import (
@@ -55,9 +56,6 @@ from paramclient.errors import ParamClientError, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.values import ParamType, format_value
 from paramclient.protocol.params.write_batch import SetOutcome
-
-if TYPE_CHECKING:
-    from paramclient.documents.command_output import WritesOutputDoc
 
 __all__ = ["set_"]
 
@@ -238,7 +236,7 @@ async def _write(
 def _print(session: CommandSession, outcomes: Sequence[SetOutcome], described: Metadata | None) -> None:
     """Print the outcomes as a table or as JSON."""
     if session.options.json:
-        print_document(_document(session, outcomes, described))
+        print_json(_json(session, outcomes, described))
         return
     print_table(
         OUTCOME_COLUMNS,
@@ -247,44 +245,26 @@ def _print(session: CommandSession, outcomes: Sequence[SetOutcome], described: M
     )
 
 
-def _document(
+def _json(
     session: CommandSession, outcomes: Sequence[SetOutcome], described: Metadata | None
-) -> WritesOutputDoc:
-    from paramclient.documents.command_output import (  # only here: loads pydantic
-        WriteOutputDoc,
-        WritesOutputDoc,
-    )
-    from paramclient.documents.receiver import ReceiverDoc
-
-    return WritesOutputDoc(
-        vehicle=ReceiverDoc.of(session.component),
-        results=[
-            WriteOutputDoc.of(each, type_of(session, each), info_of(described, each.name))
-            for each in outcomes
-        ],
-    )
+) -> dict[str, object]:
+    results = [WriteJson.of(each, type_of(session, each), info_of(described, each.name)) for each in outcomes]
+    return {"vehicle": VehicleJson.of(session.component), "results": results}
 
 
 def _show_fleet(jobs: Sequence[_Job], done: Sequence[Sequence[SetOutcome]], options: LinkOptions) -> int:
     """Print the outcomes of several vehicles; return the exit code."""
     pairs = list(zip(jobs, done, strict=True))
     if options.json:
-        from paramclient.documents.command_output import (  # only here: loads pydantic
-            FleetWritesDoc,
-            VehicleWritesDoc,
-        )
-        from paramclient.documents.receiver import ReceiverDoc
-
-        documents = [
-            VehicleWritesDoc(
-                system=job.session.component.system,
-                component=job.session.component.component,
-                vehicle=ReceiverDoc.of(job.session.component),
-                results=_document(job.session, outcomes, job.described).results,
-            )
+        vehicles = [
+            {
+                "system": job.session.component.system,
+                "component": job.session.component.component,
+                **_json(job.session, outcomes, job.described),
+            }
             for job, outcomes in pairs
         ]
-        print_document(FleetWritesDoc(vehicles=documents))
+        print_json({"vehicles": vehicles})
     else:
         rows = (
             (address_text(job.session), *outcome_cells(job.session, outcome, job.described))

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
+from typing import Any, Final, Protocol, TypeAlias
 
 from paramclient.cli.exit_codes import ExitCode, code_of
+from paramclient.cli.json_output import VehicleJson
+from paramclient.cli.json_setup import ApplyJson, PlanJson, applied_rows
 from paramclient.cli.output import Coloured, print_table, printable, report, say
 from paramclient.errors import ParamClientError
 from paramclient.model.identity import Identity
@@ -23,23 +25,17 @@ from paramclient.provision import (
     PlanStatus,
 )
 
-if TYPE_CHECKING:
-    from paramclient.documents.setup import ApplyResultDoc, InterruptedDoc, PlanDoc, VerifiedDoc
-
 __all__ = [
     "Applied",
     "NamedVehicle",
     "applied_code",
-    "applied_doc",
-    "interrupted_doc",
-    "met_code",
+    "applied_json",
+    "interrupted_json",
     "planned_code",
-    "planned_doc",
+    "planned_json",
     "show_applied",
     "show_interrupted",
     "show_planned",
-    "show_verified",
-    "verified_doc",
 ]
 
 RESULT_NAMES_MAX: Final = 10
@@ -166,21 +162,22 @@ def applied_code(result: Applied) -> ExitCode:
     return ExitCode.INCOMPLETE if result.error is None else max(ExitCode.INCOMPLETE, code_of(result.error))
 
 
-def applied_doc(vehicle: NamedVehicle, result: ApplyResult, *, full: bool) -> ApplyResultDoc:
-    """Return the JSON document of the result for one vehicle; unchanged values only if `full`."""
-    from paramclient.documents.receiver import ReceiverDoc  # only here: loads pydantic
-    from paramclient.documents.setup import ApplyResultDoc
-
+def applied_json(vehicle: NamedVehicle, result: ApplyResult, *, full: bool) -> ApplyJson:
+    """Return the JSON of the result for one vehicle; unchanged values only if `full`."""
     system, component = vehicle.system, vehicle.component
-    receiver = ReceiverDoc.at(system, component, vehicle.identity)
-    return ApplyResultDoc.of(result, system=system, component=component, full=full, vehicle=receiver)
+    receiver = VehicleJson.at(system, component, vehicle.identity)
+    return ApplyJson.of(result, system=system, component=component, full=full, vehicle=receiver)
 
 
-def interrupted_doc(vehicle: NamedVehicle, rows: Iterable[ApplyRow]) -> InterruptedDoc:
-    """Return the JSON document of a set-up that Ctrl-C ended."""
-    from paramclient.documents.setup import InterruptedDoc  # only here: loads pydantic
-
-    return InterruptedDoc.of(rows, system=vehicle.system, component=vehicle.component)
+def interrupted_json(vehicle: NamedVehicle, rows: Iterable[ApplyRow]) -> dict[str, object]:
+    """Return the JSON of a set-up that Ctrl-C ended."""
+    return {
+        "system": vehicle.system,
+        "component": vehicle.component,
+        "complete": False,
+        "params": applied_rows(rows),
+        "error": "interrupted",
+    }
 
 
 def _applied_cells(row: ApplyRow) -> Cells:
@@ -226,11 +223,9 @@ def planned_code(plan: Plan, *, skip_invalid: bool) -> ExitCode:
     return ExitCode.INCOMPLETE if is_missing else ExitCode.DONE
 
 
-def planned_doc(vehicle: NamedVehicle, plan: Plan, *, full: bool) -> PlanDoc:
-    """Return the JSON document of the plan for one vehicle."""
-    from paramclient.documents.setup import PlanDoc  # only here: loads pydantic
-
-    return PlanDoc.of(plan, system=vehicle.system, component=vehicle.component, full=full)
+def planned_json(vehicle: NamedVehicle, plan: Plan, *, full: bool) -> PlanJson:
+    """Return the JSON of the plan for one vehicle."""
+    return PlanJson.of(plan, system=vehicle.system, component=vehicle.component, full=full)
 
 
 def _planned_rows(plan: Plan, *, reboot: bool, full: bool) -> Iterator[Cells]:
@@ -264,54 +259,6 @@ def _is_notable(row: PlanRow) -> bool:
     return row.status is not PlanStatus.UNCHANGED and row.differs
 
 
-# Comparisons
-
-
-def show_verified(plans: Mapping[NamedVehicle, Plan], *, full: bool) -> None:
-    """Print the parameters that differ; all parameters if `full`."""
-    _say_firmware(plans)
-    _print(
-        ["name", "wanted", "now", "is", "reason"],
-        {
-            vehicle: (_verified_cells(row) for row in plan.rows.values() if full or not row.is_met)
-            for vehicle, plan in plans.items()
-        },
-    )
-    for vehicle, plan in plans.items():
-        words: dict[str, int] = {}
-        for row in plan.rows.values():
-            words[row.comparison] = words.get(row.comparison, 0) + 1
-        counted = ", ".join(f"{number} {word}" for word, number in sorted(words.items(), key=_by_word))
-        say(printable(f"{vehicle.label}: {counted or 'nothing to compare'}"))
-
-
-def met_code(plan: Plan) -> ExitCode:
-    """Return the exit code of a comparison."""
-    return ExitCode.DONE if plan.is_met else ExitCode.DIFFERENT
-
-
-def verified_doc(vehicle: NamedVehicle, plan: Plan, *, full: bool) -> VerifiedDoc:
-    """Return the JSON document of the comparison of one vehicle."""
-    from paramclient.documents.setup import VerifiedDoc  # only here: loads pydantic
-
-    return VerifiedDoc.of(plan, system=vehicle.system, component=vehicle.component, full=full)
-
-
-def _verified_cells(row: PlanRow) -> Cells:
-    comparison = row.comparison
-    return [
-        row.name,
-        _text(row.target.settable, row),
-        _text(row.before, row),
-        Coloured(comparison, _COMPARISON_STYLES[comparison]),
-        f"{row.rename_note} {_like(row)}".strip() if comparison == "missing" else _why(row),
-    ]
-
-
-def _by_word(counted: tuple[str, int]) -> int:
-    return list(_COMPARISON_STYLES).index(counted[0])
-
-
 # Shared by all tables
 
 _STYLES: Final = {
@@ -334,8 +281,6 @@ _PLAN_STYLES: Final = {
 """Styles of rich for each planned action."""
 _PLAN_WORDS: Final = {PlanStatus.SET: "to set", PlanStatus.LATER: "that may be revealed"}
 """Words for planned actions in the summary, where they differ from the status."""
-_COMPARISON_STYLES: Final = {"same": "", "different": "yellow", "missing": "red", "left out": "dim"}
-"""Styles of rich for each comparison; the keys are in the order of the summary."""
 
 
 def _print(

@@ -13,7 +13,7 @@ from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import Id, KeyOptions, Seconds
-from paramclient.cli.output import print_document, print_line, printable
+from paramclient.cli.output import print_json, print_line, printable
 from paramclient.cli.session import VEHICLE_TIMEOUT, Deadline, wait_for_vehicle
 from paramclient.cli.vehicle_name import VehicleName, check_uid
 from paramclient.client.client import ParamClient
@@ -192,16 +192,14 @@ def _refused(address: tuple[int, int], failure: str) -> VehicleError:
 
 def _show(options: SigningTarget, vehicle: Component, key: SigningKey | None) -> None:
     if options.json:
-        from paramclient.documents.command_output import SigningOutputDoc  # only here: loads pydantic
-
-        print_document(
-            SigningOutputDoc(
-                system=vehicle.system,
-                component=vehicle.component,
-                autopilot=vehicle.autopilot,
-                signs=key is not None,
-                fingerprint=None if key is None else key.fingerprint,
-            )
+        print_json(
+            {
+                "system": vehicle.system,
+                "component": vehicle.component,
+                "autopilot": vehicle.autopilot,
+                "signs": key is not None,
+                "fingerprint": None if key is None else key.fingerprint,
+            }
         )
         return
     name = f"{vehicle.system}/{vehicle.component} {vehicle.autopilot}"

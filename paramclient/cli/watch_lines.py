@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncGenerator
 from contextlib import aclosing
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
 
-from paramclient.cli.output import local_time, print_document, print_line, printable
+from paramclient.cli.json_output import ExtParamJson
+from paramclient.cli.output import local_time, print_json, print_line, printable
 from paramclient.cli.session import CommandSession
 from paramclient.client.events import (
     Contested,
@@ -22,14 +23,12 @@ from paramclient.client.events import (
 )
 from paramclient.client.extended_params import ExtChanges
 from paramclient.client.subscription import Changes
-from paramclient.model.ext_params import ExtValue, format_ext_value
+from paramclient.model.ext_params import ExtParam, ExtValue, format_ext_value
+from paramclient.model.notation import hash_text, time_text, value_json
 from paramclient.model.patterns import NameChoice
-from paramclient.model.values import format_value
+from paramclient.model.values import Param, format_value
 from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.params.change import Added, Change
-
-if TYPE_CHECKING:
-    from paramclient.documents.document import Document
 
 __all__ = ["HEX", "ext_value_text", "print_changes_and_events"]
 
@@ -72,7 +71,7 @@ async def print_changes_and_events(
                 text = _event_text(each)
             at = session.now
             if session.options.json:
-                print_document(_line(each, at))
+                print_json(_line(each, at))
             else:
                 print_line(f"{local_time(at)}  {text}")
 
@@ -102,15 +101,32 @@ async def _merged(
                 each.exception()  # both end with the link; one error is reported
 
 
-def _line(item: Change | ExtChange | _ComponentEvent, at: float) -> Document:
-    """Return the JSON document of a change or an event."""
-    if isinstance(item, ExtChange):
-        from paramclient.documents.extended_output import ExtChangeLineDoc  # only here: loads pydantic
+def _line(item: Change | ExtChange | _ComponentEvent, at: float) -> dict[str, object]:
+    """Return the JSON of a change or an event."""
+    if isinstance(item, Change | ExtChange):
+        old, new = (None if param is None else _value_json(param) for param in (item.old, item.new))
+        kind = "removed" if item.new is None else "added" if _is_added(item) else "changed"
+        return {"time": time_text(at), "name": item.name, "old": old, "new": new, "by": item.by, "kind": kind}
+    event: dict[str, object] = {
+        "time": time_text(at),
+        "event": type(item).__name__.lower(),
+        "system": item.component.system,
+        "component": item.component.component,
+    }
+    if isinstance(item, Lost | Found):
+        event["silence_s"] = round(item.silence, 4)
+    if isinstance(item, Contested):
+        contest = item.contest
+        event["contest"] = {"claimants": list(contest.claimants), "difference": contest.difference}
+    if isinstance(item, Resynced):
+        event |= {"changed": list(item.changed), "hash": hash_text(item.hash)}
+    return event
 
-        return ExtChangeLineDoc.of(item, at)
-    from paramclient.documents.command_output import ChangeLineDoc, EventLineDoc  # only here: loads pydantic
 
-    return ChangeLineDoc.of(item, at) if isinstance(item, Change) else EventLineDoc.of(item, at)
+def _value_json(param: Param | ExtParam) -> object:
+    if isinstance(param, ExtParam):
+        return ExtParamJson.of(param)
+    return value_json(param.settable, param.type_number)
 
 
 def _change_text(change: Change | ExtChange) -> str:

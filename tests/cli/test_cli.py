@@ -623,27 +623,6 @@ def test_show_prints_parameters_that_differ_from_the_defaults(command: Command, 
 # fetch with a sample
 
 
-def test_a_sample_may_suffice_and_its_confidence_is_printed(command: Command, tmp_path: Path) -> None:
-    cache = tmp_path / "cache.sqlite3"
-    arguments = ("fetch", "sim:ardupilot", "--cache", cache, "--accept", "sampled")
-    first = command(*arguments, "--json")
-    assert (first.json["source"], first.json["sample"]) == ("ftp", None)
-    found = command(*arguments, "--json")
-    assert found.code == 0
-    assert (found.json["source"], found.json["received"], found.json["missing"]) == ("cache", 1382, [])
-    assert len(found.json["params"]) == 1382
-    assert len(found.json["cached"]) == 1382 - 30
-    assert found.json["sample"] == {
-        "size": 30,
-        "count": 1382,
-        "confidence": {"1": 0.0217, "10": 0.1976, "100": 0.8975},
-    }
-    shown = command(*arguments, "--sample", 60)
-    assert shown.code == 0
-    assert "60 of 1382 parameters were read and agreed" in shown.err
-    assert "4% for 1 and 36% for 10 and 99% for 100" in shown.err
-
-
 def test_sample_needs_accept_sampled(command: Command) -> None:
     refused = command("fetch", "sim:ardupilot", "--sample", 5, "--no-cache")
     assert (refused.code, refused.out) == (2, "")

@@ -316,26 +316,6 @@ def test_a_component_without_extended_parameters_is_reported(command: Command, p
     assert (done.code, "no reply: extended parameters of 1/1" in done.err) == (3, True)
 
 
-def test_verify_compares_with_a_file(command: Command, put: Put, tmp_path: Path) -> None:
-    camera = small()
-    url = put(camera)
-    file = tmp_path / "camera.json"
-    assert command("save", url, file, *CAMERA).code == 0, "found without the option"
-    same = command("verify", url, file, *CAMERA)
-    assert (same.code, same.out) == (0, "")
-    assert same.err == f"1/100 no autopilot has 4 of 4 values of {file}\n"
-    camera.set_ext_param("CAM_NAME", "Rear")
-    other = command("verify", url, file, *CAMERA)
-    assert (other.code, other.rows[1:]) == (1, [["CAM_NAME", "Rear", "Front"]])
-    document = command("verify", url, file, *CAMERA, "--json").json
-    assert (document["is_same"], document["extended"][0]["left"]["value"]) == (False, "Rear")
-    camera.remove_ext_param("CAM_NAME")
-    lacking = command("verify", url, file, *CAMERA)
-    assert (lacking.code, "does not have CAM_NAME" in lacking.err) == (1, True)
-    assert command("verify", url, file, *CAMERA, "--include", "*").code == 2
-    assert not camera.requests["PARAM_EXT_SET"]
-
-
 def test_save_finds_plain_ones_of_such_a_component(command: Command, put: Put, tmp_path: Path) -> None:
     url = put(GenericVehicle({"A": 1}, component=100))
     file = tmp_path / "camera.yaml"

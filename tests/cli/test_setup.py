@@ -514,31 +514,6 @@ def test_restore_needs_a_stored_state(
 # verify
 
 
-def test_verify_compares_and_sets_nothing(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
-) -> None:
-    vehicle = copter()
-    outcome = command("verify", put(vehicle), file(FILE + "BARO1_GND_PRES,1\n"))
-    assert outcome.code == 1
-    assert outcome.rows == [
-        ["name", "wanted", "now", "is", "reason"],
-        ["RTL_ALT", "2500", "1500", "different"],
-        ["WPNAV_SPEED", "750.5", "500.0", "different"],
-        ["BARO1_GND_PRES", "1", "missing", "(did you mean BARO1_GND_PRESS?)"],
-    ]
-    assert outcome.err == "1/1 ardupilot: 1 same, 2 different, 1 missing, 1 left out\n"
-    assert vehicle.requests["PARAM_SET"] == 0
-    vehicle.set_param("RTL_ALT", 2500)
-    vehicle.set_param("WPNAV_SPEED", 750.5)
-    outcome = command("verify", put(vehicle), file())
-    assert (outcome.code, outcome.out) == (0, "")
-    assert outcome.err == "1/1 ardupilot: 3 same, 1 left out\n"
-    reported = command("verify", put(vehicle), file(), "--json", "--full").json
-    assert reported["met"] is True
-    assert reported["counts"] == {"same": 3, "different": 0, "missing": 0, "left out": 1}
-    assert reported["params"]["RTL_ALT"]["is"] == "same"
-
-
 @pytest.mark.parametrize("kind", ["px4", "ardupilot"])
 def test_simulated_links_work(command: Command, file: Callable[..., Path], kind: str) -> None:
     name = {"px4": "MC_ROLL_P", "ardupilot": "ATC_ANG_RLL_P"}[kind]

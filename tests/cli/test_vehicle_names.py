@@ -214,7 +214,6 @@ COMMANDS = [
     ["apply", LINK, "NAME", "--yes"],
     ["apply", LINK, "NAME", "--dry-run"],
     ["apply", LINK, "NAME", "--all", "--yes"],
-    ["verify", LINK, "NAME"],
 ]
 """With NAME for the vehicle, and FILE for a file that is not there."""
 

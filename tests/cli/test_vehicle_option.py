@@ -79,69 +79,6 @@ def test_a_kind_that_is_not_there(command: Command, put: Put) -> None:
     assert "Heard on sim:custom so far: 4/1 ArduPilot quadrotor." in done.err
 
 
-def test_a_nickname_names_a_vehicle_everywhere(command: Command, put: Put, tmp_path: Path) -> None:
-    one, two = px4(), copter()
-    url = put(Air([one, two]))
-    for vehicle in ("1", "4"):
-        assert command("fetch", url, "--vehicle", vehicle).code == 0
-    named = command("cache", "name", "4/1", "tractor")
-    assert named.code == 0, named.err
-    assert named.out.startswith("tractor is uid:")
-    assert command("set", url, "A", 7, "--vehicle", "Tractor").code == 0
-    assert (one.values["A"], two.values["A"]) == (1.0, 7.0)
-    assert command("show", "tractor", "A", "--json").json["components"][0]["system"] == 4
-    assert command("history", "tractor", "A", "--json").json["history"][-1]["new"] == 7.0
-    file = tmp_path / "tractor.param"
-    for source in ("tractor", "cache:tractor"):
-        assert command("save", source, file).code == 0
-    assert command("diff", "tractor", file).code == 0
-    listed = command("cache", "list")
-    assert listed.rows[0][0] == "name"
-    assert [row[0] for row in listed.rows if "4/1" in row] == ["tractor"]
-    by_system = {each["system"]: each for each in command("cache", "list", "--json").json["components"]}
-    assert by_system[4]["nickname"] == "tractor"
-    assert "nickname" not in by_system[1]
-
-
-def test_another_vehicle_under_the_system_id_of_a_nickname(command: Command, put: Put) -> None:
-    assert command("fetch", put(copter())).code == 0
-    assert command("cache", "name", "4", "tractor").code == 0
-    other = px4(4)
-    done = command("set", put(other), "A", 7, "--vehicle", "tractor")
-    assert (done.code, done.out, other.requests["PARAM_SET"]) == (1, "", 0)
-    assert "another vehicle answers as 4/1: expected the hardware id " in done.err
-
-
-def test_a_vehicle_without_hardware_id_under_the_system_id_of_a_nickname(command: Command, put: Put) -> None:
-    assert command("fetch", put(copter())).code == 0
-    assert command("cache", "name", "4", "tractor").code == 0
-    other = copter(uid2=b"")
-    done = command("set", put(other), "A", 7, "--vehicle", "tractor")
-    assert (done.code, done.out, other.requests["PARAM_SET"]) == (3, "", 0)
-    assert done.err.startswith("paramclient: no reply: the hardware id of 4/1 in ")
-    assert done.err.endswith("--vehicle 4/1 chooses by address alone.\n")
-    assert command("set", put(other), "A", 7, "--vehicle", "4/1").code == 0
-    assert other.values["A"] == 7.0
-
-
-@pytest.mark.parametrize("is_other", [False, True])
-def test_a_payload_of_a_nickname_is_known_by_the_autopilot_of_its_system(
-    command: Command, put: Put, is_other: bool
-) -> None:
-    """Components other than the autopilot report another hardware id, or none."""
-    autopilot = copter(uid2=b"another vehicle") if is_other else copter()
-    payload = GenericVehicle({"A": 5}, system=4, component=100)
-    assert command("fetch", put(copter())).code == 0
-    assert command("cache", "name", "4", "tractor").code == 0
-    url = put(Air([autopilot, payload]))
-    done = command("get", url, "A", "--plain", "--json", "--vehicle", "tractor", "--component", "100")
-    assert done.code == (1 if is_other else 0), done.err
-    if is_other:
-        assert "another vehicle answers as 4/100" in done.err
-    else:
-        assert done.json["params"]["A"]["value"] == 5
-
-
 def test_kinds_and_addresses_in_the_cache(command: Command, put: Put) -> None:
     for vehicle in (px4(), copter(), copter(5, uid2=bytes([7] * 18))):
         assert command("fetch", put(vehicle)).code == 0
@@ -176,54 +113,10 @@ def test_names_that_name_nothing(command: Command, put: Put, words: list[str], r
     assert reason in tried.err
 
 
-@pytest.mark.parametrize("words", [["show"], ["history"], ["cache", "history"]])
-@pytest.mark.parametrize("name", ["tractor", "cache:tractor", "4", "4/1", "ardupilot"])
-def test_show_and_history_take_the_option(command: Command, put: Put, words: list[str], name: str) -> None:
-    vehicle = copter()
-    for each in (px4(), vehicle):
-        assert command("fetch", put(each)).code == 0
-    assert command("set", put(vehicle), "A", 7).code == 0
-    assert command("cache", "name", "4", "tractor").code == 0
-    for names in ([], ["a"], ["a", "B*"]):
-        by_option = command(*words, *names, "--vehicle", name)
-        by_argument = command(*words, "tractor", *names)
-        assert (by_option.code, by_option.out) == (0, by_argument.out)
-    unknown = command(*words, "A", "--vehicle", "nobody")
-    assert unknown.code == 2
-    assert "vehicle nobody is not in the cache" in unknown.err
-
-
 def test_history_needs_a_vehicle(command: Command) -> None:
     failed = command("history")
     assert (failed.code, failed.out) == (2, "")
     assert "VEHICLE is missing: a vehicle in the cache" in failed.err
-
-
-def test_a_nickname_is_removed_and_replaced(command: Command, put: Put, cache: Path) -> None:
-    for vehicle in (px4(), copter()):
-        assert command("fetch", put(vehicle)).code == 0
-    assert command("cache", "name", "1", "plough", "--json").json["nickname"] == "plough"
-    taken = command("cache", "name", "4", "Plough")
-    assert taken.code == 2
-    assert "Plough is the nickname of uid:" in taken.err
-    assert command("cache", "name", "plough", "barrow").code == 0
-    assert command("show", "plough").code == 2
-    assert command("show", "barrow").code == 0
-    assert command("cache", "name", "barrow", "--remove").out.endswith(" has no nickname now\n")
-    assert command("show", "barrow").code == 2
-    with ParamCache(cache) as kept:
-        assert kept.nicknames == {}
-    for words in (["1"], ["1", "a", "--remove"]):
-        assert "takes a nickname, or --remove" in command("cache", "name", *words).err
-
-
-def test_a_nickname_of_a_removed_vehicle(command: Command, put: Put) -> None:
-    assert command("fetch", put(copter())).code == 0
-    assert command("cache", "name", "4", "tractor").code == 0
-    assert command("cache", "remove", "tractor").code == 0
-    gone = command("show", "tractor")
-    assert gone.code == 2
-    assert "tractor is the nickname of uid:" in gone.err
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,132 @@
+"""JSON of the cache: tables, changes and snapshots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from paramclient.cli.json_output import Json, ParamJson
+from paramclient.model.identity import autopilot_name
+from paramclient.model.notation import Scalar, hash_text, time_or_none, time_text, value_json
+
+if TYPE_CHECKING:
+    from paramclient.cache import CachedComponent, CachedSummary, HistoryEntry, SnapshotSummary
+
+__all__ = ["HistoryLineJson", "SnapshotJson", "SummaryJson", "TableJson"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TableJson(Json):
+    """The cached table of a component."""
+
+    system: int
+    component: int
+    autopilot: str
+    uid: str | None
+    hash: str | None
+    synced_at: str | None
+    source: str | None = None
+    params: dict[str, ParamJson]
+
+    @classmethod
+    def of(cls, table: CachedComponent, params: Mapping[str, ParamJson]) -> TableJson:
+        """Return a table with these parameters."""
+        return cls(
+            system=table.system,
+            component=table.component,
+            autopilot=autopilot_name(table.autopilot),
+            uid=table.identity.uid,
+            hash=hash_text(table.hash),
+            synced_at=time_or_none(table.synced_at),
+            source=table.source,
+            params=dict(params),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SummaryJson(Json):
+    """A cached table without its parameters; `extended` is the number of extended ones."""
+
+    key: str
+    system: int
+    component: int
+    autopilot: str
+    uid: str | None
+    size: int
+    count: int | None
+    complete: bool
+    hash: str | None
+    synced_at: str | None
+    updated_at: str | None
+    source: str | None = None
+    extended: int | None = None
+
+    @classmethod
+    def of(cls, summary: CachedSummary, extended: int | None = None) -> SummaryJson:
+        """Return a summary, with the number of extended parameters or None."""
+        return cls(
+            key=summary.key,
+            system=summary.system,
+            component=summary.component,
+            autopilot=autopilot_name(summary.autopilot),
+            uid=summary.identity.uid,
+            size=summary.size,
+            count=summary.count,
+            complete=summary.complete,
+            hash=hash_text(summary.hash),
+            synced_at=time_or_none(summary.synced_at),
+            updated_at=time_or_none(summary.updated_at),
+            source=summary.source,
+            extended=extended,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HistoryLineJson(Json):
+    """One change of a value."""
+
+    time: str
+    component: int
+    name: str
+    old: Scalar
+    new: Scalar | None
+    by: str
+
+    @classmethod
+    def of(cls, entry: HistoryEntry) -> HistoryLineJson:
+        """Return a change."""
+        return cls(
+            time=time_text(entry.at),
+            component=entry.component,
+            name=entry.name,
+            old=value_json(entry.old.settable, entry.old.type_number),
+            new=None if entry.new is None else value_json(entry.new.settable, entry.new.type_number),
+            by=entry.by,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SnapshotJson(Json):
+    """A snapshot of a table, without its parameters."""
+
+    id: int
+    time: str
+    component: int
+    size: int
+    complete: bool
+    hash: str | None
+    reason: str
+
+    @classmethod
+    def of(cls, summary: SnapshotSummary) -> SnapshotJson:
+        """Return a snapshot."""
+        return cls(
+            id=summary.id,
+            time=time_text(summary.at),
+            component=summary.component,
+            size=summary.size,
+            complete=summary.complete,
+            hash=hash_text(summary.hash),
+            reason=summary.reason,
+        )

@@ -1,0 +1,484 @@
+"""JSON of parameters, sets, fetches and writes, as the command prints it and the service sends it.
+
+A class of this module, of `json_cache` and of `json_setup` is the shape of one object. Its `of(…)` builds it
+from an object of the library, and `as_json` serialises it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from paramclient.model.defaults import add_default, default_of
+from paramclient.model.ext_params import ExtParam, ExtParamType, ExtValue, ext_type_name
+from paramclient.model.identity import Identity, autopilot_name, version_text
+from paramclient.model.notation import (
+    Scalar,
+    bits_text,
+    bits_written,
+    hash_text,
+    rounded,
+    time_or_none,
+    value_json,
+    value_written,
+)
+from paramclient.model.values import Param, ParamType, format_value, type_name
+from paramclient.protocol.vehicle.kinds import kind_in_words
+
+if TYPE_CHECKING:
+    from pydantic import GetCoreSchemaHandler, TypeAdapter
+    from pydantic_core import CoreSchema
+
+    from paramclient.client.component import Component
+    from paramclient.metadata import Metadata, ParamInfo
+    from paramclient.model.paramset import ParamSet, WrittenParam
+    from paramclient.protocol.params.fetch_result import FetchResult
+    from paramclient.protocol.params.write_batch import SetOutcome
+
+__all__ = [
+    "ExtParamJson",
+    "FetchJson",
+    "IdentityJson",
+    "InfoJson",
+    "Json",
+    "OriginJson",
+    "ParamJson",
+    "SetJson",
+    "VehicleJson",
+    "WriteJson",
+    "WrittenJson",
+    "as_json",
+    "ext_value_json",
+    "short_text",
+]
+
+SHORT_TEXT_LENGTH_MAX: Final = 400
+"""Characters of the members `text` and `units`, which thousands of rows may repeat."""
+
+
+class Json:
+    """An object with these members in this order.
+
+    A member with the default None is left out if it is None; a member without a default is then null. The
+    name in JSON has no trailing underscore: `is_` is `is`.
+    """
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        schema = handler(source)
+        members: Any = handler.resolve_ref_schema(schema)
+        for member in members["schema"]["fields"]:
+            if member["schema"]["type"] == "default":
+                member["serialization_exclude_if"] = _is_none
+            if member["name"].endswith("_"):
+                member["serialization_alias"] = member["name"].removesuffix("_")
+        return schema
+
+
+def as_json(item: object) -> Any:
+    """Return objects of this module, also in lists and mappings, as objects that `json.dumps` accepts."""
+    if isinstance(item, Json):
+        kind: Any = type(item)  # not Hashable for mypy
+        return _adapter(kind).dump_python(item, mode="json", by_alias=True)
+    if isinstance(item, Mapping):
+        return {str(key): as_json(value) for key, value in item.items()}
+    if isinstance(item, list | tuple):
+        return [as_json(each) for each in item]
+    return item
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Json]:
+    from pydantic import TypeAdapter  # only here: takes a fifth of the time of a command
+
+    return TypeAdapter(kind)
+
+
+def _is_none(value: object) -> bool:
+    return value is None
+
+
+def short_text(text: str | None) -> str | None:
+    """Return a text of metadata; None if it is empty or longer than `SHORT_TEXT_LENGTH_MAX`."""
+    return text if text and len(text) <= SHORT_TEXT_LENGTH_MAX else None
+
+
+# Parameters
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InfoJson(Json):
+    """The metadata of a parameter."""
+
+    short_description: str | None = None
+    long_description: str | None = None
+    units: str | None = None
+    minimum: Scalar | None = None
+    maximum: Scalar | None = None
+    increment: Scalar | None = None
+    decimals: int | None = None
+    default: Scalar | None = None
+    values: dict[str, str] | None = None
+    bits: dict[str, str] | None = None
+    reboot_required: bool | None = None
+    is_read_only: bool | None = None
+    is_volatile: bool | None = None
+    category: str | None = None
+    group: str | None = None
+
+    @classmethod
+    def of(cls, info: ParamInfo) -> InfoJson:
+        """Return the metadata of a parameter, without empty members."""
+        return cls(
+            short_description=info.short_description or None,
+            long_description=info.long_description or None,
+            units=info.units or None,
+            minimum=_number(info.minimum),
+            maximum=_number(info.maximum),
+            increment=_number(info.increment),
+            decimals=info.decimals,
+            default=_number(info.default),
+            values={format_value(value): name for value, name in info.values.items()} or None,
+            bits={str(bit): name for bit, name in info.bits.items()} or None,
+            reboot_required=info.reboot_required or None,
+            is_read_only=info.is_read_only or None,
+            is_volatile=info.is_volatile or None,
+            category=info.category or None,
+            group=info.group or None,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ParamJson(Json):
+    """One parameter of a vehicle; in the output of the command its name is the key.
+
+    `default_source` is the origin of `default`: `vehicle` or `metadata`. `text` is the meaning of the value.
+    `name`, `is_default`, `trust` and `heard_at` (unix seconds) come with parameters of a table, `metadata` on
+    request.
+    """
+
+    name: str | None = None
+    value: Scalar
+    type: str
+    index: int | None
+    bits: str
+    default: Scalar | None = None
+    default_source: str | None = None
+    is_default: bool | None = None
+    trust: str | None = None
+    heard_at: float | None = None
+    text: str | None = None
+    units: str | None = None
+    metadata: InfoJson | None = None
+
+    @classmethod
+    def of(
+        cls,
+        param: Param,
+        info: ParamInfo | None = None,
+        *,
+        described: int | float | None = None,
+        whole: bool = False,
+    ) -> ParamJson:
+        """Return a parameter with its default, also that of the metadata.
+
+        Args:
+            param: the parameter.
+            info: its metadata, or None.
+            described: its default in the metadata, where `info` is None; or None.
+            whole: whether to include all metadata.
+        """
+        default = default_of(param, described if info is None else info.default)
+        return cls(
+            value=value_json(param.settable, param.type_number),
+            type=type_name(param.type_number),
+            index=param.index,
+            bits=bits_text(param),
+            default=None if default is None else value_json(default.value, param.type_number),
+            default_source=None if default is None else default.source.value,
+            text=None if info is None else short_text(info.text(param.settable)),
+            units=None if info is None else short_text(info.units),
+            metadata=InfoJson.of(info) if info is not None and whole else None,
+        )
+
+    @classmethod
+    def of_table(
+        cls,
+        param: Param,
+        info: ParamInfo | None = None,
+        *,
+        described: int | float | None = None,
+        heard_at: float | None = None,
+    ) -> ParamJson:
+        """Return a parameter with its name, its trust, and the unix time in seconds of its reception."""
+        shown = cls.of(param, info, described=described)
+        is_changed = add_default(param, described if info is None else info.default).is_changed
+        return replace(
+            shown,
+            name=param.name,
+            is_default=None if is_changed is None else not is_changed,
+            trust=param.trust.value,
+            heard_at=heard_at,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WrittenJson(Json):
+    """A parameter of a file or of another set. Without a type, `bits` is null."""
+
+    value: Scalar
+    type: str | None
+    bits: str | None
+    default: Scalar | None = None
+    default_source: str | None = None
+    comment: str | None = None
+    text: str | None = None
+
+    @classmethod
+    def of(cls, param: WrittenParam, source: str | None = None) -> WrittenJson:
+        """Return a parameter, with the origin of its default if that is given."""
+        return replace(
+            cls.compared(param),
+            default=None if param.default is None else value_written(param.default, param),
+            default_source=source,
+            comment=param.comment or None,
+        )
+
+    @classmethod
+    def compared(cls, param: WrittenParam, metadata: Metadata | None = None) -> WrittenJson:
+        """Return a parameter of one side of a comparison, with the meaning of its value."""
+        info = None if metadata is None else metadata.find(param.name)
+        return cls(
+            value=value_written(param.settable, param),
+            type=None if param.type_number is None else type_name(param.type_number),
+            bits=bits_written(param),
+            text=None if info is None else short_text(info.text(param.settable)),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExtParamJson(Json):
+    """One extended parameter. `value` is null for bytes that are no text; `hex` has all bytes."""
+
+    name: str | None = None
+    value: Scalar | None
+    type: str
+    index: int | None
+    hex: str
+    trust: str | None = None
+    heard_at: float | None = None
+
+    @classmethod
+    def of(cls, param: ExtParam) -> ExtParamJson:
+        """Return a parameter without its name."""
+        return cls(
+            value=ext_value_json(param.value, param.type),
+            type=ext_type_name(param.type),
+            index=param.index,
+            hex=param.raw.hex(),
+        )
+
+    @classmethod
+    def of_table(cls, param: ExtParam, *, heard_at: float | None = None) -> ExtParamJson:
+        """Return a parameter with its name, its trust, and the unix time in seconds of its reception."""
+        return replace(cls.of(param), name=param.name, trust=param.trust.value, heard_at=heard_at)
+
+
+def ext_value_json(value: ExtValue, number: int) -> Scalar | None:
+    """Return an extended value in strict JSON; None for bytes."""
+    if isinstance(value, bytes | str):
+        return value if isinstance(value, str) else None
+    return value_json(value, ParamType.REAL32 if number == ExtParamType.REAL32 else ParamType.REAL64)
+
+
+# Vehicles and sets
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleJson(Json):
+    """A vehicle that is written to; `firmware` is null if it is not known."""
+
+    system: int
+    component: int
+    autopilot: str
+    kind: str
+    firmware: str | None
+    uid: str | None
+
+    @classmethod
+    def of(cls, vehicle: Component) -> VehicleJson:
+        """Return the vehicle of a component."""
+        return cls.at(vehicle.system, vehicle.component, vehicle.identity)
+
+    @classmethod
+    def at(cls, system: int, component: int, identity: Identity) -> VehicleJson:
+        """Return a vehicle by address and identity."""
+        return cls(
+            system=system,
+            component=component,
+            autopilot=autopilot_name(identity.autopilot),
+            kind=kind_in_words(identity.autopilot, identity.vehicle_type),
+            firmware=version_text(identity.firmware) if identity.firmware else None,
+            uid=identity.uid,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IdentityJson(Json):
+    """The identity of a vehicle; the members are those of `Identity`."""
+
+    system: int
+    link: str
+    uid: str | None
+    autopilot: int
+    vehicle_type: int
+    firmware: int
+    git_hash: str
+    board: int
+    vendor_id: int
+    product_id: int
+    capabilities: int
+
+    @classmethod
+    def of(cls, identity: Identity) -> IdentityJson:
+        """Return an identity."""
+        return cls(**{each.name: getattr(identity, each.name) for each in fields(cls)})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OriginJson(Json):
+    """The origin of a set, and the time `at` which the vehicle had these values."""
+
+    source: str
+    system: int | None
+    component: int | None
+    autopilot: str | None
+    uid: str | None
+    at: str | None
+    count: int
+
+    @classmethod
+    def of(cls, params: ParamSet) -> Self:
+        """Return the origin of a set."""
+        identity = params.identity
+        return cls(
+            source=params.source,
+            system=params.system,
+            component=params.component,
+            autopilot=None if identity is None else autopilot_name(identity.autopilot),
+            uid=None if identity is None else identity.uid,
+            at=time_or_none(params.at),
+            count=len(params),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetJson(OriginJson):
+    """A set with its parameters by name."""
+
+    params: dict[str, WrittenJson]
+
+    @classmethod
+    def with_sources(cls, params: ParamSet, sources: Mapping[str, str]) -> SetJson:
+        """Return a set, with the origins of its defaults by name where they are given."""
+        origin = OriginJson.of(params)
+        members = {each.name: getattr(origin, each.name) for each in fields(origin)}
+        written = {name: WrittenJson.of(param, sources.get(name)) for name, param in params.items()}
+        return cls(**members, params=written)
+
+
+# Fetches and writes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FetchJson(Json):
+    """A fetched table. `missing` are indices, `cached` names whose values are not confirmed."""
+
+    system: int
+    component: int
+    autopilot: str
+    uid: str | None
+    count: int
+    received: int
+    source: str
+    hash: str | None
+    missing: list[int]
+    cached: list[str]
+    lost: int
+    repeated: int
+    round_trip_s: float | None
+    elapsed_s: float
+    bytes_received: int
+    bytes_sent: int
+    params: dict[str, ParamJson]
+
+    @classmethod
+    def of(
+        cls,
+        component: Component,
+        result: FetchResult,
+        params: Iterable[Param],
+        *,
+        missing: list[int],
+        cached: list[str],
+        bytes_received: int,
+        bytes_sent: int,
+        described: Mapping[str, int | float],
+    ) -> FetchJson:
+        """Return a fetch with these parameters; `described` has defaults of the metadata by name."""
+        return cls(
+            system=component.system,
+            component=component.component,
+            autopilot=component.autopilot,
+            uid=component.identity.uid,
+            count=result.count,
+            received=result.count - len(missing),
+            source=result.source,
+            hash=hash_text(result.hash),
+            missing=missing,
+            cached=cached,
+            lost=result.lost,
+            repeated=result.repeated,
+            round_trip_s=rounded(result.round_trip),
+            elapsed_s=round(result.elapsed, 4),
+            bytes_received=bytes_received,
+            bytes_sent=bytes_sent,
+            params={each.name: ParamJson.of(each, described=described.get(each.name)) for each in params},
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WriteJson(Json):
+    """The outcome of one write. `error` is the class of the error, `reason` its text."""
+
+    name: str
+    requested: Scalar
+    actual: Scalar | None
+    status: str
+    reason: str | None = None
+    error: str | None = None
+    note: str | None = None
+    text: str | None = None
+    reboot_required: bool | None = None
+
+    @classmethod
+    def of(cls, outcome: SetOutcome, kind: ParamType | int, info: ParamInfo | None) -> WriteJson:
+        """Return an outcome; `kind` is the vehicle's type of the parameter, `info` its metadata, or None."""
+        actual, error, result = outcome.reported, outcome.error, outcome.result
+        return cls(
+            name=outcome.name,
+            requested=value_json(outcome.requested, ParamType.REAL64),
+            actual=None if actual is None else value_json(actual, kind),
+            status=outcome.status.value,
+            reason=None if error is None else str(error),
+            error=None if error is None else type(error).__name__,
+            note=None if result is None else result.note or None,
+            text=None if info is None or actual is None else info.text(actual) or None,
+            reboot_required=(info is not None and info.reboot_required) or None,
+        )
+
+
+def _number(number: int | float | None) -> Scalar | None:
+    return None if number is None else value_json(number, ParamType.REAL64)
