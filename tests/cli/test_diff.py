@@ -334,7 +334,7 @@ def test_the_autopilot_is_the_default_component(command: Command, cache: Path) -
 def test_an_empty_name_is_refused(command: Command, cache: Path) -> None:
     """An empty name, as of an unset variable in a script, does not mean the only vehicle."""
     keep(cache, BEFORE)
-    for words in (["show", ""], ["cache", "history", ""], ["cache", "remove", ""]):
+    for words in (["show", ""], ["history", ""], ["cache", "remove", ""]):
         assert command(*words).code == 2
     assert len(ParamCache(cache).vehicles()) == 1
 

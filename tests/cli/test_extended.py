@@ -244,7 +244,6 @@ def test_a_cached_table_is_applied(command: Command, put: Put) -> None:
     camera.set_ext_param("CAM_NAME", "Rear")
     done = command("apply", url, "cache:1", *CAMERA, "--extended")
     assert (done.code, camera.ext_values["CAM_NAME"]) == (0, "Front"), done.err
-    assert command("verify", url, "cache:1", *CAMERA, "--extended").code == 0
 
 
 def test_an_unknown_name_does_not_stop_the_other_values(command: Command, put: Put) -> None:

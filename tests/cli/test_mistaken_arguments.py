@@ -34,7 +34,6 @@ LINK_FIRST = "the first argument is the link, such as udpin:0.0.0.0:14550 or sim
         (["set", "MC_ROLL_P=6.5"], f"MC_ROLL_P=6.5 is the name of a parameter: {LINK_FIRST}"),
         (["get", "mc_roll_p", "MC_YAW_P"], f"mc_roll_p is the name of a parameter: {LINK_FIRST}"),
         (["apply", "quad.parm", "sim:px4"], f"quad.parm is a file: {LINK_FIRST}"),
-        (["verify", "quad.parm", "sim:px4"], f"quad.parm is a file: {LINK_FIRST}"),
         (["apply", "sim:px4", "qaud.parm"], "no such file: qaud.parm (did you mean quad.parm?)\n"),
         (["apply", "sim:px4", "my/quad.parm"], "no such file: my/quad.parm; there is no folder my here\n"),
         (["apply", "sim:px4", "fleet.yaml"], "no such file: fleet.yaml\n"),
@@ -63,9 +62,6 @@ def test_a_missing_argument_is_answered_with_the_usage(command: Command) -> None
     outcome = command("get", "MC_ROLL_P")
     assert (outcome.code, outcome.out) == (2, "")
     assert outcome.err.endswith(" Usage: paramclient get [OPTIONS] URL NAME [NAME...]\n")
-    assert command("cache", "name").err.endswith(
-        " Usage: paramclient cache name [OPTIONS] VEHICLE [NICKNAME]\n"
-    )
 
 
 def test_a_text_that_is_neither_a_number_nor_a_known_name_is_quoted(command: Command) -> None:

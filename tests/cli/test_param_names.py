@@ -172,7 +172,7 @@ def test_history_takes_patterns_and_an_unknown_name_is_an_error(command: Command
     wrong = command("history", 1, "MC_ROLLP")
     assert (wrong.code, wrong.out) == (5, "")
     assert "is called MC_ROLLP (did you mean MC_ROLL_P?)" in wrong.err
-    assert command("cache", "history", 1, "FOO*").code == 5
+    assert command("history", 1, "FOO*").code == 5
 
 
 # watch

@@ -70,7 +70,6 @@ def test_apply_writes_under_the_name_of_the_vehicle(command: Command, put: Calla
         ["RTL_ALT", "15", "15", "15", "unchanged", "RTL_ALT_M on this vehicle"],
     ]
     assert vehicle.values["WP_SPD"] == 7.5
-    assert command("verify", put(vehicle), file(), "--renames", "names.yaml").code == 0
 
 
 def test_apply_prints_the_name_of_the_vehicle_as_json(
@@ -98,9 +97,6 @@ def test_a_missing_parameter_names_its_other_name(command: Command, put: Callabl
     outcome = command("apply", put(vehicle), wanted, "--renames", "names.yaml")
     assert outcome.code == 1
     assert outcome.rows[1:] == [["GONE", "1", "skipped", f"not on this vehicle; {NOT_HERE}"]]
-    outcome = command("verify", put(vehicle), wanted, "--renames", "names.yaml")
-    assert outcome.rows[1:] == [["GONE", "1", "missing", NOT_HERE]]
-    assert command("verify", put(vehicle), wanted).rows[1:] == [["GONE", "1", "missing"]]
 
 
 def test_values_that_do_not_fit_and_names_that_collide_send_nothing(
@@ -116,7 +112,7 @@ def test_values_that_do_not_fit_and_names_that_collide_send_nothing(
     assert vehicle.requests["PARAM_SET"] == 0
 
 
-@pytest.mark.parametrize("subcommand", ["apply", "verify", "diff"])
+@pytest.mark.parametrize("subcommand", ["apply", "diff"])
 def test_a_bad_file_of_names_is_an_error_with_its_line(
     command: Command, put: Callable[[Endpoint], str], subcommand: str
 ) -> None:
@@ -126,7 +122,7 @@ def test_a_bad_file_of_names_is_an_error_with_its_line(
     assert "bad.yaml:2: the factor of C is 0" in outcome.err
 
 
-@pytest.mark.parametrize("words", [("verify",), ("apply", "--dry-run")], ids=["verify", "dry run"])
+@pytest.mark.parametrize("words", [("apply", "--dry-run")])
 def test_firmware_versions_that_differ_are_named_first(
     command: Command, put: Callable[[Endpoint], str], words: tuple[str, ...]
 ) -> None:

@@ -202,7 +202,6 @@ COMMANDS = [
     ["show", "NAME", "--json"],
     ["history", "NAME"],
     ["history", "NAME", "--snapshots"],
-    ["cache", "history", "NAME"],
     ["cache", "remove", "NAME"],
     ["cache", "remove", "NAME", "--component", "1"],
     ["save", "NAME", "FILE"],
