@@ -2,83 +2,56 @@
 
 from __future__ import annotations
 
-import math
 import multiprocessing
 import os
 import statistics
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from functools import partial
 from typing import Final
 
 import anyio
 
 from paramclient import (
-    Added,
-    Change,
-    Changes,
     Component,
     FetchResult,
-    Ftp,
-    ParamCache,
     ParamClient,
     Rebooted,
-    Removed,
 )
 from paramclient.client.events import Events
 from paramclient.client.local import local
 from paramclient.errors import (
-    FileTransferError,
-    NoReply,
     ParamClientError,
     Refused,
     UnknownParameter,
     UsageError,
     ValueNotApplied,
 )
-from paramclient.logs.telemetry import import_log
-from paramclient.metadata import ParamInfo
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import Param, ParamType, from_bits, type_name
-from paramclient.protocol.ftp.packets import DATA_SIZE_MAX
-from paramclient.protocol.params.small_changes import CHANGE_MIN
+from paramclient.model.values import ParamType, type_name
 from paramclient.protocol.vehicle.reboot_command import SAVING_TIME
 from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, message_name
-from paramclient.provision import MISSING, ApplyStatus, apply, restore, verify
+from paramclient.provision import ApplyStatus, apply, restore
 from tests.live.choice import another_value
 from tests.live.journal import check_disarmed
-from tests.live.relay import CLEAN, FILE_TRANSFER_ID, LIST_REQUEST_ID, Conditions
-from tests.live.session import DISCOVERY_TIMEOUT, Check, CheckFailed, Measured, Session, Skip
+from tests.live.relay import FILE_TRANSFER_ID, LIST_REQUEST_ID, Conditions
+from tests.live.session import Check, CheckFailed, Measured, Session, Skip
 
 __all__ = ["checks"]
 
 NO_SUCH_NAME: Final = "NO_SUCH_PARAM"
-MANY_UNKNOWN: Final = 15
-"""Names that no vehicle has, in a set-up."""
 RESTORED: Final = 5
 """Parameters that are changed before an earlier state is brought back."""
-APPLIED: Final = 20
-"""Parameters that are set by a set-up over a radio."""
 READS: Final = 10
 """Single reads of which the median counts."""
-FRACTION: Final = 0.1
-"""What is added to a float32 parameter so that its value has to be rounded."""
 SEEN_TIMEOUT: Final = 3.0
 """Seconds in which another session has to learn of a change, and this one of a group."""
-COLLECTED_AFTER: Final = 0.5
-"""Seconds without a further parameter of a group, after which all are reported."""
-SETTLED_AFTER: Final = 1.5
-"""Seconds between a fetch and a switch: the next fetch begins at least 1 s after the last one."""
 PARAMETER_FILE: Final = "@PARAM/param.pck"
-HEARTBEATS: Final = 15
-"""Datagrams beside the blocks of a file that is sent once: banner, heartbeats, and answers to requests."""
 RADIO_RATE: Final = 5760.0
 """Bytes per second at 57600 baud."""
 SLOWEST_FETCH: Final = 240.0
 """Seconds after which a fetch over a bad link is given up."""
-CANCELLED_AFTER: Final = 0.2
-"""Seconds after which a fetch is cancelled together with its client: ArduPilot's file takes 0.4 s."""
 KILLED_WITHIN: Final = 20.0
 """Seconds for another program to open the parameter file and to be killed."""
 
@@ -127,7 +100,6 @@ def checks(*, reboots: bool) -> Iterator[Check]:
             "accepted, and read back",
             writes=True,
         )
-    yield Check("set, rounded to float32", set_rounded, "accepted as the nearest float32", writes=True)
     yield Check(
         "set, a fraction for an integer",
         set_fraction,
@@ -151,28 +123,6 @@ def checks(*, reboots: bool) -> Iterator[Check]:
         writes=True,
         kinds=("ardupilot",),
     )
-    for name, conditions in (("", CLEAN), (", without the file", Conditions(refuses_files=True))):
-        yield Check(
-            f"a group shown and hidden, no fetch{name}",
-            partial(follow_group, conditions=conditions),
-            "its members added and removed in changes()",
-            {"ardupilot": 2.0},
-            writes=True,
-            kinds=("ardupilot",),
-        )
-    yield Check(
-        "set, a change too small to save",
-        set_small,
-        "accepted, with a note",
-        writes=True,
-        kinds=("px4",),
-    )
-    yield Check(
-        f"verify, {MANY_UNKNOWN} unknown names",
-        verify_unknown,
-        "all missing; what they cost",
-        {"ardupilot": 0.5, "px4": 0.5},
-    )
     yield Check(
         "apply, a group that is hidden",
         apply_hidden,
@@ -189,27 +139,12 @@ def checks(*, reboots: bool) -> Iterator[Check]:
         writes=True,
         kinds=("ardupilot", "px4"),
     )
-    yield Check("MAVFTP, list of the root", list_root, "its entries")
-    yield Check(
-        "MAVFTP, parameter file three times", read_file, "one time like the other", kinds=("ardupilot",)
-    )
-    yield Check("MAVFTP, a file that is not there", read_missing, "FileTransferError, and is_not_found")
-    yield Check(
-        "fetch after a session was cancelled in a transfer",
-        fetch_after_cancellation,
-        "as quick as the first, the file was closed",
-        {"ardupilot": 0.6},
-        kinds=("ardupilot",),
-    )
     yield Check(
         "fetch after a program was killed in a transfer",
         fetch_after_kill,
         "by list at once, or by file when the session has ended",
         {"ardupilot": 4.0},
         kinds=("ardupilot",),
-    )
-    yield Check(
-        "the log of a session, replayed and imported", replay_log, "the table of the session, of 1 vehicle"
     )
     yield Check("two sessions, fetch at the same time", fetch_in_two, "every value right in both")
     yield Check(
@@ -232,9 +167,6 @@ def checks(*, reboots: bool) -> Iterator[Check]:
             reboot_by_another,
             "noticed once, and the table is right afterwards",
             writes=True,
-        )
-        yield Check(
-            "apply with a restart", apply_restarting, "the value that the vehicle has after it", writes=True
         )
 
 
@@ -272,20 +204,6 @@ def lossy_checks() -> Iterator[Check]:
         )
     radio = Conditions(rate=RADIO_RATE, drops_telemetry=True)
     yield Check("fetch, 57600 baud", partial(fetch_under, conditions=radio), "every value right")
-    yield Check(
-        "read the parameter file, 57600 baud",
-        partial(read_file_once, conditions=radio),
-        "it is sent once, also where the round trip is known to be short",
-        {"ardupilot": 3.7},
-    )
-    yield Check(
-        f"apply {APPLIED} values, 57600 baud",
-        partial(apply_under, conditions=radio),
-        "each set and proven",
-        {"ardupilot": 6.5},
-        kinds=("ardupilot",),
-        writes=True,
-    )
     worst = Conditions(loss=0.20, round_trip=0.1, seed=2)
     yield Check(
         "10 sets, 20% loss, 100 ms",
@@ -360,17 +278,6 @@ async def fetch_after_kill(session: Session) -> Measured:
         return await fetch(session, vehicle)
 
 
-async def fetch_after_cancellation(session: Session) -> Measured:
-    with anyio.CancelScope() as scope:
-        async with session.client() as vehicle:
-            scope.deadline = anyio.current_time() + CANCELLED_AFTER
-            await vehicle.fetch_all(refresh=True)
-    if not scope.cancelled_caught:
-        raise Skip(f"the fetch takes less than {CANCELLED_AFTER} s")
-    async with session.client() as vehicle:
-        return await fetch(session, vehicle)
-
-
 def _open_file_and_die(link: str, system: int) -> None:
     """Begin to read the parameter file, and end without closing it. Exit code 0 after its first bytes."""
 
@@ -390,36 +297,6 @@ def _open_file_and_die(link: str, system: int) -> None:
 
 
 # Single reads
-
-
-async def replay_log(session: Session) -> Measured:
-    """Replay and import the log of a fetch: both hold what the client held, with types and defaults."""
-    path = session.folder / "session.tlog"
-    async with ParamClient(session.relay.link, cache=False, tlog=path) as client:
-        vehicle = await client.component(session.system, timeout=DISCOVERY_TIMEOUT)
-        source = (await vehicle.fetch_all(timeout=SLOWEST_FETCH)).source
-    began = time.monotonic()
-    async with ParamClient(f"replay:{path}?speed=0") as log:
-        result = await (await log.component(session.system, vehicle.component)).fetch_all()
-        address = (vehicle.system, vehicle.component)
-        others = [each for each in log.autopilots if (each.system, each.component) != address]
-    if others or not result.complete or result.source != source:
-        raise CheckFailed(f"{result!r} {' '.join(result.notes)}, other vehicles: {others}")
-    with ParamCache(session.folder / "session.sqlite3") as cache:
-        tables = [each for each in await import_log(path, cache) if each.system == session.system]
-        imported = cache.load(tables[0].key, vehicle.component)
-    if len(tables) != 1 or imported is None or not imported.complete:
-        raise CheckFailed(f"imported: {tables}")
-    for params in (result.params, imported.params):
-        differing = [name for name, param in vehicle.params.items() if not _is_same(params.get(name), param)]
-        if differing:
-            raise CheckFailed(f"{len(differing)} differ: {', '.join(differing[:5])}")
-    seconds = time.monotonic() - began
-    return Measured(f"{len(result.params)} {source}, {seconds:.2f} s for both")
-
-
-def _is_same(param: Param | None, expected: Param) -> bool:
-    return param is not None and param.same_value(expected) and param.default == expected.default
 
 
 async def get_some(session: Session, *, by_name: bool) -> Measured:
@@ -475,27 +352,6 @@ async def set_one(session: Session, *, number: ParamType) -> Measured:
     if done.adjusted or held.value != value:
         raise CheckFailed(f"{name} set to {value} is {held.value!r}, {done.status}")
     return Measured(f"{name} {param.value!r} to {value} in {seconds * 1000:.0f} ms")
-
-
-def harmless_float(session: Session) -> str:
-    """Return a float that may be changed; skips the check where there is none."""
-    name = session.choice.by_type.get(ParamType.REAL32)
-    if name is None:
-        raise Skip("no harmless parameter of type REAL32")
-    return name
-
-
-async def set_rounded(session: Session) -> Measured:
-    name = harmless_float(session)
-    async with session.client() as vehicle:
-        param = await vehicle.get(name)
-        assert isinstance(param.value, float)
-        done = await session.journal.set(vehicle, name, param.value + FRACTION)
-        held = await vehicle.get(name)
-        await put_back(session, vehicle)
-    if done.adjusted or not held.same_value(done.param):
-        raise CheckFailed(f"{name} set to {done.requested!r} is {held.value!r}, {done.status}")
-    return Measured(f"{name} to {done.requested!r} is {held.value!r}")
 
 
 async def set_fraction(session: Session) -> Measured:
@@ -599,91 +455,7 @@ async def show_group(session: Session) -> Measured:
     raise Skip(f"none of these shows a group: {', '.join(tried)}" if tried else "no switch of a group is off")
 
 
-async def follow_group(session: Session, *, conditions: Conditions = CLEAN) -> Measured:
-    """Switch a group on and off; `changes()` must report it without a fetch."""
-    tried: list[str] = []
-    async with session.under(conditions), session.client() as vehicle:
-        await vehicle.fetch_all(timeout=SLOWEST_FETCH)
-        before = vehicle.params.keys()
-        for switch in session.choice.groups:
-            await anyio.sleep(SETTLED_AFTER)
-            changes = vehicle.changes()
-            began = time.monotonic()
-            await session.journal.set(vehicle, switch, 1)
-            added = await collect(changes, Added)
-            seconds = time.monotonic() - began - COLLECTED_AFTER
-            if not added:
-                tried.append(switch)
-                await put_back(session, vehicle)
-                continue
-            count, names = vehicle.count, set(added)
-            await put_back(session, vehicle)
-            removed = await collect(changes, Removed)
-            if names != removed.keys() or not vehicle.params.keys() <= before | names:
-                raise CheckFailed(f"{switch}: {sorted(names)} added, {sorted(removed)} removed")
-            await session.journal.set(vehicle, switch, 1)
-            name, param = next(iter(added.items()))
-            held = await vehicle.set(name, param.value)
-            await put_back(session, vehicle)
-            if held.status != "accepted":
-                raise CheckFailed(f"{name}, just shown, was set: {held}")
-            reported = f"{switch}: {len(added)} added in {seconds:.2f} s, {count} parameters, and removed"
-            return Measured(reported, seconds)
-    raise Skip(f"none of these shows a group: {', '.join(tried)}" if tried else "no switch of a group is off")
-
-
-async def collect(changes: Changes, kind: type[Change]) -> dict[str, Param]:
-    """Return the parameters in changes of this kind, until none has arrived for a while."""
-    found: dict[str, Param] = {}
-    timeout = SEEN_TIMEOUT
-    while True:
-        change = None
-        with anyio.move_on_after(timeout):
-            while not isinstance(change := await anext(changes), kind):
-                pass
-        if change is None or not isinstance(change, kind):
-            return found
-        param = change.new or change.old
-        assert param is not None, "a change has an old or a new value"
-        found[change.name] = param
-        timeout = COLLECTED_AFTER
-
-
-async def set_small(session: Session) -> Measured:
-    name = harmless_float(session)
-    async with session.client() as vehicle:
-        param = await vehicle.get(name)
-        wanted = from_bits(param.bits + 1, ParamType.REAL32)
-        assert not isinstance(wanted, bytes)
-        assert not param.is_raw
-        if not abs(wanted - param.value) <= CHANGE_MIN:
-            raise Skip(f"{name} is {param.value!r}, too large for such a change")
-        done = await session.journal.set(vehicle, name, wanted)
-        await put_back(session, vehicle)
-    if not done.note:
-        raise CheckFailed(f"{name} to {wanted}: {done}, and no note")
-    return Measured(done.note)
-
-
 # Set-ups
-
-
-async def verify_unknown(session: Session) -> Measured:
-    name, param = next(iter(session.journal.before.items()))
-    known = {name: WrittenParam.of(param)}
-    unknown = {each: WrittenParam(each, 1) for each in (f"NO_SUCH_{n}" for n in range(MANY_UNKNOWN))}
-    async with session.client() as vehicle:
-        await verify(vehicle, ParamSet(known))
-        seconds = []
-        for wanted in (known, known | unknown):
-            began = time.monotonic()
-            plan = await verify(vehicle, ParamSet(wanted))
-            seconds.append(time.monotonic() - began)
-    missing = [row.name for row in plan.rows.values() if row.category == MISSING]
-    if missing != list(unknown):
-        raise CheckFailed(f"missing are {', '.join(missing)}")
-    cost = seconds[1] - seconds[0]
-    return Measured(f"{len(missing)} missing, {cost:.2f} s more than without", cost)
 
 
 async def apply_hidden(session: Session) -> Measured:
@@ -714,22 +486,6 @@ async def apply_hidden(session: Session) -> Measured:
     raise Skip("no switch of a group with a float is off")
 
 
-async def apply_under(session: Session, *, conditions: Conditions) -> Measured:
-    names = session.choice.many[:APPLIED]
-    if len(names) < APPLIED:
-        raise Skip("too few harmless parameters")
-    async with session.under(conditions), session.client() as vehicle:
-        before = session.journal.before
-        session.journal.note({name: before[name] for name in names})
-        await check_disarmed(vehicle)
-        wanted = {name: WrittenParam(name, another_value(before[name])) for name in names}
-        done = await apply(vehicle, ParamSet(wanted), timeout=SLOWEST_FETCH)
-        await put_back(session, vehicle)
-    if not done.complete or done.counts[ApplyStatus.SET] != APPLIED:
-        raise CheckFailed(f"{done}: {'; '.join(map(str, done.shown_rows[:5]))}")
-    return Measured(f"{APPLIED} set in {done.elapsed:.2f} s", done.elapsed)
-
-
 async def restore_before(session: Session) -> Measured:
     names = session.choice.many[:RESTORED]
     if not names:
@@ -757,74 +513,6 @@ async def put_back(session: Session, vehicle: Component) -> None:
 
 
 # Files
-
-
-async def list_root(session: Session) -> Measured:
-    async with session.client() as vehicle:
-        await vehicle.get(0)
-        try:
-            began = time.monotonic()
-            entries = await Ftp(vehicle).list("/")
-        except FileTransferError as error:
-            raise Skip(f"the vehicle does not list it: {error.reason}") from error
-        except NoReply as error:
-            raise Skip("the vehicle does not answer MAVFTP") from error
-    return Measured(f"{len(entries)} entries in {time.monotonic() - began:.2f} s")
-
-
-async def read_file(session: Session) -> Measured:
-    seconds: list[float] = []
-    sizes: set[int] = set()
-    async with session.client() as vehicle:
-        await vehicle.get(0)
-        for _ in range(3):
-            began = time.monotonic()
-            try:
-                sizes.add(len(await Ftp(vehicle).read(PARAMETER_FILE)))
-            except (FileTransferError, NoReply) as error:
-                if seconds:
-                    raise
-                raise Skip(f"the vehicle serves no parameter file: {error}") from error
-            seconds.append(time.monotonic() - began)
-    reported = ", ".join(f"{each:.2f}" for each in seconds)
-    if max(seconds) > 2 * min(seconds) + 0.2:
-        raise CheckFailed(f"{reported} s: it does not take the same time again")
-    return Measured(f"{max(sizes)} bytes in {reported} s")
-
-
-async def read_file_once(session: Session, *, conditions: Conditions) -> Measured:
-    async with session.under(conditions), session.client() as vehicle:
-        await vehicle.get(0)
-        try:
-            for _ in range(READS):  # short messages, answered at once
-                with suppress(FileTransferError):
-                    await Ftp(vehicle).list("/no-such-directory")
-            before = session.relay.counts().down
-            began = time.monotonic()
-            size = len(await Ftp(vehicle).read(PARAMETER_FILE))
-        except (FileTransferError, NoReply) as error:
-            raise Skip(f"the vehicle serves no parameter file: {error}") from error
-        seconds = time.monotonic() - began
-        datagrams = session.relay.counts().down - before
-    blocks = math.ceil(size / DATA_SIZE_MAX)
-    reported = f"{size} bytes in {seconds:.2f} s, {datagrams} datagrams for {blocks} blocks"
-    if datagrams > 1.5 * blocks + HEARTBEATS:
-        raise CheckFailed(reported)
-    return Measured(reported, seconds)
-
-
-async def read_missing(session: Session) -> Measured:
-    async with session.client() as vehicle:
-        await vehicle.get(0)
-        try:
-            await Ftp(vehicle).read("/no-such-file")
-        except FileTransferError as error:
-            if not error.is_not_found:
-                raise CheckFailed(f"{error.reason} (errno {error.errno})") from error
-            return Measured(error.reason)
-        except NoReply as error:
-            raise Skip("the vehicle does not answer MAVFTP") from error
-    raise CheckFailed("the file was read")
 
 
 # Two sessions
@@ -900,25 +588,6 @@ async def reboot(session: Session) -> Measured:
     if noticed != 1:
         raise CheckFailed(f"one restart was noticed {noticed} times")
     return Measured(f"back after {seconds:.1f} s, {name} is {value}")
-
-
-async def apply_restarting(session: Session) -> Measured:
-    name = next(iter(session.choice.many), None)
-    if name is None:
-        raise Skip("no harmless parameter")
-    async with session.client() as vehicle:
-        param = await vehicle.get(name)
-        session.journal.note({name: param})
-        await check_disarmed(vehicle)
-        value = another_value(param)
-        info = {name: ParamInfo(name, reboot_required=True)}
-        done = await apply(vehicle, ParamSet({name: WrittenParam(name, value)}), reboot=True, info=info)
-        held = await vehicle.get(name)
-        await put_back(session, vehicle)
-    row = done.rows[name]
-    if not done.complete or done.reboots != 1 or row.actual != held.value:
-        raise CheckFailed(f"{done}: {row}, and the vehicle holds {held.value!r}")
-    return Measured(f"{row} after {done.elapsed:.1f} s")
 
 
 async def reboot_by_another(session: Session) -> Measured:
