@@ -7,7 +7,7 @@
 #   make coverage     the tests with their coverage  make docs       the documentation, into docs/_build/html
 #   make bench        parser and start-up time       make dist       wheel and sdist, into dist
 #   make cost         CPU and memory                 make peers      downloads, compared with other clients
-#   make scale        250 systems on one link        make fuzz       each target of fuzz/ for SECONDS
+#   make fuzz         each target of fuzz/ for SECONDS
 #   make soak         random sessions                make kills      programs killed while they write
 #   make attack       hostile clients and services   make fuzz-http  random requests to the service
 #   make clean        removes .venv and all other files that these commands create
@@ -42,7 +42,7 @@ WORKERS ?= $(shell $(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 2)
 # the tests start several hundred processes; without bytecode, each of them would compile paramclient again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow test-all coverage soak kills live fuzz fuzz-http attack lint docs screenshots pictures bench cost scale peers dist clean
+.PHONY: demo test test-slow test-all coverage soak kills live fuzz fuzz-http attack lint docs screenshots pictures bench cost peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -112,9 +112,6 @@ bench: $(VENV)/with-cli
 
 cost: $(VENV)/with-cli
 	$(BIN)/python bench/cost.py
-
-scale: $(VENV)/with-cli
-	$(BIN)/python bench/scale.py
 
 peers: $(VENV)/with-peers
 	$(BIN)/python bench/peers.py
