@@ -368,7 +368,6 @@ async def requests(service: Service, quick: bool) -> None:
         assert status == 200, answer
     names = [f"X{number:05}" for number in range(60_000)]
     sets_json = b"[" + b"{}," * (2 * MEGABYTE // 3 - 1) + b"{}]"
-    sets_yaml = b"- {}\n" * (2 * MEGABYTE // 5)
     octets = "application/octet-stream"
     diff = {"wanted": {"defaults": True}, "known": True, "timeout_s": 60}
     unknown = b"{" + b",".join(b'"a%06d":1' % number for number in range(8 * MEGABYTE // 12)) + b"}"
@@ -383,7 +382,6 @@ async def requests(service: Service, quick: bool) -> None:
         ("8 MB of unknown members", f"{C}/diff", unknown, ""),
         ("2 MB of unknown members", f"{C}/diff", unknown[: 2 * MEGABYTE].rpartition(b",")[0] + b"}", ""),
         ("2 MB of empty sets, JSON", "/api/v1/files?name=a.json", sets_json, octets),
-        ("2 MB of empty sets, YAML", "/api/v1/files?name=a.yaml", sets_yaml, octets),
         (
             "a plan with 60,000 names",
             f"{C}/plan",
@@ -765,13 +763,10 @@ async def parsing(service: Service, quick: bool) -> None:
     numbers = b'{"x":[' + b",".join([b"9" * 4_300] * 730) + b"]}"
     values = b",".join(b'"A%05d":%s' % (number, b"9" * 1_000) for number in range(3_000))
     strings = b",".join(b'"a%05d":"%s"' % (number, b"y" * 20) for number in range(58_000))
-    flow = b",".join(b"a%d: 'x%s'" % (number, b"y" * 20) for number in range(58_000))
     posts = [
         ("730 numbers of 4,300 digits", f"{C}/diff", numbers),
         ("3,000 numbers of 1,000 digits", f"{C}/diff", b'{"wanted":{"values":{' + values + b"}}}"),
         ("a line of 1.9 million digits", "/api/v1/files?name=a.parm", b"P1 " + b"1" * 1_900_000),
-        ("480,000 escapes in YAML", "/api/v1/files?name=a.yaml", b'a: "' + b"\\x41" * 480_000 + b'"\n'),
-        ("YAML on one line", "/api/v1/files?name=a.yaml", b"a: {" + flow + b"}\n"),
         ("58,000 strings in JSON", "/api/v1/files?name=a.json", b"{" + strings + b"}"),
     ]
     for attack, path, body in posts:

@@ -39,7 +39,7 @@ async def main(link: str, file: Path) -> bool:
         return overlay(shared, ParamSet({name: WrittenParam(name, value) for name, value in own.items()}))
 
     def backup(vehicle: Component) -> Path:
-        return Path(tempfile.gettempdir()) / f"before-{vehicle.system}-{started}.yaml"
+        return Path(tempfile.gettempdir()) / f"before-{vehicle.system}-{started}.json"
 
     started = time.strftime("%Y%m%dT%H%M%S")
     async with ParamClient(link) as client:

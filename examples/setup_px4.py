@@ -36,7 +36,7 @@ async def main(link: str, file: Path) -> bool:
             raise UsageError(f"this program needs a px4 vehicle, and the vehicle is {vehicle.autopilot}")
         if not await show(vehicle, wanted):
             return False
-        backup = Path(tempfile.gettempdir()) / f"before-{time.strftime('%Y%m%dT%H%M%S')}.yaml"
+        backup = Path(tempfile.gettempdir()) / f"before-{time.strftime('%Y%m%dT%H%M%S')}.json"
         result = await apply(vehicle, wanted, reboot=True, backup=backup, progress=show_progress)
         print(f"{result}; the state before is in {backup.name}")
         if result.error is not None:

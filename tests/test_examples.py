@@ -56,7 +56,7 @@ PRINTED = {
         r"CAL_ACC0_XOFF 0\.0 -> 0\.0125, skipped: left out: ",
         r"the vehicle reboots",
         r"7/7 ",
-        r"<ApplyResult 1/1 7 set, 1 skipped in .*; the state before is in before-.*\.yaml",
+        r"<ApplyResult 1/1 7 set, 1 skipped in .*; the state before is in before-.*\.json",
         r"the vehicle matches the file",
     ],
     "test_your_program": [r"changed: \['MPC_XY_VEL_MAX', 'MPC_Z_VEL_MAX_UP'\]"],

@@ -122,7 +122,7 @@ def test_the_dependencies_of_the_library_and_its_extras(metadata: Message) -> No
     command = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra == 'cli'" in each}
     serial = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra == 'serial'" in each}
     assert always == {"anyio", "fastcrc", "filelock", "platformdirs", "pydantic", "pymavlink"}
-    assert command == {"cyclopts", "rich", "pyyaml"}
+    assert command == {"cyclopts", "rich"}
     assert serial == {"serialx"}
     assert metadata["Requires-Python"] == ">=3.11"
 

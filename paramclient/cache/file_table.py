@@ -209,7 +209,7 @@ class FileTable:
             raise UsageError(
                 f"{self.params.source or 'the file'} has no types of its parameters, and {where}: "
                 f"{first_of(unknown, ADDED_NAMES_MAX)}. Fetch the vehicle, or another one with its firmware, "
-                "once; or use a file with types (.params, .pck, .json, .yaml)"
+                "once; or use a file with types (.params, .pck, .json)"
             )
         return {name: self._param(each, reference) for name, each in self.params.items()}
 

@@ -303,7 +303,7 @@ _add(_app, "search:info", "MC_ROLL_P", "rtl_alt --vehicle 1 --json")
 _add(
     _app,
     "save:save",
-    "udpin:0.0.0.0:14550 quad.yaml",
+    "udpin:0.0.0.0:14550 quad.json",
     "sim:ardupilot tuned.param --changed",
     "1 before.params --all",
     arguments="URL|LOG|VEHICLE FILE",
@@ -312,7 +312,7 @@ _add(
     _app,
     "apply:apply",
     "udpin:0.0.0.0:14550 quad.params --dry-run",
-    "udpin:0.0.0.0:14550 quad.params --reboot --backup before.yaml",
+    "udpin:0.0.0.0:14550 quad.params --reboot --backup before.json",
     "udpin:0.0.0.0:14550 fleet.param --all --overlay 'own/{system}.param'",
     "sim:ardupilot copter.param",
     arguments="URL FILE",
@@ -322,7 +322,7 @@ _add(
     "apply:restore",
     "udpin:0.0.0.0:14550 --dry-run",
     "udpin:0.0.0.0:14550 '2h ago'",
-    "udpin:0.0.0.0:14550 before.yaml",
+    "udpin:0.0.0.0:14550 before.json",
     "udpin:0.0.0.0:14550 --all --expect 5",
     arguments="URL [WHEN|FILE]",
 )

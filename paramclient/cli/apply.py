@@ -126,7 +126,7 @@ async def apply(
         all_vehicles: Set up all vehicles on the link, concurrently.
         expect: With --all, wait for this number of vehicles, and fail with fewer.
         dry_run: Print the values that would be sent, and send none of them.
-        renames: A YAML file of names that firmware versions have changed. A parameter that the vehicle does
+        renames: A JSON file of names that firmware versions have changed. A parameter that the vehicle does
             not have is looked up under its other name.
         metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for the
             ranges of values, and for parameters that take effect only after a reboot.

@@ -66,7 +66,7 @@ async def diff(
         partial: Leave out parameters that only the right side has; if the right side is a file and the left
             one is not, those that only the left side has.
         everything: Also print parameters that do not differ.
-        renames: A YAML file of names that firmware versions have changed. A parameter that only one side has
+        renames: A JSON file of names that firmware versions have changed. A parameter that only one side has
             is compared with the parameter of its other name.
         metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
         extended: Use extended parameters (PARAM_EXT_*), such as those of a camera.

@@ -42,7 +42,7 @@ from paramclient.errors import (
     UsageError,
 )
 from paramclient.files import FileFormat
-from paramclient.files.extended_document import is_extended_file, read_extended_file, write_extended_file
+from paramclient.files.disk import is_extended_file, read_extended_file, write_extended_file
 from paramclient.model.ext_params import (
     ExtParam,
     ExtParamType,

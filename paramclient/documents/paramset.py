@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 from paramclient.documents.component import IdentityDoc
 from paramclient.documents.document import Document, Maybe
 from paramclient.documents.param import WrittenParamDoc
-from paramclient.files.formats import ENDINGS, WRITABLE, FileFormat
+from paramclient.files.formats import ENDINGS, FileFormat
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import time_or_none
 
@@ -180,7 +180,7 @@ class FormatDoc(Document):
             name=file_format.value,
             title=_TITLES[file_format],
             endings=[ending for ending, each in ENDINGS.items() if each is file_format],
-            writes=file_format in WRITABLE,
+            writes=True,
         )
 
 
@@ -195,8 +195,6 @@ _TITLES: Final = {
     FileFormat.PARM: "MAVProxy, ArduPilot",
     FileFormat.MISSION_PLANNER: "Mission Planner",
     FileFormat.PCK: "Packed file of a vehicle",
-    FileFormat.PX4_SCRIPT: "Start script of PX4",
-    FileFormat.JSON: "paramclient, JSON",
-    FileFormat.YAML: "paramclient, YAML",
+    FileFormat.JSON: "paramclient",
 }
 """The title of each file format for users: the programs that use it."""

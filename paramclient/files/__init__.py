@@ -1,12 +1,10 @@
-"""Parameter files: formats of QGroundControl, MAVProxy, Mission Planner and PX4, packed files, JSON, YAML.
+"""Parameter files: formats of QGroundControl, MAVProxy and Mission Planner, packed files, JSON.
 
 - `formats`, `param_file`: the known formats, the content of a file.
 - `conversion`, `disk`: from and to bytes, reading and replacing a file.
-- `line_formats`: QGroundControl, MAVProxy, Mission Planner. `script`, `param_pck`, `document_format`,
-  `document_schema`: PX4's scripts, packed files, JSON and YAML.
-- `extended_document`: files of extended parameters.
+- `line_formats`, `param_pck`, `json_format`: lists of ground stations, packed files, JSON.
 - `rename_file`: files of names that firmware versions have changed.
-- `text`, `includes`, `yaml_parser`: lines and bad lines, `@include` lines, YAML with JSON's rules.
+- `text`, `includes`: lines and bad lines, `@include` lines.
 """
 
 from paramclient.files.conversion import LARGEST_FILE, dumps, loads

@@ -7,7 +7,7 @@ from pathlib import PurePath
 from typing import Final, TypeAlias
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files import document_format, line_formats, param_pck, script
+from paramclient.files import json_format, line_formats, param_pck
 from paramclient.files.formats import ENDINGS, FileFormat, parse_format
 from paramclient.files.includes import Includes
 from paramclient.files.param_file import AUTOPILOT, ParamFile, address
@@ -65,12 +65,8 @@ def loads(
     match file_format:
         case FileFormat.QGC:
             return line_formats.read_qgc(text, source, params_max)
-        case FileFormat.PX4_SCRIPT:
-            return script.read_script(text, source, params_max)
         case FileFormat.JSON:
-            return document_format.read_json(text, source, params_max)
-        case FileFormat.YAML:
-            return document_format.read_yaml(text, source, params_max)
+            return json_format.read_json(text, source, params_max)
         case _:
             return line_formats.read_pairs(text, file_format, source, includes, params_max)
 
@@ -114,14 +110,10 @@ def _bytes(sets: list[ParamSet], file_format: FileFormat, around: ParamFile) -> 
     match file_format:
         case FileFormat.PCK:
             return param_pck.write_packed(sets[0])
-        case FileFormat.PX4_SCRIPT:
-            raise UsageError("PX4 start scripts can be read but not written")
         case FileFormat.QGC:
             lines = line_formats.write_qgc(sets, around)
         case FileFormat.JSON:
-            lines = document_format.write_json(sets, around)
-        case FileFormat.YAML:
-            lines = document_format.write_yaml(sets, around)
+            lines = json_format.write_json(sets, around)
         case _:
             lines = line_formats.write_pairs(sets, file_format, around)
     return "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")
@@ -142,14 +134,10 @@ def _format_of(text: str, source: str) -> FileFormat:
         return FileFormat.JSON  # behind comments
     if line_formats.is_qgc_row(first.text):
         return FileFormat.QGC
-    if any(script.is_script_line(line.text) for line in lines_of(text)):
-        return FileFormat.PX4_SCRIPT
-    if document_format.is_document(first.text):
-        return FileFormat.YAML
     named = ENDINGS.get(PurePath(source).suffix.lower())
     if named in (FileFormat.PARM, FileFormat.MISSION_PLANNER):
         return named
-    if named in (FileFormat.QGC, FileFormat.JSON, FileFormat.YAML) and not line_formats.is_pair(first.text):
+    if named in (FileFormat.QGC, FileFormat.JSON) and not line_formats.is_pair(first.text):
         return named  # no other format is possible, and reading gives the error for this one
     return FileFormat.MISSION_PLANNER if "," in first.text else FileFormat.PARM
 
@@ -158,7 +146,7 @@ def _as_file(content: Content, file_format: FileFormat) -> ParamFile:
     if isinstance(content, ParamFile):
         return content
     sets = (content,) if isinstance(content, ParamSet) else tuple(content)
-    if file_format in (FileFormat.JSON, FileFormat.YAML):
+    if file_format is FileFormat.JSON:
         return ParamFile(sets, file_format)  # the document has fields for the header's facts
     return ParamFile(sets, file_format, header=tuple(line for each in sets for line in _header_lines(each)))
 

@@ -1,13 +1,4 @@
-"""FileFormat: the supported file formats, and their file extensions.
-
-`conversion` detects the format of a file, and calls its parser:
-
-- `line_formats`: QGC, PARM and MISSION_PLANNER, with the `@include` lines of `includes`.
-- `param_pck`: PCK.
-- `script`: PX4_SCRIPT.
-- `document_format`: JSON and YAML. `extended_document` parses files of extended parameters.
-- `paramclient.logs.onboard`: on-board logs (`LogFormat`).
-"""
+"""FileFormat: the supported file formats, and their file extensions."""
 
 from __future__ import annotations
 
@@ -18,7 +9,7 @@ from typing import Final
 
 from paramclient.errors import FileError, UsageError
 
-__all__ = ["ENDINGS", "FileFormat", "LogFormat", "WRITABLE", "format_of_name", "parse_format"]
+__all__ = ["ENDINGS", "FileFormat", "LogFormat", "format_of_name", "parse_format"]
 
 
 class FileFormat(StrEnum):
@@ -32,16 +23,8 @@ class FileFormat(StrEnum):
     """Mission Planner, `.param`: a name, a comma and a value."""
     PCK = "pck"
     """`param.pck`, the packed file that vehicles serve over MAVFTP."""
-    PX4_SCRIPT = "px4-script"
-    """Lines of a PX4 start script: `param set NAME VALUE`. Can only be read."""
     JSON = "json"
     """paramclient's own format: all fields of every parameter, exactly."""
-    YAML = "yaml"
-    """paramclient's own format as YAML, for editing by hand. Reading it needs PyYAML."""
-
-
-WRITABLE: Final = tuple(file_format for file_format in FileFormat if file_format is not FileFormat.PX4_SCRIPT)
-"""Formats that can be written."""
 
 
 class LogFormat(StrEnum):
@@ -59,8 +42,6 @@ ENDINGS: Final = {
     ".param": FileFormat.MISSION_PLANNER,
     ".pck": FileFormat.PCK,
     ".json": FileFormat.JSON,
-    ".yaml": FileFormat.YAML,
-    ".yml": FileFormat.YAML,
 }
 """Formats by file extension, in lower case."""
 
@@ -89,7 +70,7 @@ def format_of_name(name: str) -> FileFormat:
     file_format = ENDINGS.get(ending)
     if file_format is None:
         raise FileError(
-            f"unknown file extension {ending!r}. Choose a format ({_listed(WRITABLE)}), or one of the "
+            f"unknown file extension {ending!r}. Choose a format ({_listed(FileFormat)}), or one of the "
             f"extensions {_listed(ENDINGS)}",
             source=name,
         )

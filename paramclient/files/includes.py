@@ -8,40 +8,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Final
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.text import decode_text
 
-__all__ = ["Include", "Includes"]
+__all__ = ["Includes"]
 
-INCLUDE_DEPTH_MAX: Final = 8
-"""Largest depth of nested `@include` lines, so that a chain of files ends."""
 FILES_MAX: Final = 64
-"""Files that one file may include in total. Two lines in each of a few files could include thousands."""
-
-
-@dataclass(frozen=True, slots=True)
-class Include:
-    """An included file.
-
-    Attributes:
-        text: the content.
-        source: the file's name, for errors.
-        includes: reads the files that this file includes.
-    """
-
-    text: str
-    source: str
-    includes: Includes
-
-
-@dataclass(slots=True)
-class _Budget:
-    size: int
-    files: int = FILES_MAX
+"""Files that one file may include in total, nested or not. Two lines in each of a few files could include
+thousands."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,23 +31,24 @@ class Includes:
 
     Args:
         source: the file's name as given.
-        read: reads a file; raises OSError if it cannot be read, FileError if it must not be.
-        chain: the real paths of the files that include each other, from the first file to this one.
-        budget: the files and bytes that all of them together may still include.
+        read_bytes: reads a file; raises OSError if it cannot be read, FileError if it must not be.
+        size_max: bytes that all included files may have together.
+        chain: the real paths of the files that include each other, from the first file to that of `source`.
     """
 
     source: str
-    read: Callable[[str], bytes]
+    read_bytes: Callable[[str], bytes]
+    size_max: int
     chain: tuple[Path, ...]
-    budget: _Budget
+    _sizes: list[int] = field(default_factory=list)
 
     @classmethod
-    def of(cls, source: str, read: Callable[[str], bytes], *, size_max: int) -> Includes:
-        """Return the includes of a file on disk, limited to a total size in bytes."""
-        return cls(source, read, (Path(os.path.realpath(source)),), _Budget(size_max))
+    def of(cls, source: str, read_bytes: Callable[[str], bytes], *, size_max: int) -> Includes:
+        """Return the includes of a file on disk."""
+        return cls(source, read_bytes, size_max, (Path(os.path.realpath(source)),))
 
-    def follow(self, path: str) -> Include:
-        """Read the file of an `@include` line.
+    def read(self, path: str) -> tuple[str, Includes]:
+        """Return the text of the file of an `@include` line, and the reader of the files that it includes.
 
         Raises:
             UsageError: the file must not be included or cannot be read; with the reason in words.
@@ -78,29 +57,22 @@ class Includes:
         if PurePath(path).is_absolute():
             raise UsageError("absolute paths are not allowed")
         name = str(Path(self.source).parent / path)
-        try:
-            real = Path(os.path.realpath(name))
-            self._check(real)
-            data = self.read(name)
-        except FileError as error:
-            raise UsageError(f"{name} {error.reason}") from None
-        except OSError as error:
-            raise UsageError(f"{name} cannot be read: {error.strerror}") from None
-        self.budget.files -= 1
-        self.budget.size -= len(data)
-        if self.budget.size < 0:
-            raise UsageError("the included files are too large together")
-        includes = Includes(name, self.read, (*self.chain, real), self.budget)
-        return Include(decode_text(data, name), name, includes)
-
-    def _check(self, real: Path) -> None:
-        """Raise UsageError if the file must not be included."""
+        real = Path(os.path.realpath(name))
         top = self.chain[0].parent.parent
         if not real.is_relative_to(top):
             raise UsageError(f"it lies outside of {top}; only files below that folder can be included")
         if real in self.chain:
             raise UsageError("the files include each other (circular @include)")
-        if len(self.chain) > INCLUDE_DEPTH_MAX:
-            raise UsageError(f"@include is nested more than {INCLUDE_DEPTH_MAX} files deep")
-        if self.budget.files == 0:
+        if len(self._sizes) == FILES_MAX:
             raise UsageError(f"more than {FILES_MAX} files are included")
+        try:
+            data = self.read_bytes(name)
+        except FileError as error:
+            raise UsageError(f"{name} {error.reason}") from None
+        except OSError as error:
+            raise UsageError(f"{name} cannot be read: {error.strerror}") from None
+        self._sizes.append(len(data))
+        if sum(self._sizes) > self.size_max:
+            raise UsageError("the included files are too large together")
+        inner = Includes(name, self.read_bytes, self.size_max, (*self.chain, real), self._sizes)
+        return decode_text(data, name), inner

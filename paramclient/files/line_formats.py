@@ -12,8 +12,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 from typing import Final
 
 from paramclient.errors import FileError, UsageError
@@ -26,7 +24,6 @@ from paramclient.files.text import (
     TextLine,
     as_type,
     comment_lines,
-    excerpt,
     lines_of,
     parse_number,
     value_text,
@@ -36,55 +33,16 @@ from paramclient.model.values import ParamType, WireValue, check_name
 
 __all__ = ["is_pair", "is_qgc_row", "read_pairs", "read_qgc", "write_pairs", "write_qgc"]
 
-DELETED_SHOWN_MAX: Final = 10
-"""Names that the note on one `@delete` line lists, so that the note stays readable."""
-DELETES_MAX: Final = 256
-"""`@delete` lines of one file: each is compared with all parameters above it."""
-DELETE_COMPARISONS_MAX: Final = 1_000_000
-"""Comparisons of parameters with `@delete` lines in one file; takes half a second."""
 _QGC_COLUMNS: Final = "Vehicle-Id Component-Id Name Value Type"
 _QGC_ROW: Final = "vehicle, component, name, value and type, with tabs between them"
 _qgc_nan: Final = re.compile(r"--\.-+").fullmatch
 """QGroundControl's notation of NaN (Fact.cc)."""
 _include: Final = re.compile(r"@include[ \t]+(.*\S)").fullmatch
-_delete: Final = re.compile(r"@delete[ \t]+(\S{1,64})").fullmatch
 _blanks: Final = re.compile(r"[ \t]+")
 _between: Final = re.compile(r"[ \t]*[,=][ \t]*|[ \t]+")
 _decimal_comma: Final = re.compile(r"(?:^|[ \t,=])[+-]?[0-9]+,[0-9]+$").search
 _name: Final = re.compile(r"(?=.*[A-Za-z])[^@\s,=#;/][^\s,=#;]*(?<!:)").fullmatch
 _qgc_row: Final = re.compile(r"[0-9]+[ \t]+[0-9]+[ \t]+[^ \t]+[ \t]+[^ \t]+[ \t]+[0-9]+").fullmatch
-
-
-@dataclass(slots=True)
-class _Lines:
-    """The content of one file, with that of the files that it includes.
-
-    Attributes:
-        params: the parameters in order, each with its position, for notes.
-        notes: a note for each `@delete` line.
-        deletes: number of `@delete` lines.
-        comparisons: number of parameters that were compared with these lines.
-        params_max: maximum number of parameters; None for any.
-    """
-
-    params: list[tuple[WrittenParam, str]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    deletes: int = 0
-    comparisons: int = 0
-    params_max: int | None = None
-
-    def delete(self, pattern: str, place: str) -> None:
-        """Remove the parameters so far whose names match a glob."""
-        self.deletes += 1
-        self.comparisons += len(self.params)
-        names = {param.name for param, _ in self.params if fnmatchcase(param.name, pattern)}
-        if not names:
-            self.notes.append(f"@delete {pattern} in {place} matches no parameter above it.")
-            return
-        self.params = [each for each in self.params if each[0].name not in names]
-        listed = ", ".join(sorted(names)[:DELETED_SHOWN_MAX])
-        listed += ", …" if len(names) > DELETED_SHOWN_MAX else ""
-        self.notes.append(f"@delete {pattern} in {place} removes {listed}.")
 
 
 def read_pairs(
@@ -98,8 +56,7 @@ def read_pairs(
 
     Name and value are separated by spaces, tabs, a comma or `=`. After the value, only a comment may follow,
     or ArduPilot's `@READONLY`, which is kept as a comment. `@include FILE` is replaced with the lines of
-    another file, of which only the comments of parameters are kept. `@delete GLOB` removes the parameters
-    above it in its file, and in the files included there, whose names match; forks of ArduPilot have it.
+    another file, of which only the comments of parameters are kept.
 
     Args:
         text: the content.
@@ -111,58 +68,34 @@ def read_pairs(
     Raises:
         FileError: a line is something else, also in an included file.
     """
-    problems = Problems(source)
-    lines = _Lines(params_max=params_max)
-    header, footer = _read_lines(text, file_format, lines, problems, includes, is_included=False)
-    builder = Builder(problems, params_max)
-    for param, place in lines.params:
-        builder.add(param, place=place)
-    sets = builder.result()
-    return ParamFile(sets, file_format, source, header, footer, (*lines.notes, *builder.notes))
-
-
-def _read_lines(
-    text: str,
-    file_format: FileFormat,
-    lines: _Lines,
-    problems: Problems,
-    includes: Includes | None,
-    *,
-    is_included: bool,
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Add the parameters of one file to `lines`, and its bad lines to `problems`."""
+    builder = Builder(source, params_max)
     expected = "NAME,VALUE" if file_format is FileFormat.MISSION_PLANNER else "NAME VALUE"
+    header, footer = _read_pairs(text, source, expected, builder, includes, is_included=False)
+    return ParamFile(builder.result(), file_format, source, header, footer, tuple(builder.notes))
+
+
+def _read_pairs(
+    text: str, source: str, expected: str, builder: Builder, includes: Includes | None, *, is_included: bool
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Add the parameters of one file, and of those that it includes; return header and footer."""
+    problems = Problems(source)
 
     def include(line: TextLine, path: str) -> None:
         try:
             if includes is None:
                 raise UsageError("only a file on disk can include another file")
-            found = includes.follow(path)
-            inner = _Lines(params_max=lines.params_max)
-            problems_inside = Problems(found.source)
-            _read_lines(found.text, file_format, inner, problems_inside, found.includes, is_included=True)
-            problems_inside.raise_if_any()
-            lines.params += inner.params
-            lines.notes += inner.notes
+            found, inner = includes.read(path)
+            _read_pairs(found, inner.source, expected, builder, inner, is_included=True)
+        except TooManyParams:
+            raise
         except FileError as error:
-            here = f"{problems.source}:{line.number}: includes that file"
-            raise error.with_more(here) from None
+            raise error.with_more(f"{source}:{line.number}: includes that file") from None
         except UsageError as error:
-            problems.add(line.number, f"@include with a file that can be read ({error})", excerpt(line.text))
+            problems.add_line(line, f"@include with a file that can be read ({error})")
 
     def take(line: TextLine, comment: str) -> None:
-        place = f"{problems.source}:{line.number}" if is_included else f"line {line.number}"
         if match := _include(line.text):
             include(line, match[1])
-            return
-        if match := _delete(line.text):
-            if lines.deletes >= DELETES_MAX:
-                problems.add(line.number, f"at most {DELETES_MAX} lines with @delete", excerpt(line.text))
-            elif lines.comparisons + len(lines.params) > DELETE_COMPARISONS_MAX:
-                most = f"at most {DELETE_COMPARISONS_MAX:,} comparisons of @delete lines with parameters"
-                problems.add(line.number, most, excerpt(line.text))
-            else:
-                lines.delete(match[1], place)
             return
         words = _between.split(line.text)
         if words[-1] == "@READONLY":
@@ -170,15 +103,17 @@ def _read_lines(
             words.pop()
         problem = _pair_problem(line.text, words, expected)
         if problem is not None:
-            problems.add(line.number, problem, excerpt(line.text))
+            problems.add_line(line, problem)
             return
         value = parse_number(words[1])
         assert value is not None
         number = None if is_included else line.number
-        lines.params.append((WrittenParam(words[0], value, comment=comment, line=number), place))
-        TooManyParams.check(len(lines.params), lines.params_max, problems.source)
+        place = f"{source}:{line.number}" if is_included else f"line {line.number}"
+        builder.add(WrittenParam(words[0], value, comment=comment, line=number), place)
 
-    return _read_commented_lines(text, take)
+    header, footer = _read_commented_lines(text, take)
+    problems.raise_if_any()
+    return header, footer
 
 
 def write_pairs(sets: Sequence[ParamSet], file_format: FileFormat, around: ParamFile) -> Iterator[str]:
@@ -214,12 +149,12 @@ def read_qgc(text: str, source: str, params_max: int | None = None) -> ParamFile
     Raises:
         FileError: a line does not have five columns, or its value does not fit its type.
     """
-    builder = Builder(Problems(source), params_max)
+    builder, problems = Builder(source, params_max), Problems(source)
 
     def take(line: TextLine, comment: str) -> None:
         columns = _blanks.split(line.text)
         if len(columns) != 5:
-            builder.problems.add(line.number, _QGC_ROW, excerpt(line.text))
+            problems.add_line(line, _QGC_ROW)
             return
         try:
             system, component = (_address(each) for each in columns[:2])
@@ -227,11 +162,12 @@ def read_qgc(text: str, source: str, params_max: int | None = None) -> ParamFile
             name, value = _checked_name(columns[2]), _qgc_value(columns[3])
             param = WrittenParam(name, _fitting(value, kind), kind, comment=comment, line=line.number)
         except UsageError as error:
-            builder.problems.add(line.number, str(error), excerpt(line.text))
+            problems.add_line(line, str(error))
             return
-        builder.add(param, system=system, component=component)
+        builder.add(param, f"line {line.number}", system=system, component=component)
 
     header, footer = _read_commented_lines(text, take)
+    problems.raise_if_any()
     return ParamFile(builder.result(), FileFormat.QGC, source, header, footer, tuple(builder.notes))
 
 
@@ -316,7 +252,7 @@ def _pair_problem(text: str, words: list[str], expected: str) -> str | None:
 def _pair_name(param: WrittenParam) -> str:
     """Return the name if a line can begin with it; else raise UsageError."""
     if _name(param.name) is None:
-        raise UsageError(f"the name {param.name!r} cannot be written in this format; json and yaml keep it")
+        raise UsageError(f"the name {param.name!r} cannot be written in this format; json keeps it")
     return param.name
 
 

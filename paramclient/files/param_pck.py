@@ -65,7 +65,7 @@ def _entry(param: WrittenParam, *, with_defaults: bool) -> param_pck.PackedParam
         has = "no type" if kind is None else f"the type {type_name(kind)}"
         raise UsageError(f"{param.name} has {has}, and a packed file holds {known}")
     if param.is_raw:
-        raise UsageError(f"{param.name} is not a number; json and yaml can keep it")
+        raise UsageError(f"{param.name} is not a number; json can keep it")
     bits = param.bits_as(kind)
     default = None
     if with_defaults and param.default is not None:

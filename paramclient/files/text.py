@@ -17,7 +17,6 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, WireValue, bits_of, format_value, from_bits, type_name
 
 __all__ = [
-    "COMMENT_START",
     "Builder",
     "TextLine",
     "Problems",
@@ -49,7 +48,7 @@ _whole: Final = re.compile(r"[+-]?[0-9]+").fullmatch
 _hexadecimal: Final = re.compile(r"0[xX][0-9a-fA-F]+").fullmatch
 _fraction: Final = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
 _nan_or_infinity: Final = re.compile(r"([+-]?)(?:(nan)|inf(?:inity)?)", re.IGNORECASE).fullmatch
-COMMENT_START: Final = re.compile(r"(?<![0-9]\.)#|#(?!INF|IND|[QS]?NAN)|(?:(?<=[ \t])|^)(?://|;)")
+_comment_start: Final = re.compile(r"(?<![0-9]\.)#|#(?!INF|IND|[QS]?NAN)|(?:(?<=[ \t])|^)(?://|;)")
 """Start of a comment in a parameter list: no name or value can begin with `//` or `;`. The `#` of `1.#INF`
 and `-1.#IND`, which older C libraries of Windows print for infinity and NaN, does not start a comment."""
 _control: Final = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
@@ -73,33 +72,44 @@ class Problems:
     """
 
     source: str
-    found: list[tuple[int, str, str]] = field(default_factory=list)
     count: int = 0
+    _found: list[tuple[int | None, str, str | None]] = field(default_factory=list)
 
-    def add(self, line: int, expected: str, found: str) -> None:
-        """Add a bad line. Keeps only the first lines: in a file of another kind, every line is bad."""
+    @property
+    def is_full(self) -> bool:
+        """Whether further problems are only counted: in a file of another kind, every line is bad."""
+        return self.count >= PROBLEMS_MAX
+
+    def add(self, line: int | None, problem: str, expected: str | None = None) -> None:
+        """Add a problem.
+
+        Args:
+            line: the bad line; None for an unknown one.
+            problem: the problem, as the end of a sentence.
+            expected: the expected content of the line, if it has a description.
+        """
+        if not self.is_full:
+            self._found.append((line, problem, expected))
         self.count += 1
-        if self.count <= PROBLEMS_MAX:
-            self.found.append((line, expected, found))
+
+    def add_line(self, line: TextLine, expected: str) -> None:
+        """Add a bad line."""
+        self.add(line.number, f"expected {expected}, found {excerpt(line.text)}", expected)
 
     def raise_if_any(self) -> None:
-        """Raise one FileError for all bad lines, if there are any."""
-        if not self.found:
+        """Raise one FileError for all problems, if there are any."""
+        if not self._found:
             return
-        place = f"{self.source}:" if self.source else "line "
-        more = [
-            f"{place}{line}: expected {expected}, found {found}" for line, expected, found in self.found[1:]
-        ]
-        if self.count > PROBLEMS_MAX:
-            more.append(f"and {self.count - PROBLEMS_MAX} more bad lines")
-        line, expected, found = self.found[0]
-        raise FileError(
-            f"expected {expected}, found {found}",
-            source=self.source,
-            line=line,
-            expected=expected,
-            more=tuple(more),
-        )
+        more = [": ".join(filter(None, (self._place(line), what))) for line, what, _ in self._found[1:]]
+        if self.count > len(self._found):
+            more.append(f"and {self.count - len(self._found)} more")
+        line, what, expected = self._found[0]
+        raise FileError(what, source=self.source, line=line, expected=expected, more=tuple(more))
+
+    def _place(self, line: int | None) -> str:
+        if line is None:
+            return self.source
+        return f"{self.source}:{line}" if self.source else f"line {line}"
 
 
 @dataclass(slots=True)
@@ -110,78 +120,66 @@ class Builder:
     after the other. A note reports the repetition.
 
     Args:
-        problems: the bad lines of the file.
+        source: the file's name.
         params_max: maximum number of parameters, repeated ones counted each time; None for any.
     """
 
-    problems: Problems
+    source: str
     params_max: int | None = None
-    sets: dict[tuple[int | None, int | None], dict[str, WrittenParam]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    repeated: int = 0
-    count: int = 0
+    _sets: dict[tuple[int | None, int | None], dict[str, WrittenParam]] = field(default_factory=dict)
     _places: dict[tuple[int | None, int | None, str], str] = field(default_factory=dict)
+    _count: int = 0
+    _repeated: int = 0
 
     def add(
-        self,
-        param: WrittenParam,
-        *,
-        system: int | None = None,
-        component: int | None = None,
-        place: str = "",
+        self, param: WrittenParam, place: str, *, system: int | None = None, component: int | None = None
     ) -> None:
         """Add a parameter; it replaces an earlier one with the same name.
 
         Args:
             param: the parameter.
+            place: its position, for notes.
             system, component: the ids of the set.
-            place: its position in the file, in words; "" for its line.
 
         Raises:
             TooManyParams: the file has more parameters than `params_max`.
         """
-        self.count += 1
-        TooManyParams.check(self.count, self.params_max, self.problems.source)
-        params = self.sets.setdefault((system, component), {})
+        self._count += 1
+        TooManyParams.check(self._count, self.params_max, self.source)
+        params = self._sets.setdefault((system, component), {})
         before = params.get(param.name)
         params[param.name] = param
         key = (system, component, param.name)
-        place = place or f"line {param.line}"
         if before is not None:
-            self.note_repeated(param, place, before, self._places[key])
+            self._note_repeated(param, place, before, self._places[key])
         self._places[key] = place
 
-    def place_of(self, name: str) -> str:
-        """Return the position of the value in use, for a file without component ids."""
-        return self._places[None, None, name]
+    def result(self) -> tuple[ParamSet, ...]:
+        """Return the sets.
 
-    def note_repeated(self, param: WrittenParam, place: str, other: WrittenParam, elsewhere: str) -> None:
-        """Add a note about a repeated name that says which value is used."""
-        self.repeated += 1
-        if self.repeated > PROBLEMS_MAX:
+        Raises:
+            FileError: the file has no parameters.
+        """
+        if not self._sets:
+            raise FileError("the file contains no parameters", source=self.source)
+        if self._repeated > PROBLEMS_MAX:
+            more = self._repeated - PROBLEMS_MAX
+            self.notes.append(f"{more} more {'line repeats' if more == 1 else 'lines repeat'} a name.")
+        return tuple(
+            ParamSet(params, component, system, source=self.source)
+            for (system, component), params in self._sets.items()
+        )
+
+    def _note_repeated(self, param: WrittenParam, place: str, other: WrittenParam, elsewhere: str) -> None:
+        self._repeated += 1
+        if self._repeated > PROBLEMS_MAX:
             return
         if _same(other, param):
             self.notes.append(f"{param.name} occurs twice with the same value, in {elsewhere} and {place}.")
         else:
             used, ignored = f"{_value_and_type(param)} in {place}", f"{_value_and_type(other)} in {elsewhere}"
             self.notes.append(f"{param.name} occurs twice: {used} is used, not {ignored}.")
-
-    def result(self) -> tuple[ParamSet, ...]:
-        """Return the sets.
-
-        Raises:
-            FileError: the file has bad lines, or no parameters.
-        """
-        self.problems.raise_if_any()
-        if not self.sets:
-            raise FileError("the file contains no parameters", source=self.problems.source)
-        if self.repeated > PROBLEMS_MAX:
-            more = self.repeated - PROBLEMS_MAX
-            self.notes.append(f"{more} more {'line repeats' if more == 1 else 'lines repeat'} a name.")
-        return tuple(
-            ParamSet(params, component, system, source=self.problems.source)
-            for (system, component), params in self.sets.items()
-        )
 
 
 def decode_text(data: bytes, source: str) -> str:
@@ -217,10 +215,10 @@ def decode_text(data: bytes, source: str) -> str:
     return text
 
 
-def lines_of(text: str, mark: re.Pattern[str] = COMMENT_START) -> Iterator[TextLine]:
-    """Generate all lines, empty ones included, with the comments that `mark` starts."""
+def lines_of(text: str) -> Iterator[TextLine]:
+    """Generate all lines, empty ones included, with their comments."""
     for number, line in enumerate(_split(text), start=1):
-        found = mark.search(line)
+        found = _comment_start.search(line)
         if found is None:
             yield TextLine(number, line.strip(" \t"), None)
         else:
@@ -277,10 +275,10 @@ def value_text(param: WrittenParam) -> str:
     value = param.settable
     if isinstance(value, bytes):
         raw = format_value(value)
-        raise UsageError(f"{param.name} is {raw}, which is not a number; json and yaml can keep it")
+        raise UsageError(f"{param.name} is {raw}, which is not a number; json can keep it")
     if isinstance(value, float) and not math.isfinite(value):
         if not is_plain(value):
-            raise UsageError(f"{param.name} is a NaN with payload bits; json and yaml can keep them")
+            raise UsageError(f"{param.name} is a NaN with payload bits; json can keep them")
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     return format_value(value, ParamType.REAL64 if param.type_number is None else param.type_number)
 

@@ -159,7 +159,7 @@ async def apply_extended(
         component: the component.
         wanted: the wanted parameters.
         durable: return only when the values and their history are on the disk, see `ExtParams.set`.
-        backup: a file for the state before the first write, JSON or YAML.
+        backup: a file for the state before the first write, a JSON file.
         timeout: seconds for the whole call; None: no limit.
         author: the author of the changes, as in `Component.set`.
         progress: called with each outcome.
@@ -263,7 +263,7 @@ async def _write(
     source = f"{component.system}/{component.component} {reason}"
     before = extended_set(component, plan.current, source)
     if backup is not None:
-        from paramclient.files.extended_document import write_extended_file
+        from paramclient.files.disk import write_extended_file
 
         await anyio.to_thread.run_sync(write_extended_file, backup, before)
     if not plan.changes:

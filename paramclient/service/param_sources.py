@@ -172,7 +172,7 @@ class UploadedFile(Body):
 
 
 class UploadedRenames(Body):
-    """A file of names that firmware versions have changed, as text in YAML or JSON; see `Renames`."""
+    """A file of names that firmware versions have changed, as text; see `Renames`."""
 
     name: Annotated[str, Field(max_length=FILE_NAME_LENGTH_MAX)] = ""
     text: str

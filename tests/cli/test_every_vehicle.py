@@ -105,8 +105,8 @@ def test_save_writes_every_vehicle_into_one_file_or_into_one_each(
     command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle], tmp_path: Path
 ) -> None:
     url = put(Air(vehicles))
-    assert command("save", url, tmp_path / "fleet.yaml", "--all").code == 0
-    assert [each.system for each in read_file(tmp_path / "fleet.yaml").sets] == [1, 2]
+    assert command("save", url, tmp_path / "fleet.json", "--all").code == 0
+    assert [each.system for each in read_file(tmp_path / "fleet.json").sets] == [1, 2]
     saved = command("save", url, tmp_path / "quad-{system}.param", "--all", "--json")
     assert saved.code == 0
     assert [each["path"] for each in saved.json["files"]] == [
@@ -114,9 +114,9 @@ def test_save_writes_every_vehicle_into_one_file_or_into_one_each(
     ]
     assert "OF_PX4" in read_file(tmp_path / "quad-1.param").choose()
     assert "OF_PX4" not in read_file(tmp_path / "quad-2.param").choose()
-    alone = command("save", url, tmp_path / "one.yaml", "--all", "--system", "2")
+    alone = command("save", url, tmp_path / "one.json", "--all", "--system", "2")
     assert alone.code == 0
-    assert [each.system for each in read_file(tmp_path / "one.yaml").sets] == [2]
+    assert [each.system for each in read_file(tmp_path / "one.json").sets] == [2]
 
 
 @pytest.mark.parametrize("option", [["--system", "1"], ["--split-peers"], ["--extended"]])

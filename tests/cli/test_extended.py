@@ -27,6 +27,9 @@ def put(monkeypatch: pytest.MonkeyPatch) -> Put:
     return behind(monkeypatch, URL)
 
 
+EXT_FILE = '{"paramclient_extended": 1, "params": {"CAM_NAME": {"value": "%s", "type": "CUSTOM"}}}'
+
+
 def small() -> Camera:
     return Camera({"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_KEY": b"\xff\0\xfe", "CAM_EV": 0.5})
 
@@ -130,16 +133,12 @@ def test_refusals_have_a_status_and_an_exit_code(command: Command, put: Put) -> 
 def test_files_and_comparisons(command: Command, put: Put, tmp_path: Path) -> None:
     camera = small()
     url = put(camera)
-    for ending in ("json", "yaml"):
-        file = tmp_path / f"camera.{ending}"
-        saved = command("save", url, file, *CAMERA, "--extended")
-        assert (saved.code, saved.err) == (
-            0,
-            f"4 extended parameters of 1/100 written to {file} ({ending})\n",
-        )
-        assert command("show", file).words[1][:2] == ["CAM_MODE", "1"]
-        same = command("diff", file, url, *CAMERA)
-        assert (same.code, same.out) == (0, "")
+    file = tmp_path / "camera.json"
+    saved = command("save", url, file, *CAMERA, "--extended")
+    assert (saved.code, saved.err) == (0, f"4 extended parameters of 1/100 written to {file} (json)\n")
+    assert command("show", file).words[1][:2] == ["CAM_MODE", "1"]
+    same = command("diff", file, url, *CAMERA)
+    assert (same.code, same.out) == (0, "")
     camera.set_ext_param("CAM_NAME", "Rear")
     camera.remove_ext_param("CAM_EV")
     other = command("diff", file, url, *CAMERA)
@@ -155,7 +154,7 @@ def test_files_and_comparisons(command: Command, put: Put, tmp_path: Path) -> No
 def test_apply_writes_what_differs_and_reads_it_back(command: Command, put: Put, tmp_path: Path) -> None:
     camera = small()
     url = put(camera)
-    file = tmp_path / "camera.yaml"
+    file = tmp_path / "camera.json"
     assert command("save", url, file, *CAMERA, "--extended").code == 0
     camera.set_ext_param("CAM_NAME", "Rear")
     camera.set_ext_param("CAM_MODE", 9)
@@ -175,7 +174,7 @@ def test_apply_writes_what_differs_and_reads_it_back(command: Command, put: Put,
 
 
 def test_apply_reports_what_it_cannot_do(command: Command, put: Put, tmp_path: Path) -> None:
-    file = tmp_path / "camera.yaml"
+    file = tmp_path / "camera.json"
     assert command("save", put(small()), file, *CAMERA, "--extended").code == 0
     url = put(Camera({"CAM_MODE": 2, "CAM_NAME": 5}, supported={"CAM_MODE": [2]}))
     done = command("apply", url, file, *CAMERA)
@@ -194,10 +193,10 @@ def test_restore_undoes_the_last_apply(command: Command, put: Put, tmp_path: Pat
     camera = small()
     before = camera.ext_values
     url = put(camera)
-    file, backup = tmp_path / "camera.yaml", tmp_path / "before.yaml"
+    file, backup = tmp_path / "camera.json", tmp_path / "before.json"
     file.write_text(
-        "paramclient_extended: 1\ncomponent: 100\nparams:\n"
-        '  CAM_NAME: {value: Rear, type: CUSTOM}\n  CAM_KEY: {hex: "01", type: CUSTOM}\n'
+        '{"paramclient_extended": 1, "component": 100, "params": {'
+        '"CAM_NAME": {"value": "Rear", "type": "CUSTOM"}, "CAM_KEY": {"hex": "01", "type": "CUSTOM"}}}'
     )
     assert command("apply", url, file, *CAMERA, "--backup", backup).code == 0
     assert camera.ext_values["CAM_NAME"] == "Rear"
@@ -215,8 +214,8 @@ def test_restore_from_the_cache(command: Command, put: Put, tmp_path: Path) -> N
     url = put(camera)
     empty = command("restore", url, *CAMERA)
     assert (empty.code, "no snapshot from before an apply" in empty.err) == (5, True), empty.err
-    file = tmp_path / "camera.yaml"
-    file.write_text("paramclient_extended: 1\nparams:\n  CAM_NAME: {value: Rear, type: CUSTOM}\n")
+    file = tmp_path / "camera.json"
+    file.write_text(EXT_FILE % "Rear")
     assert command("apply", url, file, *CAMERA).code == 0
     [kept] = command("history", 1, "--extended", "--snapshots").rows[1:]
     assert (kept[0], kept[2:4], kept[-1]) == ("1", ["100", "4"], "before apply")
@@ -317,9 +316,9 @@ def test_a_component_without_extended_parameters_is_reported(command: Command, p
 
 def test_save_finds_plain_ones_of_such_a_component(command: Command, put: Put, tmp_path: Path) -> None:
     url = put(GenericVehicle({"A": 1}, component=100))
-    file = tmp_path / "camera.yaml"
+    file = tmp_path / "camera.json"
     assert command("save", url, file, *CAMERA).code == 0
-    assert "paramclient: 1" in file.read_text()
+    assert '"paramclient": 1' in file.read_text()
 
 
 def test_the_history_of_extended_parameters(command: Command, put: Put) -> None:
@@ -401,8 +400,8 @@ def test_a_durable_set(command: Command, put: Put, tmp_path: Path, monkeypatch: 
     failed = command("set", put(small()), *CAMERA, "CAM_NAME", "Top", "--durable")
     assert "has accepted CAM_NAME, but it is not on the disk" in failed.err
     assert failed.code == 5
-    file = tmp_path / "camera.yaml"
-    file.write_text("paramclient_extended: 1\nparams:\n  CAM_NAME: {value: Top, type: CUSTOM}\n")
+    file = tmp_path / "camera.json"
+    file.write_text(EXT_FILE % "Top")
     applied = command("apply", put(small()), file, *CAMERA, "--durable", "--yes")
     assert (applied.code, "it is not on the disk" in applied.err) == (5, True)
     assert command("apply", put(small()), file, *CAMERA, "--yes").code == 0

@@ -36,7 +36,7 @@ LINK_FIRST = "the first argument is the link, such as udpin:0.0.0.0:14550 or sim
         (["apply", "quad.parm", "sim:px4"], f"quad.parm is a file: {LINK_FIRST}"),
         (["apply", "sim:px4", "qaud.parm"], "no such file: qaud.parm (did you mean quad.parm?)\n"),
         (["apply", "sim:px4", "my/quad.parm"], "no such file: my/quad.parm; there is no folder my here\n"),
-        (["apply", "sim:px4", "fleet.yaml"], "no such file: fleet.yaml\n"),
+        (["apply", "sim:px4", "fleet.json"], "no such file: fleet.json\n"),
         (
             ["set", "sim:px4", "MC_ROLL_P", "=", 6.5],
             "write MC_ROLL_P=VALUE without spaces, or MC_ROLL_P VALUE without an equals sign\n",

@@ -140,7 +140,7 @@ def test_messages_of_the_cache_have_local_times(
 
 @pytest.mark.usefixtures("in_zone")
 def test_names_that_look_like_times_stay_as_they_are() -> None:
-    for text in ("2026-01-02T03:00:00Z.yaml", "/tmp/2026-01-02T03:00:00Z", "2026-99-02T03:00:00Z of it"):
+    for text in ("2026-01-02T03:00:00Z.json", "/tmp/2026-01-02T03:00:00Z", "2026-99-02T03:00:00Z of it"):
         assert in_local_time(text) == text
     assert in_local_time("at 2026-01-01T21:30:00.250Z; later") == "at 2026-01-02T03:00:00.250+05:30; later"
 
@@ -190,11 +190,3 @@ def test_import_says_what_a_file_is_that_is_no_log(
     assert (outcome.code, outcome.out) == (2, "")
     assert kind in outcome.err
     assert outcome.err.count("\n") == 1
-
-
-def test_px4_scripts_are_not_offered_for_save(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    command = in_process(capsys)
-    assert "px4-script" not in command("save", "--help").out
-    refused = command("save", "sim:px4", tmp_path / "rc.txt", "--format", "px4-script")
-    assert refused.code == 2
-    assert "mission-planner" in refused.err

@@ -21,20 +21,22 @@ TABLE: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "OTHER": 1.0,
 }
 RULES = """\
-- {old: WPNAV_SPEED, new: WP_SPD, factor: 0.01}
-- {old: RTL_ALT, new: RTL_ALT_M, factor: 0.01}
-- {old: GONE, new: GONE_TOO}
+[
+{"old": "WPNAV_SPEED", "new": "WP_SPD", "factor": 0.01},
+{"old": "RTL_ALT", "new": "RTL_ALT_M", "factor": 0.01},
+{"old": "GONE", "new": "GONE_TOO"}
+]
 """
 FILE = "WPNAV_SPEED,750\nRTL_ALT,1500\n"
-NOT_HERE = "renamed to GONE_TOO in names.yaml, which this vehicle does not have either"
+NOT_HERE = "renamed to GONE_TOO in names.json, which this vehicle does not have either"
 
 
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run the command line in this process, on simulated time, in a folder with `names.yaml`."""
+    """Run the command line in this process, on simulated time, in a folder with `names.json`."""
     leaping(monkeypatch)
     monkeypatch.chdir(tmp_path)
-    Path("names.yaml").write_text(RULES)
+    Path("names.json").write_text(RULES)
     return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
 
 
@@ -63,7 +65,7 @@ def older_file(**values: WireValue) -> str:
 
 def test_apply_writes_under_the_name_of_the_vehicle(command: Command, put: Callable[[Endpoint], str]) -> None:
     vehicle = copter()
-    outcome = command("apply", put(vehicle), file(), "--renames", "names.yaml", "--full")
+    outcome = command("apply", put(vehicle), file(), "--renames", "names.json", "--full")
     assert outcome.code == 0
     assert outcome.rows[1:] == [
         ["WPNAV_SPEED", "10.0", "7.5", "7.5", "set", "WP_SPD on this vehicle"],
@@ -75,17 +77,17 @@ def test_apply_writes_under_the_name_of_the_vehicle(command: Command, put: Calla
 def test_apply_prints_the_name_of_the_vehicle_as_json(
     command: Command, put: Callable[[Endpoint], str]
 ) -> None:
-    reported = command("apply", put(copter()), file(), "--renames", "names.yaml", "--json").json
+    reported = command("apply", put(copter()), file(), "--renames", "names.json", "--json").json
     row = reported["params"]["WPNAV_SPEED"]
     assert (row["vehicle_name"], row["wanted"], row["actual"], row["status"]) == ("WP_SPD", 7.5, 7.5, "set")
 
 
 def test_a_dry_run_shows_the_steps_under_both_names(command: Command, put: Callable[[Endpoint], str]) -> None:
     vehicle = copter()
-    outcome = command("apply", put(vehicle), file(), "--renames", "names.yaml", "--dry-run")
+    outcome = command("apply", put(vehicle), file(), "--renames", "names.json", "--dry-run")
     reason = "WP_SPD on this vehicle; all other parameters"
     assert outcome.rows[1:] == [["1", "WPNAV_SPEED", "10.0", "7.5", "set", reason]]
-    reported = command("apply", put(vehicle), file(), "--renames", "names.yaml", "--dry-run", "--json").json
+    reported = command("apply", put(vehicle), file(), "--renames", "names.json", "--dry-run", "--json").json
     assert [step["name"] for step in reported["stages"][0]["steps"]] == ["WP_SPD"]
     assert reported["params"]["WPNAV_SPEED"]["vehicle_name"] == "WP_SPD"
     assert "firmware" not in reported
@@ -94,7 +96,7 @@ def test_a_dry_run_shows_the_steps_under_both_names(command: Command, put: Calla
 
 def test_a_missing_parameter_names_its_other_name(command: Command, put: Callable[[Endpoint], str]) -> None:
     vehicle, wanted = copter(), file("GONE,1\n")
-    outcome = command("apply", put(vehicle), wanted, "--renames", "names.yaml")
+    outcome = command("apply", put(vehicle), wanted, "--renames", "names.json")
     assert outcome.code == 1
     assert outcome.rows[1:] == [["GONE", "1", "skipped", f"not on this vehicle; {NOT_HERE}"]]
 
@@ -103,12 +105,12 @@ def test_values_that_do_not_fit_and_names_that_collide_send_nothing(
     command: Command, put: Callable[[Endpoint], str]
 ) -> None:
     vehicle = copter()
-    outcome = command("apply", put(vehicle), file("RTL_ALT,1550\n"), "--renames", "names.yaml")
+    outcome = command("apply", put(vehicle), file("RTL_ALT,1550\n"), "--renames", "names.json")
     assert outcome.code == 2
     assert "RTL_ALT: as RTL_ALT_M, 15.5 is not a whole number, and the parameter is INT16" in outcome.err
-    outcome = command("apply", put(vehicle), file(FILE + "WP_SPD,1\n"), "--renames", "names.yaml")
+    outcome = command("apply", put(vehicle), file(FILE + "WP_SPD,1\n"), "--renames", "names.json")
     assert outcome.code == 2
-    assert "are both WP_SPD by names.yaml; remove one of the two" in outcome.err
+    assert "are both WP_SPD by names.json; remove one of the two" in outcome.err
     assert vehicle.requests["PARAM_SET"] == 0
 
 
@@ -116,10 +118,10 @@ def test_values_that_do_not_fit_and_names_that_collide_send_nothing(
 def test_a_bad_file_of_names_is_an_error_with_its_line(
     command: Command, put: Callable[[Endpoint], str], subcommand: str
 ) -> None:
-    bad = file("- {old: A, new: B}\n- {old: C, new: D, factor: 0}\n", "bad.yaml")
+    bad = file('[{"old": "A", "new": "B"},\n{"old": "C", "new": "D", "factor": 0}]\n', "bad.json")
     outcome = command(subcommand, put(copter()), file(), "--renames", bad)
     assert outcome.code == 2
-    assert "bad.yaml:2: the factor of C is 0" in outcome.err
+    assert "bad.json:2: the factor of C is 0" in outcome.err
 
 
 @pytest.mark.parametrize("words", [("apply", "--dry-run")])
@@ -141,7 +143,7 @@ def test_firmware_versions_that_differ_are_named_first(
 def test_diff_compares_parameters_under_their_other_names(command: Command) -> None:
     old = file("WPNAV_SPEED,750\nRTL_ALT,1500\nOTHER,1\n", "old.param")
     new = file("WP_SPD,7.0\nRTL_ALT_M,15\nOTHER,1\nMORE,2\n", "new.param")
-    outcome = command("diff", old, new, "--renames", "names.yaml", "--all")
+    outcome = command("diff", old, new, "--renames", "names.json", "--all")
     assert outcome.code == 1
     assert outcome.rows[1:] == [
         ["MORE", "2", "only right"],
@@ -149,20 +151,20 @@ def test_diff_compares_parameters_under_their_other_names(command: Command) -> N
         ["RTL_ALT", "1500", "15", "same, RTL_ALT_M on the right, where left is 15"],
         ["WPNAV_SPEED", "750", "7.0", "different, WP_SPD on the right, where left is 7.5"],
     ]
-    outcome = command("diff", new, old, "--renames", "names.yaml", "--all", "--partial")
+    outcome = command("diff", new, old, "--renames", "names.json", "--all", "--partial")
     assert outcome.rows[1:] == [
         ["MORE", "2", "only left"],
         ["OTHER", "1", "1", "same"],
         ["RTL_ALT_M", "15", "1500", "same, RTL_ALT on the right, where left is 1500"],
         ["WP_SPD", "7.0", "750", "different, WPNAV_SPEED on the right, where left is 700"],
     ]
-    outcome = command("diff", old, new, "--renames", "names.yaml", "--partial", "--only", "RTL_ALT_M")
+    outcome = command("diff", old, new, "--renames", "names.json", "--partial", "--only", "RTL_ALT_M")
     assert outcome.code == 0
 
 
 def test_diff_prints_both_names_as_json(command: Command) -> None:
     old, new = file("WPNAV_SPEED,750\n", "old.param"), file("WP_SPD,7.0\n", "new.param")
-    reported = command("diff", old, new, "--renames", "names.yaml", "--json").json
+    reported = command("diff", old, new, "--renames", "names.json", "--json").json
     (row,) = reported["params"].values()
     assert (row["is"], row["right_name"], row["renamed"]["value"]) == ("different", "WP_SPD", 7.5)
     assert (row["left"]["value"], row["right"]["value"]) == (750, 7.0)
@@ -175,7 +177,7 @@ def test_diff_knows_the_defaults_of_renamed_parameters(command: Command) -> None
         return f"{name}.json"
 
     left, right = side("WPNAV_SPEED", 750.0, 1000.0), side("WP_SPD", 10.0, 10.0)
-    outcome = command("diff", left, right, "--renames", "names.yaml", "--base", "defaults")
+    outcome = command("diff", left, right, "--renames", "names.json", "--base", "defaults")
     (row,) = outcome.rows[1:]
     assert row[0] == "WPNAV_SPEED"
     assert row[-1] == "left"

@@ -105,7 +105,6 @@ def test_save_needs_no_link_for_a_vehicle_in_the_cache(command: Command, tmp_pat
         (["--encoding", "bytewise"], "need a link"),
         (["--refresh"], "--refresh needs a link"),
         (["--all", "--component", "1"], "--all and --component exclude each other"),
-        (["--format", "px4-script"], "px4-script"),
         (["--format", "exe"], "exe"),
     ],
 )

@@ -283,7 +283,7 @@ def test_dry_run_prints_the_stages_in_order(
 ) -> None:
     vehicle = copter()
     wanted = file(FILE + "EK2_ENABLE,1\nEK2_NO_SUCH,1\n")
-    backup = tmp_path / "before.yaml"
+    backup = tmp_path / "before.json"
     outcome = command("apply", put(vehicle), wanted, "--dry-run", "--reboot", "--backup", backup)
     assert outcome.code == 0
     assert outcome.rows[1:3] == [
@@ -342,10 +342,10 @@ def test_the_backup_file_has_the_state_before(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
 ) -> None:
     vehicle = copter()
-    backup = tmp_path / "{system}-{uid}.yaml"
+    backup = tmp_path / "{system}-{uid}.json"
     assert command("apply", put(vehicle), file(), "--backup", backup).code == 0
-    [kept] = tmp_path.glob("1-*.yaml")
-    assert re.fullmatch(r"1-[0-9a-f]{36}\.yaml", kept.name)
+    [kept] = tmp_path.glob("1-*.json")
+    assert re.fullmatch(r"1-[0-9a-f]{36}\.json", kept.name)
     assert read_file(kept).sets[0]["RTL_ALT"].value == 1500
     before = kept.read_bytes()
     outcome = command("apply", put(vehicle), file("RTL_ALT,99\n"), "--backup", backup)
@@ -539,7 +539,7 @@ def test_all_vehicles_are_set_concurrently(
     for system in (1, 2, 3):
         file(f"WPNAV_SPEED,{system}00\nWPNAV_ACCEL,{system}0.5\n", f"own/{system}.param")
     over = tmp_path / "own/{system}.param"
-    backup = tmp_path / "{system}.yaml"
+    backup = tmp_path / "{system}.json"
     options = ("--all", "--overlay", over, "--backup", backup)
     outcome = command("apply", put(air), file(), *options)
     assert outcome.code == 0
@@ -552,7 +552,7 @@ def test_all_vehicles_are_set_concurrently(
     lines = outcome.err.splitlines()
     assert lines[:3] == [f"writing to {each} on udpin:0.0.0.0:14550" for each in receivers]
     assert [line.split(":")[0] for line in lines[3:]] == receivers
-    assert sorted(path.name for path in tmp_path.glob("?.yaml")) == ["1.yaml", "2.yaml", "3.yaml"]
+    assert sorted(path.name for path in tmp_path.glob("?.json")) == ["1.json", "2.json", "3.json"]
 
 
 def test_a_failed_vehicle_does_not_stop_the_others(
@@ -611,7 +611,7 @@ def test_all_vehicles_are_restored_each_to_its_own_state(
     assert would.code == 0
     assert would.rows[0][0] == "vehicle"
     assert [vehicle.values["WPNAV_SPEED"] for vehicle in vehicles] == [750.5] * 3
-    back = command("restore", put(air), "--all", "--backup", tmp_path / "{system}.yaml")
+    back = command("restore", put(air), "--all", "--backup", tmp_path / "{system}.json")
     assert back.code == 0
     assert back.rows[0][:2] == ["vehicle", "name"]
     assert [row[:5] for row in back.rows if row[1] == "WPNAV_SPEED"] == [
@@ -626,7 +626,7 @@ def test_all_vehicles_are_restored_each_to_its_own_state(
     again = command("restore", put(air), "--all")
     assert (again.code, again.err.count("a restore ran ")) == (2, 3)
     assert all(f" --system {each}` for the state before that apply" in again.err for each in (1, 2, 3))
-    files = command("restore", put(air), tmp_path / "{system}.yaml", "--all", "--json")
+    files = command("restore", put(air), tmp_path / "{system}.json", "--all", "--json")
     assert files.code == 0
     assert [each["complete"] for each in files.json["vehicles"]] == [True] * 3
     assert [vehicle.values["WPNAV_SPEED"] for vehicle in vehicles] == [750.5] * 3
@@ -659,7 +659,7 @@ def test_one_state_is_not_restored_to_all_vehicles(
     assert (one.code, "{uid} or {system} in the file name" in one.err) == (2, True)
     number = command("restore", put(air), 1, "--all")
     assert (number.code, "snapshot 1 is of one vehicle" in number.err) == (2, True)
-    assert command("restore", put(air), "--all", "--backup", "same.yaml").code == 2
+    assert command("restore", put(air), "--all", "--backup", "same.json").code == 2
     assert command("restore", put(air), "--all", "--no-cache").code == 2
     assert command("restore", put(air), "--expect", 2).code == 2
     assert command("restore", put(air), "--all", "--extended").code == 2

@@ -37,7 +37,7 @@ UNUSABLE = [
     "12",
     "\x7f",
 ]
-FORMS = [form for form in FileFormat if form is not FileFormat.PX4_SCRIPT]  # scripts are read only
+FORMS = list(FileFormat)
 
 
 @pytest.fixture

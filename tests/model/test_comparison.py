@@ -265,7 +265,7 @@ def test_defaults_of_leaves_out_unknown_and_differing_defaults() -> None:
 
 # Renamed parameters
 
-CENTIMETRES = Renames([Rename("OLD", "NEW", 0.01), Rename("NEW", "NEWEST")], "names.yaml")
+CENTIMETRES = Renames([Rename("OLD", "NEW", 0.01), Rename("NEW", "NEWEST")], "names.json")
 
 
 def test_a_parameter_is_compared_with_that_of_its_other_name() -> None:

@@ -13,7 +13,7 @@ from paramclient import FileError, ParamSet, ParamType, Rename, Renames, UsageEr
 from paramclient.files import loads_renames
 from paramclient.model.values import WireValue
 
-CHAIN = Renames([Rename("A", "B", 0.01), Rename("B", "C", 10)], "names.yaml")
+CHAIN = Renames([Rename("A", "B", 0.01), Rename("B", "C", 10)], "names.json")
 CENTIMETRES = Renames([Rename("OLD", "NEW", 0.01)])
 
 
@@ -146,7 +146,7 @@ def test_rules_that_contradict_each_other_are_refused(entries: list[tuple[str, s
 
 
 def test_the_note_about_a_missing_parameter_names_its_other_names() -> None:
-    end = "in names.yaml, which this vehicle does not have either"
+    end = "in names.json, which this vehicle does not have either"
     assert CHAIN.missing_note("A") == f"renamed to B and C {end}"
     assert CHAIN.missing_note("B") == f"renamed to C and from A {end}"
     assert CHAIN.missing_note("C") == f"renamed from B and A {end}"
@@ -154,15 +154,18 @@ def test_the_note_about_a_missing_parameter_names_its_other_names() -> None:
 
 
 def test_the_rules_name_their_source() -> None:
-    assert repr(CHAIN) == "<Renames 2 from names.yaml>"
+    assert repr(CHAIN) == "<Renames 2 from names.json>"
     assert len(CHAIN) == 2
 
 
 @pytest.mark.parametrize(
     "entry",
-    ["{old: A, new: B, factor: [" + "x, " * 1_000 + "]}", "{old: '" + "x y " * 1_000 + "', new: B}"],
+    [
+        '{"old": "A", "new": "B", "factor": [' + '"x", ' * 1_000 + '"x"]}',
+        '{"old": "' + "x y " * 1_000 + '", "new": "B"}',
+    ],
 )
 def test_a_long_entry_has_a_short_error(entry: str) -> None:
     with pytest.raises(FileError) as error:
-        loads_renames(f"- {entry}\n".encode(), source="names.yaml")
+        loads_renames(f"[{entry}]\n".encode(), source="names.json")
     assert len(str(error.value)) < 400

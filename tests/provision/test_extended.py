@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from paramclient.files.disk import read_extended_file
 
 from paramclient import (
     AlreadyRestored,
@@ -20,7 +21,6 @@ from paramclient import (
     SetStatus,
     UsageError,
 )
-from paramclient.files.extended_document import read_extended_file
 from paramclient.provision import (
     apply_extended,
     load_extended_state,
@@ -83,14 +83,14 @@ async def test_what_differs_is_written_and_read_back(tmp_path: Path, path: Path)
             result = await apply_extended(
                 component,
                 wanted(camera, MODE=2, NAME="Rear", KEY=b"\xff\0\xfe", CLOCK=2**62 + 3),
-                backup=tmp_path / "before.yaml",
+                backup=tmp_path / "before.json",
                 progress=reported.append,
             )
             assert result.complete
             assert [each.name for each in result.outcomes] == ["MODE", "NAME", "CLOCK"]
             assert sorted(each.name for each in reported) == ["CLOCK", "MODE", "NAME"]
             assert camera.ext_values["CLOCK"] == 2**62 + 3
-            before = read_extended_file(tmp_path / "before.yaml")
+            before = read_extended_file(tmp_path / "before.json")
             assert before.params["CLOCK"].value == 2**62 + 1
             assert {name: each.value for name, each in result.before.params.items()} == {
                 name: each.value for name, each in before.params.items()

@@ -35,7 +35,7 @@ RENAMES = Renames(
         Rename("INS_OLD", "INS_ACCOFFS_X"),
         Rename("SYSID_THISMAV", "MAV_SYSID"),
     ],
-    "names.yaml",
+    "names.json",
 )
 TABLE: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "WP_SPD": 10.0,
@@ -45,7 +45,7 @@ TABLE: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "OTHER": 1.0,
 }
 GROUP: dict[str, WireValue | tuple[ParamType, WireValue]] = {"EK2_GPS_TYPE": (ParamType.INT8, 0)}
-NOT_HERE = "in names.yaml, which this vehicle does not have either"
+NOT_HERE = "in names.json, which this vehicle does not have either"
 
 
 def written(values: Mapping[str, WireValue], identity: Identity | None = None) -> ParamSet:

@@ -683,10 +683,10 @@ def test_a_file_of_changed_names_is_used_in_the_plan_and_in_the_apply(sight: Sig
     sight.page.get_by_role("button", name="Take over").click()
     expect(sight.line("OLD_PITCH_MAX")).to_contain_text("cannot be set")
     names = sight.dialog.locator("#renames")
-    names.set_input_files({"name": "n.yaml", "mimeType": "text/yaml", "buffer": b"- old: OLD_PITCH_MAX\n"})
-    expect(sight.dialog.get_by_role("alert")).to_contain_text("n.yaml")
-    rules = b"- {old: OLD_PITCH_MAX, new: MC_PITCHRATE_MAX, factor: 100}\n"
-    names.set_input_files({"name": "n.yaml", "mimeType": "text/yaml", "buffer": rules})
+    names.set_input_files({"name": "n.json", "mimeType": "application/json", "buffer": b'[{"old": "A"}]'})
+    expect(sight.dialog.get_by_role("alert")).to_contain_text("n.json")
+    rules = b'[{"old": "OLD_PITCH_MAX", "new": "MC_PITCHRATE_MAX", "factor": 100}]'
+    names.set_input_files({"name": "n.json", "mimeType": "application/json", "buffer": rules})
     expect(sight.dialog.get_by_role("alert")).to_have_text("")
     expect(sight.line("OLD_PITCH_MAX")).to_contain_text("here MC_PITCHRATE_MAX")
     sight.dialog.get_by_role("button", name="Apply 1 value").click()

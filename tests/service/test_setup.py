@@ -42,7 +42,7 @@ TUNE = {f"TUNE_{number:02}": number / 4 + 0.1 for number in range(20)}
 FILE = "".join(f"{name},{value + 1}\n" for name, value in TUNE.items())
 """The same, each one more, as Mission Planner writes it."""
 PUBLISHED: list[Published] = []
-WRITABLE = [form for form in FileFormat if form is not FileFormat.PX4_SCRIPT]
+WRITABLE = list(FileFormat)
 
 
 def px4(**options: Any) -> PX4Vehicle:
@@ -170,8 +170,8 @@ async def test_a_file_is_planned_applied_and_verified(
     assert on_board.values["TUNE_01"] == pytest.approx(1.35)
 
 
-RULES = """- {old: OLD_TUNE, new: TUNE_01, factor: 0.01}
-- {old: TUNE_02, new: NEW_TUNE}
+RULES = """[{"old": "OLD_TUNE", "new": "TUNE_01", "factor": 0.01},
+ {"old": "TUNE_02", "new": "NEW_TUNE"}]
 """
 
 
@@ -181,7 +181,7 @@ async def test_names_that_changed_with_the_firmware_are_compared_planned_and_app
     vehicle: Callable[..., Vehicle], tmp_path: Path
 ) -> None:
     on_board = vehicle()
-    renames = {"name": "names.yaml", "text": RULES}
+    renames = {"name": "names.json", "text": RULES}
     requested = {"wanted": {"values": {"OLD_TUNE": 775, "NEW_TUNE": 3.5, "GONE": 1}}, "renames": renames}
     async with serving(on_board, place=tmp_path) as service:
         differences = (await service.post(f"{HERE}/diff", {**requested, "partial": True}))["params"]
@@ -203,10 +203,10 @@ async def test_names_that_changed_with_the_firmware_are_compared_planned_and_app
 @pytest.mark.parametrize(
     ("text", "status", "reported"),
     [
-        ("- {old: A, new: B}\n- {old: B, new: A}\n", 422, "return to"),
-        ("- {old: A, new: B, factor: 0}\n", 422, "factor"),
-        ("{", 422, "YAML"),
-        ("- {old: A, new: B}\n" * 25_000, 413, "60,000"),
+        ('[{"old": "A", "new": "B"}, {"old": "B", "new": "A"}]', 422, "return to"),
+        ('[{"old": "A", "new": "B", "factor": 0}]', 422, "factor"),
+        ("{", 422, "JSON"),
+        ('{"old": "A", "new": "B"},\n' * 25_000, 413, "60,000"),
         ("x" * (LINE_BYTES_MAX + 1), 413, "bytes"),
     ],
 )
@@ -214,7 +214,7 @@ async def test_names_that_changed_with_the_firmware_are_compared_planned_and_app
 async def test_a_wrong_file_of_changed_names_is_rejected(
     text: str, status: int, reported: str, tmp_path: Path
 ) -> None:
-    requested = {"wanted": {"values": {"TUNE_01": 1}}, "renames": {"name": "names.yaml", "text": text}}
+    requested = {"wanted": {"values": {"TUNE_01": 1}}, "renames": {"name": "names.json", "text": text}}
     async with serving(px4(), place=tmp_path) as service:
         for path in ("diff", "plan", "verify", "apply"):
             assert reported in (await service.post(f"{HERE}/{path}", requested, status))["detail"]
@@ -559,7 +559,6 @@ async def test_an_earlier_state_is_served_as_a_file_too(tmp_path: Path) -> None:
         assert (await service.get(f"{HERE}/file", 404, **{"from": "5"}))[
             "type"
         ] == "urn:paramclient:unknown-state"
-        assert (await service.get(f"{HERE}/file", 422, format="px4-script"))["error"] == "FileError"
         assert (await service.get(f"{HERE}/file", 422, format="xlsx"))["status"] == 422
 
 
@@ -590,8 +589,8 @@ async def test_a_file_is_read_and_its_faults_are_reported_by_line() -> None:
         async def upload(content: bytes, status: int = 200, **query: Any) -> Any:
             return await service.ask("POST", "/api/v1/files", status, content=content, params=query or None)
 
-        script = await upload(b"param set MC_ROLL_P 6.5\n", format="px4-script")
-        assert script["params"]["MC_ROLL_P"] == {"value": 6.5, "type": None, "bits": None}
+        plain = await upload(b"MC_ROLL_P 6.5\n", format="parm")
+        assert plain["params"]["MC_ROLL_P"] == {"value": 6.5, "type": None, "bits": None}
         twice = await upload(b"A,1\nA,1\n", name="twice.param")
         assert twice["notes"]
         bad = await upload(b"A,1\nB;2\nC,x\n", 422, name="bad.param")
@@ -599,8 +598,7 @@ async def test_a_file_is_read_and_its_faults_are_reported_by_line() -> None:
         assert "bad.param:3" in bad["detail"]
         assert (await upload(b"", 422))["error"] == "FileError"
         assert (await upload(b"{" * 50_000, 422, format="json"))["error"] == "FileError"
-        assert (await upload(b"- " * 8_000, 422, format="yaml"))["error"] == "FileError"
-        assert (await upload(b"- " * 50_000, 413, format="yaml"))["most"] == LINE_BYTES_MAX
+        assert (await upload(b"- " * 50_000, 413, format="parm"))["most"] == LINE_BYTES_MAX
         assert (await upload(b"A,1\n" * (PARAM_FILE_BYTES_MAX // 4 + 1), 413))[
             "type"
         ] == "urn:paramclient:too-large"

@@ -176,8 +176,8 @@ export async function takeOver() {
     },
   });
   const table_ = changesTable([el("th", {}, all), "Name", "Now", "New", "Remark"], body);
-  const text = "Changed names: a YAML file with old and new names.";
-  const [renamesInput, renamesLabel] = fileChoice("renames", text, replan, { accept: ".yaml,.yml,.json" });
+  const text = "Changed names: a JSON file with old and new names.";
+  const [renamesInput, renamesLabel] = fileChoice("renames", text, replan, { accept: ".json" });
   let renames = null;
   let lines = [];
   let job = null;

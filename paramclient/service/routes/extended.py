@@ -23,7 +23,7 @@ from paramclient.documents.history import SnapshotsDoc
 from paramclient.documents.job import JobDoc
 from paramclient.documents.results import NotSetDoc
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
-from paramclient.files.extended_document import ext_param_of_fields
+from paramclient.files.json_format import ext_param_of_fields
 from paramclient.model.ext_params import EXT_VALUE_SIZE, ExtParamType, ExtValue, check_ext_value
 from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.patterns import NameChoice
@@ -147,15 +147,13 @@ class ExtPlanRequest(Body):
         Raises:
             UsageError: a value or type is not valid.
         """
-        try:
-            return ExtParamSet(
-                {
-                    name: ext_param_of_fields(name, each.model_dump(exclude_none=True))
-                    for name, each in self.wanted.items()
-                }
-            )
-        except ValueError as error:
-            raise UsageError(str(error)) from None
+        params = {}
+        for name, each in self.wanted.items():
+            try:
+                params[name] = ext_param_of_fields(name, each.model_dump(exclude_none=True))
+            except ValueError as error:
+                raise UsageError(f"{name}: {error}") from None
+        return ExtParamSet(params)
 
 
 class ExtApplyRequest(ExtPlanRequest):

@@ -1,0 +1,543 @@
+"""paramclient's own file format, JSON: all fields of every parameter, exactly. Plain and extended parameters.
+
+    {"paramclient": 1, "header": [...], "sets": [
+      {"system": 1, "component": 1, "at": "2026-01-31T12:00:00Z", "identity": {...}, "params": {
+        "RTL_ALT": {"value": 1500, "type": "INT32", "bits": "000005dc", "default": 1500}}}]}
+
+    {"paramclient_extended": 1, "system": 1, "component": 100, "at": "2026-01-31T12:00:00Z", "params": {
+      "CAM_MODE": {"value": 1, "type": "UINT32"},
+      "CAM_NAME": {"value": "Front", "type": "CUSTOM"},
+      "CAM_LICENSE": {"hex": "ff00fe", "type": "CUSTOM"}}}
+
+`value` is the shortest number that gives the same value in this type. "NaN", "Infinity" and "-Infinity" are
+text, as are four raw bytes ("0x0000002a"). `bits` are as in `Param.bits` and must agree with the value: an
+edit of only one of the two is an error. In a document of extended parameters, `value` is text for CUSTOM, and
+`hex` has the bytes of a value that is neither a number nor text. Each parameter is one line.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import asdict
+from datetime import datetime
+from typing import Any, Final, NoReturn, TypeAlias
+
+from paramclient.errors import FileError, UsageError
+from paramclient.files.formats import FileFormat
+from paramclient.files.param_file import ParamFile, TooManyParams
+from paramclient.files.text import Problems, as_type, excerpt, is_plain, time_of
+from paramclient.model.ext_params import (
+    EXT_VALUE_SIZE,
+    ExtParam,
+    ExtParamType,
+    ExtValue,
+    check_ext_value,
+    encode_ext_value,
+    ext_type_name,
+    ext_type_number,
+)
+from paramclient.model.ext_paramset import ExtParamSet
+from paramclient.model.identity import Identity
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import (
+    TYPES_BY_NAME,
+    ParamType,
+    Trust,
+    WireValue,
+    check_name,
+    format_value,
+    from_bits,
+    is_portable_name,
+    known_type,
+    shortest_float,
+    type_name,
+)
+
+__all__ = [
+    "ext_param_of_fields",
+    "read_ext_json",
+    "read_json",
+    "read_json_text",
+    "write_ext_json",
+    "write_json",
+]
+
+VERSION: Final = 1
+"""Version of both kinds of documents, written and required."""
+_KEY: Final = "paramclient"
+"""The key with the version of a document of plain parameters."""
+_EXT_KEY: Final = "paramclient_extended"
+"""The key with the version of a document of extended parameters."""
+PROBLEM_LENGTH_MAX: Final = 300
+"""Characters of one problem in an error, so that a long field does not make the error unreadable."""
+
+_Place: TypeAlias = tuple[str | int, ...]
+"""Position in a document: keys and list indices from the top."""
+_Checks: TypeAlias = Mapping[str, Callable[[Any], Any]]
+"""By the name of a field, a function that returns the field's content, or raises UsageError."""
+
+_NUMBER_EXPECTED: Final = "expected a number (or NaN, Infinity, 0x and 8 digits for raw bytes)"
+_WORDS: Final = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
+_raw: Final = re.compile(r"0x([0-9a-fA-F]{8})").fullmatch
+_type_number: Final = re.compile(r"TYPE_([0-9]{1,3})").fullmatch
+_date: Final = re.compile(r"[0-9]{4}-[0-9]{2}-").match
+_bits: Final = re.compile(r"[0-9a-fA-F]{8}(?:[0-9a-fA-F]{8})?").fullmatch
+
+
+# Reading
+
+
+def read_json(text: str, source: str, params_max: int | None = None) -> ParamFile:
+    """Read a document of plain parameters.
+
+    Raises:
+        TooManyParams: the document has more parameters than `params_max`.
+        FileError: invalid JSON, a repeated key, or not a valid document. The error names up to 20 problems.
+    """
+    content = read_json_text(text, source)
+    if isinstance(content, dict) and _EXT_KEY in content:
+        raise FileError("it has extended parameters, and plain ones are expected", source=source)
+    reader = _Reader(text, source)
+    document = reader.fields(content, (), _DOCUMENT, {_KEY, "sets"})
+    found = content.get("sets") if isinstance(content, dict) else None
+    sets = [
+        reader.param_set(each, ("sets", place), params_max)
+        for place, each in enumerate(found if isinstance(found, list) else [])
+    ]
+    reader.problems.raise_if_any()
+    if not any(sets):
+        raise FileError("the file contains no parameters", source=source)
+    return ParamFile(
+        tuple(each for each in sets if each is not None),
+        FileFormat.JSON,
+        source,
+        tuple(document.get("header", [])),
+    )
+
+
+def read_ext_json(text: str, source: str) -> ExtParamSet:
+    """Read a document of extended parameters.
+
+    Raises:
+        FileError: as `read_json`.
+    """
+    content = read_json_text(text, source)
+    if not isinstance(content, dict) or _EXT_KEY not in content:
+        raise FileError(f"no extended parameters: the key {_EXT_KEY} is missing", source=source)
+    reader = _Reader(text, source)
+    known = {key: each for key, each in content.items() if key in _EXT_DOCUMENT}
+    head = reader.fields(known, (), _EXT_DOCUMENT, {"params"})
+    params = {}
+    for name, fields in head.get("params", {}).items():
+        try:
+            params[name] = ext_param_of_fields(name, fields)
+        except ValueError as error:
+            reader.problem(("params", name), str(error))
+    reader.problems.raise_if_any()
+    if not params:
+        raise FileError("the file contains no parameters", source=source)
+    return ExtParamSet(params, head.get("system"), head.get("component"), head.get("at"), source)
+
+
+def read_json_text(text: str, source: str) -> object:
+    """Return the content of a JSON text without repeated keys.
+
+    Raises:
+        FileError: invalid JSON, or a repeated key.
+    """
+    try:
+        content: object = json.loads(
+            text,
+            object_pairs_hook=_unique,
+            parse_constant=_no_constant,
+            parse_float=_finite,
+            parse_int=_whole,
+        )
+    except json.JSONDecodeError as error:
+        raise FileError(
+            f"expected JSON: {error.msg} (column {error.colno})",
+            source=source,
+            line=error.lineno,
+            expected="JSON",
+        ) from None
+    except RecursionError:
+        raise FileError("the document is nested too deep", source=source) from None
+    except ValueError as error:
+        line = _line_of(text, error.args[1], last=True) if len(error.args) > 1 else None
+        raise FileError(str(error.args[0]), source=source, line=line) from None
+    return content
+
+
+class _Reader:
+    """Reads the fields of one document, and collects the problems."""
+
+    def __init__(self, text: str, source: str) -> None:
+        self.problems = Problems(source)
+        self._text = text
+        self._params = 0
+
+    def problem(self, place: _Place, what: str) -> None:
+        """Add a problem at a position of the document."""
+        line = None
+        if "params" in place[:-1] and not self.problems.is_full:
+            line = _line_of(self._text, str(place[place.index("params") + 1]))
+        described = f"{'.'.join(map(str, place)) or 'the document'}: {what}"
+        is_short = len(described) <= PROBLEM_LENGTH_MAX
+        self.problems.add(line, described if is_short else f"{described[:PROBLEM_LENGTH_MAX]}…")
+
+    def fields(
+        self, content: object, place: _Place, checks: _Checks, required: AbstractSet[str]
+    ) -> dict[str, Any]:
+        """Return the valid fields of an object; add a problem for each other field."""
+        if not isinstance(content, dict):
+            self.problem(place, f"it should be an object{_found(content)}")
+            return {}
+        found = {}
+        for key, each in content.items():
+            check = checks.get(key)
+            try:
+                if check is None:
+                    raise UsageError("unknown field")
+                found[key] = check(each)
+            except UsageError as error:
+                self.problem((*place, key), str(error))
+        for key in sorted(required - content.keys()):
+            self.problem((*place, key), "the field is missing")
+        return found
+
+    def param_set(self, content: object, place: _Place, params_max: int | None) -> ParamSet | None:
+        """Return the set at a position; None if one of its own fields is invalid."""
+        fields = self.fields(content, place, _SET, {"params"})
+        self._params += len(fields.get("params", {}))
+        TooManyParams.check(self._params, params_max, self.problems.source)
+        params = {}
+        for name, each in fields.get("params", {}).items():
+            param = self._param(name, each, (*place, "params", name))
+            if param is not None:
+                params[name] = param
+        identity = None
+        if fields.get("identity") is not None:
+            known = self.fields(fields["identity"], (*place, "identity"), _IDENTITY, {"system"})
+            identity = Identity(**known) if "system" in known else None
+        system, component = fields.get("system"), fields.get("component")
+        return ParamSet(params, component, system, identity, fields.get("at"), self.problems.source)
+
+    def _param(self, name: str, content: object, place: _Place) -> WrittenParam | None:
+        before = self.problems.count
+        fields = self.fields(content, place, _PARAM, {"value"})
+        if self.problems.count > before:
+            return None
+        value, kind, default = fields["value"], fields.get("type"), fields.get("default")
+        try:
+            if kind is not None:
+                value = as_type(value, kind)
+                default = None if default is None else as_type(default, kind)
+            if fields.get("bits") is not None:
+                value = _with_bits(value, kind, fields["bits"])
+            return WrittenParam(check_name(name), value, kind, default, fields.get("comment", ""))
+        except UsageError as error:
+            self.problem(place, str(error))
+            return None
+
+
+def ext_param_of_fields(name: str, fields: object) -> ExtParam:
+    """Return the parameter that a document has under a name: `value` or `hex`, and `type`.
+
+    Raises:
+        ValueError: a field is not valid.
+    """
+    if not isinstance(name, str) or not is_portable_name(name):
+        raise ValueError(f"{name!r:.40} is no name of a parameter")
+    if not isinstance(fields, dict) or not fields.keys() <= {"value", "hex", "type"}:
+        raise ValueError("expected value or hex, and type")
+    written = fields.get("type")
+    number = ext_type_number(written if isinstance(written, str) else repr(written))
+    if ("value" in fields) == ("hex" in fields):
+        raise ValueError("expected either value or hex")
+    if "hex" in fields:
+        raw = bytes.fromhex(_text(fields["hex"]))
+        param = ExtParam.of(name, raw, number, None, Trust.CACHED)
+        if len(raw) > EXT_VALUE_SIZE or param.raw != raw:
+            raise ValueError(f"hex is not a value of type {ext_type_name(number)}")
+        return param
+    value = fields["value"]
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise ValueError("the value must be a number or text")
+    if number != ExtParamType.CUSTOM and isinstance(value, str):
+        value = _WORDS.get(value, value)
+    return ExtParam.of(name, encode_ext_value(check_ext_value(value), number), number, None, Trust.CACHED)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in content:
+            raise ValueError(f"{excerpt(key)} occurs twice", key)
+        content[key] = value
+    return content
+
+
+def _no_constant(word: str) -> NoReturn:
+    raise ValueError(f"{word} is not valid JSON; write it as text: {json.dumps(word)}")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if math.isinf(number):
+        raise ValueError(f"{excerpt(text)} is beyond the range of a double")
+    return number
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:  # Python limits the digits of an int
+        raise ValueError(f"{excerpt(text)} is beyond the range of every type") from None
+
+
+def _line_of(text: str, key: str, *, last: bool = False) -> int | None:
+    """Return the line of a key, if the key occurs once or the last occurrence is meant."""
+    found = [match.start() for match in re.finditer(rf'"{re.escape(key)}"[ \t]*:', text)]
+    return text.count("\n", 0, found[-1]) + 1 if found and (last or len(found) == 1) else None
+
+
+# Fields
+
+
+def _found(content: object) -> str:
+    return "" if isinstance(content, dict | list) else f", found {content!r}"
+
+
+def _optional(check: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return lambda content: None if content is None else check(content)
+
+
+def _version(content: object) -> int:
+    if content is True or content != VERSION:
+        raise UsageError(f"it should be {VERSION}, the version of the format{_found(content)}")
+    return VERSION
+
+
+def _text(content: object) -> str:
+    if not isinstance(content, str):
+        raise UsageError(f"it should be text{_found(content)}")
+    return content
+
+
+def _texts(content: object) -> list[str]:
+    return [_text(each) for each in _list(content)]
+
+
+def _list(content: object) -> list[Any]:
+    if not isinstance(content, list):
+        raise UsageError(f"it should be a list{_found(content)}")
+    return content
+
+
+def _object(content: object) -> dict[str, Any]:
+    if not isinstance(content, dict):
+        raise UsageError(f"it should be an object{_found(content)}")
+    return content
+
+
+def _count(content: object) -> int:
+    if not isinstance(content, int) or isinstance(content, bool) or content < 0:
+        raise UsageError(f"it should be a whole number from 0{_found(content)}")
+    return content
+
+
+def _id(content: object) -> int:
+    if not 1 <= _count(content) <= 255:
+        raise UsageError(f"systems and components have ids from 1 to 255{_found(content)}")
+    return _count(content)
+
+
+def _time(content: object) -> float:
+    if not isinstance(content, str) or not _date(content):  # a number could be seconds or milliseconds
+        raise UsageError(f"a time is written as 2026-01-31T12:00:00Z{_found(content)}")
+    try:
+        moment = datetime.fromisoformat(content.upper())
+    except ValueError as error:
+        raise UsageError(f"{error}{_found(content)}") from None
+    if moment.tzinfo is None:
+        raise UsageError("the time needs its zone, as in 2026-01-31T12:00:00Z")
+    return moment.timestamp()
+
+
+def _type(content: object) -> ParamType | int:
+    text = _text(content)
+    if text in TYPES_BY_NAME:
+        return TYPES_BY_NAME[text]
+    if match := _type_number(text):
+        number = int(match[1])
+        if number <= 255 and not isinstance(known_type(number), ParamType):
+            return number
+    raise UsageError(f"unknown type {text!r}; the types are {', '.join(TYPES_BY_NAME)}")
+
+
+def _number(content: object) -> WireValue:
+    if isinstance(content, int | float) and not isinstance(content, bool):
+        return content
+    if isinstance(content, str):
+        if content in _WORDS:
+            return _WORDS[content]
+        if match := _raw(content):
+            return int(match[1], 16).to_bytes(4, "little")
+    raise UsageError(f"{_NUMBER_EXPECTED}{_found(content)}")
+
+
+def _with_bits(value: WireValue, kind: ParamType | int | None, text: str) -> WireValue:
+    """Return the value of the bits, if it agrees with the given value; else raise UsageError."""
+    if kind is None:
+        raise UsageError("bits need a type")
+    if not _bits(text):
+        raise UsageError(f"bits are 8 or 16 hexadecimal digits, not {text!r}")
+    bits = int(text, 16)
+    size = kind.size if isinstance(kind, ParamType) and not isinstance(value, bytes) else 4
+    if bits >= 1 << 8 * size:
+        raise UsageError(f"bits {text} exceed the size of the type")
+    exact = from_bits(bits, kind, is_raw=isinstance(value, bytes))
+    both_nan = value != value and exact != exact
+    if exact != value and not both_nan:
+        raise UsageError(f"value {value!r} and bits {text} ({exact!r}) contradict each other; leave out one")
+    return exact
+
+
+_DOCUMENT: Final[_Checks] = {_KEY: _version, "header": _texts, "sets": _list}
+_SET: Final[_Checks] = {
+    "system": _optional(_id),
+    "component": _optional(_id),
+    "identity": _optional(_object),
+    "at": _optional(_time),
+    "source": _text,
+    "params": _object,
+}
+_IDENTITY: Final[_Checks] = {
+    "system": _id,
+    "link": _text,
+    "uid": _optional(_text),
+    "git_hash": _text,
+    **dict.fromkeys(
+        ("autopilot", "vehicle_type", "firmware", "board", "vendor_id", "product_id", "capabilities"), _count
+    ),
+}
+_PARAM: Final[_Checks] = {
+    "value": _number,
+    "type": _optional(_type),
+    "bits": _optional(_text),
+    "default": _optional(_number),
+    "comment": _text,
+}
+_EXT_DOCUMENT: Final[_Checks] = {
+    _EXT_KEY: _version,
+    "system": _optional(_id),
+    "component": _optional(_id),
+    "at": _optional(_time),
+    "params": _object,
+}
+
+
+# Writing
+
+
+def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
+    """Generate the lines of a document of plain parameters.
+
+    Raises:
+        UsageError: a NaN with payload bits has no type.
+    """
+    header = [_encodable(line) for line in (*around.header, *around.footer)]
+    yield "{"
+    yield f'  "{_KEY}": {VERSION},'
+    if header:
+        yield f'  "header": {_json(header)},'
+    yield '  "sets": ['
+    for place, each in enumerate(sets):
+        yield "    {"
+        identity = None if each.identity is None else asdict(each.identity)
+        for key, content in {**_about(each), "identity": identity}.items():
+            if content is not None:
+                yield f"      {_json(key)}: {_json(content)},"
+        yield '      "params": {'
+        yield from _rows({param.name: _fields(param) for param in each.values()}, "        ")
+        yield "      }"
+        yield "    }," if place < len(sets) - 1 else "    }"
+    yield "  ]"
+    yield "}"
+
+
+def write_ext_json(content: ExtParamSet) -> Iterator[str]:
+    """Generate the lines of a document of extended parameters."""
+    yield "{"
+    for key, each in {_EXT_KEY: VERSION, **_about(content)}.items():
+        if each is not None:
+            yield f"  {_json(key)}: {_json(each)},"
+    yield '  "params": {'
+    yield from _rows({param.name: _ext_fields(param) for param in content.params.values()}, "    ")
+    yield "  }"
+    yield "}"
+
+
+def _about(params: ParamSet | ExtParamSet) -> dict[str, object]:
+    return {
+        "system": params.system,
+        "component": params.component,
+        "at": None if params.at is None else time_of(params.at),
+        "source": _encodable(params.source) or None,
+    }
+
+
+def _rows(params: Mapping[str, Mapping[str, object]], indent: str) -> Iterator[str]:
+    last = len(params) - 1
+    for number, (name, fields) in enumerate(params.items()):
+        yield f"{indent}{_json(name)}: {_json(fields)}{',' if number < last else ''}"
+
+
+def _fields(param: WrittenParam) -> dict[str, object]:
+    fields: dict[str, object] = {"value": _scalar(param.settable, param.type_number)}
+    if param.type_number is not None:
+        is_wide = param.type is not None and param.type.size == 8
+        fields["type"] = type_name(param.type_number)
+        fields["bits"] = f"{param.bits_as(param.type_number):0{16 if is_wide else 8}x}"
+    elif isinstance(param.value, float) and not is_plain(param.value):
+        raise UsageError(f"{param.name} is a NaN with payload bits, and has no type for them")
+    if param.default is not None:
+        fields["default"] = _scalar(param.default, param.type_number)
+    if param.comment:
+        fields["comment"] = _encodable(param.comment)
+    return fields
+
+
+def _ext_fields(param: ExtParam) -> dict[str, object]:
+    """Return the fields of an extended parameter; reading them gives the same bytes."""
+    value: ExtValue = param.value
+    kind = ext_type_name(param.type)
+    if isinstance(value, bytes):
+        return {"hex": param.raw.hex(), "type": kind}
+    if isinstance(value, float):
+        value = _scalar(value, ParamType.REAL32 if param.type == ExtParamType.REAL32 else None)
+        if isinstance(value, str) and encode_ext_value(_WORDS[value], param.type) != param.raw:
+            return {"hex": param.raw.hex(), "type": kind}  # a NaN with payload bits
+    return {"value": value, "type": kind}
+
+
+def _scalar(value: WireValue, kind: ParamType | int | None) -> int | float | str:
+    if isinstance(value, bytes):
+        return format_value(value)
+    if isinstance(value, int) or math.isfinite(value):
+        is_float32 = isinstance(value, float) and kind == ParamType.REAL32
+        return shortest_float(value) if is_float32 else value
+    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+
+
+def _encodable(text: str) -> str:
+    """Return text without lone surrogates, which a file name may have and a document may not."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def _json(content: object) -> str:
+    return json.dumps(content, allow_nan=False)
