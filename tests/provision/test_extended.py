@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from paramclient.files.disk import read_extended_file
 
 from paramclient import (
     AlreadyRestored,
@@ -21,6 +20,7 @@ from paramclient import (
     SetStatus,
     UsageError,
 )
+from paramclient.files.disk import read_extended_file
 from paramclient.provision import (
     apply_extended,
     load_extended_state,
