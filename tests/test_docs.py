@@ -174,14 +174,17 @@ def options_of(text: str) -> set[str]:
 def test_commands_in_the_pages_exist_with_their_options() -> None:
     known = set(subcommands())
     used = set()
+    wrong = []
     for page in PAGES:
         for line in "".join(blocks(page, "sh")).splitlines():
             words = shlex.split(line, comments=True)[1:]
             if line.startswith("paramclient ") and not words[0].startswith("-"):
-                (name,) = (each for each in known if list(each) == words[: len(each)])
-                used.add(name)
+                names = [each for each in known if list(each) == words[: len(each)]]
+                used.update(names)
                 given = {word.partition("=")[0] for word in words if word.startswith("--")}
-                assert given <= options_of(help_of(*name)), line
+                if not names or not given <= options_of(help_of(*names[0])):
+                    wrong.append(f"{name_of(page)}: {line}")
+    assert wrong == []
     assert used == known
 
 
