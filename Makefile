@@ -3,7 +3,7 @@
 #   make demo         the main job on a simulated vehicle
 #   make test         the tests                      make lint       style and types
 #   make test-slow    tests in real time, of many processes, and of every program and command in the documentation
-#   make test-all     all tests: test, test-slow, and soak, kills, attack and fuzz for some minutes each
+#   make test-all     test, test-slow, lint-platforms, and soak, kills, attack and fuzz for some minutes each
 #   make coverage     the tests with their coverage  make docs       the documentation, into docs/_build/html
 #   make bench        parser and start-up time       make dist       wheel and sdist, into dist
 #   make cost         CPU and memory                 make peers      downloads, compared with other clients
@@ -42,7 +42,7 @@ WORKERS ?= $(shell $(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 2)
 # the tests start several hundred processes; without bytecode, each of them would compile paramclient again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow test-all coverage soak kills live fuzz fuzz-http attack lint docs screenshots pictures bench cost peers dist clean
+.PHONY: demo test test-slow test-all coverage soak kills live fuzz fuzz-http attack lint lint-platforms docs screenshots pictures bench cost peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -57,6 +57,7 @@ test-slow: $(VENV)/with-test
 test-all:
 	$(MAKE) test
 	$(MAKE) test-slow
+	$(MAKE) lint-platforms
 	$(MAKE) soak SESSIONS=1000
 	$(MAKE) kills KILLS=100
 	$(MAKE) attack
@@ -93,6 +94,9 @@ lint: $(VENV)/with-test $(VENV)/with-lint
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+
+# types of the code for other platforms
+lint-platforms: $(VENV)/with-test $(VENV)/with-lint
 	$(BIN)/mypy --platform darwin paramclient
 	$(BIN)/mypy --platform win32 paramclient
 
