@@ -29,6 +29,7 @@ def inputs(kind: str, name: str) -> list[Path]:
     return sorted(path for path in (FUZZ / kind / name).glob("*") if path.is_file())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TARGETS)
 def test_no_input_of_the_corpus_finds_a_fault(name: str) -> None:
     """The corpus, all of it in one test: each input takes a millisecond."""

@@ -123,6 +123,7 @@ def test_fixtures_work_with_every_runner(suite: Suite) -> None:
     suite(**modules).assert_outcomes(passed=sum(map(len, tests)))
 
 
+@pytest.mark.slow
 def test_the_package_loads_with_the_first_test_that_uses_a_fixture(suite: Suite) -> None:
     """A suite without the fixtures does not pay for the import, and coverage starts before it."""
     result = suite("--cov=paramclient.version", "--cov-report=term-missing", test_late=LATE)

@@ -844,7 +844,7 @@ class Sessions(RuleBasedStateMachine):
 
 
 SETTINGS = settings(
-    max_examples=300,
+    max_examples=50,
     stateful_step_count=30,
     deadline=None,
     print_blob=True,
@@ -872,7 +872,7 @@ class GroupSessions(Sessions):
 
 
 class TestGroupSessions(GroupSessions.TestCase):  # type: ignore[misc,valid-type]  # made at run time
-    settings = settings(SETTINGS, max_examples=50)
+    settings = settings(SETTINGS, max_examples=20)
 
     @classmethod
     def tearDownClass(cls) -> None:
