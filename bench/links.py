@@ -19,7 +19,6 @@ import statistics
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from functools import partial
 from typing import Any
 
@@ -28,8 +27,6 @@ from oracle import FILE_FRAME, TellingLink, file_oracle_time, oracle_time
 from paramclient.model.values import Param, ParamType
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.params.upload import WriteWay
 from paramclient.protocol.params.write_batch import SetStatus
 from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
@@ -40,32 +37,10 @@ SET_VALUES = 200
 """Values of a row that sets them."""
 SET_TIME_MAX = {"PX4": 1.5, "ArduPilot": 2.0}
 """Seconds for them with a round trip of 100 ms and 5 % loss."""
-RADIO_SET_TIME_MAX = 1.3 * SET_VALUES * 37 / 5760.0
-"""Seconds for them on a radio of 57600 baud without loss: 1.3 times what their PARAM_VALUEs need, while the
-shorter PARAM_SETs are on their way in the other direction."""
-SET_WAYS = {WriteWay.SETS: " one by one", WriteWay.FILE: " as a file", WriteWay.QUICKEST: ""}
-"""How they are set, as in the names of the rows."""
-SWITCH = "GRIP_ENABLE"
-"""The switch of a group, which is in the real table."""
-GROUP_SIZE = 7
-"""Parameters of that group (recorded)."""
-PAUSE_BEFORE_SWITCH = 40.0
-"""Seconds after a fetch, so that it puts off nothing."""
-WATCH_INTERVAL = 30.0
-"""Seconds between two checks of the table, as by default."""
-SWITCH_TIME_MAX = 1.0
-"""Seconds from the acknowledgement of a switch until the table is in sync again."""
 UDP_FILE_RATE = 48_500.0
 """Bytes per second of a MAVFTP burst of an ArduPilot on UDP (measured)."""
 UDP_READ_RATE = 3 * UDP_FILE_RATE
 """Bytes per second of single MAVFTP reads from an ArduPilot on UDP."""
-
-
-class GroupChange(StrEnum):
-    """What happens to a group of parameters."""
-
-    SHOWN = "shown"
-    HIDDEN = "hidden"
 
 
 @dataclass(frozen=True)
@@ -82,10 +57,7 @@ class Row:
         vehicles: number of vehicles on the link. Several are compared with as many single downloads.
         file_rate: bytes per second of a burst of the vehicle's file, if it serves one.
         sets: whether values are set instead of downloaded; there is no oracle then.
-        way: how they are set.
         values: the number of them.
-        change: what happens to a group of parameters instead, or None; there is no oracle then.
-        downloads: whether the table is then downloaded, although single reads could follow it.
     """
 
     name: str
@@ -97,10 +69,7 @@ class Row:
     vehicles: int = 1
     file_rate: float | None = None
     sets: bool = False
-    way: WriteWay = WriteWay.QUICKEST
     values: int = SET_VALUES
-    change: GroupChange | None = None
-    downloads: bool = False
 
 
 @dataclass(frozen=True)
@@ -152,7 +121,6 @@ def rows() -> Iterator[Row]:
             yield Row(f"five {kind} on one radio 57600 {loss:.0%}", radio, served, faults, 1.1, vehicles=5)
     yield from file_rows()
     yield from set_rows()
-    yield from group_rows()
 
 
 def file_rows() -> Iterator[Row]:
@@ -182,8 +150,7 @@ def file_rows() -> Iterator[Row]:
 def set_rows() -> Iterator[Row]:
     """Yield the rows that set values instead of downloading them.
 
-    Those of ArduPilot by PARAM_SET, as a file, and by the way that the client chooses; the values are spread
-    over the real table.
+    Those of ArduPilot are spread over the real table.
     """
     table = {f"VALUE_{number:03}": float(number) for number in range(SET_VALUES)}
     for loss in (0.0, 0.05, 0.2):
@@ -208,7 +175,7 @@ def set_rows() -> Iterator[Row]:
             (
                 f"radio 57600 {loss:.0%}",
                 {"loss": loss, "delay": 0.075, "rate": 5760.0, "queue": 1024.0},
-                math.inf if loss else RADIO_SET_TIME_MAX,
+                math.inf,
             )
             for loss in (0.0, 0.05)
         ),
@@ -218,57 +185,16 @@ def set_rows() -> Iterator[Row]:
         rate = faults.get("rate", math.inf)
         make = partial(ArduPilotVehicle, ftp_rate=rate, burst=1, period=0.025)
         for values in (50, SET_VALUES, 500):
-            for way, words in (
-                (WriteWay.SETS, " one by one"),
-                (WriteWay.FILE, " as a file"),
-                (WriteWay.QUICKEST, ""),
-            ):
-                yield Row(
-                    f"set {values} values of ArduPilot {link}{words}",
-                    ArduPilotVehicle if rate == math.inf else make,
-                    0.0,
-                    faults,
-                    math.inf,
-                    limit if way is WriteWay.QUICKEST and values == SET_VALUES else math.inf,
-                    sets=True,
-                    way=way,
-                    values=values,
-                )
-
-
-def group_rows() -> Iterator[Row]:
-    """Yield the rows that switch a group of the real quad on and off, whose table is then followed.
-
-    Each also with a download of the table, which is what remains where single reads cannot follow it.
-    """
-    group = {f"GRIP_{number}": 1.0 for number in range(GROUP_SIZE)}
-    links: tuple[tuple[str, dict[str, Any], dict[str, Any]], ...] = (
-        ("UDP 1 ms 0%", {"delay": 0.0005}, {}),
-        ("UDP 100 ms 5%", {"delay": 0.05, "loss": 0.05}, {}),
-        *(
-            (
-                f"radio 57600 {loss:.0%}",
-                {"loss": loss, "delay": 0.075, "rate": 5760.0, "queue": 1024.0},
-                {"burst": 1, "period": 0.025, "ftp_rate": 5760.0},
+            yield Row(
+                f"set {values} values of ArduPilot {link}",
+                ArduPilotVehicle if rate == math.inf else make,
+                0.0,
+                faults,
+                math.inf,
+                limit if values == SET_VALUES else math.inf,
+                sets=True,
+                values=values,
             )
-            for loss in (0.0, 0.05)
-        ),
-    )
-    for link, faults, options in links:
-        for ftp, by in ((True, ""), (False, " without MAVFTP")):
-            make = partial(ArduPilotVehicle, groups={SWITCH: group}, live=(), ftp=ftp, **options)
-            for change in GroupChange:
-                for downloads, way in ((False, ""), (True, ", downloaded")):
-                    yield Row(
-                        f"group of {GROUP_SIZE} {change}, {link}{by}{way}",
-                        make,
-                        0.0,
-                        faults,
-                        math.inf,
-                        math.inf if downloads else SWITCH_TIME_MAX,
-                        change=change,
-                        downloads=downloads,
-                    )
 
 
 class Session:
@@ -279,11 +205,11 @@ class Session:
         machine: the vehicle's component.
     """
 
-    def __init__(self, row: Row, seed: int, sync_settings: SyncSettings | None = None) -> None:
+    def __init__(self, row: Row, seed: int) -> None:
         self.vehicle = row.make()
         links = (FaultyLink(**row.faults, seed=2 * seed), FaultyLink(**row.faults, seed=2 * seed + 1))
         self._air = Air([self.vehicle], uplink=links[0], downlink=links[1])
-        self.station = Station(link="bench", is_stream=False, sync_settings=sync_settings)
+        self.station = Station(link="bench", is_stream=False)
         self.now = 0.0
         self._air.tick(self.now)
         self.until(lambda: (1, 1) in self.station.components)
@@ -325,7 +251,6 @@ def set_values(row: Row, seed: int) -> Run:
     session = Session(row, seed)
     machine, vehicle = session.machine, session.vehicle
     began, before = session.now, session.count()
-    machine.uploads.way = row.way
     names = [name for name, param in machine.table.params.items() if may_be_set(param)]
     step_size = len(names) / row.values
     chosen = [names[int(number * step_size)] for number in range(row.values)]
@@ -340,40 +265,6 @@ def set_values(row: Row, seed: int) -> Run:
     return session.run_since(began, before, batch.ended_at, is_right=is_right)
 
 
-def switch_group(row: Row, seed: int) -> Run:
-    """Switch a group on, or off, and measure from the acknowledgement until the table is in sync again."""
-    session = Session(row, seed, SyncSettings(WATCH_INTERVAL))
-    machine, vehicle = session.machine, session.vehicle
-
-    def pass_time(seconds: float) -> None:
-        ends = session.now + seconds
-        session.until(lambda: session.now >= ends)
-
-    def switch(value: int) -> None:
-        write = machine.write(SWITCH, value, session.now)
-        session.until(lambda: write.done)
-
-    pass_time(PAUSE_BEFORE_SWITCH)
-    if row.change is GroupChange.HIDDEN:
-        switch(1)
-        pass_time(PAUSE_BEFORE_SWITCH)
-    session.until(lambda: machine.sync.synced and not machine.is_waiting)
-    if row.downloads:
-        machine.table.doubt_value(
-            next(iter(machine.table.params))
-        )  # a value in doubt is a reason to fetch the table
-    before = session.count()
-    switch(0 if row.change is GroupChange.HIDDEN else 1)
-    began, count = session.now, len(vehicle.params)
-    session.until(lambda: machine.sync.synced and machine.table.count == count)
-    listed = {name: param for name, param in machine.table.params.items() if param.index is not None}
-    true = vehicle.params
-    is_right = listed.keys() == true.keys() and all(
-        param.same_value(true[name]) and param.index == true[name].index for name, param in listed.items()
-    )
-    return session.run_since(began, before, session.now, is_right=is_right)
-
-
 def may_be_set(param: Param) -> bool:
     """Return whether a value may be set to any number: it is a float that nothing else depends on."""
     return param.type == ParamType.REAL32 and not param.name.startswith(("STAT_", "BARO"))
@@ -383,8 +274,6 @@ def download(row: Row, seed: int) -> Run:
     """Run a row with this library; return the run with the oracle's time."""
     if row.sets:
         return set_values(row, seed)
-    if row.change is not None:
-        return switch_group(row, seed)
     if row.vehicles == 1:
         return fetch(row, seed, oracle(row, seed))
     alone = replace(row, vehicles=1)

@@ -375,7 +375,6 @@ def residue(component: Component) -> list[object]:
     left: list[object] = [f"{len(machine.reads)} reads"] if len(machine.reads) else []
     left += [f"{len(machine.writes)} writes"] if len(machine.writes) else []
     left += [f"{len(machine.write_batches)} batches of writes"] if len(machine.write_batches) else []
-    left += [f"{len(machine.name_searches)} searches"] if len(machine.name_searches) else []
     left += [machine.fetch] if machine.fetch is not None else []
     left += [machine.refresh] if machine.refresh is not None else []
     return left

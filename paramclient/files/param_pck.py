@@ -18,25 +18,21 @@ def is_packed(data: bytes) -> bool:
 
 
 def read_packed(data: bytes, source: str) -> ParamFile:
-    """Read a packed file in the format that a vehicle serves, or in the format that is uploaded to a vehicle.
+    """Read a packed file in the format that a vehicle serves.
 
     Raises:
         FileError: the file is invalid.
     """
-    notes = []
-    with_defaults = False
     try:
-        try:
-            entries = param_pck.decode_upload(data)
-        except PackError:
-            pack = param_pck.decode(data)
-            entries, with_defaults = pack.entries, pack.with_defaults
-            if pack.total > len(entries):
-                notes.append(f"The file contains {len(entries)} of the vehicle's {pack.total} parameters.")
+        pack = param_pck.decode(data)
     except PackError as error:
         raise FileError(f"invalid packed parameter file: {error}", source=source) from error
+    entries, with_defaults = pack.entries, pack.with_defaults
     if not entries:
         raise FileError("the file contains no parameters", source=source)
+    notes = []
+    if pack.total > len(entries):
+        notes.append(f"The file contains {len(entries)} of the vehicle's {pack.total} parameters.")
     params = {}
     for name, kind, bits, default in entries:
         value = from_bits(bits, kind)

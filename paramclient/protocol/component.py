@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final, Protocol
 
 from paramclient.errors import NoReply, ParamClientError, UsageError
@@ -30,18 +30,14 @@ from paramclient.protocol.ext.reads import ExtRead
 from paramclient.protocol.ext.write_batch import ExtWriteBatch
 from paramclient.protocol.ext.writes import ExtWrite
 from paramclient.protocol.ftp import FileTransfers
-from paramclient.protocol.params.boot_values import BootValues
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch import Check, Fetch
 from paramclient.protocol.params.fetch_queue import Fetches
 from paramclient.protocol.params.fetch_result import FetchContext, FetchResult, Policy, Sampled
 from paramclient.protocol.params.foreign_list import ForeignList
-from paramclient.protocol.params.name_search import NameSearch, NameSearches
 from paramclient.protocol.params.reads import Key, Read, Reads
 from paramclient.protocol.params.sync import ComponentState, Sync, SyncSettings, SyncState
-from paramclient.protocol.params.sync_interval import SyncInterval
 from paramclient.protocol.params.table import NameQuota, Table
-from paramclient.protocol.params.upload import Uploads
 from paramclient.protocol.params.value_check import Rereads
 from paramclient.protocol.params.volatile_values import VolatileReads
 from paramclient.protocol.params.write_batch import BatchRules, WriteBatch, WriteBatches
@@ -164,14 +160,11 @@ class ComponentMachine:
         foreign_list: the list that another station has requested, while none of ours runs.
         sync: whether the table still matches the vehicle's.
         files: its files over MAVFTP.
-        uploads: its parameter file as a way to write many values.
         metadata_requests: the location of its metadata.
-        name_searches: the searches for names that may not exist.
         commands: its commands.
         messages: the messages that are requested from it.
         boot_time_requests: the requests for its time since boot.
         ext: its extended parameters.
-        boot_values: the reads of values that it measures at each boot.
         reboots: its reboot on command.
         rereads: the values to be read again.
         fetches: the fetches of its table.
@@ -228,14 +221,11 @@ class ComponentMachine:
         self.presence = Presence()
         self.peers = ComponentPeers(target, self, may_ask=context.may_send)
         self.files = FileTransfers(context)
-        self.uploads = Uploads(context, self.files, self.table)
-        sync_interval = SyncInterval(sync_settings.interval, is_chosen=sync_settings.without_hash)
         self.sync = Sync(
             context,
             self.reads,
             self.table,
             sync_settings,
-            sync_interval,
             self.presence,
             self.files,
             host=self,
@@ -243,7 +233,6 @@ class ComponentMachine:
         self.metadata_requests = MetadataRequests(context, self.messages)
         self.commands = Commands(context)
         self.boot_time_requests = BootTimeRequests(context, self.messages, self.presence)
-        self.boot_values = BootValues(context, self.reads, self.table, self.sync)
         self.reboots = Reboots(
             context,
             self.commands,
@@ -263,8 +252,7 @@ class ComponentMachine:
             doubt=self._doubt_identity,
             foreign_list=self.foreign_list,
         )
-        self.fetches = Fetches(fetch_context, self.sync, sync_settings, sync_interval, ended=self._fetched)
-        self.name_searches = NameSearches(context, self.reads, self.table, self.foreign_list)
+        self.fetches = Fetches(fetch_context, self.sync, sync_settings, ended=self._fetched)
         # without requests there are no reads: the lists of other stations take their place
         passive_table = self.fetches.passive_table
         self._receive_read = self.reads.receive if passive_table is None else passive_table.receive
@@ -292,9 +280,9 @@ class ComponentMachine:
         self._checks = self.rereads.checks
         self.writes.on_outcome_unknown = self._authors.foreign_set
         self._machines: tuple[Machine, ...] = (
-            *(self.reads, self.name_searches, self.sync, self.writes, self.files, self.commands),
+            *(self.reads, self.sync, self.writes, self.files, self.commands),
             *(self.reboots, self.fetches, self.messages, self.identification, self.metadata_requests),
-            *(self.boot_time_requests, self.boot_values, self.rereads, self.ext, self.write_batches),
+            *(self.boot_time_requests, self.rereads, self.ext, self.write_batches),
         )
         """Each machine stands behind those that it uses or calls. They end in reverse order: a machine does
         not take the end of another one for a result, and is not called after its own end."""
@@ -421,7 +409,7 @@ class ComponentMachine:
         in_background = 0 if self.refresh is None else self.refresh.in_flight
         is_busy = len(self.reads) > in_background or len(self.writes) > 0 or not self.files.is_idle
         is_busy = is_busy or len(self.commands) > 0 or self.reboots.current is not None
-        is_busy = is_busy or self.metadata_requests.is_asking or len(self.name_searches) > 0
+        is_busy = is_busy or self.metadata_requests.is_asking
         is_busy = is_busy or self.ext.is_busy
         return is_busy or self.fetch is not None or self.identification.is_asking
 
@@ -468,14 +456,12 @@ class ComponentMachine:
                 self._vehicle_replaced(now)
             elif before not in (None, self.identification.firmware):
                 self.fetches.updated(now)
-                self.uploads.forget()
         elif isinstance(message, ParamError):
             addressee = (message.target_system, message.target_component)
             if message.param_index < 0 and not is_portable_name(message.param_id):
                 self.table.leave_out(message.param_id)
             elif addressee in (self._own_address, (0, 0)) and not self.writes.refused(message, now):
                 self.reads.refused(message, now)
-                self.name_searches.refused(message, now)
         elif isinstance(message, ParamExtValue):
             self.ext.receive_value(message, now, moment)
         elif isinstance(message, ParamExtAck):
@@ -542,7 +528,7 @@ class ComponentMachine:
                 self.fetches.passive_table.announced(announced, now)
             is_count_new = count != self.table.count and count <= PARAMETERS_MAX
             if is_count_new and self.sync.synced and self.fetch is None:
-                self._count_changed(count, name, now)
+                self._count_changed(count, now)
             self.reads.receive(message, now)
             return
         table = self.table
@@ -553,7 +539,7 @@ class ComponentMachine:
             if number == ParamType.REAL32 and index == NO_INDEX:
                 message = table.with_known_type(message)
         if count != table.count and count <= PARAMETERS_MAX:
-            self._count_changed(count, name, now)
+            self._count_changed(count, now)
         authors = self._authors
         writes = self.writes
         by = writes.author(name) if writes.queues else None
@@ -585,8 +571,6 @@ class ComponentMachine:
         if writes.queues:
             writes.receive(message, now)
         self._receive_read(message, now)
-        if self.name_searches:
-            self.name_searches.receive(message, now)
 
     def boot_clock(self, message_id: int, boot_ms: int, now: float) -> None:
         """Process `time_boot_ms` of a telemetry message."""
@@ -596,9 +580,6 @@ class ComponentMachine:
     def _receive_clock(self, has_restarted: bool, now: float) -> None:
         if has_restarted:
             self._rebooted(now, by_clock=True)
-        started_at = self.presence.started_at
-        if started_at is not None and self.presence.clock_at == now:
-            self.boot_values.receive_clock(now - started_at, now)
 
     def _numbering_began(self, silent_since: float, now: float) -> None:
         """Process a possible new frame numbering, as after a reboot: the clock decides whether it is one.
@@ -719,15 +700,6 @@ class ComponentMachine:
         read.is_of_caller = True
         return read
 
-    def search(self, names: Iterable[str], now: float) -> NameSearch:
-        """Search for parameters that may not exist; give the search back with `name_searches.cancel`.
-
-        Raises:
-            NoReply: the component is lost. Nothing was sent.
-        """
-        self.check_present(f"names of {self.system}/{self.component}", now)
-        return self.name_searches.begin(names, now)
-
     def write(
         self,
         name: str,
@@ -737,7 +709,6 @@ class ComponentMachine:
         *,
         settle: float = 0.0,
         force: bool = False,
-        filed: bool = False,
     ) -> Write:
         """Write one parameter, also on behalf of another user.
 
@@ -746,7 +717,6 @@ class ComponentMachine:
             now: the time.
             settle: seconds from the acknowledgement until the value is read once more.
             force: send NaN and infinity also to an autopilot that cannot store them.
-            filed: as in `Writes.set`.
 
         Raises:
             UsageError: the type is known and the value does not fit it, or the autopilot cannot store it.
@@ -759,7 +729,7 @@ class ComponentMachine:
         if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
             encode_value(value, known.type_number, self.table.encoding)
         self.writes.check_finite(name, value, force=force)
-        write = self.writes.set(name, value, now, author, settle=settle, force=force, filed=filed)
+        write = self.writes.set(name, value, now, author, settle=settle, force=force)
         write.on_done.append(lambda: self._write_ended(write))
         return write
 
@@ -784,12 +754,8 @@ class ComponentMachine:
         """
         self.check_present(f"PARAM_SET to {self.system}/{self.component}", now)
 
-        def begin(name: str, value: WireValue, at: float, filed: bool) -> Write:
-            return self.write(name, value, at, author, settle=settle, force=force, filed=filed)
-
-        def fileable(name: str) -> Param | None:
-            name = self.spelling(name)
-            return None if name in self.writes.queues else self.uploads.entry(name)
+        def begin(name: str, value: WireValue, at: float) -> Write:
+            return self.write(name, value, at, author, settle=settle, force=force)
 
         number = self.identification.autopilot
         autopilot = "" if number is None else autopilot_name(number)
@@ -797,18 +763,7 @@ class ComponentMachine:
         def is_switch(name: str) -> bool:
             return is_group_switch(self.spelling(name), autopilot)
 
-        rules = BatchRules(
-            begin=begin,
-            cancel=self.writes.cancel,
-            committed=self.writes.committed,
-            unfile=self.writes.unfile,
-            receive=self.receive_value,
-            is_switch=is_switch,
-            fileable=fileable,
-            may_commit=lambda: self.may_be_written,
-            uploads=self.uploads if settle == 0.0 and self.may_be_written else None,
-        )
-        batch = WriteBatch(pairs, rules, now)
+        batch = WriteBatch(pairs, BatchRules(begin, self.writes.cancel, is_switch), now)
         self.write_batches.begin(batch, now)
         return batch
 
@@ -886,7 +841,6 @@ class ComponentMachine:
             self.check_present(f"the restart of {self.system}/{self.component}", now)
         self._read_clock(now)
         self.reschedule()
-        self.boot_values.stop()
         return self.reboots.begin(now, returns=returns)
 
     def end_reboot(self, reboot: Reboot, now: float) -> None:
@@ -1079,14 +1033,12 @@ class ComponentMachine:
         self._observer.replaced(self)
         self.sync.forget()
         self.fetches.forget()
-        self.uploads.forget()
         self.foreign_list.forget()
         self.ext.forget(now)
         self._checks.clear()
         self._known_as = None
         self.reboots.vehicle_replaced(now)
         self.commands.lose(now, ": another vehicle has this address now")
-        self.name_searches.lose(now)
         what = f"writes to {self.system}/{self.component}: another vehicle has this address now"
         self._fail_writes(NoReply(what, attempts=0, waited=0.0), now)
         if self.fetch is not None:
@@ -1111,10 +1063,10 @@ class ComponentMachine:
         if version > self.version:
             self.version = version
 
-    def _count_changed(self, count: int, name: str, now: float) -> None:
-        """Process a changed param_count in a PARAM_VALUE of the parameter `name`."""
+    def _count_changed(self, count: int, now: float) -> None:
+        """Process a changed param_count in a PARAM_VALUE."""
         if self.table.count is not None:
-            self.sync.count_changed(count - self.table.count, now, name)
+            self.sync.count_changed(now)
         self.table.change_count(count)
 
     def _doubt(self) -> None:
@@ -1162,7 +1114,6 @@ class ComponentMachine:
         """Process a reboot: unsaved values are lost, and a list starts again."""
         self._observer.rebooted(self)
         self.fetches.interrupt(now)
-        self.boot_values.restarted(now, by_clock=by_clock)
         started_at = self.presence.started_at if by_clock else None
         is_of_this_run = started_at is not None and self.fetches.are_since(started_at)
         if not is_of_this_run:
@@ -1221,10 +1172,6 @@ class ComponentMachine:
         """Doubt the table: another vehicle may respond by now."""
         if self.identification.settled and now - self.identification.known_at > IDENTITY_VALID_TIME:
             self.identification.ask_again(now)
-
-    def table_followed(self, changes: list[Change]) -> None:
-        """See `SyncHost`."""
-        self._fetch_changed(changes)
 
     def _fetch_changed(self, changes: list[Change]) -> None:
         """Report changes that a fetch has found without a PARAM_VALUE."""

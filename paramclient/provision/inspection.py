@@ -6,7 +6,7 @@ import time
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Final
 
 import anyio
 
@@ -18,9 +18,7 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Renames
 from paramclient.model.values import Param, ParamType, Trust, check_name
 from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.params.name_search import NameSearch
 from paramclient.protocol.wire import HASH_CHECK
-from paramclient.provision.apply_rules import rules_for
 from paramclient.provision.planning import ParamInfo, Plan, check_component, plan
 from paramclient.provision.runner import Runner, run_here
 from paramclient.provision.vehicle_params import set_maker
@@ -43,8 +41,6 @@ READS_IN_PROGRESS_MAX: Final = 64
 SETUP_IDENTITY_TIMEOUT: Final = 10.0
 """Seconds to wait for the identity of a vehicle. The identification usually ends sooner, after a few
 requests."""
-EARLY_READS_MAX: Final = 36
-"""Names that are requested while the table is downloaded: two windows, which ArduPilot answers in 0.4 s."""
 POLL_INTERVAL: Final = 0.05
 """Seconds between two checks of a state for which there is no event, such as the identity."""
 READ_OVERHEAD: Final = 0.5
@@ -115,12 +111,8 @@ async def inspect(
     """
     local(component).machine.sync.expire_hash()  # the hash may have changed since its announcement
     before = copy_params(component.params)
-    with _Search(component, _probably_hidden(component, wanted).difference(absent)) as search:
-        fetched = await component.fetch_all()
-        await component.refreshed()
-        search.leave_out(component.params)
-        await search.wait()
-    shown, absent_names = search.result()
+    fetched = await component.fetch_all()
+    await component.refreshed()
     after = copy_params(component.params)
     not_covered = frozenset(_not_covered(component, fetched))
     autopilot = component.autopilot
@@ -129,23 +121,23 @@ async def inspect(
         listed = {name: param for name, param in after.items() if param.index is not None}
         table = {name: param for name, param in listed.items() if param.trust is not Trust.CACHED}
         is_whole = fetched.complete and len(table) == len(listed)
-        hidden = absent_names
+        hidden: set[str] = set()
         names = with_other_names(wanted, table, renames)
         if is_whole and autopilot == "ardupilot":
-            hidden = absent_names | _in_no_hidden_group(table, names).difference(after)
+            hidden = set(_in_no_hidden_group(table, names).difference(after))
         missing = frozenset(fetched.missing)
         given_up = {name for name, param in table.items() if param.index in missing}
         live = {name for name, param in before.items() if param.trust is Trust.LIVE}
         unconfirmed = given_up | live.intersection(table, not_covered)
-        known = absent | hidden | shown.keys()
+        known = absent | hidden
         to_read = [name for name in names if name in unconfirmed or (name not in table and name not in known)]
         if whole:
             to_read += unconfirmed.difference(to_read)
         return table, is_whole, hidden, given_up, to_read
 
     table, is_whole, absent_names, given_up, to_read = await run(select)
-    requested, unreported = await _read_names(component, to_read, given_up)
-    found, unknown = shown | requested, absent_names.difference(table) | unreported
+    found, unreported = await _read_names(component, to_read, given_up)
+    unknown = absent_names.difference(table) | unreported
     to_set = set_maker(component, f"vehicle {component.system}/{component.component}")
 
     def make_set() -> ParamSet:
@@ -320,12 +312,10 @@ async def _read_names(
     count as not reported.
     """
     names = tuple(names)
-    with _Search(component, [name for name in names if name not in component.params]) as search:
-        await search.wait()
-    found, unknown = search.result()
+    found: dict[str, Param] = {}
+    unknown: set[str] = set()
     failed: list[NoReply | LinkError] = []
-
-    left = (name for name in names if name not in found and name not in unknown)
+    left = iter(names)
 
     async def read() -> None:
         for name in left:
@@ -346,80 +336,6 @@ async def _read_names(
     if failed:
         raise failed[0]
     return found, frozenset(unknown)
-
-
-class _Search:
-    """A context manager that searches for parameters not received before; leaving it ends the search.
-
-    Args:
-        component: the vehicle.
-        names: param_ids to search for; invalid names are left out.
-
-    Raises:
-        NoReply: the vehicle is lost, and `names` is not empty.
-    """
-
-    def __init__(self, component: Component, names: Iterable[str]) -> None:
-        self._component = local(component)
-        self._spelled = {name: self._component.machine.spelling(name) for name in names if _is_name(name)}
-        self._search: NameSearch | None = None
-
-    def __enter__(self) -> Self:
-        if self._spelled:
-            self._search = self._component.machine.search(self._spelled.values(), anyio.current_time())
-            self._component.wake()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        if self._search is not None:
-            self._component.machine.name_searches.cancel(self._search, anyio.current_time())
-
-    def leave_out(self, names: Iterable[str]) -> None:
-        """Stop the search for these names, as the vehicle spells them."""
-        if self._search is not None:
-            self._search.leave_out(names)
-
-    async def wait(self) -> None:
-        """Wait until the search has ended for all names.
-
-        Raises:
-            NoReply: the vehicle is lost.
-            LinkError: the link failed, or the client was closed.
-        """
-        if (search := self._search) is not None and search.open:
-            await self._component.wait(search, None, lambda: ("names", search.attempts))
-
-    def result(self) -> tuple[dict[str, Param], set[str]]:
-        """Return the parameters found, and the names that the vehicle does not have.
-
-        Names in neither must be read one by one: the link loses many packets, or the names are invalid.
-        """
-        found: dict[str, Param] = {}
-        unknown: set[str] = set()
-        for name, spelling in self._spelled.items():
-            param = self._component.params.get(spelling)
-            if param is not None and param.trust is Trust.LIVE:
-                found[name] = param
-            elif self._search is not None and spelling in self._search.unknown:
-                unknown.add(name)
-        return found, unknown
-
-
-def _probably_hidden(component: Component, wanted: ParamSet) -> frozenset[str]:
-    """Return wanted names of groups whose switch is wanted on, if nothing is known of them yet.
-
-    ArduPilot lists a group only while its switch is on. The request for a name that is listed after all is
-    wasted. The result is empty if there are more than `EARLY_READS_MAX`, and if the table is downloaded as a
-    list, which reads slow down.
-    """
-    if component.autopilot != "ardupilot" or not local(component).machine.fetches.may_use_file():
-        return frozenset()
-    rules = rules_for("ardupilot")
-    switches = {name for name, each in wanted.items() if rules.reveals(name) and each.settable != 0}
-    groups = tuple(f"{name.rpartition('_')[0]}_" for name in switches)
-    names = [name for name in wanted if name.startswith(groups) and name not in switches]
-    unheard = frozenset(name for name in names if name not in component.params)
-    return unheard if len(unheard) <= EARLY_READS_MAX else frozenset()
 
 
 def _in_no_hidden_group(table: Mapping[str, Param], wanted: Iterable[str]) -> frozenset[str]:

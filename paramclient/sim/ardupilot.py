@@ -14,7 +14,6 @@ from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.model.values import Encoding, ParamType, bits_of, from_bits
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
-from paramclient.protocol.ftp.param_pck import PackedParam
 from paramclient.sim.ftp import PARAM_FILE, Address, FileServer
 from paramclient.sim.param_table import (
     Entry,
@@ -57,7 +56,7 @@ class ArduPilotVehicle(Vehicle):
       change. A group may contain the switch of another one, which is shown while both are not 0. Hidden
       parameters can be read and set by name.
     - MAVFTP serves `@PARAM/param.pck` and `files`: one session, 5 requests waiting, bursts limited to a third
-      of the link (see `FileServer`). An uploaded param.pck sets parameters without announcing the changes.
+      of the link (see `FileServer`).
     - SYSID_THISMAV takes effect with the next full second, on a Copter after a reboot, without announcement.
     - A reboot command is acknowledged, and the vehicle switches off 0.2 s later; while armed the result is
       FAILED. After the reboot, the heartbeat has another MAV_STATE for a while: ACTIVE for 2 s on a Copter,
@@ -142,7 +141,7 @@ class ArduPilotVehicle(Vehicle):
         if not 0.0 <= live_period < math.inf:
             raise UsageError(f"live_period must be a number of seconds from 0 up, not {live_period}")
         if ftp:
-            self._ftp = FileServer(self._packed_params, self._apply_packed, ftp_rate)
+            self._ftp = FileServer(self._packed_params, ftp_rate)
         self._in_groups = (
             frozenset(row.name for row in rows[_NOT_IN_GROUPS:]) if table is None else frozenset()
         )
@@ -248,17 +247,6 @@ class ArduPilotVehicle(Vehicle):
 
     def _count_in_list(self) -> int:
         return self._list_count
-
-    def _set_from_file(self, entry: Entry, param: PackedParam) -> float:
-        """Set a parameter from an uploaded file: 4.6 also sets read-only ones, newer versions do not."""
-        value = from_bits(param.bits, param.type)
-        is_protected = self._param_error and entry.name in self._read_only
-        if is_protected or isinstance(value, bytes) or not math.isfinite(value):
-            return _SAVE
-        bits = param.bits if param.type == entry.type else _converted(value, entry.type)
-        is_switched_on = entry.name in self._switches and entry.bits == 0 and bits != 0
-        self._hold(entry, bits)
-        return _SAVE + is_switched_on * _SWITCH_ON
 
     def _hold(self, entry: Entry, bits: int) -> None:
         if bits != entry.bits:
@@ -482,10 +470,6 @@ _INFO = 6
 _WARNING = 4
 _LOOP = 0.0058
 """Period of the main loop, which answers sets, in seconds."""
-_SAVE = 1e-5
-"""Seconds to set and save one parameter of an uploaded file."""
-_SWITCH_ON = 0.1
-"""Seconds that ArduPilot waits after an uploaded parameter has switched on a group."""
 _SLOT = 0.1
 """Period of the parameter task, which answers reads, in seconds."""
 _ROUNDING = 1e-6

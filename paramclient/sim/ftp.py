@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-import struct
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple, TypeAlias
 
-from paramclient.errors import FileErrorCode, PackError, UsageError
+from paramclient.errors import FileErrorCode, UsageError
 from paramclient.model.px4_hash import crc32_px4
-from paramclient.model.values import ParamType
 from paramclient.protocol.ftp import param_pck
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.ftp.param_pck import PackedParam
@@ -82,11 +80,7 @@ class FileServer:
       session ends after 3 s without any response; refusals count as responses.
     - param.pck is generated for every read. With ArduPilot, all reads of a session request the same size, and
       the file size in the response to the open is an estimate, 12 bytes per parameter.
-    - An uploaded param.pck sets parameters when it is closed, also by a reset, or by another station's
-      request after 3 s of silence. ArduPilot acknowledges the closing whatever it does with the file: one
-      with another length than its header says, or another magic, is dropped; entries up to the first invalid
-      one are applied. The buffer grows to the header's length when the header is written, and is zero where
-      nothing was written. The acknowledgement waits for the parameters.
+    - Unlike on real vehicles, a param.pck that is written sets no parameters.
     - The checksum of a param.pck is that of the file as it is read 64 bytes at a time.
     - A burst of ArduPilot sends a block whenever a third of the link is free again, to the end of the file.
     - PX4 has one session for each link, closes it after 11 s without a request, and a reset from any sender
@@ -99,14 +93,12 @@ class FileServer:
 
     Args:
         params: returns all parameters for param.pck, in order; None if it cannot be generated.
-        apply: sets the parameters of an uploaded file, and returns the seconds that this takes.
         rate: bytes per second of a burst; single reads are three times as fast.
         is_px4: whether the server behaves like PX4, which assigns session numbers; else like ArduPilot,
             which uses the session number of the open request.
     """
 
     params: Callable[[], Sequence[PackedParam] | None]
-    apply: Callable[[Sequence[PackedParam]], float]
     rate: float
     is_px4: bool = False
     files: dict[str, bytes] = field(default_factory=dict)
@@ -315,10 +307,6 @@ class FileServer:
         session.used_at = now
         if session.written is None or request.offset > _LARGEST:
             return _no(FileErrorCode.FAIL)
-        magic, _, length = _UPLOAD_HEADER.unpack(request.data[: _UPLOAD_HEADER.size].ljust(6, b"\0"))
-        is_header = request.offset == 0 and len(request.data) >= _UPLOAD_HEADER.size
-        if is_header and magic == _MAGIC and _is_param_file(session.path) and not self.is_px4:
-            session.written += bytes(max(length - len(session.written), 0))
         if len(session.written) < request.offset:
             session.written += bytes(request.offset - len(session.written))
         session.written[request.offset : request.offset + len(request.data)] = request.data
@@ -346,16 +334,8 @@ class FileServer:
             return _no(FileErrorCode.INVALID_SESSION)
         if session is None or session.written is None:
             return _Answer(Opcode.ACK)
-        written = bytes(session.written)
         if not _is_param_file(session.path):
-            self.files[session.path] = written
-        elif self.is_px4:
-            try:
-                self.apply(param_pck.decode_upload(written))
-            except PackError:
-                return _no(FileErrorCode.FAIL_ERRNO, EINVAL)
-        else:
-            self._busy_time = self.apply(_uploaded(written))
+            self.files[session.path] = bytes(session.written)
         return _Answer(Opcode.ACK)
 
     def _param_file(self, query: dict[str, int]) -> Callable[[int, int], bytes | None]:
@@ -417,9 +397,6 @@ _CHECKSUM_READ = 64
 """Bytes that ArduPilot reads at a time for a checksum."""
 _CHECKSUM_TIME = 1e-6
 """Seconds of a checksum for each byte of a generated file."""
-_MAGIC = 0x671B
-_UPLOAD_HEADER = struct.Struct("<HHH")
-_UPLOAD_TYPES = {1: ParamType.INT8, 2: ParamType.INT16, 3: ParamType.INT32, 4: ParamType.REAL32}
 
 
 def _no(code: FileErrorCode, errno: int = 0) -> _Answer:
@@ -461,33 +438,6 @@ def _part(rows: Sequence[PackedParam], query: dict[str, int]) -> Sequence[Packed
     """Return the rows that a query asks for."""
     start, count = query["start"], query["count"]
     return rows[start : start + count] if count else rows[start:]
-
-
-def _uploaded(data: bytes) -> list[PackedParam]:
-    """Return the entries of an uploaded param.pck that ArduPilot applies: those before the first invalid one.
-
-    A file with another magic, or of another length than its header says, has none. Unlike `decode_upload`,
-    there is no padding, and names may repeat.
-    """
-    if len(data) < _UPLOAD_HEADER.size:
-        return []
-    magic, number, length = _UPLOAD_HEADER.unpack_from(data)
-    if magic != _MAGIC or length != len(data):
-        return []
-    rows: list[PackedParam] = []
-    at, name = _UPLOAD_HEADER.size, b""
-    for _ in range(number):
-        if at + 2 > len(data) or data[at] not in _UPLOAD_TYPES:
-            break
-        kind, shared, more = _UPLOAD_TYPES[data[at]], data[at + 1] & 0x0F, (data[at + 1] >> 4) + 1
-        end = at + 2 + more + kind.size
-        if shared + more > 16 or end > len(data):
-            break
-        name = name[:shared].ljust(shared, b"\0") + data[at + 2 : at + 2 + more]
-        bits = int.from_bytes(data[end - kind.size : end], "little")
-        rows.append(PackedParam(_text(name), kind, bits))
-        at = end
-    return rows
 
 
 def _query(path: str) -> dict[str, int] | None:

@@ -168,9 +168,7 @@ class PX4Vehicle(BytewiseVehicle):
         if clamp_delay is not None and not clamp_delay >= 0.0:
             raise UsageError(f"clamp_delay must be a number of seconds from 0 up, not {clamp_delay}")
         self._clamp_delay = clamp_delay
-        self._ftp = FileServer(
-            self._packed_params if ftp else lambda: None, self._apply_packed, ftp_rate, is_px4=True
-        )
+        self._ftp = FileServer(self._packed_params if ftp else lambda: None, ftp_rate, is_px4=True)
         self._has_metadata = metadata
         if metadata:
             if options.get("mavlink_version") == 1:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Final, Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
@@ -224,12 +224,6 @@ class Vehicle(Device):
     def _write(self, entry: Entry, bits: int) -> None:
         """Set another value, from any source, and start what follows from the change."""
 
-    def _set_from_file(self, entry: Entry, param: PackedParam) -> float:
-        """Set a parameter from an uploaded file; return the seconds that this takes."""
-        if param.type == entry.type:
-            self._write(entry, param.bits)
-        return 0.0
-
     def _is_listed(self, entry: Entry) -> bool:
         return True
 
@@ -331,14 +325,6 @@ class Vehicle(Device):
         """Return the parameters for param.pck; None if it cannot hold one of the types."""
         packed = [each for entry in self._listed if (each := entry.packed) is not None]
         return packed if len(packed) == len(self._listed) else None
-
-    def _apply_packed(self, params: Sequence[PackedParam]) -> float:
-        """Set the parameters of an uploaded file; return the seconds that this takes."""
-        return sum(
-            self._set_from_file(entry, param)
-            for param in params
-            if (entry := self._find(param.name)) is not None
-        )
 
     def _take_system_id(self, entry: Entry | None) -> None:
         """Use the system id in a parameter, if the parameter exists and its value is a valid id."""

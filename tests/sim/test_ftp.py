@@ -180,98 +180,6 @@ def test_a_written_file_exists_after_closing() -> None:
     assert refusal(pilot.ask(Opcode.WRITE_FILE, b"x")) == (FileErrorCode.FILE_NOT_FOUND,)
 
 
-def upload(pilot: Pilot, data: bytes) -> Packet:
-    assert pilot.ask(Opcode.CREATE_FILE, PARAMS).opcode == Opcode.ACK
-    for at in range(0, len(data), 200):
-        assert pilot.ask(Opcode.WRITE_FILE, data[at : at + 200], offset=at).opcode == Opcode.ACK
-    return pilot.ask(Opcode.TERMINATE_SESSION)
-
-
-UPLOADED = [
-    PackedParam("RTL_ALT", ParamType.REAL32, 0x449A4000),  # 1234, for an INT16 or an INT32
-    PackedParam("STAT_RESET", ParamType.INT32, 16777217),
-    PackedParam("RTL_SPEED", ParamType.INT16, 7),
-    PackedParam("COMPASS_DEC", ParamType.REAL32, 0x7FC00000),
-    PackedParam("NOT_THERE", ParamType.INT8, 1),
-    PackedParam("WPNAV_SPEED", ParamType.INT16, 321),
-]
-
-
-@pytest.mark.parametrize(("param_error", "speed"), [(False, 7), (True, 0)])
-def test_an_uploaded_param_pck_sets_parameters_on_closing(param_error: bool, speed: int) -> None:
-    """4.6 sets read-only parameters too; newer versions, those with PARAM_ERROR, do not."""
-    pilot = Pilot(ArduPilotVehicle(read_only=["RTL_SPEED"], param_error=param_error))
-    declination = pilot.vehicle.param("COMPASS_DEC").bits
-    assert upload(pilot, param_pck.encode_upload(UPLOADED)).opcode == Opcode.ACK
-    assert pilot.vehicle.param("RTL_ALT").value == 1234
-    assert pilot.vehicle.param("STAT_RESET").value == 16777217
-    assert pilot.vehicle.param("RTL_SPEED").value == speed
-    assert pilot.vehicle.param("COMPASS_DEC").bits == declination
-    assert pilot.vehicle.param("WPNAV_SPEED").value == 321
-
-
-def test_an_upload_that_switches_on_a_group_is_acknowledged_late() -> None:
-    pilot = Pilot(ArduPilotVehicle())
-    data = param_pck.encode_upload([PackedParam("EK2_ENABLE", ParamType.INT8, 1)])
-    assert pilot.ask(Opcode.CREATE_FILE, PARAMS).opcode == Opcode.ACK
-    assert pilot.ask(Opcode.WRITE_FILE, data).opcode == Opcode.ACK
-    pilot.send(Packet(9, 3, Opcode.TERMINATE_SESSION))
-    pilot.send(Packet(11, 3, Opcode.LIST_DIRECTORY, b"nothing"))
-    assert pilot.listen(0.1) == []
-    assert [each.requested for each in pilot.listen(0.1)] == [Opcode.TERMINATE_SESSION, Opcode.LIST_DIRECTORY]
-    assert len(pilot.vehicle.params) == 1434
-
-
-@pytest.mark.parametrize("what", ["longer", "magic", "header only"])
-def test_a_param_pck_that_is_dropped_is_acknowledged_all_the_same(what: str) -> None:
-    pilot = Pilot(ArduPilotVehicle())
-    before = pilot.vehicle.values
-    data = param_pck.encode_upload([PackedParam("RTL_ALT", ParamType.INT16, 5)])
-    changed = {
-        "longer": data + b"x",
-        "magic": b"\x1c" + data[1:],
-        "header only": data[:5],
-    }[what]
-    assert upload(pilot, changed).opcode == Opcode.ACK
-    assert pilot.vehicle.values == before
-
-
-def test_an_invalid_entry_ends_an_upload_and_the_earlier_ones_stay() -> None:
-    pilot = Pilot(ArduPilotVehicle())
-    data = bytearray(param_pck.encode_upload(UPLOADED))
-    data[data.index(b"RTL_SPEED") - 2 if b"RTL_SPEED" in data else data.index(b"SPEED") - 2] |= 0x10
-    assert upload(pilot, bytes(data)).opcode == Opcode.ACK
-    assert pilot.vehicle.param("RTL_ALT").value == 1234
-    assert pilot.vehicle.param("WPNAV_SPEED").value != 321
-
-
-def test_a_param_pck_in_parts_is_zero_where_nothing_was_written() -> None:
-    """Closed by another session after 3 s; without its header it is dropped."""
-    pilot = Pilot(ArduPilotVehicle())
-    data = param_pck.encode_upload(
-        [PackedParam("RTL_ALT", ParamType.INT32, 5), PackedParam("WPNAV_SPEED", ParamType.INT16, 0x0141)]
-    )
-    pilot.ask(Opcode.CREATE_FILE, PARAMS)
-    pilot.ask(Opcode.WRITE_FILE, data[6:], offset=6)
-    pilot.listen(3.3)
-    pilot.ask(Opcode.LIST_DIRECTORY, b"", session=4)
-    assert pilot.vehicle.param("RTL_ALT").value == 1500
-    pilot.ask(Opcode.CREATE_FILE, PARAMS)
-    pilot.ask(Opcode.WRITE_FILE, data[:-1])
-    pilot.listen(3.3)
-    pilot.ask(Opcode.LIST_DIRECTORY, b"", session=4)
-    assert (pilot.vehicle.param("RTL_ALT").value, pilot.vehicle.param("WPNAV_SPEED").value) == (5, 0x41)
-
-
-def test_a_reset_closes_an_upload() -> None:
-    pilot = Pilot(ArduPilotVehicle())
-    data = param_pck.encode_upload([PackedParam("RTL_ALT", ParamType.INT16, 5)])
-    pilot.ask(Opcode.CREATE_FILE, PARAMS + b"?start=5")
-    pilot.ask(Opcode.WRITE_FILE, data)
-    assert pilot.ask(Opcode.RESET_SESSIONS).opcode == Opcode.ACK
-    assert pilot.vehicle.param("RTL_ALT").value == 5
-
-
 def test_the_checksum_of_param_pck_is_that_of_reads_of_64_bytes() -> None:
     pilot = Pilot(ArduPilotVehicle())
     rows = packed(pilot.vehicle)
@@ -531,19 +439,6 @@ class TestSwitches:
         assert new.ask(Opcode.OPEN_FILE_RO, PARAMS).opcode == Opcode.ACK
         data = b"".join(each.data for each in new.burst(session=0) if each.opcode == Opcode.ACK)
         assert list(param_pck.decode(data).entries) == packed(new.vehicle)
-
-    def test_px4_sets_uploaded_parameters_of_the_right_type(self) -> None:
-        pilot = Pilot(PX4Vehicle(ftp=True))
-        rows = [
-            PackedParam("MC_ROLL_P", ParamType.REAL32, 0x40E00000),
-            PackedParam("SYS_AUTOSTART", ParamType.INT8, 1),
-        ]
-        autostart = pilot.vehicle.param("SYS_AUTOSTART").bits
-        pilot.ask(Opcode.CREATE_FILE, PARAMS)
-        pilot.ask(Opcode.WRITE_FILE, param_pck.encode_upload(rows), session=0)
-        assert pilot.ask(Opcode.TERMINATE_SESSION, session=0).opcode == Opcode.ACK
-        assert pilot.vehicle.param("MC_ROLL_P").value == 7.0
-        assert pilot.vehicle.param("SYS_AUTOSTART").bits == autostart
 
     @pytest.mark.parametrize(
         "vehicle", [ArduPilotVehicle(ftp=False), GenericVehicle({"A": 1})], ids=["ardupilot", "generic"]

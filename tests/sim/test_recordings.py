@@ -243,16 +243,6 @@ def without_pushes(name: str, messages: Messages, start: float) -> Messages:
     return kept
 
 
-def without_network(name: str) -> ArduPilotVehicle:
-    """Return an ArduPilot that was built without networking: its table lacks the parameters of that.
-
-    The members of the gripper's group are not in the log.
-    """
-    rows = [row for row in ardupilot_table() if not row.name.startswith(("NET_", "SR5_", "SR6_"))]
-    members = [SimParam(f"GRIP_{number}", ParamType.REAL32, 0.0) for number in range(7)]
-    return ArduPilotVehicle(table=rows, live_period=0.0, groups={"GRIP_ENABLE": members})
-
-
 def quiet(name: str) -> ArduPilotVehicle:
     return ArduPilotVehicle(live_period=0.0)
 
@@ -272,8 +262,6 @@ ARDUPILOT: dict[str, tuple[Callable[[str], ArduPilotVehicle], float]] = {
     "ardupilot_list_beside_50_reads": (ardupilot_of, 0.0022),
     "ardupilot_list_beside_ftp": (ardupilot_of_file, 0.0010),
     "ardupilot_list_restarted": (ardupilot_of, 0.0080),
-    "ardupilot_param_upload": (without_network, 0.0),
-    "ardupilot_upload_abandoned": (without_network, 0.0),
 }
 """Recordings with their vehicle, and the phase of its loop."""
 

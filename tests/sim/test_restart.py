@@ -12,7 +12,6 @@ from paramclient import CommandResult, UsageError
 from paramclient.cli.simulate import VehicleFaults
 from paramclient.model.values import Encoding, ParamType, encode_value
 from paramclient.protocol import wire
-from paramclient.protocol.ftp.param_pck import PackedParam
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, Vehicle
 from tests.shell import generic
 
@@ -233,14 +232,10 @@ def test_first_start_only_parameters_are_unused_from_the_second_start_on() -> No
         PX4Vehicle(first_start_only=["NO_SUCH"])
 
 
-@pytest.mark.parametrize("by_file", [True, False])
-def test_plane_and_rover_change_their_system_id_within_a_second(by_file: bool) -> None:
+def test_plane_and_rover_change_their_system_id_within_a_second() -> None:
     desk = Desk(ArduPilotVehicle(kind="plane"))
     desk.run(10.25)
-    if by_file:
-        desk.vehicle._apply_packed([PackedParam("SYSID_THISMAV", ParamType.INT16, 9)])
-    else:
-        desk.set("SYSID_THISMAV", 9, ParamType.INT16, Encoding.C_CAST)
+    desk.set("SYSID_THISMAV", 9, ParamType.INT16, Encoding.C_CAST)
     desk.run(10.9)
     assert {frame.system for _, frame, _ in desk.received} == {1}
     desk.received.clear()

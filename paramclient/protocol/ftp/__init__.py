@@ -2,7 +2,7 @@
 
 `blocks`: received pieces of a file, and its gaps.
 `file_read`: the read of a file: one burst, and single reads of lost blocks.
-`file_write`: the write of a file: in order, or with its header last.
+`file_write`: the write of a file.
 `packets`: the payload of FILE_TRANSFER_PROTOCOL.
 `param_pck`: the packed parameter file.
 `passive`: files that other stations read.
@@ -13,13 +13,12 @@
 from __future__ import annotations
 
 from paramclient.protocol.ftp.file_read import FILE_SIZE_MAX, FileRead
-from paramclient.protocol.ftp.file_write import CommittedWrite, FileWrite
+from paramclient.protocol.ftp.file_write import FileWrite
 from paramclient.protocol.ftp.passive import ObservedRead, ObservedReads
 from paramclient.protocol.ftp.transfer_job import BUSY
 from paramclient.protocol.ftp.transfers import (
     DirectoryEntry,
     FileChecksum,
-    FileChecksums,
     FileList,
     FileTransfers,
 )
@@ -27,10 +26,8 @@ from paramclient.protocol.ftp.transfers import (
 __all__ = [
     "BUSY",
     "FILE_SIZE_MAX",
-    "CommittedWrite",
     "DirectoryEntry",
     "FileChecksum",
-    "FileChecksums",
     "FileList",
     "FileRead",
     "FileTransfers",

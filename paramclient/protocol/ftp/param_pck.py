@@ -24,9 +24,7 @@ __all__ = [
     "PackedParam",
     "decode",
     "decode_prefix",
-    "decode_upload",
     "encode",
-    "encode_upload",
 ]
 
 READ_SIZE_DEFAULT: Final = 239
@@ -116,20 +114,6 @@ def total_of(beginning: bytes) -> int | None:
     return total if magic in (_MAGIC, _MAGIC_WITH_DEFAULTS) else None
 
 
-def decode_upload(data: bytes) -> tuple[PackedParam, ...]:
-    """Decode a file of the format that is written to a vehicle.
-
-    Raises:
-        PackError: as in `decode`; and its length differs from the header's, or it has defaults.
-    """
-    magic, number, length = _header(data)
-    if magic != _MAGIC:
-        raise PackError(f"a parameter file to be written does not begin with 0x{magic:04x}", offset=0)
-    if length != len(data):
-        raise PackError(f"{len(data)} bytes of a file of {length}", offset=4)
-    return _entries(data, number, False)
-
-
 def encode(
     entries: Iterable[PackedParam],
     *,
@@ -160,21 +144,6 @@ def encode(
     magic = _MAGIC_WITH_DEFAULTS if with_defaults else _MAGIC
     out = bytearray(_HEADER.pack(magic, len(rows), total))
     _append(out, rows, with_defaults, read_size)
-    return bytes(out)
-
-
-def encode_upload(entries: Iterable[PackedParam]) -> bytes:
-    """Encode the file that is written to a vehicle to set parameters; it has no padding and no defaults.
-
-    Raises:
-        UsageError: as in `encode`; or it would be longer than 65535 bytes, the limit of its header.
-    """
-    rows = list(entries)
-    out = bytearray(_HEADER.size)
-    _append(out, rows, False, None)
-    if len(out) > 0xFFFF:
-        raise UsageError(f"a parameter file to be written holds 65535 bytes, and this would have {len(out)}")
-    _HEADER.pack_into(out, 0, _MAGIC, len(rows), len(out))
     return bytes(out)
 
 
@@ -236,7 +205,7 @@ def _entries(
     return tuple(found.values())
 
 
-def _append(out: bytearray, rows: list[PackedParam], with_defaults: bool, read_size: int | None) -> None:
+def _append(out: bytearray, rows: list[PackedParam], with_defaults: bool, read_size: int) -> None:
     last = ""
     names = set()
     for name, kind, bits, default in rows:
@@ -257,10 +226,9 @@ def _append(out: bytearray, rows: list[PackedParam], with_defaults: bool, read_s
         shared = _shared(last, name)
         own = name[shared:].encode("ascii")
         size = 2 + len(own) + len(value)
-        if read_size is not None:
-            over = (len(out) + size) % read_size
-            if 0 < over < kind.size:
-                out += bytes(kind.size - over)
+        over = (len(out) + size) % read_size
+        if 0 < over < kind.size:
+            out += bytes(kind.size - over)
         out += bytes((number, shared | len(own) - 1 << 4))
         out += own
         out += value

@@ -8,30 +8,24 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Final, NamedTuple, TypeVar
 
-from paramclient.errors import FileErrorCode, NoReply, UsageError
+from paramclient.errors import FileErrorCode, NoReply
 from paramclient.protocol.ftp.file_read import FILE_SIZE_MAX, FileRead
-from paramclient.protocol.ftp.file_write import CommittedWrite, FileWrite
+from paramclient.protocol.ftp.file_write import FileWrite
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
-from paramclient.protocol.ftp.transfer_job import FileTransferJob, FtpChannel, path_bytes
+from paramclient.protocol.ftp.transfer_job import FileTransferJob, FtpChannel
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
-from paramclient.protocol.requests.retry import FileAttempts
 from paramclient.protocol.wire import FileTransfer
 
-__all__ = ["DirectoryEntry", "FileChecksum", "FileChecksums", "FileList", "FileTransfers"]
+__all__ = ["DirectoryEntry", "FileChecksum", "FileList", "FileTransfers"]
 
 AnyJob = TypeVar("AnyJob", bound=FileTransferJob[Any])
 
 ENTRIES_MAX: Final = 65_536
 """Entries of a directory: more than a FAT card can hold in one."""
-CHECKSUMS_IN_FLIGHT_MAX: Final = 4
-"""Requests for checksums in flight: ArduPilot queues 5 requests of all stations and drops further ones
-(GCS_FTP.cpp)."""
-GENERATED_PARAMETERS: Final = "@PARAM/"
-"""The beginning of the path of the parameter file."""
 SESSION_TIMEOUT: Final = 3.3
 """Seconds after the last message to another station for which its session may still be open: ArduPilot ends
 one 3 s after its last response (measured)."""
@@ -93,66 +87,6 @@ class FileChecksum(FileTransferJob[int]):
             self._wait_or_refuse(packet, "gives no checksum of", now)
         else:
             self.finish(int.from_bytes(packet.data[:4], "little"), now)
-
-
-class FileChecksums(FileTransferJob[tuple[int | None, ...]]):
-    """The checksums of several files, requested in parallel. See `FileTransfers.checksums`."""
-
-    def __init__(self, line: FtpChannel, paths: Sequence[str], now: float) -> None:
-        super().__init__(line, paths[0], now)
-        self._paths = [path_bytes(path) for path in paths]
-        self._found: dict[int, int | None] = {}
-        self._waiting = deque(range(len(paths)))
-        self._pending_reads: dict[int, tuple[int, FileAttempts]] = {}  # by sequence number of the request
-
-    def begin(self, now: float) -> None:
-        self._go_on(now)
-
-    def take(self, packet: Packet, now: float) -> None:
-        flight = self._pending_reads.pop((packet.sequence - 1) & 0xFFFF, None)
-        if flight is None or self.is_ended:
-            return
-        number, attempts = flight
-        attempts.answered(now)
-        is_there = packet.opcode == Opcode.ACK
-        self._found[number] = int.from_bytes(packet.data[:4], "little") if is_there else None
-        self._go_on(now)
-
-    def tick(self, now: float) -> None:
-        for sequence, (number, attempts) in list(self._pending_reads.items()):
-            if attempts.due_at <= now and not self.is_ended:
-                attempts.timed_out()
-                if attempts.should_give_up(now):
-                    self.fail(self._no_reply(attempts.count, now), now)
-                else:
-                    self._transmit_flight(sequence, number, attempts, now)
-
-    def next_deadline(self) -> float:
-        if self.is_ended:
-            return math.inf
-        return min((attempts.due_at for _, attempts in self._pending_reads.values()), default=math.inf)
-
-    def resume(self, now: float) -> None:
-        for sequence, (number, attempts) in self._pending_reads.items():
-            attempts.restart()
-            self._transmit_flight(sequence, number, attempts, now)
-
-    def _go_on(self, now: float) -> None:
-        while self._waiting:
-            attempts = FileAttempts(self._line.retry, self._line, is_slow=True)
-            if len(self._pending_reads) >= CHECKSUMS_IN_FLIGHT_MAX // attempts.copies:
-                break
-            number = self._waiting.popleft()
-            sequence = self._line.next_sequence()
-            self._pending_reads[sequence] = number, attempts
-            self._transmit_flight(sequence, number, attempts, now)
-        if not self._pending_reads:
-            self.finish(tuple(self._found[number] for number in range(len(self._paths))), now)
-
-    def _transmit_flight(self, sequence: int, number: int, attempts: FileAttempts, now: float) -> None:
-        attempts.sent(now)
-        for _ in range(attempts.copies):
-            self._line.send(Packet(sequence, 0, Opcode.CALC_FILE_CRC32, self._paths[number]))
 
 
 class FileTransfers(Machine):
@@ -239,40 +173,12 @@ class FileTransfers(Machine):
         """Write a whole file, and replace an existing one.
 
         If it fails or is released, the part written so far stays on board; PX4 and ArduPilot then refuse a
-        param.pck as a whole. ArduPilot does not report what it does with a param.pck, see `CommittedWrite`.
+        param.pck as a whole. ArduPilot does not report what it does with a param.pck.
 
         Raises:
             UsageError: the path or the size of one piece is invalid.
         """
-        if self._context.is_ardupilot and path.startswith(GENERATED_PARAMETERS):
-            return self.write_whole(path, data, now, may_commit=lambda at: True, write_size=write_size)
         return self._begin(FileWrite(self._line_at(now), path, data, now, write_size=write_size), now)
-
-    def write_whole(
-        self,
-        path: str,
-        data: bytes,
-        now: float,
-        *,
-        may_commit: Callable[[float], bool],
-        write_size: int = DATA_SIZE_MAX,
-    ) -> CommittedWrite:
-        """Write a param.pck to ArduPilot so that it takes all of it or nothing.
-
-        Whether it has taken the file is to be read: see `CommittedWrite`.
-
-        Args:
-            path, data, now, write_size: as in `write`.
-            may_commit: called with the time before the server can take the file. Nothing is taken if it
-                returns false.
-
-        Raises:
-            UsageError: the path or the size of one piece is invalid.
-        """
-        job = CommittedWrite(
-            *(self._line_at(now), path, data, now), write_size=write_size, may_commit=may_commit
-        )
-        return self._begin(job, now)
 
     def list(self, path: str, now: float) -> FileList:
         """List a directory.
@@ -289,16 +195,6 @@ class FileTransfers(Machine):
             UsageError: the path is invalid.
         """
         return self._begin(FileChecksum(self._line_at(now), path, now), now)
-
-    def checksums(self, paths: Sequence[str], now: float) -> FileChecksums:
-        """Let the server compute the CRC-32 of several files; None for one that it refuses.
-
-        Raises:
-            UsageError: there is no path, or an invalid one.
-        """
-        if not paths:
-            raise UsageError("no file to compute the checksum of")
-        return self._begin(FileChecksums(self._line_at(now), paths, now), now)
 
     def release(self, job: FileTransferJob[Any], now: float, *, is_served: bool = True) -> None:
         """Cancel a transfer: its end is not reported, and its session is closed.

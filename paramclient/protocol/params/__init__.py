@@ -1,6 +1,5 @@
 """The parameter protocol of one component: table, reads, writes, downloads, hash check, sync.
 
-`boot_values`: reads again what a vehicle without a hash measures at boot.
 `change`: a change of one parameter.
 `change_origin`: the author of a change.
 `download_ranges`: the state of the parts of a download.
@@ -15,16 +14,12 @@
 `list_download`: PARAM_REQUEST_LIST and the repair of its gaps.
 `list_estimate`: the expected duration of a list.
 `list_stream`: progress, pace, losses and end of a running list.
-`name_search`: reads of many names that may not exist.
 `passive`: tables from the traffic of other stations, and from logs.
 `passive_file`: the packed file as other stations read it.
 `reads`: PARAM_REQUEST_READ.
 `sampling`: check of a cached table by a random sample.
 `sync`: detection of changes that were missed.
-`sync_interval`: the interval of checks without a hash.
 `table`: the parameters, their trust and their hash.
-`table_shift`: single reads that follow a table after parameters were added or removed.
-`upload`: many values as one file, for ArduPilot.
 `value_check`: values that may be older than a change.
 `volatile_values`: reads of the values that a hash does not cover.
 `write_batch`: many PARAM_SETs in one call: which are sent next, and the outcome of each.

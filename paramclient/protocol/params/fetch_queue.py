@@ -11,7 +11,6 @@ from paramclient.protocol.params.fetch import Check, Fetch
 from paramclient.protocol.params.fetch_result import FetchContext, FetchResult, Policy, Sampled
 from paramclient.protocol.params.passive import PassiveFetch, PassiveTable
 from paramclient.protocol.params.sync import Sync, SyncSettings
-from paramclient.protocol.params.sync_interval import SyncInterval
 from paramclient.protocol.requests.machine import Machine
 
 __all__ = ["Fetches"]
@@ -27,7 +26,6 @@ class Fetches(Machine):
         fetch_context: the objects that each fetch uses.
         sync: the component's.
         sync_settings: what may be requested.
-        sync_interval: receives the duration of fetches.
         ended: called with each result for which the vehicle has sent something of its table.
 
     Attributes:
@@ -43,7 +41,6 @@ class Fetches(Machine):
         fetch_context: FetchContext,
         sync: Sync,
         sync_settings: SyncSettings,
-        sync_interval: SyncInterval,
         *,
         ended: Callable[[FetchResult], None],
     ) -> None:
@@ -60,7 +57,6 @@ class Fetches(Machine):
                 fetch_context, sync, whole=self._passive_ended, is_log=sync_settings.is_log
             )
         self._ended = ended
-        self._sync_interval = sync_interval
         self._restarted_at = -math.inf  # of the last fetch
 
     @property
@@ -111,8 +107,6 @@ class Fetches(Machine):
             (refresh and fetch.may_end_with_cache) or (sampled is None and fetch.is_sampling)
         ):
             fetch.restart(now)
-        if fetch is None:
-            self._sync.fetch_begins(now)
         may_sample = self.is_same_firmware and self._fetch_policy is Policy.AUTO and not self._sync.is_doubted
         if fetch is None and self.passive_table is not None:
             fetch = self.current = PassiveFetch(self._fetch_context, self.passive_table, now)
@@ -199,7 +193,6 @@ class Fetches(Machine):
             self.passive_table.file.forget()
             self.passive_table.forget()
         self.file_works = None
-        self._sync_interval.forget()
         self.is_same_firmware = False
 
     def updated(self, now: float) -> None:
@@ -242,6 +235,6 @@ class Fetches(Machine):
         if result is None:
             return
         self.last = result
-        self._sync_interval.fetched(result, fetch.queue_wait(fetch.ended_at))
-        if self._sync.fetched(result, fetch.ended_at):
+        waited = fetch.queue_wait(fetch.ended_at)
+        if self._sync.fetched(result, fetch.ended_at, waited=waited):
             self._ended(result)

@@ -279,6 +279,5 @@ class FileDownload(Operation[None]):
             )
         )
         table.outdated_indices.clear()
-        table.previous_order = ()
         table.count = self._count = pack.total
         self._changed(changes)

@@ -142,7 +142,7 @@ class PassiveTable:
         table, total = self._table, observed.pack.total
         if table.count != total:
             if table.count is not None:
-                self._sync.count_changed(total - table.count, now)
+                self._sync.count_changed(now)
             table.change_count(total)
         entries = {index: entry.name for index, entry in observed.entries()}
         is_all = len(entries) == total

@@ -9,24 +9,13 @@ from functools import partial
 from typing import Final, Protocol
 
 from paramclient.errors import FileTransferError, UnknownParameter, UsageError
-from paramclient.model.group_switches import precedes_group
 from paramclient.model.values import Trust
 from paramclient.protocol.ftp import BUSY, FileTransfers
-from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import is_ours
 from paramclient.protocol.params.fetch import Check, Fetch
 from paramclient.protocol.params.fetch_result import Announcement, FetchResult, Policy
-from paramclient.protocol.params.hash_check import HashCheck
 from paramclient.protocol.params.reads import Read, Reads
-from paramclient.protocol.params.sync_interval import SyncInterval
 from paramclient.protocol.params.table import NAMES_MAX, Table
-from paramclient.protocol.params.table_shift import (
-    SEARCH_ROUNDS,
-    CountChange,
-    TableShift,
-    reads_expected,
-    search_reads_expected,
-)
 from paramclient.protocol.params.volatile_values import VolatileReads
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
@@ -55,24 +44,15 @@ IDLE_CHECK_INTERVAL: Final = 0.1
 """Seconds until the next look at whether the link is idle."""
 GAP_CHECK_INTERVAL: Final = 5.0
 """Seconds between two checks caused by gaps in the heartbeats, which are frequent on a bad link."""
+DOWNLOAD_SHARE: Final = 0.05
+"""The share of time that downloads may take that check a table without a hash: 1.5 s of 30 s."""
+CHOSEN_DOWNLOAD_SHARE: Final = 0.5
+"""The same if the user has chosen the interval."""
+DOWNLOAD_PAUSE_MIN: Final = 1.0
+"""Seconds from one check by download to the next, at least: the count may change all the time."""
 LOW_BANDWIDTH_GAP: Final = 0.1
 """Seconds between two values of the list that indicate a low-bandwidth mode: PX4's sends 8 values/s, a
 57600-baud radio carries 40."""
-SHIFT_TIME_SHARE: Final = 0.5
-"""The share of a download's time that reads of the shifted indices may be expected to take: they may not
-succeed, and then the download follows."""
-READ_BATCH_TIME: Final = 0.1
-"""Seconds that the first reads wait for the next batch of ArduPilot (measured)."""
-COUNT_CHANGES_FOLLOWED_MAX: Final = 16
-"""Changes of the number of parameters that are followed without a download: more groups are not switched at
-once."""
-SHIFTS_MAX: Final = 8
-"""Times that the shifted indices are read anew because the number has changed again; then the table is
-fetched. While ArduPilot sends its list, the numbers before and after a change alternate."""
-STALE_COUNT_TIME: Final = 0.3
-"""Seconds after a change within which the number before may belong to a late response: ArduPilot takes
-responses to reads up to 100 ms before it sends them (measured), and the link adds its latency."""
-
 _EXPIRED: Final = -math.inf  # the time of an announcement that is stale
 
 
@@ -123,7 +103,7 @@ class SyncSettings:
     Attributes:
         interval: seconds between two checks whether the table has changed; infinity for none.
         without_hash: whether every vehicle without a hash is checked too, by fetching its whole table.
-            Vehicles that serve it as a file are checked anyway, as often as that costs little.
+            Vehicles that serve it as a file are checked anyway.
         policy: what may be requested.
         listens_only: nothing is sent, for any reason; the policy is then "cache-only".
         is_log: the link is a log, which accepts no requests and ends.
@@ -182,9 +162,6 @@ class SyncHost(Protocol):
     def end_fetch(self, fetch: Fetch, now: float) -> None:
         """Give a fetch back."""
 
-    def table_followed(self, changes: list[Change]) -> None:
-        """Report changes that no PARAM_VALUE brought: parameters were removed."""
-
     def resynced(self, changed: tuple[str, ...], confirmed: int | None) -> None:
         """Report that the table matches the vehicle's again, with the changed names and the hash."""
 
@@ -198,18 +175,14 @@ class Sync(Machine):
     to a table that was fetched on this link. Nothing is requested in high-latency mode, or on a link measured
     to be in a low-bandwidth mode, nor, except after changes, while other requests are in flight.
 
-    When parameters were added or removed, only the shifted indices are read where that is faster than a
-    download, see `TableShift`: of an ArduPilot, whose table keeps its order, and of a PX4, whose table is
-    sorted. The hash of a PX4 then proves the table. The values of an ArduPilot that stay are as recent as
-    before.
+    When parameters were added or removed, the table is fetched.
 
     With each interval, the values that the hash does not cover are read again. For a component without a hash
-    the file, or the list, is fetched, as often as `sync_interval` says.
+    the file, or the list, is fetched: with each interval, or less often if that takes long.
 
     Args:
         context, reads, table, presence, files: the component's.
         sync_settings: what is done without a request.
-        sync_interval: the interval of fetches without a hash.
         host: the component.
 
     Attributes:
@@ -225,7 +198,6 @@ class Sync(Machine):
         reads: Reads,
         table: Table,
         sync_settings: SyncSettings,
-        sync_interval: SyncInterval,
         presence: Presence,
         files: FileTransfers,
         host: SyncHost,
@@ -234,7 +206,6 @@ class Sync(Machine):
         self._reads = reads
         self._table = table
         self._sync_settings = sync_settings
-        self._sync_interval = sync_interval
         self._presence = presence
         self._files = files
         self._host = host
@@ -254,16 +225,7 @@ class Sync(Machine):
         self._volatile_at = -math.inf  # when values outside the hash may be read again
         self._reads_volatile = False  # after a match of the requested hash
         self._resync: Fetch | None = None
-        self._shift: TableShift | None = None
-        self._proof_read: Read | None = None  # of the hash that is to prove the table so shown
-        self._shift_at = -math.inf  # when the next one may begin
-        self._shifts = 0  # begun since the table was in sync
-        self._count_changed_at = -math.inf
-        self._count_changes: list[CountChange] | None = (
-            None  # since the table was in sync; None if it was not
-        )
-        self._last_switch = ""  # the group switch that has changed last
-        self._known_at = -math.inf  # the moment of the last fetched table
+        self._download_time = 0.0  # seconds of the last download of the whole table
         self._was_marked_unsynced = False  # was synced and is not
         self._changed_names: dict[str, None] = {}  # names changed since then
 
@@ -272,7 +234,7 @@ class Sync(Machine):
         """The state of the table of a component that is not lost."""
         if self.synced:
             return SyncState.SYNCED
-        if self._resync is not None or self._is_shifting:
+        if self._resync is not None:
             return SyncState.RESYNCING
         return SyncState.CHECKING if self._is_checking else SyncState.UNSYNCED
 
@@ -313,9 +275,6 @@ class Sync(Machine):
                 if now is not None:
                     self._foreign_changed(now)
             self.expire_hash()
-        is_followed = self.synced or self._count_changes is not None
-        if now is not None and is_followed and precedes_group(name):
-            self._last_switch = name
         if (self._was_marked_unsynced or self._resync is not None) and len(self._changed_names) < NAMES_MAX:
             self._changed_names[name] = None
 
@@ -325,39 +284,16 @@ class Sync(Machine):
         if announced is not None and announced.at != _EXPIRED:
             self.announced = replace(announced, at=_EXPIRED)
 
-    def count_changed(self, added: int, now: float, carrier: str = "") -> None:
+    def count_changed(self, now: float) -> None:
         """Process a changed count: the table has changed.
 
-        Without a hash, the table is followed by reads, or fetched, by list where it is not served as a file.
-
-        Args:
-            added: parameters more than before; negative if there are fewer.
-            now: the time.
-            carrier: the parameter whose PARAM_VALUE had the changed count.
+        Without a hash, the table is fetched, by list where it is not served as a file.
         """
-        if self.synced:
-            self._count_changes = []
-            self._shifts = 0
-        if (changes := self._count_changes) is not None:
-            is_late = now - self._count_changed_at < STALE_COUNT_TIME
-            if is_late and changes and changes[-1].added == -added:
-                changes.pop()
-            else:
-                changes.append(CountChange(carrier if precedes_group(carrier) else self._last_switch, added))
-            if len(changes) > COUNT_CHANGES_FOLLOWED_MAX or self._shifts >= SHIFTS_MAX:
-                self._count_changes = None
-        self._count_changed_at = now
-        self._cancel_shift()
         self._mark_unsynced()
         if self._keeps_in_sync:
             self._has_count_changed = not self.expects_hash
-            if self._is_shift_worthwhile(now):
-                # the start of a module brings more than one parameter into use
-                earliest = max(self._shift_at, now + SETTLING_TIME) if self.expects_hash else self._shift_at
-            else:
-                pause = 0.0 if self.expects_hash else self._sync_interval.shortest_pause
-                earliest = self._checked_at + pause
-            self._check_at = min(self._check_at, max(now, earliest))
+            pause = 0.0 if self.expects_hash else self._shortest_pause
+            self._check_at = min(self._check_at, max(now, self._checked_at + pause))
 
     def silence(self, now: float) -> None:
         """Process the end of a gap in which changes may have been missed.
@@ -385,13 +321,19 @@ class Sync(Machine):
             self._is_checking = self.expects_hash
             self._check_at = now
 
-    def fetched(self, result: FetchResult, now: float) -> bool:
-        """Process the end of any fetch. Return False when the vehicle has sent nothing of its table."""
+    def fetched(self, result: FetchResult, now: float, *, waited: float = 0.0) -> bool:
+        """Process the end of any fetch. Return False when the vehicle has sent nothing of its table.
+
+        Args:
+            result: of the fetch.
+            now: the time.
+            waited: seconds for which the fetch waited for its turn on the link.
+        """
         if result.source == "cache" and result.hash is None:
             self._not_confirmed()
             return False
-        self._count_changes = None
-        self._last_switch = ""
+        if result.source != "cache" and result.complete:
+            self._download_time = result.elapsed - waited
         table = self._table
         complete = result.complete and table.complete and not result.may_be_mixed
         if result.hash is None:  # values from before the loss may have changed since
@@ -402,19 +344,12 @@ class Sync(Machine):
         self._has_count_changed &= not complete
         self._was_synced |= complete or result.may_be_mixed
         self._changed_only_by_us = result.hash is not None
-        self._known_at = now if result.hash is not None else now - result.elapsed
-        self._settled(now, self._known_at)
+        self._settled(now, now if result.hash is not None else now - result.elapsed)
         if result.may_be_mixed and self._keeps_in_sync:
             self._check_at = now + GAP_CHECK_INTERVAL
         if result.hash is not None:
             self._read_unhashed(result.hash, now)
         return True
-
-    def fetch_begins(self, now: float) -> None:
-        """Process the beginning of a fetch, which brings what reads of shifted indices would."""
-        if self._is_shifting:
-            self._cancel_shift()
-            self._check_at = now  # in case that the fetch is cancelled
 
     def contradicted(self) -> None:
         """Process a hash mismatch after which nothing can be fetched."""
@@ -426,7 +361,7 @@ class Sync(Machine):
         self._context.has_hash = None
         self.synced = self._was_synced = self._changed_only_by_us = False
         self._was_marked_unsynced = self._has_count_changed = False
-        self._last_switch = ""
+        self._download_time = 0.0
         self.stop()
 
     # requests
@@ -456,18 +391,6 @@ class Sync(Machine):
             self._resync = None
             self._host.end_fetch(fetch, now)
             self._check_at = now
-
-    def is_known_since(self, at: float) -> bool:
-        """Return whether the whole table was fetched by requests after this moment, and has not changed."""
-        return self.synced and self._known_at >= at
-
-    def fetch_quick_file(self, now: float) -> bool:
-        """Fetch the table again if its file is fast; return False where it is not, or is not permitted."""
-        may_fetch = self._keeps_in_sync and not self.must_not_poll and not self._files.is_in_use(now)
-        if not may_fetch or not self._sync_interval.file_is_quick:
-            return False
-        self._begin_resync(now, Check(may_list=True))
-        return True
 
     def compare(self, now: float) -> bool:
         """Return whether the vehicle has just announced the table's hash, which is then confirmed."""
@@ -505,21 +428,12 @@ class Sync(Machine):
         """Request nothing any more until there is a new reason."""
         self._settle_at = self._foreign_check_at = self._check_at = math.inf
         self._is_checking = self._reads_volatile = False
-        self._count_changes = None
-        self._cancel_shift()
 
     @property
     def must_not_poll(self) -> bool:
         """Whether the component is lost, or in a mode in which requests are sent for callers only."""
         presence = self._presence
         return presence.is_lost or presence.is_high_latency or self._reads.pace.gap >= LOW_BANDWIDTH_GAP
-
-    @property
-    def wants_boot_values(self) -> bool:
-        """Whether values measured at boot are to be read again, as no hash covers them."""
-        sync_settings = self._sync_settings
-        is_kept_up = sync_settings.interval < math.inf and sync_settings.policy is Policy.AUTO
-        return is_kept_up and not self.expects_hash and not self.must_not_poll
 
     @property
     def may_resync(self) -> bool:
@@ -533,6 +447,11 @@ class Sync(Machine):
         """Whether the table is to be kept in sync."""
         sync_settings = self._sync_settings
         return self._was_synced and sync_settings.interval < math.inf and sync_settings.policy is Policy.AUTO
+
+    @property
+    def _shortest_pause(self) -> float:
+        """Seconds from one check by download to the next, at least, for any reason."""
+        return max(DOWNLOAD_PAUSE_MIN, self._download_time)
 
     def _mark_unsynced(self) -> None:
         if self.synced:
@@ -574,14 +493,12 @@ class Sync(Machine):
 
     def _check(self, now: float) -> None:
         """Check whether the table still matches the vehicle's, if the link is idle."""
-        if self.holds or self._is_shifting or self._host.is_link_busy:
+        if self.holds or self._host.is_link_busy:
             self._check_at = now + IDLE_CHECK_INTERVAL
             return
         self._plan_check(now, now)
         if self.must_not_poll:
             self._is_checking = False
-        elif self._begin_shift(now):
-            return
         elif self.expects_hash:
             self._reads_volatile = self._keeps_in_sync
             self.ask(now)
@@ -589,20 +506,22 @@ class Sync(Machine):
             if self._files.is_in_use(now):
                 self._check_at = min(self._check_at, now + FILE_IN_USE_RETRY)
             else:
-                may_list = self._sync_interval.may_list or self._has_count_changed
+                may_list = self._sync_settings.without_hash or self._has_count_changed
                 self._begin_resync(now, Check(may_list=may_list))
 
     def _plan_check(self, now: float, known_at: float) -> None:
         """Plan the next check to end an interval after the moment of the known table."""
         self._checked_at = now
         self._check_at = math.inf
-        if self._keeps_in_sync:
-            pace = self._sync_interval
-            if self.expects_hash:
-                self._check_at = max(known_at + pace.hash_interval, now)
-            else:
-                interval = pace.interval(may_use_file=self._host.may_use_file)
-                self._check_at = max(known_at + interval, now + pace.shortest_pause)
+        if not self._keeps_in_sync:
+            return
+        settings = self._sync_settings
+        if self.expects_hash:
+            self._check_at = max(known_at + settings.interval, now)
+        elif settings.without_hash or self._host.may_use_file:
+            share = CHOSEN_DOWNLOAD_SHARE if settings.without_hash else DOWNLOAD_SHARE
+            interval = max(settings.interval, self._download_time / share)
+            self._check_at = max(known_at + interval, now + self._shortest_pause)
 
     def _take_hash(self, read: Read) -> None:
         """Process a response to our own request for the hash, or its absence."""
@@ -629,119 +548,16 @@ class Sync(Machine):
             if reads_volatile and now >= self._volatile_at:
                 self._read_unhashed(announced, now, again=True)
             self._settled(now, now)
-        elif self._context.is_writing or self._context.is_fetching or self._is_shifting:
+        elif self._context.is_writing or self._context.is_fetching:
             return
         elif table.hash is None and self._changed_only_by_us and not self._keeps_in_sync:
             # cannot be recomputed here: the cause may be our writes only, or also a missed change
             self._is_checking = False
-        elif not (self.may_resync and self._begin_shift(now)):
+        else:
             self._not_confirmed()
             self._is_checking = False
             if self._keeps_in_sync and not self.must_not_poll:
                 self._begin_resync(now, None)
-
-    def _is_shift_worthwhile(self, now: float) -> bool:
-        """Return whether reads of the shifted indices are expected to be clearly faster than a download."""
-        changes = self._count_changes
-        if not changes or len({change.added > 0 for change in changes}) > 1:
-            return False  # the order is certain for additions or removals only
-        seconds = self._download_time(now)
-        if self.expects_hash:
-            expected = search_reads_expected(changes)
-            seconds -= SEARCH_ROUNDS * (self._context.round_trip.smoothed or 0.0)
-            is_shown = self._keeps_in_sync and self._table.volatile_known  # the hash then proves the table
-        else:
-            expected = reads_expected(changes)
-            is_shown = self._context.is_ardupilot and self._has_count_changed
-        return is_shown and expected <= SHIFT_TIME_SHARE * self._reads_within(seconds)
-
-    def _download_time(self, now: float) -> float:
-        """Return the expected seconds of a download of the whole table."""
-        may_use_file = self._host.may_use_file
-        wait = FILE_IN_USE_RETRY if may_use_file and self._files.is_in_use(now) else 0.0
-        return wait + self._sync_interval.download_time(may_use_file=may_use_file)
-
-    def _reads_within(self, seconds: float) -> int:
-        """Return how many reads the component serves within a time."""
-        wait = 0.0 if self.expects_hash else READ_BATCH_TIME
-        round_trip = self._context.round_trip.smoothed or 0.0
-        return max(0, int((seconds - round_trip - wait) * self._reads.pace.rate))
-
-    def _begin_shift(self, now: float) -> bool:
-        """Read the shifted indices; return False if the table must be fetched."""
-        table = self._table
-        changes, count = self._count_changes, table.count
-        order = table.previous_order if self.expects_hash else table.followed_order
-        if not (changes and order and count and self._is_shift_worthwhile(now)):
-            return False
-        if len(order) + sum(change.added for change in changes) != count:
-            return False
-        self._shifts += 1
-        shift = self._shift = TableShift(
-            *(self._reads, order, count, changes, now),
-            reads_max=self._reads_within(self._download_time(now)),
-        )
-        self._context.trace(
-            "%s/%s: %s indices shift, they are read", *self._context.target, count - len(order)
-        )
-        if shift.done:
-            self._shift_ended(shift)
-        else:
-            shift.on_done.append(partial(self._shift_ended, shift))
-        return True
-
-    def _shift_ended(self, shift: TableShift) -> None:
-        """Take the table that the reads have shown; fetch it if they have not shown it."""
-        now, names = shift.ended_at, shift.result
-        self._shift = None
-        self._shift_at = now + (now - shift.begun_at)  # they take half of the time at most
-        self._count_changes = None
-        self._context.reschedule()
-        if names is None:
-            self._check_at = now
-            return
-        table = self._table
-        self._host.table_followed(table.settle(names))
-        table.complete = True
-        self._has_count_changed = False
-        if self.expects_hash:
-            read = self._proof_read = self._reads.ask(HASH_CHECK, now)
-            read.on_done.append(partial(self._take_proof, read))
-            return
-        self.synced = True
-        self._settled(now, self._known_at)
-
-    def _take_proof(self, read: Read) -> None:
-        """Take the table that the reads have shown if the hash proves it; otherwise check it as any other."""
-        if self._proof_read is not read:
-            return
-        self._proof_read = None
-        now, table = read.ended_at, self._table
-        announced = None if read.result is None else Announcement.answering(read)
-        is_proven = announced is not None and (
-            HashCheck(table).settle(announced, table.count or 0, needs_proof=True) is not None
-        )
-        if announced is None or not is_proven:
-            self._check_at = now
-            return
-        self.synced = self._changed_only_by_us = True
-        self._known_at = now
-        self._read_unhashed(announced.hash, now)
-        self._settled(now, now)
-
-    @property
-    def _is_shifting(self) -> bool:
-        """Whether the shifted indices are being read, or the table that they have shown is being proven."""
-        return self._shift is not None or self._proof_read is not None
-
-    def _cancel_shift(self) -> None:
-        proof, self._proof_read = self._proof_read, None
-        if proof is not None:
-            self._reads.release(proof)
-        shift, self._shift = self._shift, None
-        if shift is not None:
-            shift.cancel()
-            shift.drop_callbacks()
 
     def _begin_resync(self, now: float, check: Check | None) -> None:
         fetch = self._resync = self._host.begin_fetch(now, refresh=check is not None, check=check)
@@ -752,7 +568,7 @@ class Sync(Machine):
             if isinstance(fetch.error, FileTransferError) and fetch.error.code in BUSY:
                 self._check_at = min(self._check_at, fetch.ended_at + FILE_IN_USE_RETRY)
             elif self._has_count_changed:
-                pause = max(GAP_CHECK_INTERVAL, self._sync_interval.shortest_pause)
+                pause = max(GAP_CHECK_INTERVAL, self._shortest_pause)
                 self._check_at = min(self._check_at, fetch.ended_at + pause)
 
         if fetch.done:

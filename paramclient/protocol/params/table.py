@@ -116,8 +116,6 @@ class Table:
         volatile_known: whether a recomputed hash has proven `volatile`.
         complete: whether the table has a parameter for every index below `count`.
         hash: the PX4 hash by which the vehicle would confirm exactly this table, or None while unknown.
-        previous_order: the names by index of the last complete table, while the count has changed since;
-            empty if they are unknown.
         outdated_indices: names whose index belongs to an earlier count. The vehicle may no longer have them;
             some may have been received again since.
         doubts: how often live values were marked as stale.
@@ -148,7 +146,6 @@ class Table:
         self.volatile_known = False
         self.complete = False
         self._was_complete = False  # before the count changed
-        self.previous_order: tuple[str, ...] = ()
         self.outdated_indices: set[str] = set()
         self.doubts = 0
         self.duplicate_indices: dict[str, frozenset[int]] = {}
@@ -520,10 +517,6 @@ class Table:
         if self.count is not None:
             if self.complete:
                 self._was_complete = True
-                names = self.present()
-                self.previous_order = tuple(map(names.__getitem__, sorted(names)))
-                if len(names) < self.count or self.duplicate_indices:
-                    self.previous_order = ()
             self.complete = False
             self.duplicate_indices.clear()
             for name, compact in self._compact.items():
@@ -540,13 +533,6 @@ class Table:
         }
         return bool(self.outdated_indices)
 
-    @property
-    def followed_order(self) -> tuple[str, ...]:
-        """`previous_order`, if the present value of each of these parameters was received on this link."""
-        compact = self._compact
-        are_live = all(name in compact and trust_of(compact[name]) == LIVE for name in self.previous_order)
-        return self.previous_order if are_live else ()
-
     def place(self, names: Mapping[int, str]) -> None:
         """Set the indices that a download has determined."""
         everything, duplicate_indices = self._compact, self.duplicate_indices
@@ -561,7 +547,6 @@ class Table:
     def settle(self, names: Mapping[int, str]) -> list[Change]:
         """Finish a complete download: set its indices and remove what the vehicle no longer has."""
         self.place(names)
-        self.previous_order = ()
         present = frozenset(names.values())
         removed = [
             name
@@ -618,7 +603,6 @@ class Table:
         self.volatile_known = False
         self.count = None
         self.complete = self._was_complete = False
-        self.previous_order = ()
         return changes
 
     def forget_defaults(self) -> None:

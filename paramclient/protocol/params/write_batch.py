@@ -5,20 +5,15 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Protocol
 
 from paramclient.errors import NoReply, ParamClientError, ValueNotApplied
-from paramclient.model.values import Param, Value, WireValue
-from paramclient.protocol.ftp.param_pck import PackedParam
-from paramclient.protocol.params.upload import ParamUpload, UploadHooks, Uploads
+from paramclient.model.values import Value, WireValue
 from paramclient.protocol.params.writes import SetResult, Write
 from paramclient.protocol.requests.bulk_writes import BulkOutcome, BulkResult, BulkWrites, SetStatus
 from paramclient.protocol.requests.machine import Machine
-from paramclient.protocol.wire import ParamValue
 
 __all__ = [
     "Batch",
@@ -60,27 +55,14 @@ class BatchRules:
     """What a batch needs of its component.
 
     Attributes:
-        begin: begins a write: name, value, time, and whether it is filed (see `Writes.set`).
+        begin: begins a write: name, value, time.
         cancel: cancels a write.
-        committed: records that the vehicle may take the parameter file with the value of a filed write.
-        unfile: continues a filed write with PARAM_SET.
-        receive: processes a PARAM_VALUE of the component.
         is_switch: whether other parameters depend on one with this name.
-        fileable: returns the parameter with this name if its value can be written with the parameter file;
-            None otherwise.
-        may_commit: whether it is still certain which vehicle receives a write.
-        uploads: the component's; None if the values are not to be written as a file.
     """
 
-    begin: Callable[[str, WireValue, float, bool], Write]
+    begin: Callable[[str, WireValue, float], Write]
     cancel: Callable[[Write, float], None]
-    committed: Callable[[Write, float], None]
-    unfile: Callable[[Write, float], None]
-    receive: Callable[[ParamValue, float], None]
     is_switch: Callable[[str], bool]
-    fileable: Callable[[str], Param | None]
-    may_commit: Callable[[], bool]
-    uploads: Uploads | None
 
 
 class WriteBatch(BulkWrites[WireValue, Write, SetOutcome]):
@@ -95,18 +77,11 @@ class WriteBatch(BulkWrites[WireValue, Write, SetOutcome]):
     def __init__(self, pairs: Sequence[tuple[str, WireValue]], rules: BatchRules, begun_at: float) -> None:
         super().__init__(pairs, begun_at)
         self._rules = rules
-        self._upload: ParamUpload | None = None
-        self._unproven: deque[int] = deque()  # numbers of filed writes that go on with PARAM_SET
         self._barrier: int | None = None  # the open write that the next ones wait for
 
     def proceed(self, now: float) -> None:
         """See `BulkWrites.proceed`."""
-        while self._unproven and self._in_flight < self._window.limit:
-            self._rules.unfile(self._open[self._unproven.popleft()], now)
         while self.failure is None and self._waiting and self._may_begin():
-            if not self._open and (filed := self._stage_for_file(now)):
-                self._begin_upload(filed, now)
-                continue
             number = self._waiting.popleft()
             if self._rules.is_switch(self._pairs[number][0]):
                 self._barrier = number
@@ -114,11 +89,11 @@ class WriteBatch(BulkWrites[WireValue, Write, SetOutcome]):
         if not self._open and (self.failure is not None or not self._waiting):
             self._finish(now)
 
-    def _begin(self, number: int, now: float, *, filed: bool = False) -> None:
+    def _begin(self, number: int, now: float) -> None:
         """Begin one write."""
         name, value = self._pairs[number]
         try:
-            write = self._rules.begin(name, value, now, filed)
+            write = self._rules.begin(name, value, now)
         except ParamClientError as error:
             if self._barrier == number:
                 self._barrier = None
@@ -127,90 +102,6 @@ class WriteBatch(BulkWrites[WireValue, Write, SetOutcome]):
         if not write.done:
             write.on_acknowledged.append(self._acknowledged)
         self._follow(number, write)
-
-    # by one file
-
-    def _stage_for_file(self, now: float) -> list[int]:
-        """Return the pairs up to the next switch that are to be written as one file; none for PARAM_SET."""
-        uploads = self._rules.uploads
-        if uploads is None or not uploads.is_served(now):
-            return []
-        numbers: list[int] = []
-        params: list[Param] = []
-        names = set()
-        for number in self._waiting:
-            name = self._pairs[number][0]
-            if self._rules.is_switch(name):
-                break
-            param = self._rules.fileable(name)
-            if param is not None and param.name not in names:
-                numbers.append(number)
-                params.append(param)
-            elif param is not None:
-                break  # the values of one name follow each other
-            if param is not None:
-                names.add(param.name)
-        return numbers if uploads.is_quicker(params) else []
-
-    def _begin_upload(self, numbers: Sequence[int], now: float) -> None:
-        """Begin the writes of these pairs, and write their values as one file."""
-        filed = frozenset(numbers)
-        self._waiting = deque(number for number in self._waiting if number not in filed)
-        entries: dict[str, PackedParam] = {}
-        for number in numbers:
-            self._begin(number, now, filed=True)
-            write = self._open.get(number)
-            if write is not None and write.filed_as is not None:
-                entries[write.name] = write.filed_as
-        if not entries:
-            return
-        uploads = self._rules.uploads
-        assert uploads is not None
-        hooks = UploadHooks(self._commit, self._rules.receive)
-        upload = self._upload = uploads.begin(entries, hooks, now)
-        if upload.done:
-            self._upload_ended(upload)
-        else:
-            upload.on_done.append(partial(self._upload_ended, upload))
-
-    def _commit(self, now: float) -> bool:
-        """Record that the vehicle may take the file, if that is still the vehicle."""
-        if not self._rules.may_commit() or self.failure is not None:
-            return False
-        for write in self._open.values():
-            if write.is_filed:
-                self._rules.committed(write, now)
-        return True
-
-    def _upload_ended(self, upload: ParamUpload) -> None:
-        """Continue with PARAM_SET what the file has not proven."""
-        self._upload = None
-        self._unproven.extend(number for number, write in self._open.items() if write.is_filed)
-        self.proceed(upload.ended_at)
-
-    def _cancel_upload(self, now: float) -> None:
-        upload, self._upload = self._upload, None
-        self._unproven.clear()
-        if upload is not None:
-            upload.cancel(now)
-
-    # the end
-
-    def interrupt(self, error: ParamClientError, now: float) -> None:
-        """Begin no further write and end an upload; `Writes` ends the open writes."""
-        super().interrupt(error, now)
-        self._cancel_upload(now)
-
-    def give_up(self, error: ParamClientError, now: float) -> None:
-        """See `BulkWrites.give_up`."""
-        if not self.done:
-            self._cancel_upload(now)
-        super().give_up(error, now)
-
-    def discard(self, now: float) -> None:
-        """See `BulkWrites.discard`."""
-        self._cancel_upload(now)
-        super().discard(now)
 
     def _cancel_write(self, write: Write, now: float) -> None:
         write.on_acknowledged.clear()
@@ -226,7 +117,7 @@ class WriteBatch(BulkWrites[WireValue, Write, SetOutcome]):
     @property
     def _in_flight(self) -> int:
         """PARAM_SETs that are not acknowledged."""
-        return sum(write.acknowledged is None and not write.is_filed for write in self._open.values())
+        return sum(write.acknowledged is None for write in self._open.values())
 
     def _acknowledged(self, now: float) -> None:
         """Begin further writes while the value of one is watched."""
@@ -234,11 +125,10 @@ class WriteBatch(BulkWrites[WireValue, Write, SetOutcome]):
         self.proceed(now)
 
     def _ended(self, number: int, write: Write) -> None:
-        if write.result is not None and write.acknowledged is None and not write.is_filed:
+        if write.result is not None and write.acknowledged is None:
             self._window.acknowledged()
         self._take(number, write)
-        if self._upload is None or not write.is_filed:
-            self.proceed(write.ended_at)
+        self.proceed(write.ended_at)
 
     def _take(self, number: int, write: Write) -> None:
         """Record the outcome of a write that has ended."""
@@ -280,11 +170,9 @@ class WriteBatches(Machine):
     """The batches of writes to one component, of plain or of extended parameters.
 
     As many writes are in flight as `WriteWindow` permits, in the order of the request: the writes to one name
-    follow each other, and a write that other parameters depend on is alone. Between two of these, many values
-    for ArduPilot are written as one file if that should be quicker (see `Uploads`). A value that the file
-    does not prove is then sent by PARAM_SET, whose outcome counts. A write that fails does not stop the
-    others, unless the component is lost, the link fails, or `UNANSWERED_WRITES_MAX` writes in a row get no
-    response.
+    follow each other, and a write that other parameters depend on is alone. A write that fails does not stop
+    the others, unless the component is lost, the link fails, or `UNANSWERED_WRITES_MAX` writes in a row get
+    no response.
 
     Args:
         target: system and component.

@@ -26,7 +26,6 @@ from paramclient.model.values import (
     format_value,
     type_name,
 )
-from paramclient.protocol.ftp.param_pck import PackedParam
 from paramclient.protocol.params.change_origin import by_us
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.small_changes import note_on_small_change
@@ -51,7 +50,7 @@ class SetResult:
             of PX4 change values up to 1.1 s later, which is seen while the value is watched).
         requested: the requested value: a number, or bytes if bytes were requested.
         param: the parameter as it is now.
-        attempts: PARAM_SETs sent; a parameter file with the value counts as one.
+        attempts: PARAM_SETs sent.
         note: a further sentence: PX4 does not save a change as small as this one.
     """
 
@@ -86,8 +85,6 @@ class Write(Operation[SetResult]):
         request: its attempts.
         settle: seconds from the acknowledgement until the value is read once more.
         is_forced: whether a value that the vehicle cannot store is sent anyway.
-        is_filed: whether the value is written with the parameter file. Meanwhile no PARAM_SET is sent, and
-            only the requested value counts.
         acknowledged: the result so far, while the value is watched for `settle` seconds.
         on_acknowledged: called with the time when that begins.
     """
@@ -102,7 +99,6 @@ class Write(Operation[SetResult]):
         *,
         settle: float = 0.0,
         is_forced: bool = False,
-        is_filed: bool = False,
     ) -> None:
         super().__init__(begun_at)
         self.name = name
@@ -110,7 +106,6 @@ class Write(Operation[SetResult]):
         self.by = by_us(author)
         self.settle = settle
         self.is_forced = is_forced
-        self.is_filed = is_filed
         self.acknowledged: SetResult | None = None
         self.on_acknowledged: list[Callable[[float], None]] = []
         self.request = WriteAttempts(policy)
@@ -124,16 +119,8 @@ class Write(Operation[SetResult]):
         self.was_retyped = False
 
     @property
-    def filed_as(self) -> PackedParam | None:
-        """The entry of a parameter file that sets what its PARAM_SET would set; None where it cannot."""
-        wanted = self.wanted
-        if not self.is_filed or wanted is None or not isinstance(wanted.type_number, ParamType):
-            return None
-        return PackedParam(wanted.name, wanted.type_number, wanted.bits)
-
-    @property
     def attempts(self) -> int:
-        """PARAM_SETs sent; a parameter file with the value counts as one."""
+        """PARAM_SETs sent."""
         return self.request.count
 
 
@@ -219,17 +206,9 @@ class Writes(Machine):
         *,
         settle: float = 0.0,
         force: bool = False,
-        filed: bool = False,
     ) -> Write:
-        """Begin a write, after the open ones to the same name.
-
-        With `filed`, which needs a live type and no open write to the name, nothing is sent: the caller
-        writes the value with the parameter file, and reports that with `committed` and with PARAM_VALUEs, or
-        gives it up with `unfile`.
-        """
-        write = Write(
-            *(name, value, self._retry_policy, now, author), settle=settle, is_forced=force, is_filed=filed
-        )
+        """Begin a write, after the open ones to the same name."""
+        write = Write(name, value, self._retry_policy, now, author, settle=settle, is_forced=force)
         self.begun += 1
         queue = self.queues.setdefault(name, deque())
         queue.append(write)
@@ -261,23 +240,11 @@ class Writes(Machine):
         else:
             queue.remove(write)
 
-    def committed(self, write: Write, now: float) -> None:
-        """Record that the vehicle may take the parameter file with the value of a filed write."""
-        write.request.sent(now)
-
-    def unfile(self, write: Write, now: float) -> None:
-        """Continue a filed write with PARAM_SET: the parameter file does not prove its value."""
-        write.is_filed = False
-        if write.attempts:
-            self._transmit(write, now)
-        else:
-            self._start(write, now)
-
     def proceed(self, now: float) -> None:
         """Begin the writes that waited for the permission."""
         self.is_awaiting_permission = False
         for queue in list(self.queues.values()):
-            if queue and not queue[0].attempts and queue[0].read is None and not queue[0].is_filed:
+            if queue and not queue[0].attempts and queue[0].read is None:
                 self._start(queue[0], now)
 
     def wants(self, message: ParamValue) -> bool:
@@ -295,10 +262,7 @@ class Writes(Machine):
             return
         value, bits = decode_value(message.raw, message.param_type, self._table.encoding)
         received = Param(write.name, value, message.param_type, None, bits)
-        if write.is_filed:
-            if write.wanted is not None and write.wanted.same_value(received):
-                self._succeed(write, now)
-        elif message.param_type != write.number:
+        if message.param_type != write.number:
             if write.was_retyped:
                 reported = type_name(received.type_number)
                 words = f"it is written as {type_name(write.number)} and reported as {reported}"
@@ -321,14 +285,14 @@ class Writes(Machine):
         If it has the requested value, the parameter is read at `until` to decide.
         """
         write = self._active(message.param_id)
-        if write is not None and write.read is None and not write.is_filed and self.wants(message):
+        if write is not None and write.read is None and self.wants(message):
             write.is_answered = True
             write.verify_at = min(write.verify_at, until)
 
     def refused(self, message: ParamError, now: float) -> bool:
         """Process a PARAM_ERROR and return whether it ended a write."""
         write = self._active(message.param_id) if message.param_index < 0 or message.param_id else None
-        if write is None or write.is_filed:
+        if write is None:
             return False
         self._fail(write, self._reads.error_of(message, write.name), now)
         return True
@@ -336,7 +300,7 @@ class Writes(Machine):
     def denied(self, name: str, now: float) -> None:
         """Process ArduPilot's STATUSTEXT that a write to this name was denied."""
         write = self._active(name)
-        if write is not None and not write.is_filed:
+        if write is not None:
             message = ParamError(0, 0, name, -1, ParamErrorCode.READ_ONLY)
             self._fail(write, self._reads.error_of(message, name), now)
 
@@ -408,19 +372,14 @@ class Writes(Machine):
 
     @staticmethod
     def _awaits_answer(write: Write) -> bool:
-        is_sent = write.attempts > 0 and not write.is_filed
-        return is_sent and write.acknowledged is None and write.read is None
+        return write.attempts > 0 and write.acknowledged is None and write.read is None
 
     def _start(self, write: Write, now: float) -> None:
         known = self._params.get(write.name)
         if not self._permission.may_be_written:
             self.is_awaiting_permission = True
             return
-        if write.is_filed:
-            assert known is not None
-            write.before, write.number = known, known.type_number
-            self._prepare(write, now)
-        elif known is not None and known.trust is not Trust.CACHED:
+        if known is not None and known.trust is not Trust.CACHED:
             self._begin(write, known, now)
         else:
             self._read(write, now)

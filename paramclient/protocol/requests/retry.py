@@ -9,8 +9,7 @@ this order:
   nothing was received for 20 s.
 - PARAM_SET: `WriteAttempts`. PARAM_EXT_SET: `ExtWriteAttempts`.
 - COMMAND_LONG: `CommandAttempts`. MAV_CMD_REQUEST_MESSAGE: `MessageAttempts`, `VersionAttempts`.
-- PARAM_REQUEST_READ, PARAM_EXT_REQUEST_READ: `ReadAttempts`, `ReadRetries`. The search for names:
-  `NameRetries`.
+- PARAM_REQUEST_READ, PARAM_EXT_REQUEST_READ: `ReadAttempts`, `ReadRetries`.
 - PARAM_REQUEST_LIST: `ListAttempts`. PARAM_EXT_REQUEST_LIST: `ExtListAttempts`.
 - MAVFTP: `FileAttempts`. The blocks of a file: `BurstAttempts`, `BlockRetries`. The parameter file:
   `OpenRetries`.
@@ -31,7 +30,6 @@ from paramclient.protocol.requests.round_trip import SAMPLE_WEIGHT, RoundTrip
 __all__ = [
     "BASELINE_DELAY",
     "CLOCK_FOLLOW_DELAY",
-    "COMMIT_COPIES",
     "COUNT_CHANGES_MAX",
     "EMPTY_LISTS_MAX",
     "FETCH_RESTARTS_MAX",
@@ -62,7 +60,6 @@ __all__ = [
     "FileAttempts",
     "ListAttempts",
     "MessageAttempts",
-    "NameRetries",
     "OpenRetries",
     "ReadAttempts",
     "ReadRetries",
@@ -780,89 +777,6 @@ class ReadRetries:
         return (1.0 - answered) ** attempts < DEAD_INDEX_RISK
 
 
-# the search for names
-
-LOOKUP_TIME: Final = 0.01
-"""Seconds that ArduPilot takes to look up one request, at most: its simulation does so about every 5 ms
-(measured), boards every 1 ms. A request for an unknown parameter takes no longer."""
-NAME_LOSS_RISK: Final = 1e-6
-"""The probability that all requests of one name were lost, at the highest loss that the observations allow,
-below which the name counts as unknown."""
-NAME_LOSS_RISK_CLEAN: Final = 1e-3
-"""The same while nothing at all was lost: the link is then much better than that loss."""
-PASSES_MIN: Final = 2
-"""Unanswered requests of one name, at least, before the name counts as unknown."""
-CONTROL_RISK: Final = 0.01
-"""The probability of losing all controls of a window below which no further control is added."""
-CONTROLS_MAX: Final = 4
-"""Control reads of one window, at most."""
-CONTROLS_LOST_MAX: Final = 3
-"""Windows in a row without an answer to their control, after which the search gives up."""
-
-
-class NameRetries:
-    """The windows of PARAM_REQUEST_READs of a search for names, each with its control reads.
-
-    Attributes:
-        sent_at: when the present window was sent.
-        received_at: when the last name of it was answered.
-    """
-
-    def __init__(self, policy: RetryPolicy) -> None:
-        self._policy = policy
-        self._controls_lost = 0
-        self.sent_at = self.received_at = -math.inf
-
-    def restart(self) -> None:
-        """Begin again, with another search or another link."""
-        self._controls_lost = 0
-
-    def name_answered(self, passes: int, now: float) -> None:
-        """Record the response to a name after this many silent requests: those were lost, as it exists."""
-        for _ in range(passes):
-            self._policy.timed_out(1)
-        self._policy.answered(self.sent_at, now, 2)
-        self.received_at = now
-
-    def control_answered(self, now: float) -> None:
-        """Record the response to a control read."""
-        is_sure = self.received_at <= self.sent_at  # otherwise the vehicle may have served names first
-        self._policy.answered(self.sent_at, now, 1 if is_sure else 2)
-        self._controls_lost = 0
-
-    def control_timed_out(self) -> None:
-        """Record that the control reads of a window count as lost."""
-        self._policy.timed_out(1)
-        self._controls_lost += 1
-
-    @property
-    def should_give_up(self) -> bool:
-        """Whether the search is to be given up."""
-        return self._controls_lost >= CONTROLS_LOST_MAX
-
-    @property
-    def passes_max(self) -> int:
-        """Silent requests of one name after which the name counts as unknown."""
-        trip = self._policy.round_trip
-        risk = NAME_LOSS_RISK if trip.seen_loss else NAME_LOSS_RISK_CLEAN
-        return max(PASSES_MIN, math.ceil(math.log(risk) / math.log(trip.feared_loss)))
-
-    @property
-    def controls(self) -> int:
-        """Control reads of one window."""
-        return self._policy.copies(CONTROL_RISK, CONTROLS_MAX)
-
-    def due_at(self, names: int, *, is_batched: bool) -> float:
-        """Return when the control reads count as lost.
-
-        Args:
-            names: silent names of the window.
-            is_batched: whether the component serves reads in batches: the next one cannot begin before.
-        """
-        serving = BATCH_INTERVAL + LOOKUP_TIME * names if is_batched else 0.0
-        return max(self.sent_at, self.received_at) + self._policy.timeout + serving
-
-
 # PARAM_REQUEST_LIST
 
 LIST_TIMEOUT: Final = 20.0
@@ -1067,9 +981,6 @@ UNANSWERED_ATTEMPTS_MAX: Final = 16
 all of them are lost once in 700 times."""
 UNANSWERED_ATTEMPTS_WITHOUT_BACKOFF: Final = 2
 """Requests without backoff to a server that has not responded yet."""
-COMMIT_COPIES: Final = 2
-"""Requests of each kind that are sent at once at the end of an uploaded param.pck: they are short, and if all
-that write the header are lost, the whole file was in vain."""
 SLOW_ATTEMPTS_WITHOUT_BACKOFF: Final = 4
 """Requests without backoff on which the server works for long: the first ones may only be lost."""
 SLOW_ATTEMPTS_MIN: Final = 9

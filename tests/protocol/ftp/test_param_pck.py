@@ -19,9 +19,7 @@ from paramclient.protocol.ftp.param_pck import (
     Pack,
     PackedParam,
     decode,
-    decode_upload,
     encode,
-    encode_upload,
 )
 from paramclient.sim import ardupilot_table
 from tests.recordings import DATA
@@ -199,37 +197,6 @@ class TestTheFormat:
             encode([A], total=total)
 
 
-class TestTheUpload:
-    def test_its_header_gives_the_length_of_the_file(self) -> None:
-        data = encode_upload([A, B])
-        assert data == b"\x1b\x67\x02\x00" + struct.pack("<H", len(data)) + encode([A, B])[6:]
-        assert decode_upload(data) == (A, B._replace(default=None))
-
-    def test_an_upload_has_no_padding(self) -> None:
-        entries = [each for each in decode(PLAIN).entries if each.type is not ParamType.INT8]
-        data = encode_upload(entries)
-        assert len(data) < len(encode(entries))
-        assert decode_upload(data) == tuple(entries)
-
-    @pytest.mark.parametrize(
-        ("data", "words"),
-        [
-            (encode_upload([A])[:-1], "bytes of a file of"),
-            (encode([A]), "bytes of a file of"),
-            (encode([A], with_defaults=True), "does not begin with 0x671c"),
-            (b"\x1b", "cut off in its header"),
-        ],
-    )
-    def test_an_upload_that_is_no_param_pck_is_an_error(self, data: bytes, words: str) -> None:
-        with pytest.raises(PackError, match=words):
-            decode_upload(data)
-
-    def test_an_upload_above_the_size_of_the_header_is_refused(self) -> None:
-        rows = [PackedParam(f"{number:016d}"[::-1], ParamType.INT32, 0) for number in range(4000)]
-        with pytest.raises(UsageError, match="65535"):
-            encode_upload(rows)
-
-
 names = st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=1, max_size=16)
 
 
@@ -254,18 +221,11 @@ def test_an_encoded_file_decodes_to_the_same_entries(
     assert decode(data) == Pack(tuple(kept), len(rows) + more, with_defaults)
 
 
-@busy
-@given(tables)
-def test_an_encoded_upload_decodes_to_the_same_entries(rows: list[PackedParam]) -> None:
-    assert decode_upload(encode_upload(rows)) == tuple(each._replace(default=None) for each in rows)
-
-
 @given(st.binary(max_size=200) | st.builds(lambda tail: PLAIN[:6] + tail, st.binary(max_size=200)))
 @example(b"\x1b\x67\xff\xff\xff\xff")
 def test_any_bytes_are_a_table_or_none(data: bytes) -> None:
-    for read in (decode, decode_upload):
-        with suppress(PackError):
-            read(data)
+    with suppress(PackError):
+        decode(data)
 
 
 @given(st.data())

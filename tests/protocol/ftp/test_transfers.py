@@ -18,7 +18,6 @@ from paramclient.protocol import wire
 from paramclient.protocol.ftp import DirectoryEntry, FileRead, FileTransfers, FileWrite, param_pck
 from paramclient.protocol.ftp.file_read import WINDOW_MIN
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
-from paramclient.protocol.ftp.param_pck import PackedParam
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.retry import (
@@ -1329,89 +1328,6 @@ def test_a_transfer_ends_whatever_packets_the_server_sends(junk: list[Packet], w
     assert desk.transfers.is_idle
 
 
-class TestWritingAtOnce:
-    """A file of a header and four blocks, written with its header last."""
-
-    def begin(self, desk: Desk, *, may_commit: bool = True) -> Operation[None]:
-        job = desk.transfers.write_whole(
-            PARAMS, bytes(range(14)), desk.now, may_commit=lambda now: may_commit, write_size=2
-        )
-        desk.answer(desk.next(Opcode.CREATE_FILE))
-        return job
-
-    def test_four_blocks_are_in_flight_and_the_header_ends_the_file(self) -> None:
-        desk = Desk()
-        job = self.begin(desk)
-        blocks = desk.take()
-        assert [packet.offset for packet in blocks] == [6, 8, 10, 12]
-        assert {packet.opcode for packet in blocks} == {Opcode.WRITE_FILE}
-        for block in blocks[:3]:
-            desk.answer(block)
-            assert desk.take() == []
-        desk.answer(blocks[3])
-        first, again, end, _ = desk.take()
-        assert first == again
-        assert (first.opcode, first.offset, first.data) == (Opcode.WRITE_FILE, 0, bytes(range(6)))
-        assert end.opcode == Opcode.TERMINATE_SESSION
-        desk.answer(first)
-        assert not desk.transfers.is_idle
-        desk.answer(end)
-        assert job.done
-        assert job.error is None
-
-    def test_a_block_that_a_later_one_has_overtaken_is_sent_again_at_once(self) -> None:
-        desk = Desk()
-        self.begin(desk)
-        _, second, *_ = desk.take()
-        desk.answer(second)
-        assert desk.next(Opcode.WRITE_FILE).offset == 6
-
-    def test_nothing_ends_the_file_while_a_block_is_missing(self) -> None:
-        desk = Desk()
-        self.begin(desk)
-        for block in desk.take()[1:]:
-            desk.answer(block)
-        desk.pass_time(0.5)
-        assert {packet.offset for packet in desk.take()} == {6}
-
-    def test_a_block_that_is_never_acknowledged_ends_the_write_without_its_beginning(self) -> None:
-        desk = Desk()
-        job = self.begin(desk)
-        sent: list[Packet] = []
-        while not job.done:
-            sent += desk.take()
-            desk.pass_time(1.0)
-        assert isinstance(job.error, NoReply)
-        assert 0 not in {packet.offset for packet in sent if packet.opcode == Opcode.WRITE_FILE}
-        assert desk.take()[-1].opcode == Opcode.TERMINATE_SESSION
-
-    def test_a_write_that_may_not_be_committed_is_closed_without_its_beginning(self) -> None:
-        desk = Desk()
-        job = self.begin(desk, may_commit=False)
-        for block in desk.take():
-            desk.answer(block)
-        desk.answer(desk.next(Opcode.TERMINATE_SESSION))
-        assert isinstance(job.error, UsageError)
-
-    def test_the_beginning_is_repeated_with_the_end_until_it_is_acknowledged(self) -> None:
-        desk = Desk()
-        job = self.begin(desk)
-        for block in desk.take():
-            desk.answer(block)
-        first, *_ = desk.take()
-        desk.pass_time(1.1)
-        again = [packet.opcode for packet in desk.take()]
-        assert Opcode.WRITE_FILE in again
-        assert Opcode.TERMINATE_SESSION in again
-        desk.answer(first)
-        desk.pass_time(1.1)
-        later = desk.take()
-        assert {packet.opcode for packet in later} == {Opcode.TERMINATE_SESSION}
-        desk.answer(later[0])
-        assert job.error is None
-        assert job.done
-
-
 @pytest.mark.parametrize("round_trip", [0.1, 3.0, 8.0])
 def test_a_server_that_has_died_at_work_is_given_up_after_a_minute(round_trip: float) -> None:
     """The autopilot is still heard, and packet loss would explain 60 unanswered requests."""
@@ -1435,23 +1351,6 @@ def test_a_server_that_has_died_at_work_is_given_up_after_a_minute(round_trip: f
     assert SLOW_TIME_MAX <= desk.now - began <= SLOW_TIME_MAX + max(TIMEOUT_MAX, desk.retry.timeout)
     assert ATTEMPTS_MIN <= len(sent) <= desk.retry.tries
     assert max(after - before for before, after in pairwise(sent)) <= max(TIMEOUT_MAX, desk.retry.timeout)
-
-
-def test_checksums_are_requested_in_parallel() -> None:
-    desk = Desk()
-    job = desk.transfers.checksums(["a", "b", "c", "d", "e"], desk.now)
-    requests = desk.take()
-    assert [packet.data for packet in requests] == [b"a", b"b", b"c", b"d"]
-    desk.answer(requests[1], (7).to_bytes(4, "little"))
-    last = desk.next(Opcode.CALC_FILE_CRC32)
-    assert last.data == b"e"
-    for request in (last, requests[3], requests[0]):
-        desk.answer(request, (9).to_bytes(4, "little"))
-    assert not desk.transfers.is_idle
-    desk.answer(requests[2], code=FileErrorCode.FILE_NOT_FOUND)
-    assert job.result == (9, 7, None, 9, 9)
-    with pytest.raises(UsageError, match="no file"):
-        desk.transfers.checksums([], desk.now)
 
 
 # Whole transfers
@@ -1663,27 +1562,6 @@ class TestOnTheAir:
         names = [f"d/{entry.name}" for entry in entries or ()]
         assert names == sorted(vehicle.files)
         assert ground.outcome(ground.transfers.checksum("d/new", ground.now)) == crc32_px4(content)
-        ground.settle()
-
-    def test_parameters_are_written(self) -> None:
-        vehicle = ardupilot()
-        ground = Ground(vehicle, loss=0.2, delay=0.05, seed=1)
-        rows = [
-            PackedParam(name, ParamType.INT32, 5)
-            for name, param in vehicle.params.items()
-            if param.type == ParamType.INT32 and not name.startswith("BARO")  # BARO*_DEVID are read-only
-        ]
-        ground.outcome(ground.transfers.write(PARAMS, param_pck.encode_upload(rows), ground.now))
-        assert {vehicle.param(row.name).value for row in rows} == {5}
-        ground.settle()
-
-    def test_a_damaged_parameter_file_is_taken_without_a_word(self) -> None:
-        vehicle = ardupilot()
-        ground = Ground(vehicle)
-        before = vehicle.param("RTL_ALT")
-        damaged = param_pck.encode_upload([PackedParam("RTL_ALT", ParamType.INT16, 5)]) + b"x"
-        ground.outcome(ground.transfers.write(PARAMS, damaged, ground.now))
-        assert vehicle.param("RTL_ALT") == before
         ground.settle()
 
     def test_a_value_that_changes_meanwhile_is_the_old_or_the_new_one(self) -> None:

@@ -166,7 +166,6 @@ def test_two_autopilots_under_one_address_are_contested_at_once() -> None:
         lambda: net.machine.read("P", net.now),
         lambda: net.machine.begin_fetch(net.now),
         lambda: net.machine.begin_reboot(net.now),
-        lambda: net.machine.search(["P"], net.now),
         lambda: net.machine.check_present("a file", net.now),
     ):
         with pytest.raises(ContestedAddress, match="is contested"):

@@ -11,7 +11,6 @@ from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentRebooted, Event, EventMaker
-from paramclient.protocol.params.boot_values import MEASURING_TIME, MEASURING_UPTIME_MAX
 from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.retry import (
@@ -316,82 +315,6 @@ def test_numbers_prove_nothing_while_a_clock_goes_on() -> None:
     assert desk.reboots == 0
     desk.machine.end_reboot(restart, desk.now)
     assert desk.machine.boot_time_requests.next_deadline() == math.inf
-
-
-# values that are measured at each start
-
-
-def test_values_measured_at_each_start_are_read_again_after_a_reboot() -> None:
-    desk = Desk()
-    measured = {"INS_GYR1_CALTEMP", "BARO1_GND_PRESS", "ARSPD_OFFSET", "RC1_DZ"}
-    for name in (*sorted(measured), "ATC_RAT_RLL_P", "INS_TCAL1_TMIN"):
-        desk.value(name)
-    desk.run_connected(100.0)
-    desk.hear(SystemTime(0, 2_000))
-    assert desk.reboots == 1
-    desk.hear(AutopilotVersion(0, uid=7))
-    desk.take()
-    desk.run(100.0 + MEASURING_TIME - 0.1)
-    assert desk.names_read() == set()
-    desk.run(100.0 + MEASURING_TIME)
-    assert desk.names_read() == measured
-    for name in measured:
-        desk.value(name, 2.0)
-    desk.run(120.0)
-    assert desk.names_read() == set()
-    assert desk.machine.table.params["BARO1_GND_PRESS"].value == 2.0
-
-
-def test_boot_values_are_read_after_a_set_up() -> None:
-    desk = Desk()
-    desk.value("BARO1_GND_PRESS")
-    desk.run_connected(100.0)
-    desk.hear(SystemTime(0, 2_000))
-    desk.hear(AutopilotVersion(0, uid=7))
-    desk.machine.sync.hold()
-    desk.run_connected(110.0)
-    assert desk.names_read() == set()
-    desk.machine.sync.release()
-    desk.run(110.2)
-    assert desk.names_read() == {"BARO1_GND_PRESS"}
-
-
-def test_measuring_counts_from_the_first_clock() -> None:
-    """A restart that shows in the heartbeat is noticed before the main loop runs."""
-    desk = Desk()
-    desk.value("BARO1_GND_PRESS")
-    desk.run_connected(100.0)
-    desk.hear(Heartbeat(2, MAV_AUTOPILOT_ARDUPILOTMEGA, system_status=wire.MAV_STATE_BOOT))
-    assert desk.reboots == 1
-    desk.hear(AutopilotVersion(0, uid=7))
-    desk.run(102.0)
-    desk.hear(SystemTime(0, 2_000))
-    desk.take()
-    desk.run(102.0 + MEASURING_TIME - 0.1)
-    assert desk.names_read() == set()
-    desk.run(102.0 + MEASURING_TIME)
-    assert desk.names_read() == {"BARO1_GND_PRESS"}
-
-
-@pytest.mark.parametrize(
-    ("uptime", "is_young"), [(MEASURING_UPTIME_MAX - 1.0, True), (MEASURING_UPTIME_MAX + 1.0, False)]
-)
-def test_a_vehicle_that_is_met_soon_after_its_start(uptime: float, is_young: bool) -> None:
-    desk = Desk(uptime=int(1000 * uptime))
-    desk.value("BARO1_GND_PRESS")
-    desk.run(MEASURING_TIME + 0.1)
-    assert desk.names_read() == ({"BARO1_GND_PRESS"} if is_young else set())
-
-
-@pytest.mark.parametrize("desk", [Desk(interval=math.inf), Desk(PX4)], ids=["no sync_settings", "a hash"])
-def test_boot_values_are_not_read_where_that_is_not_allowed_or_needed(desk: Desk) -> None:
-    desk.value("BARO1_GND_PRESS")
-    desk.run_connected(100.0)
-    desk.hear(SystemTime(0, 2_000))
-    desk.hear(AutopilotVersion(0, uid=7))
-    desk.take()
-    desk.run(110.0)
-    assert "BARO1_GND_PRESS" not in desk.names_read()
 
 
 # telemetry
