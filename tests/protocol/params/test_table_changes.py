@@ -20,6 +20,7 @@ TABLE = {
     **{f"Z{number:02d}": (ParamType.INT32, number) for number in range(20)},
 }
 
+
 def vehicle(*, ftp: bool = True) -> ArduPilotVehicle:
     return ArduPilotVehicle(table=TABLE, groups={"GRIP_ENABLE": GROUP}, live=(), ftp=ftp)
 
