@@ -168,13 +168,12 @@ class _Import:
             params=len(machine.table.params) + len(machine.ext.table.params),
             complete=complete,
             hash=machine.table.hash if machine.table.complete else None,
-            notes=machine.fetches.notes,
         )
 
 
 def _has_content(machine: ComponentMachine) -> bool:
     """Return whether the log has parameters of a component, or something to say of them."""
-    return bool(machine.table.params or machine.ext.table.params or machine.fetches.notes)
+    return bool(machine.table.params or machine.ext.table.params)
 
 
 class _LogWriter(CacheWriter):

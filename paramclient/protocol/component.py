@@ -34,7 +34,6 @@ from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch import Check, Fetch
 from paramclient.protocol.params.fetch_queue import Fetches
 from paramclient.protocol.params.fetch_result import FetchContext, FetchResult, Policy, Sampled
-from paramclient.protocol.params.foreign_list import ForeignList
 from paramclient.protocol.params.reads import Key, Read, Reads
 from paramclient.protocol.params.sync import ComponentState, Sync, SyncSettings, SyncState
 from paramclient.protocol.params.table import NameQuota, Table
@@ -157,7 +156,6 @@ class ComponentMachine:
         round_trip: round-trip time and loss of its responses.
         presence: whether its messages are received.
         peers: the peers that send with its address, and whether several vehicles do.
-        foreign_list: the list that another station has requested, while none of ours runs.
         sync: whether the table still matches the vehicle's.
         files: its files over MAVFTP.
         metadata_requests: the location of its metadata.
@@ -241,7 +239,6 @@ class ComponentMachine:
             self.boot_time_requests,
             self._reboot_noticed,
         )
-        self.foreign_list = ForeignList()
         fetch_context = FetchContext(
             context,
             self.reads,
@@ -250,7 +247,6 @@ class ComponentMachine:
             self.files,
             changed=self._fetch_changed,
             doubt=self._doubt_identity,
-            foreign_list=self.foreign_list,
         )
         self.fetches = Fetches(fetch_context, self.sync, sync_settings, ended=self._fetched)
         # without requests there are no reads: the lists of other stations take their place
@@ -448,8 +444,6 @@ class ComponentMachine:
             elif state not in (None, message.system_status):
                 self.boot_time_requests.want(now)
             self.rereads.forget_old(now)
-            if self.fetches.passive_table is not None:
-                self.fetches.passive_table.file.tick(now)  # in a log the time advances with messages only
         elif isinstance(message, AutopilotVersion):
             before = self.identification.firmware
             if self.identification.version(message, now):
@@ -477,8 +471,6 @@ class ComponentMachine:
             self._receive_clock(self.presence.system_time(message, now), now)
         elif isinstance(message, FileTransfer):
             self.files.receive(message, now)
-            if self.fetches.passive_table is not None:
-                self.fetches.passive_table.file.receive_reply(message, now)
         elif isinstance(message, ComponentMetadata):
             self.metadata_requests.receive(message, now)
         elif isinstance(message, HighLatency2):
@@ -566,8 +558,6 @@ class ComponentMachine:
         fetch = self.fetches.current
         if fetch is not None:
             fetch.receive(message, now)
-        elif not self.reads.awaits(message):
-            self.foreign_list.receive(message, now)
         if writes.queues:
             writes.receive(message, now)
         self._receive_read(message, now)
@@ -590,7 +580,6 @@ class ComponentMachine:
             return
         self.boot_time_requests.want(now)
         if now - silent_since >= NUMBERING_SILENCE and self.fetches.seems_restarted(silent_since, now):
-            self.foreign_list.forget()
             self._doubt()
 
     def _note_replaced(self, change: Change, message: ParamValue, now: float) -> None:
@@ -609,8 +598,6 @@ class ComponentMachine:
         fetch = self.fetches.current
         if fetch is not None:
             fetch.receive(message, now)
-        elif not self.reads.awaits(message):
-            self.foreign_list.receive(message, now)
         self.writes.defer(message, until)
         if self.fetches.passive_table is not None:
             self.fetches.passive_table.receive(message, now)
@@ -628,13 +615,6 @@ class ComponentMachine:
         """Record another station's PARAM_EXT_SET to this component."""
         self.reschedule()
         self.ext.foreign_set(name, station, now)
-
-    def foreign_file_request(self, message: FileTransfer, station: tuple[int, int], now: float) -> None:
-        """Process another station's request for a file of this component."""
-        self.reschedule()
-        self.files.foreign_at = now
-        if self.fetches.passive_table is not None:
-            self.fetches.passive_table.file.receive_request(message, station, now)
 
     def use_cached(
         self,
@@ -1033,7 +1013,6 @@ class ComponentMachine:
         self._observer.replaced(self)
         self.sync.forget()
         self.fetches.forget()
-        self.foreign_list.forget()
         self.ext.forget(now)
         self._checks.clear()
         self._known_as = None
@@ -1113,12 +1092,10 @@ class ComponentMachine:
     def _rebooted(self, now: float, *, by_clock: bool = False) -> None:
         """Process a reboot: unsaved values are lost, and a list starts again."""
         self._observer.rebooted(self)
-        self.fetches.interrupt(now)
         started_at = self.presence.started_at if by_clock else None
         is_of_this_run = started_at is not None and self.fetches.are_since(started_at)
         if not is_of_this_run:
             self._doubt()
-        self.foreign_list.forget()
         self.ext.restart(now)
         self.rereads.clear()
         if self.sync.expects_hash or self.fetch is not None or not is_of_this_run:

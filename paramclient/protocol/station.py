@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Final
@@ -17,7 +16,6 @@ from paramclient.protocol.events import Event, EventMaker
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.params.list_download import present_of
-from paramclient.protocol.params.passive_file import acknowledges_open, opens_parameter_file
 from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.params.table import NameQuota
 from paramclient.protocol.requests.retry import HEARTBEAT_REQUESTS
@@ -76,9 +74,6 @@ STREAM_PEERS_MAX: Final = 256
 """Stream peers with an incomplete frame."""
 SENDERS_MAX: Final = 32
 """Senders that are remembered while no autopilot has been heard, to name them to the user."""
-EARLY_REQUESTS_MAX: Final = 32
-"""Requests for parameter files that are kept for components that are not known yet: a log may begin with the
-read of one."""
 HANDLED_IDS: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 322, 323, 324, 345, 397})
 """The message ids that the core handles: HEARTBEAT, SYSTEM_TIME, PARAM_VALUE, PARAM_SET (of other stations),
 COMMAND_ACK, FILE_TRANSFER_PROTOCOL, AUTOPILOT_VERSION, HIGH_LATENCY2, STATUSTEXT, PARAM_EXT_VALUE,
@@ -171,7 +166,6 @@ class Station:
         self._splits_peers = split_peers
         self._by_vehicle: dict[tuple[int, Peer], list[ComponentMachine]] = {}
         self._name_quota = NameQuota()
-        self._early_requests: deque[tuple[FileTransfer, Address]] = deque(maxlen=EARLY_REQUESTS_MAX)
         self._full_until = -math.inf
         self._awaits_autopilot = not self.listens_only  # none was received yet
         self._heartbeat_requested_at = -math.inf
@@ -260,14 +254,8 @@ class Station:
                 self._receive_foreign_set(message, (frame.system, frame.component), now)
 
     def tick(self, now: float) -> None:
-        """Do what is due: our heartbeat, and the timeouts of components.
-
-        In a log nothing is due except the end of unfinished exchanges of other stations.
-        """
-        if self.is_log:
-            self._tick_log(now)
-            return
-        if self._is_paused:
+        """Do what is due: our heartbeat, and the timeouts of components. In a log nothing is due."""
+        if self.is_log or self._is_paused:
             return
         if self._signer is not None:
             self._signer.advance(now)
@@ -447,7 +435,7 @@ class Station:
         has a table worth resuming, a fetch in progress or a file to serve, and no other list runs.
         """
         is_new = self.scheduler.list_admission.is_free and not any(
-            machine.fetch is not None or machine.foreign_list.is_running(now) for machine in machines
+            machine.fetch is not None for machine in machines
         )
         may_list = self.policy is Policy.AUTO
         is_fresh = refresh or not any(m.can_hit or present_of(m.table, m.reads) for m in machines)
@@ -465,11 +453,6 @@ class Station:
                 self._send(ParamRequestList(system, COMP_ID_ALL), machines[0].address, version)
                 return [machine.begin_fetch(now, refresh=refresh, listed=True) for machine in machines]
         return [machine.begin_fetch(now, refresh=refresh) for machine in machines]
-
-    def _tick_log(self, now: float) -> None:
-        for machine in self.components.values():
-            if machine.fetches.passive_table is not None:
-                machine.fetches.passive_table.file.tick(now)
 
     def _before_decoding(self, data: bytes, peer: Peer, now: float) -> None:
         """Pass received bytes to traffic counts and the search for heartbeats, before they are decoded."""
@@ -592,7 +575,7 @@ class Station:
     ) -> ComponentMachine | None:
         """Add a component on its first message; only messages that show parameters make one."""
         is_sign = isinstance(message, Heartbeat | HighLatency2 | ParamValue | ParamExtValue)
-        if not (is_sign or self._is_awaited_file(message, sender)) or not self._has_capacity(now):
+        if not is_sign or not self._has_capacity(now):
             return None
         system, component = sender
         address = self._key(system, component, peer)
@@ -625,9 +608,6 @@ class Station:
         self.components[address] = machine
         self.scheduler.add(machine)
         self._reporter.discovered(machine)
-        for request, station in self._early_requests:
-            if _is_for(request, sender):
-                machine.foreign_file_request(request, station, now)
         return machine
 
     def _has_capacity(self, now: float) -> bool:
@@ -676,20 +656,12 @@ class Station:
     def _receive_foreign_file_request(self, message: FileTransfer, sender: Address, now: float) -> None:
         """Process a MAVFTP request of another station."""
         target = (message.target_system, message.target_component)
-        if self.listens_only and target not in self.components and opens_parameter_file(message):
-            self._early_requests.append((message, sender))
         machines = (
             self.components.values() if self._splits_peers else self._by_vehicle.get((target[0], None), ())
         )
         for machine in machines:
             if machine.system == target[0] and message.target_component in (machine.component, COMP_ID_ALL):
-                machine.foreign_file_request(message, sender, now)
-
-    def _is_awaited_file(self, message: Message, sender: Address) -> bool:
-        """Return whether an unknown component has opened its parameter file for another station."""
-        if not isinstance(message, FileTransfer) or not acknowledges_open(message):
-            return False
-        return any(_is_for(request, sender) for request, _ in self._early_requests)
+                machine.files.foreign_at = now
 
     def _accepts(self, machine: ComponentMachine, peer: Peer, now: float) -> bool:
         """Return whether to accept a message that cannot distinguish vehicles."""
@@ -734,7 +706,3 @@ class Station:
         self.bytes_sent += len(data)
         self.frames_sent += 1
         self._outbox.append((data, peer))
-
-
-def _is_for(message: FileTransfer, address: Address) -> bool:
-    return message.target_system == address[0] and message.target_component in (address[1], COMP_ID_ALL)

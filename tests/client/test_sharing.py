@@ -18,14 +18,10 @@ from paramclient import ParamCache
 from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.protocol.params.fetch import Fetch
-from paramclient.protocol.params.foreign_list import LIST_VALUES_MIN, ForeignList
-from paramclient.protocol.params.reads import Reads
-from paramclient.protocol.params.table import Table
-from paramclient.protocol.requests.context import Context
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import ParamRequestList
 from paramclient.sim import Air, OtherStation, PX4Vehicle, SimParam, Vehicle
-from tests.simulation import Simulation, listing_ardupilot, param_value
+from tests.simulation import Simulation, listing_ardupilot
 
 Make = Callable[[], Vehicle]
 KINDS: dict[str, Make] = {"px4": PX4Vehicle, "ardupilot": listing_ardupilot}
@@ -80,26 +76,6 @@ class Shared:
         )
 
 
-@pytest.mark.parametrize("later", [0.2, 0.5, 0.8])
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_list_that_another_station_has_requested_is_followed(kind: str, later: float) -> None:
-    def seconds_of_first(with_second: bool) -> float:
-        """When the first one has everything; the second one begins in the middle of its list."""
-        world = Shared(KINDS[kind](), delay=0.01)
-        world.meet()
-        began = world.now
-        first = world.fetch(0)
-        world.run(lambda: world.now >= began + later)
-        fetches = [first, world.fetch(1)] if with_second else [first]
-        ended = world.run(lambda: first.done)
-        world.run(lambda: all(fetch.done for fetch in fetches))
-        assert all(map(world.is_right, fetches))
-        assert world.vehicle.requests["PARAM_REQUEST_LIST"] == 1
-        return ended - began
-
-    assert seconds_of_first(True) == pytest.approx(seconds_of_first(False), abs=0.03)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_two_fetches_of_two_stations_complete_with_packet_loss(kind: str) -> None:
     world = Shared(KINDS[kind](), loss=0.1, delay=0.01)
@@ -135,37 +111,6 @@ def test_a_fetch_reads_what_a_stopped_list_of_another_station_lacks() -> None:
     fetch = world.fetch(1)
     world.run(lambda: fetch.done)
     assert world.is_right(fetch)
-
-
-@pytest.mark.parametrize("ahead", [1, 2])
-def test_single_answers_to_others_are_no_list(ahead: int) -> None:
-    following = ForeignList()
-    for index in range(0, ahead * (LIST_VALUES_MIN - 1), ahead):
-        following.receive(param_value(f"P{index}", index=index, count=500), index * 0.01)
-        assert not following.is_running(index * 0.01)
-
-
-def test_a_list_is_over_at_its_end_and_when_it_falls_quiet() -> None:
-    following = ForeignList()
-    for index in range(20):
-        following.receive(param_value(f"P{index}", index=index, count=21), index * 0.01)
-    assert following.is_running(0.2)
-    assert following.is_running(0.6)  # ArduPilot pauses for up to 400 ms while it answers reads (measured)
-    assert not following.is_running(0.75)
-    reads = Reads(Context((1, 1), lambda message: None), Table())
-    names, count = following.hand_over(reads)
-    assert (len(names), count) == (20, 21)
-    assert reads.pace.gap == pytest.approx(0.01)
-    following.receive(param_value("P20", index=20, count=21), 0.2)
-    assert not following.is_running(0.2)
-
-
-def test_a_list_of_another_count_begins_anew() -> None:
-    following = ForeignList()
-    for index in range(15):
-        following.receive(param_value(f"P{index}", index=index, count=100), index * 0.01)
-    following.receive(param_value("P15", index=15, count=101), 0.15)
-    assert not following.is_running(0.15)
 
 
 PROGRAM = """

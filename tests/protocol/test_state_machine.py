@@ -548,9 +548,7 @@ class Sessions(RuleBasedStateMachine):
 
     def requests_end(self) -> None:
         world = self.world
-        # one value after the other under one name looks like a late answer, which is requested again
-        is_flapping = len(self.vehicle.params) < len(self.vehicle.listed) and world.air.others
-        if self.sync_settings.interval == math.inf and not is_flapping:
+        if self.sync_settings.interval == math.inf:
             world.run(SETTLING)
             world.sent.clear()
             world.run(2 * SETTLING)
@@ -777,9 +775,6 @@ class Sessions(RuleBasedStateMachine):
         if subject is self.subject and self.is_incomplete:
             listed = vehicle.listed
             skipped = {listed[index].name for index in self.misfortunes.dead if index < len(listed)}
-            is_open = self.world.air.others or not self.machine_of(subject).table.duplicate_indices
-            if len(true) < len(listed) and is_open:
-                skipped.add(INTEGERS[0])  # lists that pass by all the time may hide which one is meant
             skipped |= held.keys() - true.keys()
         assert held.keys() - skipped == true.keys() - skipped
         for name in held.keys() - skipped:

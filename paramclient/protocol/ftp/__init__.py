@@ -5,7 +5,6 @@
 `file_write`: the write of a file.
 `packets`: the payload of FILE_TRANSFER_PROTOCOL.
 `param_pck`: the packed parameter file.
-`passive`: files that other stations read.
 `transfer_job`: sessions, retries and errors, common to all transfers.
 `transfers`: the queue of transfers of a component: reads, writes, lists, checksums.
 """
@@ -14,7 +13,6 @@ from __future__ import annotations
 
 from paramclient.protocol.ftp.file_read import FILE_SIZE_MAX, FileRead
 from paramclient.protocol.ftp.file_write import FileWrite
-from paramclient.protocol.ftp.passive import ObservedRead, ObservedReads
 from paramclient.protocol.ftp.transfer_job import BUSY
 from paramclient.protocol.ftp.transfers import (
     DirectoryEntry,
@@ -32,6 +30,4 @@ __all__ = [
     "FileRead",
     "FileTransfers",
     "FileWrite",
-    "ObservedRead",
-    "ObservedReads",
 ]

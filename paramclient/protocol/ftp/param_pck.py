@@ -23,7 +23,6 @@ __all__ = [
     "Pack",
     "PackedParam",
     "decode",
-    "decode_prefix",
     "encode",
 ]
 
@@ -91,21 +90,6 @@ def decode(data: bytes) -> Pack:
     return Pack(_entries(data, number, with_defaults), total, with_defaults)
 
 
-def decode_prefix(data: bytes) -> tuple[Pack, int]:
-    """Decode the complete entries at the beginning of a file from a vehicle.
-
-    No entry depends on later ones, so each of these is valid, whatever is missing. Also returns the number of
-    entries in the whole file by its header.
-
-    Raises:
-        PackError: as in `decode`, except for a file that is truncated behind its header.
-    """
-    magic, number, total = _header(data)
-    _check_header(magic, number, total)
-    with_defaults = magic == _MAGIC_WITH_DEFAULTS
-    return Pack(_entries(data, number, with_defaults, may_end=True), total, with_defaults), number
-
-
 def total_of(beginning: bytes) -> int | None:
     """Return the vehicle's number of parameters by the beginning of its file; None if that is too short."""
     if len(beginning) < _HEADER.size:
@@ -163,10 +147,8 @@ def _check_header(magic: int, number: int, total: int) -> None:
         raise PackError(f"{number} entries of a table of {total}", offset=2)
 
 
-def _entries(
-    data: bytes, number: int, with_defaults: bool, *, may_end: bool = False
-) -> tuple[PackedParam, ...]:
-    """Decode all entries behind the header: exactly that many; fewer where the file may be truncated."""
+def _entries(data: bytes, number: int, with_defaults: bool) -> tuple[PackedParam, ...]:
+    """Decode all entries behind the header: exactly that many."""
     found: dict[str, PackedParam] = {}
     name = b""
     at = _HEADER.size
@@ -174,8 +156,6 @@ def _entries(
         match = _padding(data, at)
         at = at if match is None else match.end()
         if at + 2 > len(data):
-            if may_end:
-                break
             raise PackError(f"the file is cut off: {place} of {number} entries", offset=len(data))
         kind = _TYPES.get(data[at] & 0x0F)
         flags = data[at] & 0xF0
@@ -185,8 +165,6 @@ def _entries(
         value_at = at + 2 + more
         end = value_at + (2 * kind.size if flags else kind.size)
         if end > len(data):
-            if may_end:
-                break
             raise PackError(f"the file is cut off in entry {place} of {number}", offset=len(data))
         if shared > len(name):
             raise PackError(f"entry {place} shares {shared} characters with {name!r}", offset=at)
@@ -200,7 +178,7 @@ def _entries(
         default = int.from_bytes(data[value_at + kind.size : end], "little") if flags else None
         found[text] = PackedParam(text, kind, bits, default)
         at = end
-    if len(found) == number and at < len(data):
+    if at < len(data):
         raise PackError(f"{len(data) - at} bytes are left over behind {number} entries", offset=at)
     return tuple(found.values())
 

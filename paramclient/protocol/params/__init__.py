@@ -3,19 +3,15 @@
 `change`: a change of one parameter.
 `change_origin`: the author of a change.
 `download_ranges`: the state of the parts of a download.
-`duplicate_names`: parameters that share a name.
 `fetch`: one fetch: cache, file, list or sample.
 `fetch_notes`: the sentences of `FetchResult.notes`.
 `fetch_queue`: the fetches of a component, one at a time.
 `fetch_result`: policy, progress and result of a fetch.
 `file_download`: the packed parameter file over MAVFTP.
-`foreign_list`: a list that another station has requested.
 `hash_check`: what an announced hash proves about a downloaded table.
 `list_download`: PARAM_REQUEST_LIST and the repair of its gaps.
-`list_estimate`: the expected duration of a list.
 `list_stream`: progress, pace, losses and end of a running list.
 `passive`: tables from the traffic of other stations, and from logs.
-`passive_file`: the packed file as other stations read it.
 `reads`: PARAM_REQUEST_READ.
 `sampling`: check of a cached table by a random sample.
 `sync`: detection of changes that were missed.

@@ -9,7 +9,6 @@ from functools import partial
 from typing import Final, NamedTuple
 
 from paramclient.errors import CacheError, LinkError, NoReply, UnknownParameter
-from paramclient.protocol.params.duplicate_names import DuplicateNameReads, repeated_names
 from paramclient.protocol.params.fetch_notes import (
     CACHED_UNVERIFIED,
     FILE_IN_USE,
@@ -36,7 +35,6 @@ from paramclient.protocol.params.fetch_result import (
 from paramclient.protocol.params.file_download import FileDownload
 from paramclient.protocol.params.hash_check import HashCheck
 from paramclient.protocol.params.list_download import ListDownload, present_of
-from paramclient.protocol.params.list_estimate import ListPace
 from paramclient.protocol.params.reads import Read
 from paramclient.protocol.params.sampling import Sampling
 from paramclient.protocol.requests.operation import Operation
@@ -45,10 +43,6 @@ from paramclient.protocol.wire import HASH_CHECK, ParamRequestRead, ParamValue
 
 __all__ = ["Check", "Fetch"]
 
-FILE_TIME_RATIO: Final = 0.1
-"""The duration of the file as a share of the list's: 3.07 s of 34.6 s at 57600 baud (measured)."""
-FILE_TIME_MIN: Final = 0.4
-"""Seconds that the file takes on a link that is no bottleneck (measured)."""
 REPEATED_TIME_MAX: Final = 1.5
 """Seconds of a download that may be repeated when the component seems to have restarted: ArduPilot's clock
 shows a restart 1.4 s later (measured)."""
@@ -74,8 +68,8 @@ class Fetch(Operation[FetchResult]):
     cached table, if the caller requested one.
 
     The list is requested in parallel to the file when the opening of the file stays unanswered, and when
-    another station has a file open and the list is faster than waiting for the end of its session. As soon as
-    the file is opened after all, the list's gaps are left to it. The first complete one ends the fetch.
+    another station has a file open. As soon as the file is opened after all, the list's gaps are left to it.
+    The first complete one ends the fetch.
 
     For a vehicle with a hash, `HashCheck` decides whether the downloaded table is confirmed.
 
@@ -118,7 +112,6 @@ class Fetch(Operation[FetchResult]):
         table = self._table = fetch_context.table
         self._may_use_file = may_use_file
         self._present: Mapping[int, str] | None = None  # the values with which a list would resume
-        self._list_pace: ListPace | None = None  # while another station has a file open
         self._list_error: Exception | None = None  # why the list in parallel to the file failed
         self._was_in_use = False  # the server's session was in use when the list was requested
         self._is_cancelled = False
@@ -126,7 +119,6 @@ class Fetch(Operation[FetchResult]):
         self._sampling: Sampling | None = None
         self._hash_read: Read | None = None
         self._proof = HashCheck(table)
-        self._repeated: DuplicateNameReads | None = None
         self._was_requested_meanwhile = False
         self._is_hash_unknown = False  # the vehicle answers other reads, but not that of the hash
         self.first_value_at = math.inf
@@ -192,13 +184,8 @@ class Fetch(Operation[FetchResult]):
         """Process a PARAM_VALUE of the component, before the reads do."""
         if self.file is not None:
             self.file.receive(message)
-        if self._repeated is not None:
-            self._repeated.receive(now)
         download = self.download
-        if download is None:
-            if not self._reads.awaits(message):  # otherwise it is the response to our request
-                self._fetch_context.foreign_list.receive(message, now)
-        elif not download.done:
+        if download is not None and not download.done:
             if self.first_value_at > now:
                 self.first_value_at = now
             download.receive(message, now)
@@ -210,18 +197,11 @@ class Fetch(Operation[FetchResult]):
 
     def tick(self, now: float) -> None:
         self.check_file(now)
-        if self._repeated is not None:
-            self._repeated.tick(now)
-        if self._list_pace is not None:
-            self._list_pace.tick(now)
         if self.download is not None:
             self.download.tick(now)
 
     def next_deadline(self) -> float:
-        if self._repeated is not None:
-            return self._repeated.next_deadline()
-        deadline = self._list_due_at if self.download is None else self.download.next_deadline()
-        return deadline if self._list_pace is None else min(deadline, self._list_pace.next_deadline())
+        return self._list_due_at if self.download is None else self.download.next_deadline()
 
     def check_file(self, now: float) -> None:
         """Check the state of the file: the component may have none, or the list may be faster."""
@@ -233,7 +213,6 @@ class Fetch(Operation[FetchResult]):
         if file.is_served:
             if self.download is not None and not self.download.done:
                 self.download.gives_way = True
-            self._drop_list_pace()
         elif self._is_file_check:
             return
         elif file.is_awaited and not self._may_use_file():
@@ -242,8 +221,9 @@ class Fetch(Operation[FetchResult]):
             if self.download is None:
                 self._begin_list(now)
         elif self.download is None and self._list_error is None:
-            if file.blocked_until is not None and self._list_pace is None:
-                self._measure_list(now)
+            if file.blocked_until is not None:
+                self._was_in_use = True
+                self._begin_list_in_parallel(now)
             elif self._list_due_at <= now:
                 self._begin_list_in_parallel(now)
 
@@ -500,36 +480,6 @@ class Fetch(Operation[FetchResult]):
             return math.inf
         return self._open_retries.list_due_at(file.requested_at)
 
-    def _measure_list(self, now: float) -> None:
-        """Measure whether the list is faster than waiting for the end of another station's session."""
-        gap, count = self._reads.pace.gap, self._table.count
-        if gap and count:
-            self._choose_list_or_file(count * gap, now)
-            return
-        pace = self._list_pace = ListPace(self._reads, now)
-
-        def ended() -> None:
-            if self._list_pace is pace and pace.result is not None:
-                self._choose_list_or_file(pace.result, pace.ended_at)
-
-        pace.on_done.append(ended)
-
-    def _choose_list_or_file(self, list_takes: float, now: float) -> None:
-        """Request the list if it is faster than the file will be."""
-        file = self.file
-        if file is None or file.blocked_until is None or self.download is not None:
-            return
-        file_takes = file.blocked_until - now + max(FILE_TIME_MIN, FILE_TIME_RATIO * list_takes)
-        self._context.trace(
-            "%s/%s: another station has a file open; the list takes %.1f s and the file %.1f s",
-            *self._target,
-            list_takes,
-            file_takes,
-        )
-        if list_takes <= file_takes:
-            self._was_in_use = True
-            self._begin_list_in_parallel(now)
-
     def _begin_list_in_parallel(self, now: float) -> None:
         """Request the list while the file is not served."""
         assert self.file is not None
@@ -539,18 +489,13 @@ class Fetch(Operation[FetchResult]):
     def _begin_list(self, now: float) -> None:
         fetch_context, present = self._fetch_context, self._present
         self._context.trace("%s/%s: the list is requested, %s there", *self._target, len(present or ()))
-        count, foreign_list = self._table.count, fetch_context.foreign_list
-        if not self._listed and foreign_list.is_running(now):
-            # another station has requested it: another request would restart it for both
-            followed, of = foreign_list.hand_over(fetch_context.reads)
-            present, count = {**(present or {}), **followed} if of == count else followed, of
         download = self.download = ListDownload(
             self._context,
             fetch_context.reads,
             fetch_context.list_admission,
             now,
             listed=self._listed,
-            count=count,
+            count=self._table.count,
             present=present,
             parallel_to_file=self.file is not None,
         )
@@ -567,7 +512,6 @@ class Fetch(Operation[FetchResult]):
         if self.file is not file:
             return
         now = file.ended_at
-        self._drop_list_pace()
         if file.error is None:
             self._drop_download()
             self.file_failed = False
@@ -645,27 +589,15 @@ class Fetch(Operation[FetchResult]):
             self._drop_file(download.ended_at)
         if download.missing:
             self._drop_hash_read()  # proves nothing
-        if self._hash_read is not None or self._asks_for_repeated(download):
+        if self._hash_read is not None:
             return  # in flight
-        now = download.ended_at if self._repeated is None else self._repeated.ended_at
+        now = download.ended_at
         if self._is_proven(download):
             self._finish_download(download, now, ())
         elif self._context.expects_hash and not (self._is_hash_unknown or download.missing):
             self._ask_hash(lambda read: self._settle(download, read, read.ended_at), now)
         else:
             self._settle(download, None, now)
-
-    def _asks_for_repeated(self, download: ListDownload) -> bool:
-        """Return whether reads of repeated names are still open."""
-        if self._repeated is None:
-            names = repeated_names(download.names)
-            if not (names or self._table.duplicate_indices):
-                return False
-            self._repeated = DuplicateNameReads(
-                names, self._context.retry, self._reads, self._table, download.ended_at
-            )
-            self._repeated.on_done.append(partial(self._download_ended, download))
-        return not self._repeated.done
 
     def _is_proven(self, download: ListDownload) -> bool:
         """Return whether a hash announced during the download proves the table."""
@@ -703,11 +635,8 @@ class Fetch(Operation[FetchResult]):
         count = download.count or 0
         missing = download.missing
         table = self._table
-        if self._repeated is not None and self._repeated.names:
-            notes += (self._repeated.note,)
-            table.complete = False
-        elif not missing:
-            table.complete = download.is_settled
+        if not missing:
+            table.complete = download.is_settled and len(set(download.names.values())) == count
         else:
             table.place(download.names)
         table.count = count
@@ -763,20 +692,10 @@ class Fetch(Operation[FetchResult]):
         sampling, self._sampling = self._sampling, None
         if sampling is not None:
             sampling.cancel()
-        self._drop_list_pace()
-        repeated, self._repeated = self._repeated, None
-        if repeated is not None:
-            repeated.cancel()
         self._drop_file(now)
         self._drop_download()
 
-    def _drop_list_pace(self) -> None:
-        pace, self._list_pace = self._list_pace, None
-        if pace is not None:
-            pace.cancel()
-
     def _drop_file(self, now: float, *, is_served: bool = True) -> None:
-        self._drop_list_pace()
         file, self.file = self.file, None
         if file is not None:
             self._held_before += file.queue_wait(now)

@@ -69,11 +69,6 @@ class Fetches(Machine):
         self._current = fetch
         self._fetch_context.context.is_fetching = fetch is not None
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Notes on what was not taken from files that other stations read."""
-        return () if self.passive_table is None else tuple(self.passive_table.file.notes)
-
     def may_use_file(self) -> bool:
         """Return whether to request the file: the table was received as one, or the component says that it
         serves it."""
@@ -144,25 +139,18 @@ class Fetches(Machine):
                 self.current = None
 
     def tick(self, now: float) -> None:
-        """Do what is due of the fetch in progress, and of the files that other stations read."""
-        if self.passive_table is not None:
-            self.passive_table.file.tick(now)
+        """Do what is due of the fetch in progress."""
         if self.current is not None:
             self.current.tick(now)
 
     def next_deadline(self) -> float:
         """See `Machine`."""
-        first = math.inf if self.current is None else self.current.next_deadline()
-        return first if self.passive_table is None else min(first, self.passive_table.file.next_deadline())
+        return math.inf if self.current is None else self.current.next_deadline()
 
     def resume(self, now: float) -> None:
         """See `Machine`."""
         if self.current is not None:
             self.current.resume(now)
-
-    def lose(self, now: float) -> None:
-        """End the files that other stations read. A fetch goes on: the component may only be rebooting."""
-        self.interrupt(now)
 
     def fail_all(self, error: Exception, now: float) -> None:
         """See `Machine`."""
@@ -170,11 +158,6 @@ class Fetches(Machine):
             fetch = self.current
             fetch.cancel(now)
             fetch.fail(error, now)
-
-    def interrupt(self, now: float) -> None:
-        """End the files that other stations read: the component is lost or restarts."""
-        if self.passive_table is not None:
-            self.passive_table.file.close(now)
 
     def seems_restarted(self, silent_since: float, now: float) -> bool:
         """Restart the fetch where the component may have restarted, before its clock shows that; see
@@ -190,7 +173,6 @@ class Fetches(Machine):
     def forget(self) -> None:
         """Forget everything: another vehicle uses the address."""
         if self.passive_table is not None:
-            self.passive_table.file.forget()
             self.passive_table.forget()
         self.file_works = None
         self.is_same_firmware = False
@@ -204,7 +186,6 @@ class Fetches(Machine):
 
     def over(self, now: float) -> None:
         """End the passive fetch: nothing more is received."""
-        self.interrupt(now)
         if self.passive_table is not None:
             self.passive_table.is_over = True
         if isinstance(self.current, PassiveFetch):

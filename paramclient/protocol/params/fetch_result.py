@@ -12,7 +12,6 @@ from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.download_ranges import DownloadRanges
 from paramclient.protocol.params.fetch_notes import CHANGED_MEANWHILE
-from paramclient.protocol.params.foreign_list import ForeignList
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.sampling import Sample
 from paramclient.protocol.params.table import Table
@@ -53,7 +52,6 @@ class FetchContext:
         context, reads, table, list_admission, files: as their names say.
         changed: called with changes that no PARAM_VALUE brought.
         doubt: called when a table turns out to have changed.
-        foreign_list: the list that another station may have requested.
     """
 
     context: Context
@@ -63,7 +61,6 @@ class FetchContext:
     files: FileTransfers
     changed: Callable[[list[Change]], None]
     doubt: Callable[[float], None]
-    foreign_list: ForeignList
 
 
 @dataclass(frozen=True, slots=True)

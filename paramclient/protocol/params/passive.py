@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from paramclient.errors import NoReply
-from paramclient.model.values import is_portable_name
 from paramclient.protocol.params.download_ranges import DownloadRange, DownloadRanges, split_indices
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import (
@@ -19,7 +18,6 @@ from paramclient.protocol.params.fetch_result import (
     Progress,
 )
 from paramclient.protocol.params.hash_check import HashCheck
-from paramclient.protocol.params.passive_file import FileObserver, ObservedPack
 from paramclient.protocol.params.sync import Sync
 from paramclient.protocol.wire import PARAMETERS_MAX, ParamValue
 
@@ -36,9 +34,8 @@ class PassiveTable:
     """Collects the lists of a component that other stations request, and the hashes that it announces to
     them.
 
-    A table is complete when every index below the count was received since the table was last in doubt, from
-    lists, or in the packed file that another station reads over MAVFTP. An announced hash proves it where the
-    hash recomputed from the table is the same.
+    A table is complete when every index below the count was received since the table was last in doubt. An
+    announced hash proves it where the hash recomputed from the table is the same.
 
     Args:
         fetch_context: the component's.
@@ -52,7 +49,6 @@ class PassiveTable:
         new_index_at: when the last new index was received.
         is_log: as above.
         is_over: whether nothing more is received.
-        file: the packed file, as other stations read it.
     """
 
     def __init__(
@@ -68,14 +64,12 @@ class PassiveTable:
         self.new_index_at = -math.inf
         self.is_log = is_log
         self.is_over = False
-        self.file = FileObserver(self._take_file)
         self._fetch_context = fetch_context
         self._table = fetch_context.table
         self._sync = sync
         self._whole = whole
         self._began_at = 0.0
         self._is_whole = False
-        self._source: FetchSource = "stream"
 
     def split(self, number: int) -> tuple[DownloadRange, ...]:
         """Return the state of `number` parts of the indices; see `DownloadRanges.split`."""
@@ -84,8 +78,6 @@ class PassiveTable:
     def receive(self, message: ParamValue, now: float) -> None:
         """Process a PARAM_VALUE of the component, after the table has stored it."""
         name, _, _, count, index = message
-        if self.file.is_reading:
-            self.file.receive_value(message)
         if index >= count or count > PARAMETERS_MAX:
             return
         names = self.names
@@ -97,7 +89,7 @@ class PassiveTable:
             names[index] = name
             self.new_index_at = now
             if len(names) == count:
-                self._complete("stream", now)
+                self._complete(now)
 
     def announced(self, announcement: Announcement, now: float) -> None:
         """Process a hash that the component has announced to any station."""
@@ -108,7 +100,7 @@ class PassiveTable:
             if not self._sync.synced:
                 self._whole(self._result("cache", (), announcement.hash, now), now)
         elif self._is_whole and self._is_proven(announcement):
-            self._whole(self._result(self._source, (), table.hash, now), now)
+            self._whole(self._result("stream", (), table.hash, now), now)
         elif table.hash is not None:
             self.forget()
             self._sync.contradicted()
@@ -123,7 +115,7 @@ class PassiveTable:
         """Return the table as a result if it is known to match the vehicle's."""
         if not self._sync.synced:
             return None
-        source: FetchSource = self._source if self._is_whole else "cache"
+        source: FetchSource = "stream" if self._is_whole else "cache"
         return self._result(source, (), self._table.hash, now, notes)
 
     def result(self, now: float, notes: tuple[str, ...] = ()) -> FetchResult | None:
@@ -137,46 +129,17 @@ class PassiveTable:
         missing = tuple(index for index in range(self.count) if index not in self.names)
         return self._result("stream", missing, None, now, notes)
 
-    def _take_file(self, observed: ObservedPack, now: float) -> None:
-        """Take the packed file, or its beginning, that another station has read."""
-        table, total = self._table, observed.pack.total
-        if table.count != total:
-            if table.count is not None:
-                self._sync.count_changed(now)
-            table.change_count(total)
-        entries = {index: entry.name for index, entry in observed.entries()}
-        is_all = len(entries) == total
-        names = {index: name for index, name in entries.items() if is_portable_name(name)}
-        if (
-            is_all
-            or total != self.count
-            or any(self.names.get(at, name) != name for at, name in names.items())
-        ):
-            self.forget()
-            self.count = total
-            self._began_at = observed.began_at
-        was_whole = len(self.names) == total
-        self.names |= names
-        self.new_index_at = now
-        self._fetch_context.changed(
-            table.take_pack(observed.pack, observed.began_at, observed.newer, start=observed.start)
-        )
-        if len(self.names) == total and not was_whole:
-            self._complete("ftp" if is_all else "stream", now)
-
-    def _complete(self, source: FetchSource, now: float) -> None:
+    def _complete(self, now: float) -> None:
         """Finish the table: every index was received."""
         table = self._table
         self._is_whole = True
-        self._source = source
-        self.file.notes.clear()
         self._fetch_context.changed(table.settle(self.names))
         table.complete = True
         table.count = self.count
         announced = self._sync.announced
         if announced is None or not self._is_proven(announced):
             table.unconfirm()
-        self._whole(self._result(source, (), table.hash, now), now)
+        self._whole(self._result("stream", (), table.hash, now), now)
 
     def _is_proven(self, announcement: Announcement) -> bool:
         proof = HashCheck(self._table)
@@ -201,7 +164,7 @@ class PassiveTable:
             missing,
             confirmed,
             max(0.0, now - self._began_at),
-            (*self.file.notes, *notes),
+            notes,
         )
 
 
@@ -245,7 +208,7 @@ class PassiveFetch(Fetch):
 
     def next_deadline(self) -> float:
         passive_table = self._passive_table
-        if passive_table.is_log or passive_table.file.is_reading or not passive_table.names:
+        if passive_table.is_log or not passive_table.names:
             return math.inf
         return max(passive_table.new_index_at, self.begun_at) + LIST_PAUSE_MAX
 
@@ -258,7 +221,7 @@ class PassiveFetch(Fetch):
     @property
     def is_silent(self) -> bool:
         passive_table = self._passive_table
-        return not (passive_table.names or passive_table.file.is_reading or passive_table.is_log)
+        return not (passive_table.names or passive_table.is_log)
 
     def progress(self, now: float) -> Progress:
         passive_table = self._passive_table

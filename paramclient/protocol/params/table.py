@@ -119,7 +119,6 @@ class Table:
         outdated_indices: names whose index belongs to an earlier count. The vehicle may no longer have them;
             some may have been received again since.
         doubts: how often live values were marked as stale.
-        duplicate_indices: for a name that several parameters share, the indices of the other parameters.
         dirty: names whose value, type or index changed since the last `take_dirty`.
         removed_at: when each removed name was found missing, since the last `take_removed_at`.
         suspended: seconds of system suspend by which moments were moved back, see `age`.
@@ -148,7 +147,6 @@ class Table:
         self._was_complete = False  # before the count changed
         self.outdated_indices: set[str] = set()
         self.doubts = 0
-        self.duplicate_indices: dict[str, frozenset[int]] = {}
         self.dirty: dict[str, str] = {}
         self.overwritten: list[Observation] = []
         self.keeps_all = False
@@ -221,8 +219,6 @@ class Table:
                 of a known integer.
         """
         name, raw, number, count, given = message
-        if self.duplicate_indices and given in self.duplicate_indices.get(name, ()):
-            return None
         everything = self._compact
         old = everything.get(name)
         self._latest = moment
@@ -267,8 +263,7 @@ class Table:
         """Store the index of a PARAM_VALUE of a known parameter, without its value."""
         name, _, _, count, given = message
         compact = self._compact[name]
-        is_index = given < count <= PARAMETERS_MAX and given not in self.duplicate_indices.get(name, ())
-        if is_index and not has_index(compact, given):
+        if given < count <= PARAMETERS_MAX and not has_index(compact, given):
             self._compact[name] = with_index(compact, given)
             self.dirty.setdefault(name, "vehicle")
 
@@ -518,7 +513,6 @@ class Table:
             if self.complete:
                 self._was_complete = True
             self.complete = False
-            self.duplicate_indices.clear()
             for name, compact in self._compact.items():
                 if is_listed(compact):
                     self._compact[name] = self._with_outdated_index(name, compact)
@@ -535,10 +529,10 @@ class Table:
 
     def place(self, names: Mapping[int, str]) -> None:
         """Set the indices that a download has determined."""
-        everything, duplicate_indices = self._compact, self.duplicate_indices
+        everything = self._compact
         for index, name in names.items():
             compact = everything.get(name)
-            if compact is None or (duplicate_indices and index in duplicate_indices.get(name, ())):
+            if compact is None:
                 continue
             if not has_index(compact, index):
                 everything[name] = with_index(compact, index)

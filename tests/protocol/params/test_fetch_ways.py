@@ -266,7 +266,7 @@ def test_beside_a_session_that_was_left_open_a_quick_list_is_taken() -> None:
     assert session.fetch().source == "ftp"
 
 
-def test_on_a_radio_the_end_of_the_session_is_waited_for() -> None:
+def test_on_a_radio_the_file_is_opened_when_the_session_ends() -> None:
     vehicle = ArduPilotVehicle(live_period=0, burst=1, period=0.025, ftp_rate=5760.0)
     vehicle.files["a"] = b"a"
     session = Simulation(air=Air.symmetric([vehicle], delay=0.02, rate=5760.0, queue=4096))
@@ -275,12 +275,11 @@ def test_on_a_radio_the_end_of_the_session_is_waited_for() -> None:
     began = session.now
     result = session.outcome(fetch)
     assert (result.source, result.notes) == ("ftp", ())
-    assert times_of(session, ParamRequestList) == []
     requested = sorted({at for at, opcode in requests_to_server(session) if opcode is Opcode.OPEN_FILE_RO})
     assert len(requested) == 2
     assert requested[0] == began
     assert SESSION_IDLE_TIME < requested[1] - began < SESSION_IDLE_TIME + 0.4
-    assert result.elapsed < SESSION_IDLE_TIME + 4.5
+    assert result.elapsed < SESSION_IDLE_TIME + 5.5  # the list takes a third of the link
 
 
 def test_nothing_is_sent_while_another_station_reads() -> None:
