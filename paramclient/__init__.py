@@ -118,7 +118,6 @@ if TYPE_CHECKING:
     from paramclient.protocol.ext.writes import ExtSetResult
     from paramclient.protocol.ftp import DirectoryEntry
     from paramclient.protocol.params.change import Added, Change, Changed, FirstValue, Removed
-    from paramclient.protocol.params.download_ranges import DownloadRange, DownloadRanges
     from paramclient.protocol.params.fetch_result import FetchResult, FetchSource, Policy, Progress
     from paramclient.protocol.params.sampling import Sample
     from paramclient.protocol.params.sync import ComponentState, SyncState
@@ -171,8 +170,6 @@ __all__ = [
     "CopyResult",
     "Difference",
     "DirectoryEntry",
-    "DownloadRange",
-    "DownloadRanges",
     "Encoding",
     "Event",
     "Events",
@@ -425,10 +422,6 @@ _HOMES: Final = {
         "Changed",
         "FirstValue",
         "Removed",
-    ),
-    "paramclient.protocol.params.download_ranges": (
-        "DownloadRange",
-        "DownloadRanges",
     ),
     "paramclient.protocol.params.fetch_result": (
         "FetchResult",

@@ -20,7 +20,7 @@
 - `metadata`: metadata that a subcommand uses, and the columns with units and meanings.
 - `default_sources`: the metadata that gives the firmware's defaults.
 - `write_outcomes`, `confirmation`: writes with their outcomes, and the question before them.
-- `download_strip`, `link_history`, `block_characters`: drawings of a download and of a link on a terminal.
+- `link_history`, `block_characters`: drawings of a link on a terminal.
 - `signals`: SIGINT and SIGTERM.
 """
 

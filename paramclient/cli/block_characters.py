@@ -18,17 +18,13 @@ class Marks:
 
     Attributes:
         levels: the heights of a column, from zero to the full one.
-        requested_again: a part of a download with lost values that were requested again.
-        missing: a part of which nothing was received.
     """
 
     levels: str
-    requested_again: str
-    missing: str
 
     @property
     def full(self) -> str:
-        """The full column, and a part that was received."""
+        """The full column."""
         return self.levels[-1]
 
     def column(self, share: float) -> str:
@@ -39,16 +35,16 @@ class Marks:
         return self.full if share >= 1.0 else self.levels[min(math.floor(share * between), between - 1) + 1]
 
 
-BLOCKS: Final = Marks(levels="▁▂▃▄▅▆▇█", requested_again="▒", missing="·")
+BLOCKS: Final = Marks(levels="▁▂▃▄▅▆▇█")
 """Block elements of Unicode."""
-ASCII: Final = Marks(levels="_-:=+*%#", requested_again="?", missing=".")
+ASCII: Final = Marks(levels="_-:=+*%#")
 """The same in ASCII."""
 
 
 def marks_for(output: TextIO) -> Marks:
     """Return the characters that an output can show."""
     try:
-        f"{BLOCKS.levels}{BLOCKS.requested_again}{BLOCKS.missing}".encode(output.encoding or "ascii")
+        BLOCKS.levels.encode(output.encoding or "ascii")
     except (LookupError, UnicodeEncodeError):
         return ASCII
     return BLOCKS

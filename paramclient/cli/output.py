@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Final, TextIO, TypeAlias
 
 import anyio
 
-from paramclient.cli.block_characters import Piece, marks_for
-from paramclient.cli.download_strip import strip_lines
+from paramclient.cli.block_characters import Piece
 from paramclient.cli.json_output import as_json
 from paramclient.model.values import Param, format_value
 from paramclient.protocol.params.fetch_result import Progress
@@ -299,8 +298,7 @@ def _shortened(text: str, length: int) -> str:
 def progress_bar(title: str) -> Iterator[Callable[[Progress], None] | None]:
     """Yield a function that draws the progress of a fetch; None if stderr is not a terminal.
 
-    Draws the parts of the download as a strip if the progress has them, otherwise a bar. Before the first
-    response, the function says that it is awaited. Needs a running event loop.
+    Before the first response, the function says that it is awaited. Needs a running event loop.
     """
     if not sys.stderr.isatty():
         yield None
@@ -320,7 +318,7 @@ def _bar(title: str, stack: ExitStack) -> Callable[[Progress], None]:
             line.draw(f"{title}: waiting for the first response", anyio.current_time() - began)
         if update is None and state.received:  # nothing is drawn for a fetch that needs no download
             line.end()
-            update = (_start_bar if state.ranges is None else _start_strip)(title, stack)
+            update = _start_bar(title, stack)
         if update is not None:
             update(state)
 
@@ -357,21 +355,6 @@ def _start_bar(title: str, stack: ExitStack) -> Callable[[Progress], None]:
             pace=f"{state.rate:.0f}/s{left}",
             refresh=True,
         )
-
-    return update
-
-
-def _start_strip(title: str, stack: ExitStack) -> Callable[[Progress], None]:
-    from rich.console import Console, Group  # only here: not needed to get started
-    from rich.live import Live
-    from rich.text import Text
-
-    console, marks = Console(stderr=True), marks_for(sys.stderr)
-    live = stack.enter_context(Live(console=console, auto_refresh=False, transient=True))
-
-    def update(state: Progress) -> None:
-        lines = strip_lines(title, state, marks, console.width)
-        live.update(Group(*(Text.assemble(*line) for line in lines)), refresh=True)
 
     return update
 

@@ -180,12 +180,7 @@ async def test_a_list_with_gaps_ends_when_it_pauses_and_goes_on_with_what_others
         reported: list[Progress] = []
         result = await component.fetch_all(progress=reported.append)
         assert result.missing == (3, 9)
-        assert reported[-1].ranges is not None
-        parts = reported[-1].ranges.split(5)
-        assert [(part.received, part.requested_again, part.missing) for part in parts] == [
-            *((4, 0, 1), (4, 0, 1), (5, 0, 0), (5, 0, 0), (5, 0, 0))
-        ]
-        assert result.received == 23
+        assert reported[-1].received == result.received == 23
         assert LIST_PAUSE_MAX <= anyio.current_time() - began < LIST_PAUSE_MAX + 3.0
         assert (component.state, component.sync_state) == ("partial", SyncState.UNSYNCED)
         assert (await client.fetch_all()).results[1, 1].missing == (3, 9)

@@ -15,7 +15,6 @@ from paramclient.model.wording import counted
 from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.ext.reads import ExtRead, ExtReads
 from paramclient.protocol.ext.table import ExtTable
-from paramclient.protocol.params.download_ranges import DownloadRange, DownloadRanges, split_indices
 from paramclient.protocol.params.fetch_result import Progress
 from paramclient.protocol.params.list_download import REQUESTED_INDICES_MAX
 from paramclient.protocol.requests.context import Context
@@ -70,7 +69,6 @@ class ExtFetch(Operation[ExtFetchResult]):
         request: the requests for the list.
         received: the names by index, since the fetch began.
         dead: indices whose reads were in vain.
-        requested_again: indices that a list was without, and that were requested again.
         reads: the open reads of missing indices.
         unread: missing indices that are read next.
         value_at: when the last value was received; minus infinity before the first.
@@ -85,7 +83,6 @@ class ExtFetch(Operation[ExtFetchResult]):
         self.request = request
         self.received: dict[int, str] = {}
         self.dead: set[int] = set()
-        self.requested_again: set[int] = set()
         self.value_at = self.quiet_since = -math.inf
         self.lists = 0
         self.first_at = math.inf
@@ -194,7 +191,6 @@ class ExtFetches(Machine):
             self._release(fetch)
             fetch.received.clear()
             fetch.dead.clear()
-            fetch.requested_again.clear()
             fetch.front = -1
             fetch.lists = 0
             fetch.longest = None
@@ -209,12 +205,7 @@ class ExtFetches(Machine):
     def progress(self, fetch: ExtFetch, now: float) -> Progress:
         """Return the progress of a fetch."""
         running = now - fetch.first_at if fetch.first_at < math.inf else 0.0
-        ranges = DownloadRanges("parameters", partial(self._split, fetch)) if fetch.has_begun else None
-        return Progress.after(len(fetch.received), self._table.count, fetch.downloaded, running, ranges)
-
-    def _split(self, fetch: ExtFetch, number: int) -> tuple[DownloadRange, ...]:
-        requested = fetch.requested_again - fetch.dead
-        return split_indices(self._table.count or 0, number, fetch.received, requested)
+        return Progress.after(len(fetch.received), self._table.count, fetch.downloaded, running)
 
     def tick(self, now: float) -> None:
         """Repeat the request for the list, or read what is missing after it."""
@@ -281,7 +272,6 @@ class ExtFetches(Machine):
         missing = [index for index in self._missing(fetch) if index not in fetch.dead]
         self._trace("%s/%s: the extended list lacks %s", *self._target, len(missing))
         if fetch.request.should_list_again(len(missing), self._table.count or 0, fetch.lists):
-            fetch.requested_again.update(missing)
             fetch.lists += 1
             fetch.front = -1
             fetch.longest = None
@@ -297,7 +287,6 @@ class ExtFetches(Machine):
         while fetch.unread and len(fetch.reads) < REQUESTED_INDICES_MAX:
             index = fetch.unread.popleft()
             if index not in fetch.received:
-                fetch.requested_again.add(index)
                 fetch.reads[index] = read = self._reads.ask(index, now, urgent=False)
                 read.on_done.append(partial(self._read_ended, fetch, index, read))
 

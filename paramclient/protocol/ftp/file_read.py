@@ -132,30 +132,6 @@ class FileRead(FileTransferJob[bytes]):
         return self._blocks.received
 
     @property
-    def size_known(self) -> int | None:
-        """Bytes of the file: the received end, before that the server's size, which may be an estimate."""
-        blocks = self._blocks
-        if blocks.end is not None:
-            return blocks.end
-        return None if self.size is None else max(self.size, blocks.reached)
-
-    def unreceived(self) -> list[tuple[int, int]]:
-        """Return first byte and end of what was not received, rising; the rest of the file is the last."""
-        size, reached = self.size_known, self._blocks.reached
-        rest = [(reached, size)] if size is not None and size > reached else []
-        return [*self._blocks.gaps, *rest]
-
-    def requested_again(self) -> list[tuple[int, int]]:
-        """Return first byte and end of what the burst lost and single reads have requested, rising."""
-        offsets = {pending.offset for pending in tuple(self._pending_reads.values())} | set(self._unanswered)
-        return [
-            (at, min(at + self._read_size, last))
-            for first, last in self._blocks.gaps
-            for at in range(first, last, self._read_size)
-            if at in offsets
-        ]
-
-    @property
     def beginning(self) -> bytes:
         """The beginning of the file, as far as it was received in one piece; b"" before."""
         return self._blocks.beginning

@@ -2,7 +2,6 @@
 
 `change`: a change of one parameter.
 `change_origin`: the author of a change.
-`download_ranges`: the state of the parts of a download.
 `fetch`: one fetch: cache, file, list or sample.
 `fetch_notes`: the sentences of `FetchResult.notes`.
 `fetch_queue`: the fetches of a component, one at a time.

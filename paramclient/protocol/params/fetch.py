@@ -346,8 +346,7 @@ class Fetch(Operation[FetchResult]):
             return self.file.progress(now)
         received, total = (0, self._table.count) if self.download is None else self.download.progress
         downloaded = received - (0 if self.download is None else self.download.resumed)
-        ranges = None if self.download is None else self.download.ranges
-        return Progress.after(received, total, downloaded, now - self.first_value_at, ranges)
+        return Progress.after(received, total, downloaded, now - self.first_value_at)
 
     def _sample(self, sampled: Sampled, count: int, now: float) -> None:
         """Check the cached table by a sample of its parameters."""

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, Literal, TypeAlias
 
 from paramclient.model.values import Param, Trust
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.params.change import Change
-from paramclient.protocol.params.download_ranges import DownloadRanges
 from paramclient.protocol.params.fetch_notes import CHANGED_MEANWHILE
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.sampling import Sample
@@ -108,29 +107,19 @@ class Progress:
         total: parameters of the component, or None while unknown.
         rate: parameters per second since the first one was received.
         seconds_left: at that rate, or None while unknown.
-        ranges: what of each part of the download was received, requested again, and is missing, counted only
-            when it is read. None without a download. Not compared.
     """
 
     received: int
     total: int | None
     rate: float
     seconds_left: float | None
-    ranges: DownloadRanges | None = field(default=None, compare=False, repr=False)
 
     @classmethod
-    def after(
-        cls,
-        received: int,
-        total: int | None,
-        downloaded: int,
-        running: float,
-        ranges: DownloadRanges | None = None,
-    ) -> Progress:
+    def after(cls, received: int, total: int | None, downloaded: int, running: float) -> Progress:
         """Return the progress when `downloaded` of the received ones took `running` seconds."""
         rate = downloaded / running if downloaded > 0 and running > 0 else 0.0
         left = (total - received) / rate if rate and total is not None else None
-        return cls(received, total, rate, left, ranges)
+        return cls(received, total, rate, left)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,6 @@ from paramclient.protocol.ftp import BUSY, FileRead, FileTransfers
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX
 from paramclient.protocol.ftp.param_pck import MAGICS, PACK_SIZE_MAX, Pack, decode, total_of
 from paramclient.protocol.params.change import Change
-from paramclient.protocol.params.download_ranges import DownloadRange, DownloadRanges, split_bytes
 from paramclient.protocol.params.fetch_result import Progress
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
@@ -161,14 +160,7 @@ class FileDownload(Operation[None]):
         received, running = int(share * (total or 0)), now - self.begun_at - self.queue_wait(now)
         left = running * (1 - share) / share if share else None
         rate = received / running if running > 0 else 0.0
-        return Progress(received, total, rate, left, DownloadRanges("bytes", self._split))
-
-    def _split(self, number: int) -> tuple[DownloadRange, ...]:
-        job = self._job
-        size = None if job is None else job.size_known
-        if job is None or size is None:
-            return ()
-        return split_bytes(size, number, job.unreceived(), job.requested_again())
+        return Progress(received, total, rate, left)
 
     @property
     def count(self) -> int | None:

@@ -8,7 +8,6 @@ from itertools import filterfalse
 from typing import Final
 
 from paramclient.errors import NoReply
-from paramclient.protocol.params.download_ranges import DownloadRange, DownloadRanges, split_indices
 from paramclient.protocol.params.list_stream import JUMP_MAX, ListStream
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.table import Table
@@ -179,15 +178,6 @@ class ListDownload(Operation[None]):
     def progress(self) -> tuple[int, int | None]:
         """The number of received values, and of all where it is known."""
         return self.received, self.count
-
-    @property
-    def ranges(self) -> DownloadRanges | None:
-        """The parts of the list, counted when they are read; None before the count is known."""
-        return None if self.count is None else DownloadRanges("parameters", self._split)
-
-    def _split(self, number: int) -> tuple[DownloadRange, ...]:
-        requested = self._lost - self.given_up
-        return split_indices(self.count or 0, number, self.names, requested)
 
     @property
     def is_awaited(self) -> bool:

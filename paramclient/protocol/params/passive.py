@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from paramclient.errors import NoReply
-from paramclient.protocol.params.download_ranges import DownloadRange, DownloadRanges, split_indices
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import (
     Announcement,
@@ -70,10 +69,6 @@ class PassiveTable:
         self._whole = whole
         self._began_at = 0.0
         self._is_whole = False
-
-    def split(self, number: int) -> tuple[DownloadRange, ...]:
-        """Return the state of `number` parts of the indices; see `DownloadRanges.split`."""
-        return split_indices(self.count or 0, number, self.names, ())
 
     def receive(self, message: ParamValue, now: float) -> None:
         """Process a PARAM_VALUE of the component, after the table has stored it."""
@@ -225,8 +220,7 @@ class PassiveFetch(Fetch):
 
     def progress(self, now: float) -> Progress:
         passive_table = self._passive_table
-        ranges = None if passive_table.count is None else DownloadRanges("parameters", passive_table.split)
-        return Progress(len(passive_table.names), passive_table.count, 0.0, None, ranges)
+        return Progress(len(passive_table.names), passive_table.count, 0.0, None)
 
     def _begin_download(self, now: float, present: Mapping[int, str] | None = None) -> None:
         passive_table = self._passive_table
