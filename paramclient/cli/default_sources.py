@@ -8,7 +8,7 @@ from typing import Final
 from paramclient.cli.metadata import known_of_session
 from paramclient.cli.output import printable, report, say
 from paramclient.cli.session import CommandSession
-from paramclient.metadata import Metadata, load_if_quick
+from paramclient.metadata import Metadata
 from paramclient.model.defaults import Default, DefaultSource
 from paramclient.model.values import Param
 from paramclient.model.wording import counted
@@ -44,20 +44,16 @@ async def find_defaults(
     choice: str | None,
     given: Metadata | None,
     params: Collection[Param],
-    *,
-    loads: bool = True,
 ) -> Mapping[str, int | float]:
     """Return the defaults in the metadata of a vehicle by name, where the vehicle has given none.
 
-    The metadata is that of --metadata; else the stored one of the firmware; else, where the link is quick, it
-    is requested from the vehicle for at most 2 s. If there is none, the reason is printed.
+    The metadata is that of --metadata, else the stored one of the firmware.
 
     Args:
         session: the session.
         choice: the value of --metadata.
         given: the metadata of the file that --metadata names, or None.
         params: the parameters.
-        loads: whether the metadata may be requested although --metadata is not `vehicle`.
 
     Raises:
         UsageError, VehicleError, NoReply, LinkError: as `known_of_session`.
@@ -68,11 +64,6 @@ async def find_defaults(
     found = given
     if found is None:
         found = await known_of_session(session, choice)
-    if found is None and loads:
-        quick = await load_if_quick(session.component, timeout=session.deadline.left())
-        found = quick.metadata
-        if found is None:
-            say(printable(f"{session.label}: no metadata was requested or received: {quick.note}"))
     return defaults_in(found, unknown)
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from functools import partial
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Final, TypeAlias
 
@@ -20,27 +19,21 @@ from paramclient.cli.session import (
     FIRMWARE_POLL_INTERVAL,
     FIRMWARE_TIMEOUT,
     CommandSession,
-    wait_for_firmware,
 )
-from paramclient.cli.waiting import while_waiting
 from paramclient.errors import UsageError
 from paramclient.links import LinkKind
 from paramclient.metadata import (
     Metadata,
     MetadataStore,
     ParamInfo,
-    QuickDownload,
-    load_if_quick,
     metadata_of,
     read_metadata,
 )
 from paramclient.metadata.added_files import file_address
 from paramclient.metadata.info import number_of
-from paramclient.metadata.quick_download import obstacle_to_load
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, WireValue, check_name, format_value
-from paramclient.model.wording import counted
 
 __all__ = [
     "DESCRIBED_COLUMNS",
@@ -55,7 +48,6 @@ __all__ = [
     "known_of_session",
     "known_of_sets",
     "known_of_table",
-    "loaded_of_session",
     "meaning_of",
     "needs_reboot",
     "parse_pairs",
@@ -73,13 +65,8 @@ VEHICLE: Final = "vehicle"
 """The value of --metadata that downloads the metadata from the vehicle."""
 _ARDUPILOT_FILES: Final = "ArduPilot's files are at https://autotest.ardupilot.org/Parameters/"
 """Where the files of firmware that does not provide its metadata are, for messages."""
-PX4_NAME: Final = "px4"
-"""The autopilot that may serve its metadata: its firmware version is awaited before that is known."""
 ARDUPILOT_NAME: Final = "ardupilot"
 """The autopilot that does not serve its metadata."""
-FAILURE_AGE_MAX: Final = 86_400.0
-"""Seconds without another attempt to load metadata without a request after a failed one on the same link: one
-day, so that a slow link delays one command, not each."""
 ANNOUNCED_SIZE_MIN: Final = 5_000
 """Bytes from which the download of a metadata file is announced: the first, general file is smaller."""
 
@@ -125,41 +112,6 @@ async def known_of_session(
             )
         return found
     return await _stored(session)
-
-
-async def loaded_of_session(session: CommandSession, choice: str | None) -> Metadata | None:
-    """Return the metadata as `known_of_session`, else load it where the link is quick; or None.
-
-    Loads as `load_if_quick`, in at most 2 s, and remembers the metadata. Nothing is loaded with --json, so
-    that scripts take the same time and get the same members each time; nor with --no-cache; nor within
-    `FAILURE_AGE_MAX` after a failure on this link. For subcommands that read.
-
-    Raises:
-        UsageError, VehicleError, NoReply, LinkError: as `known_of_session`.
-    """
-    found = await known_of_session(session, choice)
-    component, store = session.component, _store_of(session)
-    if found is not None or session.options.json or store is None:
-        return found
-    if component.autopilot == PX4_NAME:
-        await wait_for_firmware([component], session.deadline)
-    if obstacle_to_load(component) is not None:
-        return None
-    identity, number = component.identity, component.component
-    has_failed = partial(store.has_failed, identity, number, within=FAILURE_AGE_MAX)
-    if await anyio.to_thread.run_sync(has_failed):
-        return None
-
-    async def load(_: Callable[[], None]) -> QuickDownload:
-        return await load_if_quick(component, store=store, timeout=session.deadline.left())
-
-    loaded = await while_waiting(load, f"the parameter descriptions of {session.label}")
-    if loaded.metadata is None:
-        await anyio.to_thread.run_sync(store.remember_failure, identity, number)
-        return None
-    described = counted(len(loaded.metadata), "parameter description")
-    say(printable(f"{described} of {session.label} loaded; `paramclient info NAME` shows one"))
-    return loaded.metadata
 
 
 async def request_from_vehicle(session: CommandSession) -> Metadata | None:

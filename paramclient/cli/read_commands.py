@@ -38,7 +38,6 @@ from paramclient.cli.metadata import (
     described_cells,
     from_file,
     known_of_session,
-    loaded_of_session,
 )
 from paramclient.cli.options import Count, LinkOptions
 from paramclient.cli.output import (
@@ -135,7 +134,7 @@ async def fetch(
         """Add the defaults of the metadata, if they are shown."""
         if not (changed or options.json or metadata is not None):
             return fetched
-        found = await find_defaults(fetched.session, metadata, from_option, fetched.params, loads=changed)
+        found = await find_defaults(fetched.session, metadata, from_option, fetched.params)
         return replace(fetched, described=found)
 
     async def fetch_described(session: CommandSession) -> _Fetched:
@@ -155,8 +154,6 @@ async def fetch(
         with progress_bar(f"fetching {session.label}") as progress:
             fetched = await fetching.fetch(session, progress)
         fetched = await described(fetched)
-        if not changed and metadata is None:
-            await loaded_of_session(session, None)  # for info, search and show
         await session.report_others(has_all=True)
     has_defaults = fetched.has_defaults
     if only:
@@ -527,8 +524,7 @@ async def _read(
     """Read the chosen parameters of a vehicle; return them, the errors by name, and the metadata."""
     params, errors = await _get_chosen(session, name_patterns, draws=draws)
     if described is None:
-        load = loaded_of_session if draws else known_of_session  # over one link, no two at a time
-        described = await load(session, choice)
+        described = await known_of_session(session, choice)
     return params, errors, described
 
 

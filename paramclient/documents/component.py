@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from paramclient.documents.document import Document, Maybe
+from paramclient.documents.document import Document
 from paramclient.model.notation import hash_text, rounded
 
 if TYPE_CHECKING:
@@ -111,8 +111,7 @@ class ComponentDoc(Document):
     `key` is the cache key of its table, null until the vehicle is identified. `peer` is the source address of
     its messages. `params` is the number of known parameters, `count` the number that the component announces,
     `fetch` the progress of a running fetch. `contest` names the vehicles if several use the address.
-    `extended` is the state of the extended parameters. `metadata_note` says why the service has not
-    loaded the descriptions of the parameters without a request.
+    `extended` is the state of the extended parameters.
     """
 
     link: str
@@ -139,7 +138,6 @@ class ComponentDoc(Document):
     fetch: ProgressDoc | None
     last_fetch: LastFetchDoc | None
     extended: ExtendedStateDoc
-    metadata_note: Maybe[str] = None
 
     @classmethod
     def of(
@@ -151,7 +149,6 @@ class ComponentDoc(Document):
         key: str | None,
         progress: Progress | None,
         last: FetchResult | None,
-        metadata_note: str | None = None,
     ) -> ComponentDoc:
         """Return the document of the present state of a component.
 
@@ -162,7 +159,6 @@ class ComponentDoc(Document):
             key: the cache key of its table, or None while the vehicle is not identified.
             progress: the progress of a running fetch, or None.
             last: the result of the last fetch, or None.
-            metadata_note: why the descriptions are not loaded, or None.
         """
         identity = component.identity
         sync = component.sync_state
@@ -193,7 +189,6 @@ class ComponentDoc(Document):
             if last is None
             else LastFetchDoc(source=last.source, elapsed_s=round(last.elapsed, 4)),
             extended=ExtendedStateDoc.of(component.ext),
-            metadata_note=metadata_note,
         )
 
 

@@ -17,7 +17,7 @@ from paramclient.metadata.formats import read_metadata
 from paramclient.metadata.info import Metadata
 from paramclient.model.identity import Identity, autopilot_name, version_text
 
-__all__ = ["AddedFiles", "AddedMetadata", "VehicleKind", "file_address"]
+__all__ = ["AddedFiles", "AddedMetadata", "VehicleKind", "file_address", "replace_file"]
 
 VehicleKind: TypeAlias = Literal["copter", "plane", "rover", "sub", "tracker", "blimp", "px4"]
 """The firmwares whose metadata can be added: ArduPilot's, one for each vehicle type, and PX4."""
@@ -90,11 +90,10 @@ class AddedFiles:
         self.folder = folder
 
     def __iter__(self) -> Iterator[AddedMetadata]:
-        paths: list[Path] = []
+        found: list[AddedMetadata] = []
         with suppress(OSError):
-            paths += self.folder.iterdir()
-        named = [(match, path) for path in paths if (match := _name(path.name)) is not None]
-        found = [AddedMetadata(_kinds[match[1]], match[2], path) for match, path in named]
+            named = ((_name(path.name), path) for path in self.folder.iterdir())
+            found += [AddedMetadata(_kinds[match[1]], match[2], path) for match, path in named if match]
         return iter(sorted(found, key=lambda each: (each.kind, _numbers(each.firmware))))
 
     def add(
@@ -121,16 +120,7 @@ class AddedFiles:
         name = f"{chosen}.added" if firmware is None else f"{chosen}-{firmware}.added"
         added = AddedMetadata(chosen, firmware, self.folder / name)
         try:
-            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            number, part = tempfile.mkstemp(dir=self.folder, suffix=".new")  # mode 0600
-            try:
-                with os.fdopen(number, "wb") as file:
-                    file.write(Path(path).read_bytes())
-                Path(part).replace(added.path)
-            except BaseException:
-                with suppress(OSError):
-                    Path(part).unlink()
-                raise
+            replace_file(added.path, Path(path).read_bytes())
         except OSError as error:
             raise MetadataError(f"{source}: cannot be copied: {error.strerror}", source=source) from error
         return added, metadata
@@ -147,10 +137,8 @@ class AddedFiles:
                 try:
                     each.path.unlink(missing_ok=True)
                 except OSError as error:
-                    place = str(each.path)
-                    raise MetadataError(
-                        f"{place}: cannot be removed: {error.strerror}", source=place
-                    ) from error
+                    text = f"{each.path}: cannot be removed: {error.strerror}"
+                    raise MetadataError(text, source=str(each.path)) from error
                 return each
         known = ", ".join(map(str, self)) or "none"
         raise UsageError(f"no metadata was added for {kind} {firmware or 'any version'}; added: {known}")
@@ -181,6 +169,24 @@ def file_address(identity: Identity) -> str:
     folder = _FOLDERS.get(_TYPES.get(identity.vehicle_type, "px4"))
     files = "https://autotest.ardupilot.org/Parameters/"
     return files if folder is None else f"{files}{folder}/apm.pdef.xml"
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Replace a file atomically by one that only its owner can read; create the folder if needed.
+
+    Raises:
+        OSError: writing failed; an existing file is unchanged.
+    """
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    number, part = tempfile.mkstemp(dir=path.parent, suffix=".new")  # mode 0600
+    try:
+        with os.fdopen(number, "wb") as file:
+            file.write(content)
+        Path(part).replace(path)
+    except BaseException:
+        with suppress(OSError):
+            Path(part).unlink()
+        raise
 
 
 def _kind_of(identity: Identity) -> VehicleKind | None:

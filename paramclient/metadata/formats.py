@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from paramclient.errors import MetadataError
-from paramclient.metadata.info import DESCRIPTION_LENGTH_MAX, Metadata, too_long_texts
+from paramclient.metadata.info import Metadata
 
 __all__ = [
     "PACKED_SIZE_MAX",
@@ -25,6 +25,9 @@ CONTENT_SIZE_MAX: Final = 8 << 20
 up to seven times as much memory, if its text is not ASCII."""
 UNPACKING_MEMORY_MAX: Final = 96 << 20
 """Bytes of memory for unpacking. PX4 packs with a dictionary of 64 million, `xz -9`."""
+TEXT_LENGTH_MAX: Final = 65_536
+"""Characters of all texts of one parameter: ten times the longest of ArduPilot. The description of a group
+may be that of thousands of parameters."""
 
 
 def read_metadata(path: str | os.PathLike[str]) -> Metadata:
@@ -56,8 +59,9 @@ def read_content(content: bytes, *, source: str) -> Metadata:
     """
     metadata = _read_unpacked(unpacked(content, source=source).removeprefix(b"\xef\xbb\xbf"), source)
     for name, info in metadata.params.items():
-        if info.text_length > DESCRIPTION_LENGTH_MAX:
-            raise MetadataError(f"{source}: {too_long_texts(name)}", source=source)
+        if info.text_length > TEXT_LENGTH_MAX:
+            text = f"the texts of {name!r:.40} have more than {TEXT_LENGTH_MAX:,} characters"
+            raise MetadataError(f"{source}: {text}", source=source)
     return metadata
 
 
@@ -65,14 +69,14 @@ def json_of(content: bytes, *, source: str) -> dict[str, object]:
     """Parse a JSON object.
 
     Raises:
-        MetadataError: the text is not a JSON object, or has too many values.
+        MetadataError: the text is not a JSON object.
     """
-    from paramclient.metadata.json_parser import parse_json  # imported here: loads pydantic
+    from pydantic_core import from_json  # imported here: loads pydantic
 
     try:
-        document = parse_json(content)
+        document = from_json(content)
     except ValueError as error:
-        raise MetadataError(f"{source}: {error}", source=source) from None
+        raise MetadataError(f"{source}: not JSON: {error}", source=source) from None
     if not isinstance(document, dict):
         raise MetadataError(f"{source}: is JSON, but not an object", source=source)
     return document

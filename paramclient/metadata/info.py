@@ -17,15 +17,12 @@ from paramclient.errors import UsageError
 from paramclient.model.values import ParamType, WireValue, format_value, shortest_float
 from paramclient.model.wording import counted
 
-__all__ = ["DESCRIPTION_LENGTH_MAX", "Metadata", "ParamInfo", "names_of", "number_of", "too_long_texts"]
+__all__ = ["BITS_MAX", "Metadata", "ParamInfo", "finite", "names_of", "number_of", "whole"]
 
 CHOICES_LISTED_MAX: Final = 12
 """Names that an error lists; of more names it lists the closest ones, so that the error stays readable."""
 BITS_MAX: Final = 64
 """Bits of the widest type."""
-DESCRIPTION_LENGTH_MAX: Final = 65_536
-"""Characters of all texts of one parameter: ten times the longest of ArduPilot. The description of a group
-may be that of thousands of parameters."""
 INSTANCE: Final = "{n}"
 """Placeholder of the number in the name and texts of a group of equal parameters."""
 
@@ -269,14 +266,19 @@ class Metadata(Mapping[str, ParamInfo]):
         return f"<Metadata of {counted(len(self), 'param')}{origin}>"
 
 
-def too_long_texts(name: str) -> str:
-    """Return the reason to reject texts of a parameter longer than `DESCRIPTION_LENGTH_MAX`."""
-    return f"the texts of {name!r:.40} have more than {DESCRIPTION_LENGTH_MAX:,} characters"
-
-
 def names_of(named: Mapping[Key, str]) -> Mapping[Key, str]:
     """Return names of values or bits as a read-only mapping."""
     return MappingProxyType(named) if named else _NO_NAMES
+
+
+def whole(number: int | float | None) -> int | float | None:
+    """Return a whole number as int; other numbers, and None, unchanged."""
+    return int(number) if isinstance(number, float) and number.is_integer() else number
+
+
+def finite(number: int | float | None) -> int | float | None:
+    """Return a finite number, a whole one as int; else None."""
+    return None if number is None or not math.isfinite(number) else whole(number)
 
 
 def number_of(text: str) -> int | float | None:

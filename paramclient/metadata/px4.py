@@ -6,17 +6,16 @@ versions only add fields. Unknown fields are ignored, as MAVLink requires.
 
 from __future__ import annotations
 
-import math
-from typing import Annotated, Any, Final, NotRequired, TypeVar
+from typing import Annotated, Final, NotRequired, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, with_config
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from paramclient.errors import MetadataError
-from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo, names_of
+from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo, finite, names_of, whole
 from paramclient.model.values import ParamType
 
-__all__ = ["MetadataFile", "error_text", "read_general", "read_parameters", "whole"]
+__all__ = ["MetadataFile", "read_general", "read_parameters", "validated"]
 
 PARAMS_MAX: Final = 65_535
 """Parameters of a file: as many as param_count can count."""
@@ -70,10 +69,10 @@ class _Parameter(_Strict):
     group: str = ""
 
     def info(self) -> ParamInfo:
-        low, high = _finite(self.minimum), _finite(self.maximum)
+        low, high = finite(self.minimum), finite(self.maximum)
         if low is not None and high is not None and low > high:
             low = high = None
-        values = {whole(each["value"]): each.get("description") for each in self.values}
+        values = {finite(each["value"]): each.get("description") for each in self.values}
         bits = {each["index"]: each.get("description") for each in self.bits}
         return ParamInfo(
             self.name,
@@ -83,10 +82,10 @@ class _Parameter(_Strict):
             self.units,
             low,
             high,
-            _finite(self.increment),
+            finite(self.increment),
             self.decimals,
-            None if self.default is None else whole(self.default),
-            names_of({value: name for value, name in values.items() if name and math.isfinite(value)}),
+            whole(self.default),
+            names_of({value: name for value, name in values.items() if name and value is not None}),
             names_of({bit: name for bit, name in bits.items() if name}),
             self.reboot_required,
             self.is_read_only,
@@ -98,7 +97,7 @@ class _Parameter(_Strict):
 
 class _Parameters(_Strict):
     version: int = Field(ge=1)
-    parameters: list[Any] = Field(max_length=PARAMS_MAX)
+    parameters: list[_Parameter] = Field(max_length=PARAMS_MAX)
 
 
 class MetadataFile(_Strict):
@@ -129,12 +128,8 @@ def read_parameters(document: object, *, source: str) -> Metadata:
     Raises:
         MetadataError: the document does not follow the schema.
     """
-    read = _read(_Parameters, document, source)
-    # one by one: pydantic lets no other thread run while it validates all in one call
-    described = (
-        _read(_Parameter, each, source, ("parameters", number)) for number, each in enumerate(read.parameters)
-    )
-    return Metadata.of((each.info() for each in described), source=source)
+    read = validated(_Parameters, document, source)
+    return Metadata.of((each.info() for each in read.parameters), source=source)
 
 
 def read_general(document: object, *, source: str) -> tuple[MetadataFile, ...]:
@@ -143,35 +138,29 @@ def read_general(document: object, *, source: str) -> tuple[MetadataFile, ...]:
     Raises:
         MetadataError: the document does not follow the schema.
     """
-    return tuple(_read(_General, document, source).files)
+    return tuple(validated(_General, document, source).files)
 
 
-def whole(number: int | float) -> int | float:
-    """Return a whole number as int; other numbers unchanged."""
-    return int(number) if isinstance(number, float) and number.is_integer() else number
-
-
-def error_text(error: ValidationError, within: tuple[int | str, ...] = ()) -> str:
-    """Return the first problem as text, to be appended to the file's name.
+def validated(model: type[Model], document: object, source: str, within: tuple[int | str, ...] = ()) -> Model:
+    """Return a part of a document as an instance of a model.
 
     Args:
-        error: the error.
-        within: place of the validated part in the file.
+        model: the model.
+        document: the part.
+        source: the file, for errors.
+        within: the place of the part in the file.
+
+    Raises:
+        MetadataError: the part is invalid, with the place of the first problem.
     """
-    first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-    place = "".join(f"[{each}]" if isinstance(each, int) else f".{each}" for each in (*within, *first["loc"]))
-    return f"{', ' if place else ''}{place.lstrip('.')}: {first['msg']}"
-
-
-def _read(model: type[Model], document: object, source: str, within: tuple[int | str, ...] = ()) -> Model:
     try:
         return model.model_validate(document)
     except ValidationError as error:
-        raise MetadataError(f"{source}{error_text(error, within)}", source=source) from None
-
-
-def _finite(number: float | None) -> int | float | None:
-    return None if number is None or not math.isfinite(number) else whole(number)
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        steps = (*within, *first["loc"])
+        place = "".join(f"[{each}]" if isinstance(each, int) else f".{each}" for each in steps)
+        comma = ", " if place else ""
+        raise MetadataError(f"{source}{comma}{place.lstrip('.')}: {first['msg']}", source=source) from None
 
 
 _TYPES: Final = {

@@ -6,7 +6,6 @@
 `scheduler`: many components on one link: which are due, and whose lists run.
 `addresses`: addresses of components and peers.
 `vehicle_selection`: the only vehicle that an incomplete address fits.
-`quick_transfer`: whether a large file may be read without a request of the user.
 `no_reply_hint`: the hint of a `NoReply`: what was heard on a link instead of the awaited response.
 `system_id_change`: the search for a vehicle under a new system id.
 `wire`: frames, messages, signatures.

@@ -7,7 +7,6 @@ Needs the extra `service`.
   extended parameters.
 - `event_feed`, `jobs`: numbered events, jobs. The members of events are built by `followed_component`,
   `followed_extended`, `link` and `jobs`.
-- `description_loader`: descriptions of parameters, loaded without a request.
 - `access`, `request`, `tokens`, `client_address`, `tls`: access checks of every request.
 - `acceptor`, `connection_slots`, `connections`: connections before TLS, their number, their limits.
 - `quota`, `body_limits`, `body_memory`, `log_limit`: limits of requests in progress, request bodies and log

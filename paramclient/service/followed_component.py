@@ -58,7 +58,6 @@ class FollowedComponent:
         component: the component of the library.
         link: its link.
         metadata: descriptions of its parameters, or None; see `describe`.
-        metadata_note: why the service has not loaded the descriptions without a request, or None.
         extended: its extended parameters.
     """
 
@@ -66,7 +65,6 @@ class FollowedComponent:
         self.component = local(component)
         self.link = link
         self.metadata: Metadata | None = None
-        self.metadata_note: str | None = None
         self._described_firmware: tuple[object, ...] | None = None
         self._feed = feed
         self._published = as_params(component.params).copy()
@@ -105,7 +103,6 @@ class FollowedComponent:
             key=self.key,
             progress=None if fetch is None else fetch.progress(anyio.current_time()),
             last=machine.fetches.last,
-            metadata_note=self.metadata_note,
         )
 
     def describe(self, metadata: Metadata, identity: Identity | None = None) -> None:
@@ -115,7 +112,6 @@ class FollowedComponent:
             metadata: the descriptions. They are removed when the firmware is another one.
             identity: the identity whose firmware they belong to; None for the present one.
         """
-        self.metadata_note = None
         self._described_firmware = _firmware_of(self.component.identity if identity is None else identity)
         if self.metadata is None or metadata.params != self.metadata.params:
             self._set_metadata(metadata)
@@ -311,7 +307,6 @@ class FollowedComponent:
             component.is_armed,
             component.machine.fetches.last,
             self.link.state,
-            self.metadata_note,
             (ext.is_spoken, ext.is_expected, ext.is_complete, ext.count),
         )
 

@@ -31,7 +31,6 @@ from paramclient.metadata.metadata_cache import MetadataStore
 from paramclient.model.notation import time_text
 from paramclient.protocol.no_reply_hint import hint_of_link
 from paramclient.protocol.vehicle_selection import LOOK_TIME, VehicleChoice
-from paramclient.service.description_loader import DescriptionLoader
 from paramclient.service.event_feed import EventFeed
 from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.jobs import Job, Jobs
@@ -129,7 +128,6 @@ class Hub:
         self.fleet_comparisons = anyio.Semaphore(1)
         self._closing = anyio.Event()
         self.metadata_store = None if self.cache is None else MetadataStore.beside(self.cache.path)
-        self._descriptions = DescriptionLoader(self.metadata_store)
         self._setups = None if self.cache is None else SetupNotes.beside(self.cache.path)
         self._tasks: anyio.abc.TaskGroup | None = None
         self._link_tasks: anyio.abc.TaskGroup | None = None
@@ -415,7 +413,7 @@ class Hub:
             make()  # invalid options raise an error here
         if name in self.links:
             raise UsageError(f"the link {name} is given twice")
-        self.links[name] = ServiceLink(name, make, self.feed, self._on_found, self._on_checked)
+        self.links[name] = ServiceLink(name, make, self.feed, self._on_found)
 
     def _check_link(self, link: str | None) -> None:
         if link is not None and link not in self.links:
@@ -434,12 +432,6 @@ class Hub:
         """Handle a component that is new, found again, or restarted."""
         assert self._tasks is not None, "the hub is open"
         self._tasks.start_soon(self._load_component, followed)
-
-    def _on_checked(self, followed: FollowedComponent) -> None:
-        """Load the descriptions of a component if they are due."""
-        if self._fetches and not self.is_closing and self._descriptions.check(followed):
-            assert self._tasks is not None, "the hub is open"
-            self._tasks.start_soon(self._descriptions.begin(followed))
 
     async def _load_component(self, followed: FollowedComponent) -> None:
         """Load cached data of a component, then fetch its table."""

@@ -51,7 +51,6 @@ class ServiceLink:
         make: creates a client for it, not yet open.
         feed: the event feed.
         on_found: called with every component that is heard, found again, or restarted.
-        on_checked: called with every component about five times a second.
 
     Attributes:
         name: name of the link in the service.
@@ -70,7 +69,6 @@ class ServiceLink:
         make: Callable[[], ParamClient],
         feed: EventFeed,
         on_found: Callable[[FollowedComponent], None],
-        on_checked: Callable[[FollowedComponent], None],
     ) -> None:
         self.name = name
         self.state = "opening"
@@ -82,7 +80,6 @@ class ServiceLink:
         self._make = make
         self._feed = feed
         self._on_found = on_found
-        self._on_checked = on_checked
         self._ended: anyio.Event = anyio.Event()
         self._ending: ParamClientError | None = None
 
@@ -200,7 +197,6 @@ class ServiceLink:
                     followed.publish_state_changes()
                 else:
                     followed.publish_changes()
-                self._on_checked(followed)
                 if not number % COMPONENTS_PER_TURN:
                     await anyio.lowlevel.checkpoint()
         if self._ending is not None:

@@ -38,7 +38,6 @@ __all__ = [
     "apply_extended",
     "check_vehicle",
     "load_extended_state",
-    "load_if_quick",
     "metadata_of",
     "prepare",
     "restore",
@@ -83,7 +82,6 @@ verify_extended = _blocking(provision.verify_extended)
 restore_extended = _blocking(provision.restore_extended)
 load_extended_state = _blocking(provision.load_extended_state)
 metadata_of = _blocking(metadata.metadata_of)
-load_if_quick = _blocking(metadata.load_if_quick)
 
 
 def apply_all(

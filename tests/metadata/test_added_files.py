@@ -1,4 +1,4 @@
-"""Metadata files that the user adds: for which firmware each is used, and the subcommand metadata."""
+"""Metadata files that the user adds: for which firmware each is used."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 
 from paramclient import MetadataError, UsageError
-from paramclient.metadata import AddedFiles, Metadata, MetadataStore, metadata_cache, read_metadata
+from paramclient.metadata import AddedFiles, MetadataStore
 from paramclient.model.identity import Identity
 from paramclient.model.px4_hash import crc32_px4
-from tests.commands import Command, Put, behind, in_process, leaping
 
 DATA = Path(__file__).parent.parent / "data"
 ARDUPILOT, PX4 = 3, 12
@@ -35,32 +34,6 @@ def maximum(files: AddedFiles, identity: Identity, component: int = 1) -> float 
     """Return the maximum by which it shows which file is used; None for no file."""
     found = files.find(identity, component)
     return None if found is None else found["GAIN"].maximum
-
-
-def test_a_store_parses_an_added_file_once_and_again_when_it_has_changed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    parsed: list[Path] = []
-
-    def noting(path: Path) -> Metadata:
-        parsed.append(path)
-        return read_metadata(path)
-
-    monkeypatch.setattr(metadata_cache, "read_metadata", noting)
-    store = MetadataStore(tmp_path / "kept")
-    others = [replace(COPTER, vehicle_type=number) for number in (1, 10)]  # a plane and a rover
-    for vehicle in ("ArduCopter", "ArduPlane", "Rover"):
-        store.added.add(described(tmp_path, vehicle))
-    first = store.known(COPTER, 1)
-    assert first is not None
-    assert store.known(COPTER, 1) is first
-    assert len(parsed) == 1
-    store.added.add(described(tmp_path, "ArduCopter", 20))
-    found = store.known(COPTER, 1)
-    assert found is not None
-    assert (found["GAIN"].maximum, len(parsed)) == (20, 2)
-    assert all(store.known(each, 1) is not None for each in others)
-    assert (store.known(COPTER, 1), len(parsed)) == (found, 5), "two files are kept"
 
 
 def test_the_most_exact_version_that_fits_is_used(tmp_path: Path) -> None:
@@ -130,19 +103,13 @@ def test_a_store_prefers_what_the_vehicle_has_provided(tmp_path: Path) -> None:
     found = store.known(identity, 1)
     assert found is not None
     assert found["GAIN"].maximum == 7
+    assert store.known(identity, 1) is found, "an unchanged file is parsed once"
+    store.added.add(described(tmp_path, "ArduCopter", 9))
+    found = store.known(identity, 1)
+    assert found is not None
+    assert found["GAIN"].maximum == 9
     store.put(own, crc32_px4(own))
     store.remember(identity, 1, crc32_px4(own))
     found = store.known(identity, 1)
     assert found is not None
     assert found["GAIN"].maximum == 8
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
-    leaping(monkeypatch)
-    return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    return behind(monkeypatch, "udpin:0.0.0.0:14550")

@@ -241,7 +241,6 @@ export function offerDescriptions() {
   const { table } = store;
   const isWanted = table.isLoaded && table.rows.size && !store.component?.is_kept;
   byId("describe").hidden = !isWanted || table.sorted.some((row) => row.info);
-  setAttribute(byId("describe"), "title", store.component?.metadata_note);
 }
 
 async function stopFetch() {
