@@ -1,9 +1,11 @@
-"""Keeps all tests, and the processes that they start, away from the folders of the user who runs them."""
+"""Runs tests in any order, and keeps them and the processes that they start away from the user's folders."""
 
 from __future__ import annotations
 
 import itertools
 import os
+import random
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,7 +20,31 @@ FOLDERS = {
 }
 """Environment variables that name a file or folder of the user, and where it is below HOME."""
 
+ORDER = os.environ.setdefault("TEST_ORDER", str(random.randrange(1, 10_000)))
+"""Seed of the order of the tests, which workers inherit; 0 for the order of the files."""
+
 _homes = itertools.count()
+
+
+def pytest_report_header() -> str:
+    """Name the order, to run it again."""
+    return f"order of the tests: TEST_ORDER={ORDER}"
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Shuffle the modules, and the tests of each module."""
+    if ORDER == "0":
+        return
+    modules = defaultdict[Path, list[pytest.Item]](list)
+    for item in items:
+        modules[item.path].append(item)
+    chance = random.Random(ORDER)
+    groups = list(modules.values())
+    chance.shuffle(groups)
+    for group in groups:
+        chance.shuffle(group)
+    items[:] = itertools.chain.from_iterable(groups)
 
 
 def _use_home(environment: pytest.MonkeyPatch, home: Path) -> Path:
