@@ -55,7 +55,8 @@ except Exception as error:
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "aarch64"), reason="the numbers of calls are others")
 def test_only_a_durable_write_waits_for_the_disk(tmp_path: Path) -> None:
-    said = start(WITHOUT_FSYNC, tmp_path / "cache").communicate()[0].splitlines()
+    with start(WITHOUT_FSYNC, tmp_path / "cache") as program:
+        said = program.communicate()[0].splitlines()
     assert said[0] == "written"
     assert said[1].startswith("CacheError")
     assert said[1].endswith("disk I/O error")
