@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from paramclient import (
-    AlreadyRestored,
     CacheError,
     Component,
     ExtParam,
@@ -141,21 +140,6 @@ async def test_the_state_before_the_last_apply_is_restored(path: Path) -> None:
 
 
 @in_simulated_time
-async def test_an_apply_is_not_undone_twice(path: Path) -> None:
-    camera = small()
-    async with a_client(camera, cache=path) as client:
-        component = await the_camera(client)
-        await apply_extended(component, wanted(camera, MODE=2))
-        assert (await restore_extended(component, await load_extended_state(component))).complete
-        await component.ext.set("NAME", "Top")
-        with pytest.raises(AlreadyRestored, match=r"a restore ran \d+ s ago, after the last apply") as caught:
-            await load_extended_state(component)
-        point, later = await component.ext.snapshots()
-        assert (caught.value.before_apply, caught.value.before_restore) == (point.id, later.id)
-        assert (await load_extended_state(component, caught.value.before_apply)).params["MODE"].value == 1
-
-
-@in_simulated_time
 async def test_a_state_at_a_time_is_restored(path: Path) -> None:
     camera = small()
     async with a_client(camera, cache=path) as client:
@@ -174,34 +158,6 @@ async def test_a_state_at_a_time_is_restored(path: Path) -> None:
             await component.ext.load_state(99)
         with pytest.raises(NotInCache, match="the history begins at"):
             await component.ext.load_state(5.0)
-
-
-@in_simulated_time
-async def test_without_a_cache_there_are_no_earlier_states() -> None:
-    camera = small()
-    async with a_client(camera) as client:
-        component = await the_camera(client)
-        result = await apply_extended(component, wanted(camera, MODE=2))
-        assert (result.complete, result.snapshot) == (True, None)
-        with pytest.raises(UsageError, match="earlier states are in the cache, and the client has none"):
-            await load_extended_state(component)
-
-
-@in_simulated_time
-async def test_what_is_done_before_writing_may_end_the_call(path: Path) -> None:
-    camera = small()
-    requested = []
-
-    async def refuse() -> None:
-        requested.append(camera.ext_values["MODE"])
-        raise UsageError("not now")
-
-    async with a_client(camera, cache=path) as client:
-        component = await the_camera(client)
-        with pytest.raises(UsageError, match="not now"):
-            await apply_extended(component, wanted(camera, MODE=2), before_writing=refuse)
-        assert (requested, await component.ext.snapshots()) == ([1], [])
-        assert (await apply_extended(component, wanted(camera, MODE=1), before_writing=refuse)).complete
 
 
 @in_simulated_time

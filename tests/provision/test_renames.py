@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import pytest
 
-from paramclient import InvalidParameters, ParamSet, ParamType, Rename, Renames, UsageError, WrittenParam
-from paramclient.model.identity import Identity, version_text
+from paramclient import ParamSet, ParamType, Rename, Renames, UsageError, WrittenParam
+from paramclient.model.identity import Identity
 from paramclient.model.values import Encoding, Param, WireValue, bits_of
 from paramclient.provision import (
     MISSING,
@@ -16,13 +15,10 @@ from paramclient.provision import (
     ApplyStatus,
     PlanStatus,
     apply,
-    apply_all,
     plan,
     prepare,
     verify,
-    verify_all,
 )
-from paramclient.provision.inspection import wait_for_identity
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from tests.shell import a_client, in_simulated_time
 
@@ -83,11 +79,6 @@ def test_a_renamed_parameter_is_planned_under_the_name_of_the_vehicle() -> None:
     assert made.rows["RTL_ALT"].is_met
 
 
-def test_a_newer_name_is_planned_under_the_older_one_of_the_vehicle() -> None:
-    made = plan(held(WPNAV_SPEED=1000.0), written({"WP_SPD": 7.5}), renames=RENAMES)
-    assert [(step.name, step.value) for step in made.steps] == [("WPNAV_SPEED", 750)]
-
-
 def test_a_name_that_the_vehicle_has_is_not_touched() -> None:
     made = plan(held(WPNAV_SPEED=5.0, WP_SPD=10.0), written({"WPNAV_SPEED": 750}), renames=RENAMES)
     assert [(step.name, step.value) for step in made.steps] == [("WPNAV_SPEED", 750)]
@@ -127,24 +118,6 @@ def test_a_parameter_is_left_out_by_either_of_its_names() -> None:
     assert back.rows["INS_ACCOFFS_X"].category == "calibration"
 
 
-def test_the_order_goes_by_the_names_of_the_vehicle() -> None:
-    made = plan(
-        held(**TABLE),
-        written({"WPNAV_SPEED": 750, "EK1_ENABLE": 1, "EK1_TYPE": 3}),
-        renames=RENAMES,
-        autopilot="ardupilot",
-    )
-    assert [[step.name for step in stage.steps] for stage in made.stages] == [["EK2_ENABLE"], ["WP_SPD"]]
-    assert made.rows["EK1_TYPE"].status is PlanStatus.LATER
-
-
-def test_a_switch_may_reveal_a_parameter_under_its_other_name() -> None:
-    wanted = written({"EK1_ENABLE": 1, "EK1_TYPE": 3, "EK1_NEW": 1})
-    made = plan(held(**TABLE), wanted, renames=RENAMES, autopilot="ardupilot")
-    statuses = {name: str(made.rows[name].status) for name in wanted}
-    assert statuses == {"EK1_ENABLE": "set", "EK1_TYPE": "later", "EK1_NEW": "skipped"}
-
-
 # Firmware versions
 
 
@@ -169,17 +142,6 @@ def test_a_plan_names_firmware_versions_that_differ(
     file: Identity | None, vehicle: Identity, note: str
 ) -> None:
     assert plan(written({"A": 1}, vehicle), written({"A": 1}, file)).firmware_note == note
-
-
-def test_a_plan_for_a_bare_table_knows_no_firmware() -> None:
-    assert plan(held(A=1.0), written({"A": 1}, at(0x040507FF))).firmware_note == ""
-
-
-@pytest.mark.parametrize(
-    ("firmware", "text"), [(0x040600C0, "4.6.0-rc"), (0x04060040, "4.6.0-alpha"), (0x040600FE, "4.6.0-rc")]
-)
-def test_the_type_of_a_firmware_is_part_of_its_version(firmware: int, text: str) -> None:
-    assert version_text(firmware) == text
 
 
 # Vehicles
@@ -226,45 +188,6 @@ async def test_names_are_looked_up_again_after_a_stage_that_reveals_parameters()
         assert (row.renamed.name, row.actual) == ("EK2_GPS_TYPE", 3)
         assert made.rows["EK1_ENABLE"].target.name == "EK2_ENABLE"
     assert vehicle.values["EK2_GPS_TYPE"] == 3
-
-
-@in_simulated_time
-async def test_apply_refuses_a_converted_value_that_is_invalid_under_the_name_of_the_file() -> None:
-    vehicle = copter()
-    async with a_client(vehicle) as client:
-        component = await client.component()
-        with pytest.raises(InvalidParameters) as error:
-            await apply(component, written({"RTL_ALT": 1550}), renames=RENAMES)
-        assert error.value.problems == {
-            "RTL_ALT": "as RTL_ALT_M, 15.5 is not a whole number, and the parameter is INT16"
-        }
-        with pytest.raises(UsageError, match="both WP_SPD"):
-            await apply(component, written({"WPNAV_SPEED": 1, "WP_SPD": 1}), renames=RENAMES)
-    assert vehicle.requests["PARAM_SET"] == 0
-
-
-@in_simulated_time
-async def test_fleets_are_set_up_with_renames() -> None:
-    vehicle = copter()
-    wanted = written({"WPNAV_SPEED": 750})
-    async with a_client(vehicle) as client:
-        await client.component()
-        vehicles = list(client.components.values())
-        assert (await apply_all(vehicles, wanted, renames=RENAMES)).complete
-        assert (await verify_all(vehicles, wanted, renames=RENAMES)).is_met
-        assert not (await verify_all(vehicles, wanted)).is_met
-
-
-@in_simulated_time
-async def test_the_plan_of_a_vehicle_names_its_firmware_if_the_file_has_another_one() -> None:
-    async with a_client(copter()) as client:
-        component = await client.component()
-        await wait_for_identity(component)
-        own = component.identity
-        older = replace(own, firmware=0x040507FF)
-        made = await prepare(component, written({"OTHER": 1}, older))
-        assert made.firmware_note == "the file is of ArduPilot 4.5.7, the vehicle has 4.6.0-dev"
-        assert (await verify(component, written({"OTHER": 1}, own))).firmware_note == ""
 
 
 @in_simulated_time

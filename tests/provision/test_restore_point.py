@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from unittest import mock
 
 import pytest
 
@@ -41,20 +40,6 @@ async def test_the_point_has_the_state_before_the_apply_and_later_changes(path: 
         assert list(point.changes) == ["RATE", "GAIN"]
         with pytest.raises(NotInCache, match="no snapshot from before an apply to uid:00"):
             load_restore_point(cache, "uid:00", 1)
-
-
-@in_simulated_time
-async def test_the_snapshots_are_read_once(path: Path) -> None:
-    async with a_client(GenericVehicle({"GAIN": 1}), cache=path) as client:
-        component = await client.component()
-        await apply(component, wanted(GAIN=5))
-    with (
-        ParamCache(path) as cache,
-        mock.patch.object(ParamCache, "snapshots", autospec=True, side_effect=ParamCache.snapshots) as read,
-    ):
-        load_restore_point(cache, *where(component))
-        load_state_before_apply(cache, *where(component))
-    assert read.call_count == 2
 
 
 @in_simulated_time

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import itertools
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -15,22 +14,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from paramclient import Component, ParamCache, ParamClient, read_file
+from paramclient import ParamCache, ParamClient
 from paramclient.client.client import local_client
-from paramclient.client.link_client import LinkClient
-from paramclient.client.link_component import LinkComponent
 from paramclient.errors import (
     AnotherVehicle,
     CacheError,
     CommandRefused,
-    FileError,
     InvalidParameters,
     LinkError,
     NoReply,
     UsageError,
     VehicleArmed,
 )
-from paramclient.metadata import ParamInfo
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, WireValue, bits_of, from_bits
@@ -40,7 +35,6 @@ from paramclient.provision import (
     MISSING,
     ApplyProgress,
     ApplyStatus,
-    PlanStatus,
     apply,
     apply_all,
     overlay,
@@ -50,8 +44,7 @@ from paramclient.provision import (
     verify,
     verify_all,
 )
-from paramclient.provision.execution import VERIFY_DELAY, ApplyRun
-from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, GenericVehicle, PX4Vehicle, SimParam
+from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, SimParam
 from paramclient.sim.param_table import Entry
 from tests.shell import FlakyLink, Tap, a_client, in_simulated_time, residue
 
@@ -194,43 +187,6 @@ async def test_all_values_are_written_and_verified(make: Callable[[], Any], loss
     assert "FRAME_CLASS" in result.extra
 
 
-@EVERY_KIND
-@in_simulated_time
-async def test_prepare_lists_exactly_the_values_that_apply_sends(
-    make: Callable[[], Any],
-) -> None:
-    tap = Tap(make())
-    wanted = written(another("TUNE_01", "TUNE_02") | {"EK2_ALT_M_NSE": 1.0, "EK2_ENABLE": 1, "TUNE_04": 1.0})
-    async with a_client(tap) as client:
-        component = await client.component()
-        plan = await prepare(component, wanted)
-        assert tap.messages(wire.ParamSetMessage) == []
-        assert [[step.name for step in stage.steps] for stage in plan.stages] == [
-            ["EK2_ENABLE"],
-            ["TUNE_01", "TUNE_02", "EK2_ALT_M_NSE"],
-        ]
-        result = await apply(component, plan)
-    assert result.complete
-    assert sets(tap) == [step.name for step in plan.steps]
-    assert result.rows["TUNE_04"].status is ApplyStatus.UNCHANGED
-
-
-@EVERY_KIND
-@in_simulated_time
-async def test_the_verification_is_requested_after_the_last_write(make: Callable[[], Any]) -> None:
-    tap = Tap(make())
-    async with a_client(tap) as client:
-        assert (await apply(await client.component(), written(another()))).complete
-    messages = [message for _, _, message in tap.received]
-    last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSetMessage))
-    requested = messages[last + 1 :]
-    if make is ardupilot:
-        assert any(isinstance(message, wire.FileTransfer) for message in requested)
-    else:
-        hashes = [message for message in requested if isinstance(message, wire.ParamRequestRead)]
-        assert {message.param_id for message in hashes} == {wire.HASH_CHECK}
-
-
 @in_simulated_time
 async def test_a_value_missing_from_the_last_list_is_unproven() -> None:
     vehicle = ardupilot(ftp=False)
@@ -247,222 +203,12 @@ async def test_a_value_missing_from_the_last_list_is_unproven() -> None:
     assert not result.complete
 
 
-@in_simulated_time
-async def test_values_that_no_hash_covers_are_read_again_for_verification() -> None:
-    vehicle = px4()
-
-    def learn(progress: ApplyProgress) -> None:
-        if progress.phase == "reading":  # changed in flight, without a PARAM_VALUE
-            vehicle._entry("CAL_ACC0_XOFF").store(bits_of(0.75, ParamType.REAL32))
-
-    wanted = written({"TUNE_01": 9.5, "CAL_ACC0_XOFF": 0.5})
-    async with a_client(vehicle) as client:
-        component = await client.component()
-        await component.fetch_all()
-        result = await apply(component, wanted, include="calibration", progress=learn)
-    assert result.before["CAL_ACC0_XOFF"].value == 0.75
-    assert statuses(result) == {"TUNE_01": "set", "CAL_ACC0_XOFF": "adjusted"}
-    assert result.rows["CAL_ACC0_XOFF"].actual == 0.75
-
-
-@EVERY_KIND
-@pytest.mark.parametrize("policy", ["hash-only", "cache-only"])
-@in_simulated_time
-async def test_the_verification_reads_the_values_with_every_cache_policy(
-    make: Callable[[], Any], policy: str, tmp_path: Path
-) -> None:
-    vehicle = make()
-    with ParamCache(tmp_path / "cache.sqlite3") as cache:
-        async with ParamClient(vehicle, cache=cache) as client:
-            await (await client.component()).fetch_all()
-        tap = Tap(vehicle)
-        async with ParamClient(tap, cache=cache, policy=policy) as client:
-            result = await apply(await client.component(), written(another("TUNE_01", "TUNE_04")))
-        assert result.complete
-        (kept,) = cache.snapshots(cache.vehicles()[0].key)
-    messages = [message for _, _, message in tap.received]
-    last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSetMessage))
-    requested = {each.param_id for each in messages[last + 1 :] if isinstance(each, wire.ParamRequestRead)}
-    by_hash = make is px4 and policy == "hash-only"
-    assert requested == ({wire.HASH_CHECK} if by_hash else {"TUNE_01", "TUNE_04"})
-    assert not kept.complete  # values that were only cached are not in it
-
-
-@EVERY_KIND
-@in_simulated_time
-async def test_a_plan_without_steps_writes_and_rereads_nothing(make: Callable[[], Any]) -> None:
-    vehicle = make()
-    tap = Tap(vehicle)
-    wanted = ParamSet.of(vehicle.params.values())
-    async with a_client(tap) as client:
-        component = await client.component()
-        result = await apply(component, wanted)
-        listed = vehicle.requests["PARAM_REQUEST_LIST"]
-        assert (await verify(component, wanted)).is_met
-    assert result.complete
-    assert set(statuses(result).values()) == {"unchanged", "skipped"}
-    assert tap.messages(wire.ParamSetMessage) == []
-    assert listed <= 1
-
-
 def downloads(tap: Tap) -> int:
     """Return the number of times that the table was requested, as a file or as a list."""
     packets = [Packet.unpack(message.payload) for message in tap.messages(wire.FileTransfer)]
     files = {packet.sequence for packet in packets if packet.opcode == Opcode.OPEN_FILE_RO}
     lists = {round(at, 1) for at, _, message in tap.received if isinstance(message, wire.ParamRequestList)}
     return len(files) or len(lists)  # copies that are sent together count once
-
-
-@pytest.mark.parametrize("ftp", [True, False])
-@in_simulated_time
-async def test_two_downloads_suffice_for_any_file(ftp: bool) -> None:
-    switch: dict[str, WireValue | tuple[ParamType, WireValue]] = {"GRIP_ENABLE": (ParamType.INT8, 1)}
-    grip: dict[str, WireValue | tuple[ParamType, WireValue]] = {
-        "GRIP_TYPE": (ParamType.INT8, 0),
-        "GRIP_REGRAB": 1.0,
-    }
-    groups = {"EK2_ENABLE": GROUP, "GRIP_ENABLE": grip}
-    vehicle = ArduPilotVehicle(table=SETTINGS | OTHERS | switch, groups=groups, ftp=ftp)
-    tap = Tap(vehicle)
-    hidden = {"EK2_ENABLE": 1, "EK2_ALT_M_NSE": 1.5, "EK2_GPS_TYPE": 2, "GRIP_ENABLE": 0, "GRIP_REGRAB": 2.0}
-    of_a_hidden_group = {f"GRIP_NONE{number}": 1 for number in range(15)}
-    unknown = {f"NO_SUCH_{number}": 1 for number in range(60)} | of_a_hidden_group
-    async with a_client(tap) as client:
-        component = await client.component()
-        await anyio.sleep(10.0)  # what it measures at its start has been read
-        result = await apply(component, written(another() | hidden))
-        assert result.complete
-        assert downloads(tap) == 2
-        assert sets(tap)[0] == "EK2_ENABLE"
-        for name, value in hidden.items():
-            assert vehicle.param(name).value == value
-        for name in ("EK2_ENABLE", "TUNE_01"):
-            vehicle.set_param(name, 0)
-        await anyio.sleep(10.0)  # the watch fetches the table with the other count
-        tap.received.clear()
-        result = await apply(component, written(another() | hidden | unknown))
-        assert {row.name for row in result.rows.values() if row.category == MISSING} == unknown.keys()
-        assert downloads(tap) == 2
-        requested = {message.param_id for message in tap.messages(wire.ParamRequestRead)}
-        assert of_a_hidden_group.keys() <= requested
-        assert requested.isdisjoint(unknown.keys() - of_a_hidden_group), "no hidden group can have them"
-
-
-def whole_tables(tap: Tap) -> int:
-    """Return the number of downloads of the whole table, as the vehicle has received their requests.
-
-    Each request for a list counts. A file counts with the first read after it was opened: it is opened again
-    where the response was lost, and that is still the same download.
-    """
-    files = 0
-    is_open = False
-    for message in tap.messages(wire.FileTransfer):
-        packet = Packet.unpack(message.payload)
-        if packet.opcode == Opcode.OPEN_FILE_RO:
-            is_open = packet.data.startswith(b"@PARAM/param.pck") and b"start=" not in packet.data
-        elif packet.opcode in (Opcode.READ_FILE, Opcode.BURST_READ_FILE):
-            files += is_open
-            is_open = False
-    return files + len(tap.messages(wire.ParamRequestList))
-
-
-@contextlib.asynccontextmanager
-async def four_groups(
-    ways: tuple[FaultyLink, FaultyLink], delay: float
-) -> AsyncIterator[tuple[Component, Tap, dict[str, WireValue]]]:
-    """A vehicle that has been up for a while, and 30 values, of which 4 show groups of the real quad."""
-    switches = ("GRIP_ENABLE", "SCR_ENABLE", "FOLL_ENABLE", "SPRAY_ENABLE")
-    groups: dict[str, dict[str, WireValue]] = {
-        switch: {f"{switch.removesuffix('ENABLE')}{number}": 1.0 for number in range(7 + (at < 2))}
-        for at, switch in enumerate(switches)
-    }
-    tap = Tap(vehicle := ArduPilotVehicle(groups=groups, live=()))
-    wanted: dict[str, WireValue] = dict.fromkeys(switches, 1)
-    wanted |= {
-        name: 2.0 for switch in switches for name in list(groups[switch])[: 6 + (switch in switches[:2])]
-    }
-    assert len(wanted) == 30
-    async with a_client(Air([tap], uplink=ways[0], downlink=ways[1])) as client:
-        component = await client.component()
-        await anyio.sleep(delay)
-        tap.received.clear()
-        yield component, tap, wanted
-        assert {name: vehicle.param(name).value for name in wanted} == wanted
-
-
-def lossy(seed: int) -> tuple[FaultyLink, FaultyLink]:
-    """100 ms round trip, and 5 % loss in each direction."""
-    uplink, downlink = (FaultyLink(loss=0.05, delay=0.05, seed=2 * seed + number) for number in (0, 1))
-    return uplink, downlink
-
-
-@pytest.mark.parametrize("delay", [10.0, 5.0], ids=["boot values were read", "while they are due"])
-@pytest.mark.parametrize("seed", [*range(6), 10])
-@in_simulated_time
-async def test_with_packet_loss_four_groups_take_two_downloads_and_six_seconds(
-    seed: int, delay: float
-) -> None:
-    """With seed 10 and after 10 s, the only response to an open is lost, and the burst behind it is received.
-
-    ArduPilot measures values at its boot, which are read again when the client has been connected for 5 s.
-    """
-    async with four_groups(lossy(seed), delay) as (component, tap, wanted):
-        began = anyio.current_time()
-        result = await apply(component, written(wanted))
-        elapsed = anyio.current_time() - began
-        await anyio.sleep(5.0)  # neither the count that has changed nor the boot is a reason for more
-        downloaded = whole_tables(tap)
-    assert result.complete, result
-    assert set(statuses(result).values()) == {"set"}
-    assert downloaded <= 2
-    assert elapsed <= 6.0
-
-
-@pytest.mark.parametrize("osd_type", [0, 1])
-@in_simulated_time
-async def test_a_hidden_group_may_follow_its_switch_without_an_underscore(osd_type: int) -> None:
-    """ArduPilot's AP_OSD: OSD_TYPE hides OSD_CHAN and the screens OSD1_ to OSD4_."""
-    osd: dict[str, WireValue | tuple[ParamType, WireValue]] = {"OSD_CHAN": 0.0, "OSD1_ENABLE": 0.0}
-    table = SETTINGS | {"OSD_TYPE": (ParamType.INT8, 0)}
-    vehicle = ArduPilotVehicle(table=table, groups={"OSD_TYPE": osd}, ftp=True)
-    async with a_client(vehicle) as client:
-        result = await apply(
-            await client.component(), written({"OSD_TYPE": osd_type, "OSD_CHAN": 5.0, "OSD1_ENABLE": 1.0})
-        )
-    assert result.complete
-    assert (vehicle.param("OSD_CHAN").value, vehicle.param("OSD1_ENABLE").value) == (5.0, 1.0)
-
-
-@in_simulated_time
-async def test_a_group_that_cannot_be_read_by_name_is_set_once_it_is_revealed() -> None:
-    vehicle = ardupilot(HidingGroup)
-    wanted = written({"EK2_GPS_TYPE": 3, "TUNE_01": 9.0, "EK2_ENABLE": 1, "EK2_NO_SUCH": 1})
-    tap = Tap(vehicle)
-    requested: list[int] = []
-
-    def count(progress: ApplyProgress) -> None:
-        reads = tap.messages(wire.ParamRequestRead)
-        requested.append(sum(message.param_id == "EK2_NO_SUCH" for message in reads))
-
-    async with a_client(tap) as client:
-        component = await client.component()
-        plan = await prepare(component, wanted)
-        assert plan.rows["EK2_GPS_TYPE"].status is PlanStatus.LATER
-        result = await apply(component, wanted, progress=count)
-        count(ApplyProgress("over", 0, 0))
-    # missing names were requested again after others had been revealed, and the whole table was not
-    assert requested[0] < requested[1] < requested[-1]
-    assert downloads(tap) == 3  # one for the plan, one before the first write, one for the verification
-    assert statuses(result) == {
-        "EK2_GPS_TYPE": "set",
-        "TUNE_01": "set",
-        "EK2_ENABLE": "set",
-        "EK2_NO_SUCH": "skipped",
-    }
-    assert sets(tap) == ["EK2_ENABLE", "EK2_GPS_TYPE", "TUNE_01"]
-    assert result.rows["EK2_GPS_TYPE"].before is None
-    assert result.rows["EK2_NO_SUCH"].category == MISSING
-    assert not result.complete
 
 
 @in_simulated_time
@@ -507,32 +253,6 @@ async def test_a_refused_or_adjusted_value_does_not_stop_the_others() -> None:
     assert again.counts[ApplyStatus.UNCHANGED] == len(SETTINGS) - 3
 
 
-@pytest.mark.parametrize("bring", [apply, restore])
-@in_simulated_time
-async def test_every_written_value_records_its_author(bring: Callable[..., Any]) -> None:
-    async with a_client(px4()) as client:
-        component = await client.component()
-        await component.fetch_all()
-        changes = component.changes()
-        wanted = written({"TUNE_01": 8.0, "TUNE_02": 9.0, "MAV_SYS_ID": 7})
-        result = await bring(component, wanted, include="identity", author="anna@10.0.0.2")
-        assert set(statuses(result).values()) == {"set"}
-        reported = {}
-        with anyio.move_on_after(1.0):
-            async for change in changes:
-                reported[change.name] = change.by
-    assert reported == dict.fromkeys(wanted, "us for anna@10.0.0.2")
-    async with a_client(Air([px4(), px4(system=2)])) as client:
-        components = [await client.component(1), await client.component(2)]
-        feeds = [each.changes() for each in components]
-        await apply_all(components, written({"TUNE_01": 8.0}), author="anna@10.0.0.2")
-        for feed in feeds:
-            async for change in feed:
-                if change.name == "TUNE_01" and change.by != "vehicle":
-                    assert change.by == "us for anna@10.0.0.2"
-                    break
-
-
 @in_simulated_time
 async def test_invalid_values_are_raised_before_anything_is_sent() -> None:
     tap = Tap(ardupilot())
@@ -550,20 +270,6 @@ async def test_invalid_values_are_raised_before_anything_is_sent() -> None:
 
 
 @in_simulated_time
-async def test_a_wrong_include_is_raised_before_the_vehicle_is_read() -> None:
-    tap = Tap(ardupilot())
-    async with a_client(tap) as client:
-        component = await client.component()
-        requested = len(tap.messages(wire.ParamRequestRead))
-        for call in (apply, prepare):
-            with pytest.raises(UsageError, match="neither a glob"):
-                await call(component, written({"TUNE_01": 1}), include="everything")
-            with pytest.raises(UsageError, match="component 100"):
-                await call(component, written({"TUNE_01": 1}, component=100))
-        assert len(tap.messages(wire.ParamRequestRead)) == requested
-
-
-@in_simulated_time
 async def test_left_out_parameters_can_be_included() -> None:
     vehicle = ardupilot()
     async with a_client(vehicle) as client:
@@ -574,22 +280,6 @@ async def test_left_out_parameters_can_be_included() -> None:
         assert result.complete
         assert (await verify(component, wanted, include="calibration")).is_met
         assert not (await verify(component, wanted, include=["STAT_*"])).is_met
-
-
-@in_simulated_time
-async def test_a_value_changed_by_a_later_write_is_written_again() -> None:
-    for quarrels in (False, True):
-        vehicle = px4(RevertingVehicle)
-        assert isinstance(vehicle, RevertingVehicle)
-        vehicle.quarrels = quarrels
-        tap = Tap(vehicle)
-        async with a_client(tap) as client:
-            result = await apply(await client.component(), written(another("TUNE_01", "TUNE_19")))
-        assert result.complete is not quarrels
-        for name, row in result.rows.items():
-            assert row.actual == vehicle.param(name).value
-            assert row.is_as_wanted is (row.actual == another(name)[name])
-        assert len(tap.messages(wire.ParamSetMessage)) <= 5
 
 
 @in_simulated_time
@@ -651,35 +341,6 @@ async def test_before_writing_may_end_the_call(bring: Callable[..., Any], tmp_pa
         key = component.identity.key
         await anyio.sleep(1.0)
     assert cache.snapshots(key) == []
-
-
-@in_simulated_time
-async def test_before_writing_may_end_the_call_for_one_of_several_vehicles() -> None:
-    one, two = ardupilot(system=1), ardupilot(system=2)
-
-    async def stop(component: Component) -> None:
-        if component.system == 2:
-            raise UsageError("not this one")
-
-    async with a_client(Air([one, two])) as client:
-        both = [await client.component(system) for system in (1, 2)]
-        fleet = await apply_all(both, written(another("TUNE_01")), before_writing=stop)
-    assert fleet.results[1, 1].complete
-    assert str(fleet.errors[2, 1]) == "not this one"
-    assert (one.requests["PARAM_SET"], two.requests["PARAM_SET"]) == (1, 0)
-
-
-@in_simulated_time
-async def test_progress_is_reported() -> None:
-    reported: list[ApplyProgress] = []
-    async with a_client(ardupilot()) as client:
-        await apply(await client.component(), written(another()), progress=reported.append)
-    phases = list(dict.fromkeys(each.phase for each in reported))
-    assert phases == ["reading", "writing"]
-    done = [each.done for each in reported if each.phase == "writing"]
-    assert done == list(range(1, len(SETTINGS) + 1))
-    assert {each.total for each in reported if each.phase == "writing"} == {len(SETTINGS)}
-    assert {each.row.name for each in reported if each.row is not None} == set(SETTINGS)
 
 
 @in_simulated_time
@@ -807,26 +468,6 @@ async def test_restore_skips_measured_and_read_only_parameters() -> None:
 
 
 @in_simulated_time
-async def test_restore_reports_parameters_that_the_state_does_not_have() -> None:
-    vehicle = ardupilot()
-    state = {name: param for name, param in vehicle.params.items() if name != "TUNE_05"}
-    vehicle.set_param("TUNE_05", 5.0)
-    vehicle.set_param("TUNE_04", 5.0)
-    async with a_client(vehicle) as client:
-        component = await client.component()
-        await component.fetch_all()
-        kept = ParamSet.of(state.values(), identity=component.identity)
-        result = await restore(component, kept)
-        assert result.extra == ("TUNE_05",)
-        assert statuses(result)["TUNE_04"] == "set"
-        # a state without an identity restores only the settings
-        vehicle.set_param("COMPASS_OFS_X", 4.0)
-        unsaid = await restore(component, ParamSet.of(state.values()))
-        assert unsaid.rows["COMPASS_OFS_X"].category == "calibration"
-        assert (await restore(component, kept)).rows["COMPASS_OFS_X"].status is ApplyStatus.SET
-
-
-@in_simulated_time
 async def test_the_state_or_plan_of_another_vehicle_is_refused() -> None:
     async with a_client(ardupilot(uid2=b"another")) as client:
         component = await client.component()
@@ -921,33 +562,6 @@ async def test_an_armed_vehicle_is_refused_unless_allowed(make: Callable[..., An
 
 
 @in_simulated_time
-async def test_another_component_of_an_armed_vehicle_is_refused() -> None:
-    for system in (1, 2):
-        camera = GenericVehicle({"TUNE_01": 0.25}, system=1, component=100)
-        air = Air.symmetric([camera, ardupilot(armed=True, system=system)])
-        async with a_client(air) as client:
-            await client.component(system=system, component=1)
-            component = await client.component(system=1, component=100)
-            if system == 1:
-                with pytest.raises(VehicleArmed, match="1/100 is armed"):
-                    await apply(component, written({"TUNE_01": 1.5}))
-            assert (await apply(component, written({"TUNE_01": 1.5}), allow_armed=system == 1)).complete
-
-
-@in_simulated_time
-async def test_a_vehicle_with_unknown_armed_state_is_refused() -> None:
-    vehicle = ardupilot()
-    async with a_client(vehicle) as client:
-        component = await client.component()
-        with (
-            mock.patch.object(LinkComponent, "is_armed", None),
-            pytest.raises(VehicleArmed, match="1/1 does not report whether it is armed"),
-        ):
-            await apply(component, written(another()))
-        assert vehicle.requests["PARAM_SET"] == 0
-
-
-@in_simulated_time
 async def test_a_vehicle_armed_during_the_run_ends_it() -> None:
     vehicle = ardupilot()
 
@@ -987,32 +601,6 @@ async def test_a_reboot_follows_values_that_take_effect_after_it() -> None:
 
 
 @in_simulated_time
-async def test_a_change_too_small_for_px4_is_reported_with_the_value_after_the_reboot() -> None:
-    vehicle = px4(table=SETTINGS | {"SYS_HITL": 0}, not_in_use=(), late_use={})
-    near = from_bits(bits_of(0.25, ParamType.REAL32) + 1, ParamType.REAL32)
-    async with a_client(vehicle) as client:
-        component = await client.component()
-        reported = await apply(component, written({"TUNE_01": near}))
-        assert reported.complete
-        assert reported.rows["TUNE_01"].reason == (
-            "PX4 takes a change of at most 1.19e-07 for none: its next start may bring 0.25 back"
-        )
-        result = await apply(component, written({"TUNE_01": near, "SYS_HITL": 1}), reboot=True)
-        assert result.reboots == 1
-        assert statuses(result) == {"TUNE_01": "unchanged", "SYS_HITL": "set"}  # all were saved with SYS_HITL
-        for value in (0.5, 0.25):
-            vehicle.set_param("TUNE_01", value)
-            await anyio.sleep(2.5)  # it saves at most every 2 s
-        info = {"TUNE_01": ParamInfo("TUNE_01", reboot_required=True)}
-        result = await apply(component, written({"TUNE_01": near}), reboot=True, info=info)
-    assert result.reboots == 1
-    row = result.rows["TUNE_01"]
-    assert (row.status, row.actual) == (ApplyStatus.ADJUSTED, 0.25)
-    assert row.reason == "the vehicle acknowledged the value, and has another one after the reboot"
-    assert vehicle.requests["PARAM_SET"] == 3  # a value that a reboot reverts is not written again
-
-
-@in_simulated_time
 async def test_a_group_revealed_by_a_reboot_is_set_after_it() -> None:
     vehicle = ardupilot(reboot_groups=["EK2_ENABLE"], make=HidingGroup)
     tap = Tap(vehicle)
@@ -1025,52 +613,6 @@ async def test_a_group_revealed_by_a_reboot_is_set_after_it() -> None:
     assert result.complete
     assert result.reboots == 1
     assert sets(tap) == ["EK2_ENABLE", "TUNE_01", "EK2_ALT_M_NSE"]
-
-
-@in_simulated_time
-async def test_names_that_no_reboot_reveals_cost_at_most_one_reboot() -> None:
-    async with a_client(ardupilot(make=HidingGroup)) as client:
-        component = await client.component()
-        wanted = written({"EK2_NO_SUCH": 1.5, "EK2_ENABLE": 1})
-        assert (await apply(component, wanted, reboot=True)).reboots == 1
-        assert (await apply(component, wanted, reboot=True)).reboots == 1
-        assert (await apply(component, written({"TUNE_X": 1, "EK2_ENABLE": 1}), reboot=True)).reboots == 0
-
-
-@in_simulated_time
-async def test_px4_reboots_before_parameters_that_the_frame_resets() -> None:
-    vehicle = px4(uid=77)
-    vehicle.set_param("TUNE_05", 9.0)
-    tap = Tap(vehicle)
-    wanted = written(another("TUNE_01") | {"SYS_AUTOSTART": 4050, "SYS_AUTOCONFIG": 1, "TUNE_05": 9.0})
-    async with a_client(tap) as client:
-        component = await client.component()
-        with pytest.raises(UsageError, match="SYS_AUTOCONFIG resets other parameters to their defaults"):
-            await apply(component, wanted, include="SYS_AUTOCONFIG")
-        assert tap.messages(wire.ParamSetMessage) == []
-        result = await apply(component, wanted, include="SYS_AUTOCONFIG", reboot=True)
-    assert result.complete
-    assert result.reboots == 1
-    # values that were right before the reset were reset too, and written again
-    assert [message.param_id for message in tap.messages(wire.ParamSetMessage)] == [
-        *("SYS_AUTOSTART", "SYS_AUTOCONFIG", "TUNE_01", "TUNE_05")
-    ]
-    assert result.rows["SYS_AUTOCONFIG"].reason == "done by the vehicle"
-    assert [vehicle.param(name).value for name in ("TUNE_01", "TUNE_05", "SYS_AUTOCONFIG")] == [1.25, 9.0, 0]
-
-
-@in_simulated_time
-async def test_a_reset_that_changes_the_system_id_is_followed() -> None:
-    vehicle = px4(uid=77, system=5)
-    vehicle.set_param("MAV_SYS_ID", 5)
-    async with a_client(vehicle) as client:
-        wanted = written(another("TUNE_01") | {"SYS_AUTOCONFIG": 1})
-        first = await apply(await client.component(), wanted, include="action", reboot=True)
-        assert (first.complete, first.system) == (True, 1)
-        back = await apply(
-            client.components[1, 1], written({"MAV_SYS_ID": 5}), include="identity", reboot=True
-        )
-        assert (back.complete, back.system) == (True, 5)
 
 
 @EVERY_KIND
@@ -1124,18 +666,6 @@ async def test_copter_keeps_its_system_id_until_it_reboots() -> None:
 
 
 @in_simulated_time
-async def test_a_copter_that_changes_its_system_id_immediately_is_followed() -> None:
-    vehicle = ardupilot(kind="plane")
-    vehicle._heartbeat = dataclasses.replace(vehicle._heartbeat, type=2)
-    async with a_client(vehicle) as client:
-        component = await client.component()
-        result = await apply(component, written({"SYSID_THISMAV": 7}), include="identity", reboot=True)
-    assert result.plan.reboot_for == ("SYSID_THISMAV",)
-    assert (result.reboots, result.reboot_required) == (0, ())
-    assert (result.system, vehicle.system) == (7, 7)
-
-
-@in_simulated_time
 async def test_a_system_id_of_another_vehicle_is_not_set() -> None:
     vehicles = [ardupilot(), ardupilot(system=7)]
     async with a_client(Air(vehicles)) as client:
@@ -1149,107 +679,6 @@ async def test_a_system_id_of_another_vehicle_is_not_set() -> None:
 
 
 @in_simulated_time
-async def test_without_a_reboot_a_px4_keeps_its_system_id_for_now() -> None:
-    vehicle = px4(uid=77)
-    async with a_client(vehicle) as client:
-        result = await apply(await client.component(), written({"MAV_SYS_ID": 7}), include="identity")
-        assert (result.system, vehicle.system) == (1, 1)
-        # the pending system id can be detected
-        component = await client.component()
-        started = await apply(component, written({"MAV_SYS_ID": 7}), include="identity", reboot=True)
-    assert statuses(result) == {"MAV_SYS_ID": "set"}
-    assert result.reboot_required == ("MAV_SYS_ID",)
-    assert statuses(started) == {"MAV_SYS_ID": "unchanged"}
-    assert (started.reboots, started.system, vehicle.system) == (1, 7, 7)
-
-
-@in_simulated_time
-async def test_the_backup_file_restores_every_parameter(tmp_path: Path) -> None:
-    vehicle = ardupilot()
-    original = vehicle.values
-    path = tmp_path / "before.json"
-    async with a_client(vehicle) as client:
-        component = await client.component()
-        with pytest.raises(FileError):
-            await apply(component, written(another()), backup=tmp_path / "nowhere" / "before.json")
-        assert vehicle.values == original
-        assert (await apply(component, written(another()), backup=path)).complete
-        assert vehicle.values != original
-        (state,) = read_file(path).sets
-        assert (await restore(component, state)).complete
-    assert vehicle.values == original
-
-
-@in_simulated_time
-async def test_parameters_that_may_end_the_connection_are_written_one_by_one() -> None:
-    tap = Tap(ardupilot())
-    async with a_client(tap) as client:
-        wanted = written({"SYSID_THISMAV": 7, "SYSID_ENFORCE": 1})
-        assert (await apply(await client.component(), wanted, include="identity")).complete
-    received = [(at, message) for at, _, message in tap.received if isinstance(message, wire.ParamSetMessage)]
-    times = {message.param_id: at for at, message in reversed(received)}
-    assert times["SYSID_ENFORCE"] + 0.001 < times["SYSID_THISMAV"]
-
-
-@in_simulated_time
-async def test_a_link_that_fails_during_the_system_id_change_ends_the_run() -> None:
-    broken = mock.AsyncMock(side_effect=LinkError("gone", link="x"))
-    async with a_client(ardupilot()) as client:
-        component = await client.component()
-        with mock.patch.object(LinkClient, "successor", broken):
-            result = await apply(component, written({"SYSID_THISMAV": 7}), include="identity")
-        assert isinstance(result.error, LinkError)
-        assert statuses(result) == {"SYSID_THISMAV": "failed"}
-        assert residue(component) == []
-
-
-@in_simulated_time
-async def test_cached_values_do_not_count_as_values_of_the_vehicle(tmp_path: Path) -> None:
-    wanted = written({"EK2_ALT_M_NSE": 3.0, "TUNE_01": 0.25})
-    for vehicle in (ardupilot(), px4(uid=77)):
-        with ParamCache(tmp_path / f"{type(vehicle).__name__}.sqlite3") as cache:
-            async with ParamClient(vehicle, cache=cache) as client:
-                assert (await apply(await client.component(), wanted)).counts == {ApplyStatus.UNCHANGED: 2}
-            vehicle.set_param("EK2_ALT_M_NSE", 9.0)
-            vehicle.set_param("TUNE_01", 9.0)
-            async with ParamClient(vehicle, cache=cache) as client:
-                result = await apply(await client.component(), wanted)
-        assert statuses(result) == {"EK2_ALT_M_NSE": "set", "TUNE_01": "set"}
-        assert {row.before for row in result.rows.values()} == {9.0}
-
-
-@in_simulated_time
-async def test_the_stored_state_includes_values_that_no_hash_covers(tmp_path: Path) -> None:
-    vehicle = px4(uid=77)
-    path = tmp_path / "cache.sqlite3"
-    async with ParamClient(vehicle, cache=path) as client:
-        assert (await apply(await client.component(), written({"TUNE_01": 0.25}))).complete
-    vehicle.set_param("CAL_ACC0_XOFF", 0.75)
-    vehicle.reboot()  # so that it does not send the value unrequested
-    async with ParamClient(vehicle, cache=path) as client:
-        result = await apply(await client.component(), written({"TUNE_01": 0.25}))
-    assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
-    assert result.before["CAL_ACC0_XOFF"].value == 0.75
-
-
-@in_simulated_time
-async def test_the_run_ends_after_three_unanswered_writes() -> None:
-    many = {f"TUNE_{number:02}": float(number) for number in range(60)}
-    tap = Tap(ardupilot(table=many, groups={}))
-
-    def stop_answering(progress: ApplyProgress) -> None:
-        tap.is_deaf = progress.phase == "writing"
-
-    async with a_client(tap) as client:
-        component = await client.component()
-        wanted = written({name: value + 1.0 for name, value in many.items()})
-        result = await apply(component, wanted, progress=stop_answering)
-        assert component.state != "lost"
-    assert isinstance(result.error, NoReply)
-    assert [row.reason for row in result.rows.values()].count("not reached") >= 5
-
-
-@in_simulated_time
 async def test_another_vehicle_at_the_same_address_ends_the_run() -> None:
     vehicle = ardupilot()
     tap = Tap(vehicle)
@@ -1260,21 +689,6 @@ async def test_another_vehicle_at_the_same_address_ends_the_run() -> None:
     assert isinstance(result.error, AnotherVehicle)
     assert not result.complete
     assert len(tap.messages(wire.ParamSetMessage)) == len(SETTINGS)
-
-
-@in_simulated_time
-async def test_a_failure_before_anything_is_sent_is_raised() -> None:
-    vehicle = ardupilot()
-    tap = Tap(vehicle)
-
-    async def arm(run: ApplyRun) -> None:
-        vehicle.armed = True
-        await anyio.sleep(2)
-
-    async with a_client(tap) as client:
-        with mock.patch.object(ApplyRun, "_store_state", arm), pytest.raises(VehicleArmed):
-            await apply(await client.component(), written(another()))
-    assert tap.messages(wire.ParamSetMessage) == []
 
 
 class EndpointWithEvent(Tap):
@@ -1391,23 +805,6 @@ def test_the_next_run_completes_after_an_interruption_anywhere(
     reported()
 
 
-@EVERY_KIND
-@in_simulated_time
-async def test_a_file_of_another_autopilot_is_refused_before_the_vehicle_is_read(
-    make: Callable[[], Any],
-) -> None:
-    tap = Tap(make())
-    other = written(another(), identity=Identity(1, "sim:", autopilot=12 if make is ardupilot else 3))
-    async with a_client(tap) as client:
-        component = await client.component()
-        for call in (prepare, verify, apply):
-            with pytest.raises(UsageError, match="are those of a vehicle with"):
-                await call(component, other)
-    assert not {wire.ParamSetMessage, wire.ParamRequestRead, wire.ParamRequestList} & {
-        type(message) for _, _, message in tap.received
-    }
-
-
 # Values that the vehicle changes after its acknowledgement
 
 
@@ -1427,71 +824,11 @@ async def test_a_value_clamped_within_a_second_is_adjusted(delay: float) -> None
 
 
 @in_simulated_time
-async def test_a_clamp_to_the_old_value_is_adjusted_and_not_failed() -> None:
-    vehicle = PX4Vehicle(table=SETTINGS | CLAMPED | {"MPC_TILTMAX_LND": 45.0}, clamp_delay=0.5)
-    async with a_client(vehicle) as client:
-        result = await apply(await client.component(), written({"MPC_TILTMAX_LND": 80.0}))
-    assert statuses(result) == {"MPC_TILTMAX_LND": "adjusted"}
-    assert result.rows["MPC_TILTMAX_LND"].actual == 45.0
-
-
-@in_simulated_time
 async def test_a_value_clamped_by_another_wanted_value_is_set_with_the_second_attempt() -> None:
     vehicle = PX4Vehicle(table=SETTINGS | CLAMPED, clamp_delay=0.0)
     async with a_client(vehicle) as client:
         wanted = {"MPC_XY_CRUISE": 18.0, "MPC_XY_VEL_MAX": 19.0}
         assert (await apply(await client.component(), written(wanted))).complete
-
-
-@in_simulated_time
-async def test_an_unchanged_value_that_another_write_changes_is_detected() -> None:
-    vehicle = PX4Vehicle(table=SETTINGS | CLAMPED, clamp_delay=1.0)
-    async with a_client(vehicle) as client:
-        wanted = {"MPC_XY_VEL_MAX": 8.0, "MPC_VEL_MANUAL": 10.0}
-        result = await apply(await client.component(), written(wanted))
-    assert statuses(result) == {"MPC_XY_VEL_MAX": "set", "MPC_VEL_MANUAL": "adjusted"}
-
-
-@in_simulated_time
-async def test_the_verification_begins_after_the_verify_delay() -> None:
-    tap = Tap(px4())
-    async with a_client(tap) as client:
-        assert (await apply(await client.component(), written(another()))).complete
-    sets = [at for at, _, message in tap.received if isinstance(message, wire.ParamSetMessage)]
-    hashes = [
-        at
-        for at, _, message in tap.received
-        if isinstance(message, wire.ParamRequestRead) and message.param_id == wire.HASH_CHECK
-    ]
-    assert hashes[-1] - sets[-1] >= VERIFY_DELAY
-
-
-@in_simulated_time
-async def test_a_run_without_writes_has_no_verify_delay() -> None:
-    async with a_client(px4()) as client:
-        result = await apply(await client.component(), written({"TUNE_01": 0.25}))
-    assert result.complete
-    assert result.elapsed < VERIFY_DELAY
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("-inf")])
-@in_simulated_time
-async def test_a_value_that_px4_cannot_save_is_set_only_if_forced(value: float) -> None:
-    vehicle = px4()
-    async with a_client(vehicle) as client:
-        component = await client.component()
-        with pytest.raises(InvalidParameters, match="cannot save NaN"):
-            await apply(component, written({"TUNE_01": value}), include="out-of-range")
-        assert vehicle.requests["PARAM_SET"] == 0
-        state = (await apply(component, written({"TUNE_02": 0.75}))).before
-        forced = await apply(component, written({"TUNE_01": value}), force=True)
-        assert statuses(forced) == {"TUNE_01": "set"}
-        await apply(component, written({"TUNE_01": 0.25}))
-        state = ParamSet({**state.params, **written({"TUNE_01": value}).params}, identity=state.identity)
-        result = await restore(component, state)
-        assert statuses(result)["TUNE_01"] == "skipped"
-        assert "cannot save NaN" in result.rows["TUNE_01"].reason
-        assert statuses(await restore(component, state, force=True))["TUNE_01"] == "set"
 
 
 # On a radio
@@ -1539,72 +876,3 @@ async def test_twenty_values_over_a_radio_take_one_download_and_are_verified_by_
     assert result.elapsed <= 6.5
     assert downloads(tap) == 1
     assert sorted(reads_after_the_last_set(tap)) == sorted(wanted)
-
-
-@in_simulated_time
-async def test_switches_of_groups_take_one_download_over_a_radio_too() -> None:
-    tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
-    hidden = {"EK2_ENABLE": 1, "EK2_ALT_M_NSE": 4.0, "EK2_GPS_TYPE": 2}
-    async with a_client(tap) as client:
-        result = await apply(await client.component(), written(hidden))
-    assert result.complete
-    assert {name: vehicle.param(name).value for name in hidden} == hidden
-    assert result.elapsed <= 6.5
-    assert downloads(tap) == 1
-
-
-@in_simulated_time
-async def test_a_value_that_changes_after_its_acknowledgement_is_detected_over_a_radio() -> None:
-    tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
-    wanted = tuned(vehicle, 4)
-    one, other, dead, *_ = wanted
-
-    def change(progress: ApplyProgress) -> None:
-        if progress.row is not None and progress.row.name == one:  # changed on board, without a PARAM_VALUE
-            vehicle._entry(one).store(bits_of(77.0, ParamType.REAL32))
-            vehicle._dead.add(dead)
-
-    async with a_client(tap) as client:
-        result = await apply(await client.component(), wanted, progress=change)
-    assert (statuses(result)[one], statuses(result)[other]) == ("adjusted", "set")
-    assert result.rows[one].actual == 77.0
-    assert statuses(result)[dead] == "unproven"
-    assert "no longer reports it" in str(result.rows[dead])
-    assert not result.complete
-    assert downloads(tap) == 1
-
-
-@in_simulated_time
-async def test_a_vehicle_that_falls_silent_before_verification_over_a_radio_ends_the_run() -> None:
-    tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
-    wanted = tuned(vehicle, 3)
-
-    def stop_answering(progress: ApplyProgress) -> None:
-        tap.is_deaf = progress.phase == "reading" and vehicle.requests["PARAM_SET"] > 0
-
-    async with a_client(tap) as client:
-        result = await apply(await client.component(), wanted, progress=stop_answering)
-    assert isinstance(result.error, NoReply)
-    assert set(statuses(result).values()) == {"unproven"}
-
-
-@in_simulated_time
-async def test_a_large_file_is_verified_by_a_download_over_a_radio_too() -> None:
-    tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
-    wanted = ParamSet.of(vehicle.params.values())
-    wanted = ParamSet({**wanted.params, **tuned(vehicle, 5).params})
-    async with a_client(tap) as client:
-        result = await apply(await client.component(), wanted)
-    assert result.complete
-    assert downloads(tap) == 2
-    assert reads_after_the_last_set(tap) == []
-
-
-@in_simulated_time
-async def test_a_hash_verifies_all_values_over_a_radio_too() -> None:
-    tap = on_a_radio(PX4Vehicle(burst=3, period=0.025))
-    async with a_client(tap) as client:
-        result = await apply(await client.component(), written({"MC_ROLL_P": 6.25, "MC_PITCH_P": 6.25}))
-    assert result.complete
-    assert set(reads_after_the_last_set(tap)) == {wire.HASH_CHECK}
-    assert downloads(tap) == 1
