@@ -14,7 +14,6 @@ import anyio
 import anyio.lowlevel
 import pytest
 
-from paramclient.client import reconnect_delays
 from paramclient.errors import LinkError
 from paramclient.links import Link, Peer, create_link, serve_endpoint, udp
 from paramclient.protocol import wire
@@ -137,56 +136,6 @@ async def test_a_socket_without_a_route_is_reopened_on_its_port(
     await link.close()
 
 
-@pytest.mark.asyncio
-async def test_a_socket_for_every_address_is_not_reopened(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Linux sends with the current address of the computer."""
-    monkeypatch.setattr(udp, "UNREACHABLE_TIMEOUT", 0.0)
-    link: Any = create_link("udpin:0.0.0.0:0")
-    await link.open()
-    with listening() as vehicle:
-        vehicle.sendto(HEARTBEAT, ("127.0.0.1", link.address[1]))
-        await link.receive()
-        net.reason = errno.ENETUNREACH
-        for _ in range(5):
-            await link.send(b"1", None)
-        net.reason = None
-        await link.send(b"2", None)
-        assert vehicle.recv(10) == b"2"
-    await link.close()
-
-
-@pytest.mark.asyncio
-async def test_an_address_that_is_lost_and_restored(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A complete session: `udpin` on an address that this computer loses for a while."""
-    monkeypatch.setattr(udp, "UNREACHABLE_TIMEOUT", 0.0)
-    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.01)
-    is_gone = [False]
-    bind = udp.UdpIn._open
-
-    async def open_if_there(link: udp.UdpIn, opening: int) -> None:
-        if is_gone[0]:
-            raise OSError(errno.EADDRNOTAVAIL, os.strerror(errno.EADDRNOTAVAIL))
-        await bind(link, opening)
-
-    monkeypatch.setattr(udp.UdpIn, "_open", open_if_there)
-    vehicle = generic(burst=50, period=0.001)
-    with anyio.fail_after(TIMEOUT):
-        async with a_client("udpin:127.0.0.1:0") as client, anyio.create_task_group() as tasks:
-            far: Any = create_link(f"udpout:127.0.0.1:{client.link.address[1]}")  # type: ignore[attr-defined]
-            far.is_the_vehicles = True
-            tasks.start_soon(serve_endpoint, vehicle, far)
-            component = await client.component()
-            is_gone[0], net.reason = True, errno.ENETUNREACH
-            while " reconnecting, " not in repr(client):
-                with anyio.move_on_after(0.05):
-                    await component.get("PARAM_01")
-            await anyio.sleep(0.05)
-            is_gone[0], net.reason = False, None
-            assert (await component.fetch_all()).complete
-            assert bits(component.params) == bits(vehicle.params)
-            tasks.cancel_scope.cancel()
-
-
 @pytest.mark.parametrize("kind", ["udpin", "udpout"])
 @pytest.mark.asyncio
 async def test_a_failed_socket_is_reopened(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,93 +192,7 @@ async def test_udpout_resolves_a_silent_name_again(
         await link.close()
 
 
-@pytest.mark.asyncio
-async def test_a_temporary_resolver_failure_changes_nothing(
-    names: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(udp, "RESOLVE_INTERVAL", 0.01)
-    requested = anyio.Event()
-
-    async def unknown() -> str:
-        requested.set()
-        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
-
-    with listening() as far:
-        names["drone"] = "127.0.0.1"
-        link: Any = create_link(f"udpout:drone:{far.getsockname()[1]}")
-        await link.open()
-        names["drone"] = unknown
-        async with anyio.create_task_group() as tasks:
-            got: list[tuple[Peer, bytes]] = []
-
-            async def receive() -> None:
-                got.extend(await link.receive())
-
-            tasks.start_soon(receive)
-            await requested.wait()
-            await anyio.sleep(0.03)
-            far.sendto(HEARTBEAT, link.address)
-        assert [data for _, data in got] == [HEARTBEAT]
-        await link.close()
-
-
-@pytest.mark.asyncio
-async def test_a_slow_resolver_does_not_delay_received_data(
-    names: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(udp, "RESOLVE_INTERVAL", 0.01)
-    with listening() as far:
-
-        async def slow() -> str:
-            far.sendto(HEARTBEAT, link.address)
-            await anyio.sleep_forever()
-            raise AssertionError
-
-        names["drone"] = "127.0.0.1"
-        link: Any = create_link(f"udpout:drone:{far.getsockname()[1]}")
-        await link.open()
-        names["drone"] = slow
-        with anyio.fail_after(TIMEOUT):
-            assert [data for _, data in await link.receive()] == [HEARTBEAT]
-        await link.close()
-
-
-@pytest.mark.asyncio
-async def test_tcp_resolves_a_name_at_each_opening(names: dict[str, Any]) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as before:
-        port = before.getsockname()[1]
-        with socket.create_server(("127.0.0.2", port)) as after:
-            names["drone"] = "127.0.0.1"
-            link: Any = create_link(f"tcp:drone:{port}")
-            await link.open()
-            before.accept()[0].close()
-            names["drone"] = "127.0.0.2"
-            await failure(link)
-            await link.open()
-            after.settimeout(TIMEOUT)
-            after.accept()[0].close()
-            await link.close()
-
-
 # Ports used by other programs
-
-
-@pytest.mark.parametrize("kind", ["udpin", "tcpin", "udpout"])
-@pytest.mark.parametrize("theirs", ["127.0.0.1", "0.0.0.0"])
-@pytest.mark.parametrize("options", [[socket.SO_REUSEADDR], [socket.SO_REUSEADDR, socket.SO_REUSEPORT]])
-@pytest.mark.asyncio
-async def test_no_program_can_share_an_open_port(kind: str, theirs: str, options: list[int]) -> None:
-    """Two programs on one port would each receive a part of the data, or the wrong one all of it."""
-    link: Any = create_link(f"{kind}:127.0.0.1:{14999 if kind == 'udpout' else 0}")
-    await link.open()
-    transport = socket.SOCK_STREAM if kind == "tcpin" else socket.SOCK_DGRAM
-    with socket.socket(socket.AF_INET, transport) as other:
-        for option in options:
-            other.setsockopt(socket.SOL_SOCKET, option, 1)
-        with pytest.raises(OSError, match="Address already in use"):  # noqa: PT012 - binding may succeed
-            other.bind((theirs, link.address[1]))
-            other.listen()
-    await link.close()
 
 
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
@@ -389,20 +252,6 @@ async def test_tcpin_receives_from_all_connections_without_a_selector_file() -> 
     assert "closed" in str(errors[0])
     for client in clients:
         client.close()
-
-
-@pytest.mark.usefixtures("without_a_file")
-@pytest.mark.asyncio
-async def test_a_session_over_a_listener_without_a_selector_file() -> None:
-    vehicle = generic(stream=True, burst=50, period=0.001)
-    with anyio.fail_after(TIMEOUT):
-        async with a_client("tcpin:127.0.0.1:0") as client, anyio.create_task_group() as tasks:
-            port = client.link.address[1]  # type: ignore[attr-defined]
-            tasks.start_soon(serve_endpoint, vehicle, create_link(f"tcp:127.0.0.1:{port}"))
-            component = await client.component()
-            assert (await component.fetch_all()).complete
-            assert bits(component.params) == bits(vehicle.params)
-            tasks.cancel_scope.cancel()
 
 
 # Event loops without socket readiness, as on Windows

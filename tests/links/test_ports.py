@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 from typing import Any
 
 import pytest
 import serialx
 
 from paramclient.cli import run
-from paramclient.links import SerialPort, create_link, list_ports, refusals
+from paramclient.links import SerialPort, create_link, list_ports
 
 BY_ID = "/dev/serial/by-id/usb-Hex_ProfiCNC_CubeOrange_2E0045-if00"
 
@@ -96,20 +95,6 @@ def test_detection_of_autopilots(
     assert port.autopilot == autopilot
 
 
-def test_the_command_prints_a_table(
-    plugged: list[serialx.SerialPortInfo], capsys: pytest.CaptureFixture[str]
-) -> None:
-    plugged += a_few()
-    assert run(["ports"]) == 0
-    head, cube, radio, *_, uart = capsys.readouterr().out.splitlines()
-    assert head.split() == ["device", "autopilot", "product", "manufacturer", "usb", "id", "link"]
-    assert cube.split() == [
-        *("/dev/ttyACM1", "CubePilot", "CubeOrange", "Hex/ProfiCNC", "2dae:1016", f"serial:{BY_ID}:57600")
-    ]
-    assert r"CP2102\x1b[31m" in radio
-    assert uart.split() == ["/dev/ttyS0", "serial:/dev/ttyS0:57600"]
-
-
 def test_the_command_prints_json(
     plugged: list[serialx.SerialPortInfo], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -131,37 +116,5 @@ def test_the_command_prints_json(
     assert ports[3]["by_id"] is ports[3]["autopilot"] is ports[3]["vendor_id"] is None
 
 
-def test_no_ports_at_all(plugged: list[serialx.SerialPortInfo], capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["ports"]) == 0
-    assert tuple(capsys.readouterr()) == ("", "this computer has no serial ports\n")
-    assert run(["ports", "--json"]) == 0
-    assert capsys.readouterr().out == '{"ports": []}\n'
-
-
 def test_the_ports_of_this_computer() -> None:
     assert all(create_link(port.link).name == port.link for port in list_ports())
-
-
-@pytest.mark.parametrize("arguments", [["ports"], ["fetch", "/dev/ttyACM0", "--no-cache"]])
-def test_without_the_extra_the_command_names_it(
-    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "serialx", None)
-    assert run(arguments) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith("paramclient: ")
-    assert err.endswith(" needs serialx: pip install 'paramclient[serial]'\n")
-    assert err.count("\n") == 1
-
-
-def test_a_missing_port_is_exit_code_4(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    present = [SerialPort("/dev/ttyACM1", vendor_id=0x26AC, product_id=0x11), SerialPort("/dev/ttyS0")]
-    monkeypatch.setattr(refusals, "list_ports", lambda: present)
-    assert run(["fetch", "/dev/nowhere,115200", "--no-cache"]) == 4
-    assert capsys.readouterr().err == (
-        "paramclient: serial:/dev/nowhere:115200: /dev/nowhere does not exist. "
-        "The serial ports are /dev/ttyACM1 (Pixhawk), /dev/ttyS0\n"
-    )

@@ -5,14 +5,9 @@ from __future__ import annotations
 import asyncio
 import errno
 import fcntl
-import grp
 import os
-import pwd
-import stat
 import struct
-import subprocess
 import sys
-import termios
 import threading
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
@@ -25,7 +20,6 @@ import anyio.lowlevel
 import pytest
 import serialx
 
-from paramclient import ParamClient
 from paramclient.client import reconnect_delays
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link, refusals, serial
@@ -67,14 +61,6 @@ async def opened(cable: Cable) -> AsyncIterator[Any]:
         await link.close()
 
 
-async def received(link: Link, count: int) -> bytes:
-    """Receive until this many bytes have arrived."""
-    found = b""
-    while len(found) < count:
-        found += b"".join(data for _, data in await link.receive())
-    return found
-
-
 async def refusal(link: Link) -> LinkError:
     with pytest.raises(LinkError) as caught:
         await link.open()
@@ -101,22 +87,6 @@ async def test_a_whole_session(cable: Cable, port: str) -> None:
         assert (await component.set("PARAM_01", 77)).status == "accepted"
         assert (await component.get("PARAM_01")).value == 77
         tasks.cancel_scope.cancel()
-
-
-@pytest.mark.asyncio
-async def test_the_cache_knows_the_vehicle_by_its_port(cable: Cable, tmp_path: Path) -> None:
-    """The key of a vehicle without a hardware id has the canonical name for every spelling of the link."""
-    for spelling in (f"serial:{cable.device}:115200", f"serial://{cable.device},115200"):
-        vehicle = small_px4(stream=True)
-        async with (
-            asyncio.timeout(TIMEOUT),
-            ParamClient(spelling, cache=tmp_path / "cache") as client,
-            anyio.create_task_group() as tasks,
-        ):
-            tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))
-            result = await (await client.component()).fetch_all()
-            tasks.cancel_scope.cancel()
-    assert result.source == "cache"
 
 
 @pytest.mark.asyncio
@@ -181,38 +151,6 @@ async def test_unplugged_permanently(cable: Cable, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.asyncio
-async def test_a_replugged_device_is_another_peer(cable: Cable, port: str) -> None:
-    """Half a frame of the old peer is not continued, and data for the old peer is not sent to the new one."""
-    async with opened(cable) as link:
-        cable.send(b"\xfd")
-        [(before, _)] = await link.receive()
-        cable.pull_out()
-        with pytest.raises(LinkError, match=f"lost {cable.device}: unplugged"):
-            await link.receive()
-        with pytest.raises(LinkError, match="not open"):
-            await link.send(HEARTBEAT, None)
-        cable.plug_in()
-        await link.open()
-        cable.send(b"\xfe")
-        [(after, data)] = await link.receive()
-        assert (data, after != before) == (b"\xfe", True)
-        await link.send(b"old", before)
-        await link.send(b"new", after)
-        assert cable.recv(100) == b"new"
-
-
-@pytest.mark.asyncio
-async def test_unplugged_while_sending(cable: Cable, port: str) -> None:
-    async with opened(cable) as link:
-        cable.pull_out()
-        with pytest.raises(LinkError, match=f"lost {cable.device}: unplugged, or reset") as caught:  # noqa: PT012
-            while True:  # a transport gets the error later
-                await link.send(HEARTBEAT, None)
-        assert isinstance(caught.value.__cause__, OSError)
-        assert caught.value.link == link.name
-
-
-@pytest.mark.asyncio
 async def test_a_stalled_device_is_lost_and_its_data_dropped(
     cable: Cable, port: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,25 +185,6 @@ async def test_a_stalled_device_is_lost_and_its_data_dropped(
 
 
 @pytest.mark.asyncio
-async def test_a_slow_device_limits_the_send_rate(cable: Cable, port: str) -> None:
-    """More than the system's buffer holds: data waits, and arrives complete and in order."""
-    frames = [bytes([number]) * 1000 for number in range(60)]
-    async with opened(cable) as link:
-        read_bytes = b""
-
-        async def send() -> None:
-            for frame in frames:
-                await link.send(frame, None)
-
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(send)
-            while len(read_bytes) < 60_000:
-                await anyio.sleep(0.001)
-                read_bytes += await anyio.to_thread.run_sync(cable.recv, 1500)
-        assert read_bytes == b"".join(frames)
-
-
-@pytest.mark.asyncio
 async def test_a_transport_pauses_at_its_limit(cable: Cable) -> None:
     port = await Transport.opened(str(cable.device), 115200)
     try:
@@ -284,17 +203,6 @@ async def test_a_transport_pauses_at_its_limit(cable: Cable) -> None:
                 read += len(await port.read())
     finally:
         await port.close()
-
-
-@pytest.mark.asyncio
-async def test_settings_of_an_open_port(cable: Cable) -> None:
-    """Raw bytes, 8N1, no flow control; DTR falls when the last program closes the port, as usual."""
-    async with opened(cable) as link:
-        iflag, oflag, cflag, lflag, _, ospeed, _ = termios.tcgetattr(link._port._file)
-    assert (iflag, oflag, lflag, ospeed) == (0, 0, 0, termios.B115200)
-    assert cflag & (termios.CSIZE | termios.CSTOPB | termios.PARENB | termios.CRTSCTS) == termios.CS8
-    assert cflag & termios.HUPCL
-    assert cflag & termios.CLOCAL
 
 
 # Ports that cannot be opened
@@ -359,61 +267,6 @@ async def test_files_that_are_not_ports(tmp_path: Path, name: str, monkeypatch: 
     assert f"{expected} {NO_PORTS}" in str(await refusal(create_link(f"serial:{path}")))
 
 
-JOIN = ", which needs the group dialout: sudo usermod -aG dialout $USER, then log in again"
-
-
-@pytest.mark.asyncio
-@pytest.mark.parametrize(
-    ("mode", "groups", "members", "hint"),
-    [
-        (0o660, [100], [], JOIN),
-        (
-            0o660,
-            [100],
-            [pwd.getpwuid(os.getuid()).pw_name],
-            ", which needs the group dialout. The user is in it since the last login: log out and in again",
-        ),
-        (0o600, [100], [], ": only its owner may open it. A udev rule can give it to a group"),
-        (0o660, [20], [], ""),
-    ],
-    ids=["not a member", "a member since the last login", "no group", "a member"],
-)
-async def test_without_permission_the_error_names_the_group(
-    mode: int, groups: list[int], members: list[str], hint: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(_: object) -> None:
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-
-    class Group:
-        gr_name = "dialout"
-        gr_mem = members
-
-    info = os.stat_result((stat.S_IFCHR | mode, 1, 1, 1, 0, 20, 0, 0, 0, 0))
-    monkeypatch.setattr(serialx.Serial, "open", refuse)
-    link = create_link("/dev/ttyUSB0")
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "stat", lambda _: info)
-        patch.setattr(grp, "getgrgid", {20: Group}.__getitem__)
-        patch.setattr(os, "getgroups", lambda: groups)
-        error = await refusal(link)
-    assert str(error) == f"serial:/dev/ttyUSB0:57600: no permission to open /dev/ttyUSB0{hint}"
-
-
-@pytest.mark.parametrize(
-    ("system", "command"),
-    [
-        ("darwin", "sudo dseditgroup -o edit -a $USER -t user dialout"),
-        ("freebsd14", "sudo pw groupmod dialout -m $USER"),
-        ("linux", "sudo usermod -aG dialout $USER"),
-    ],
-)
-def test_each_system_has_its_command_to_join_a_group(
-    system: str, command: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "platform", system)
-    assert refusals._join("dialout") == command
-
-
 @pytest.mark.asyncio
 async def test_an_unsupported_baud_rate(cable: Cable, port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
@@ -422,16 +275,6 @@ async def test_an_unsupported_baud_rate(cable: Cable, port: str, monkeypatch: py
     monkeypatch.setattr(serialx.Serial, "_reconfigure_port", refuse)
     with pytest.raises(UsageError, match="this system does not support 115200 baud"):
         await create_link(cable.link).open()
-
-
-@pytest.mark.asyncio
-async def test_a_driver_that_does_not_report_its_rate(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise RuntimeError("termios2 speed fields are zero")
-
-    monkeypatch.setattr(serialx.Serial, "_reconfigure_port", refuse)
-    error = await refusal(create_link(cable.link))
-    assert str(error) == f"{cable.link}: {cable.device} cannot be set to 115200 baud"
 
 
 class Stuck:
@@ -478,22 +321,6 @@ async def test_opening_a_stalled_driver_times_out(cable: Cable, monkeypatch: pyt
 
 
 @pytest.mark.asyncio
-async def test_closing_during_an_open(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
-    stuck = Stuck(monkeypatch, "open")
-    link = create_link(cable.link)
-    async with anyio.create_task_group() as tasks:
-
-        async def open_it() -> None:
-            assert str(await refusal(link)) == f"{cable.link}: closed"
-
-        tasks.start_soon(open_it)
-        await until(stuck.is_in_it.is_set)
-        await link.close()
-        stuck.may_go_on.set()
-    assert stuck.is_closed.is_set()
-
-
-@pytest.mark.asyncio
 async def test_closing_a_stalled_driver_times_out(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serial, "CLOSE_TIMEOUT", 0.01)
     async with opened(cable) as link:
@@ -504,41 +331,6 @@ async def test_closing_a_stalled_driver_times_out(cable: Cable, monkeypatch: pyt
         await until(lambda: "paramclient link" not in {thread.name for thread in threading.enumerate()})
 
 
-@pytest.mark.asyncio
-async def test_closing_drops_unsent_bytes(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Closing does not wait; Linux would wait 30 s for the device to accept unsent bytes."""
-    calls: list[str] = []
-    close = serialx.Serial.close
-    monkeypatch.setattr(termios, "tcflush", lambda _, queue: calls.append(f"flush {queue}"))
-
-    async with opened(cable) as link:
-        ours = id(link._port._serial)  # the port itself would end with the patch, and call it
-
-        def closed(port: serialx.BaseSerial) -> None:
-            if id(port) == ours:
-                calls.append("close")
-            close(port)
-
-        calls.clear()
-        monkeypatch.setattr(serialx.Serial, "close", closed)
-        await link.close()
-        assert calls[:2] == [f"flush {termios.TCOFLUSH}", "close"]
-
-
-def test_a_transport_needs_asyncio() -> None:
-    program = (
-        "import asyncio\n"
-        "from paramclient.links.serial_transport import Transport\n"
-        "opening = Transport.opened('COM5', 57600)\n"
-        "try:\n"
-        "    opening.send(None)\n"
-        "except ValueError as error:\n"
-        "    print(error)\n"
-    )
-    run = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
-    assert run.stdout == "COM5: on Windows serial ports need asyncio's own event loop\n"
-
-
 # The extra
 
 
@@ -547,19 +339,3 @@ def test_without_the_extra_the_error_names_it(monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(UsageError) as caught:
         create_link("/dev/ttyACM0")
     assert str(caught.value) == "serial:/dev/ttyACM0:57600 needs serialx: pip install 'paramclient[serial]'"
-
-
-def test_serialx_is_loaded_on_the_first_open() -> None:
-    program = (
-        "import sys, anyio, paramclient.links as links\n"
-        "link = links.create_link('serial:/dev/null')\n"
-        "assert not {'serialx', 'asyncio'} & sys.modules.keys()\n"
-        "try:\n"
-        "    anyio.run(link.open)\n"
-        "except OSError as error:\n"
-        "    print(error)\n"
-        "assert 'serialx' in sys.modules\n"
-    )
-    run = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
-    assert run.stdout.startswith("serial:/dev/null:57600: /dev/null is not a serial port. ")
-    assert run.stdout.count("\n") == 1

@@ -57,13 +57,6 @@ def test_a_dataflash_log_has_values_defaults_and_the_vehicle(tmp_path: Path) -> 
     assert log.notes == ()
 
 
-def test_a_dataflash_log_without_ver_takes_the_firmware_of_its_text(tmp_path: Path) -> None:
-    log = read_onboard_log(written(tmp_path, dataflash(COMMON)))
-    assert (log.identity.firmware, log.identity.git_hash) == (0x04060000, "3fc7011a")
-    assert log.boot_time is None
-    assert log.at_end().at is None
-
-
 def test_later_values_of_a_dataflash_log_are_changes(tmp_path: Path) -> None:
     later = [
         ("PARM", 60_000_000, "ATC_RAT_RLL_P", 0.2, NAN),
@@ -78,21 +71,6 @@ def test_later_values_of_a_dataflash_log_are_changes(tmp_path: Path) -> None:
     assert (end["ATC_RAT_RLL_P"].value, end["ATC_RAT_RLL_P"].default) == (0.2, 0.135)
     assert end["SCR_USER1"].value == 4
     assert end.at == pytest.approx(BOOT + 70)
-
-
-def test_logs_of_versions_before_4_3_have_no_defaults(tmp_path: Path) -> None:
-    old = [
-        ("OLD", 1_000_000, "A", 1.0),
-        ("OLD", 1_050_000, "B", 2.5),
-        ("OLD", 9_000_000, "A", 2.0),
-        ("OLD", 9_000_000, "C", 3.0),
-    ]
-    log = read_onboard_log(written(tmp_path, dataflash(old)))
-    assert {name: (param.value, param.default) for name, param in log.initial.items()} == {
-        "A": (1, None),
-        "B": (2.5, None),
-    }
-    assert log.changes == (LoggedChange(9.0, "A", 2), LoggedChange(9.0, "C", 3))
 
 
 def test_a_damaged_name_is_left_out_and_noted(tmp_path: Path) -> None:
@@ -169,19 +147,6 @@ def test_other_files_are_not_on_board_logs(tmp_path: Path, data: bytes) -> None:
     assert not is_onboard_log(path)
     with pytest.raises(FileError, match="neither a dataflash log nor a ULog file"):
         read_onboard_log(path)
-
-
-def test_a_missing_file_a_folder_and_a_nul_are_errors(tmp_path: Path) -> None:
-    for path in (tmp_path / "none.bin", tmp_path, Path("a\0b")):
-        assert not is_onboard_log(path)
-        with pytest.raises(FileError):
-            read_onboard_log(path)
-
-
-@pytest.mark.parametrize("empty", [dataflash([FIX]), bytes(ULogWriter().data)])
-def test_a_log_without_parameters_is_an_error(tmp_path: Path, empty: bytes) -> None:
-    with pytest.raises(FileError, match="has no"):
-        read_onboard_log(written(tmp_path, empty))
 
 
 def test_without_pyulog_the_error_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
@@ -16,8 +15,7 @@ from paramclient.logs.onboard import read_onboard_log
 from paramclient.logs.onboard_import import import_onboard_log
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param
-from tests.commands import Command, in_process
-from tests.logs.test_onboard import BOOT, COMMON, FIX, flight, written
+from tests.logs.test_onboard import BOOT, COMMON, FIX, written
 from tests.logs.writers import dataflash
 
 DATA = Path(__file__).parent.parent / "data"
@@ -94,23 +92,6 @@ def test_a_log_without_time_or_system_is_refused(cache: ParamCache, tmp_path: Pa
     with pytest.raises(FileError, match="no system id"):
         anyio.run(import_onboard_log, written(tmp_path, dataflash([*nameless, FIX])), cache)
     assert cache.components() == []
-
-
-def test_the_command_imports_logs_of_all_kinds(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, cache: ParamCache
-) -> None:
-    command: Command = in_process(capsys)
-    writer = flight()
-    writer.gps(1_000_000, (BOOT + 1) * 1_000_000, 3)
-    quad = written(tmp_path, bytes(writer.data), "flight.ulg")
-    logs = (DATA / "ardupilot_flight.bin", quad, DATA / "px4_full_download.tlog")
-    done = command("import", *logs, "--cache", cache.place, "--json")
-    assert done.code == 0, done.err
-    tables = json.loads(done.out)["tables"]
-    assert [(each["autopilot"], each["params"]) for each in tables[:2]] == [("ardupilot", 1382), ("px4", 5)]
-    assert len(tables) == 3
-    refused = command("import", DATA / "px4_flight.ulg", "--cache", cache.place)
-    assert (refused.code, "no UTC time" in refused.err) == (2, True)
 
 
 def test_a_log_of_a_real_copter() -> None:

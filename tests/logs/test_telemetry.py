@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import time
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 
@@ -21,8 +19,6 @@ from paramclient import (
     UsageError,
 )
 from paramclient.cache import BY_US, StoredParam, TableUpdate
-from paramclient.cache.history_columns import HISTORY_ENTRIES_MAX
-from paramclient.cli import run
 from paramclient.links import LinkKind, ReplayLink, create_link, parse_link
 from paramclient.links.replay import PAUSE_MAX
 from paramclient.links.tlog import FIRST_FRAME_OFFSET_MAX
@@ -30,7 +26,6 @@ from paramclient.logs.imported_table import ImportedTable
 from paramclient.logs.telemetry import import_log
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param
-from paramclient.protocol import wire
 from tests.recordings import DATA, from_vehicle, param_values, read
 from tests.shell import in_simulated_time
 from tests.simulation import known
@@ -64,12 +59,6 @@ def test_link_names_of_logs(text: str, name: str, path: str, options: tuple[tupl
     assert (spec.kind, spec.name, spec.host, spec.options) == (LinkKind.REPLAY, name, path, options)
     assert parse_link(name) == spec
     assert isinstance(create_link(text), ReplayLink)
-
-
-@pytest.mark.parametrize("text", ["replay:", "replay:?speed=1", "replay:x?speed=-1", "replay:x?speed=fast"])
-def test_invalid_link_names_of_logs(text: str) -> None:
-    with pytest.raises(UsageError, match="accepted forms"):
-        parse_link(text)
 
 
 @in_simulated_time
@@ -168,20 +157,6 @@ async def test_missing_parameters_are_reported_at_the_end_of_the_log(tmp_path: P
         # the clock stops at the end of the log, so no component is lost
         assert component.state == "partial"
         assert component.params["A"].trust is Trust.LIVE
-
-
-@in_simulated_time
-async def test_the_last_value_is_used(tmp_path: Path) -> None:
-    log = whole(A=1, B=2).wait(5.0).set("A", 7).wait(5.0)
-    async with a_replay(log.write(tmp_path / "flight.tlog")) as client:
-        component = await client.component()
-        changes, events = component.changes(), client.events()
-        assert (await component.fetch_all()).params["A"].value == 7
-        # both end with the log, also for late subscribers
-        assert [(each.name, each.by) async for each in changes] == [("A", "station 255/190")]
-        assert [each async for each in events] == []
-        assert [each async for each in component.changes()] == []
-        assert [each async for each in client.events()] == []
 
 
 @in_simulated_time
@@ -296,35 +271,6 @@ def test_a_repeated_import_changes_nothing(tmp_path: Path) -> None:
         assert repr(kept.component(KEY)) == table
 
 
-def test_a_repeated_import_changes_nothing_after_a_clock_jump(tmp_path: Path) -> None:
-    """All later frames have the same time, until the end of the log."""
-    cache = tmp_path / "cache"
-    log = Log().report("A", A=1).wait(-60.0).change("A", 2).write(tmp_path / "flight.tlog")
-    [table] = imported(log, cache=cache)
-
-    def kept() -> str:
-        with ParamCache(cache) as kept:
-            return repr((kept.component(table.key).params["A"].value, kept.history(table.key)))
-
-    before = kept()
-    imported(log, cache=cache)
-    assert kept() == before
-
-
-def test_a_repeated_import_changes_nothing_for_a_restored_name(tmp_path: Path) -> None:
-    cache = tmp_path / "cache"
-    updated = wire.AutopilotVersion(0, uid=0xDEADBEEF, flight_sw_version=8)
-    log = whole(A=1, B=2).say(updated)
-    del log.values["B"]
-    log.list().wait(9.0).list(B=5).wait(9.0).change("A", 3).wait(1.0).beat()
-    imported(log.write(tmp_path / "flight.tlog"), cache=cache)
-    before = (kept_values(cache), lines(cache))
-    assert before[0] == {"A": 3, "B": 5}
-    assert [each[:3] for each in before[1]] == [("B", 2, None), ("A", 1, 3)]
-    imported(tmp_path / "flight.tlog", cache=cache)
-    assert (kept_values(cache), lines(cache)) == before
-
-
 @pytest.mark.parametrize("is_reversed", [False, True])
 def test_the_order_of_logs_does_not_matter(is_reversed: bool, tmp_path: Path) -> None:
     first = whole(A=1, B=2).wait(9.0).change("A", 3).wait(1.0).beat()
@@ -363,16 +309,6 @@ def test_later_observations_in_the_cache_stay(tmp_path: Path) -> None:
         assert kept.vehicles()[0].last_seen == NOW + 5000.0
 
 
-def test_a_log_before_and_after_the_observations_in_the_cache(tmp_path: Path) -> None:
-    """Observations before, between and after those in the cache are sorted by time."""
-    cache = tmp_path / "cache"
-    log = whole(A=1, B=2).wait(199.0).change("A", 9).wait(1.0).beat()
-    save(cache, NOW + 100.0, known("A", 5), known("B", 6, index=1))
-    imported(log.write(tmp_path / "flight.tlog"), cache=cache)
-    assert kept_values(cache) == {"A": 9, "B": 6}
-    assert sorted(each[:3] for each in lines(cache)) == [("A", 1, 5), ("A", 5, 9), ("B", 2, 6)]
-
-
 def test_a_change_that_was_also_received_live_has_one_line(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     save(cache, NOW + 0.2, known("A", 1))
@@ -381,15 +317,6 @@ def test_a_change_that_was_also_received_live_has_one_line(tmp_path: Path) -> No
     log = whole(A=1).wait(9.0).change("A", 3).wait(1.0).beat()
     imported(log.write(tmp_path / "flight.tlog"), cache=cache)
     assert lines(cache) == [("A", 1, 3, BY_US, pytest.approx(10.25))]
-
-
-def test_a_name_missing_in_a_later_table_is_not_restored(tmp_path: Path) -> None:
-    cache = tmp_path / "cache"
-    later = Log(NOW + 500.0).beat().identify().list(A=1).wait(1.0).beat()
-    imported(later.write(tmp_path / "later.tlog"), cache=cache)
-    imported(whole(A=1, OLD=2).write(tmp_path / "earlier.tlog"), cache=cache)
-    assert kept_values(cache) == {"A": 1}
-    assert lines(cache) == []
 
 
 def test_a_name_removed_later_is_not_restored(tmp_path: Path) -> None:
@@ -410,97 +337,4 @@ def test_a_name_removed_later_is_not_restored(tmp_path: Path) -> None:
     assert kept_values(cache) == {"A": 1, "OLD": 5}
 
 
-def test_unidentified_vehicles_are_distinguished_by_the_log(tmp_path: Path) -> None:
-    cache = tmp_path / "cache"
-    one = Log().beat().list(A=1).write(tmp_path / "1.tlog")
-    two = Log().beat().report("A", 0, A=2, B=3).write(tmp_path / "2.tlog")
-    tables = imported(one, two, cache=cache)
-    assert [table.key for table in tables] == [f"system:1@replay:{one}", f"system:1@replay:{two}"]
-    assert [table.complete for table in tables] == [True, False]
-
-
-def test_values_before_the_identification_keep_their_times(tmp_path: Path) -> None:
-    cache = tmp_path / "cache"
-    log = Log().beat().list(A=1).wait(500.0).identify().beat()
-    save(cache, NOW + 100.0, known("A", 5))
-    imported(log.write(tmp_path / "flight.tlog"), cache=cache)
-    assert kept_values(cache) == {"A": 5}
-
-
-def test_history_keeps_the_newest_lines_by_time(tmp_path: Path) -> None:
-    cache = tmp_path / "cache"
-    names = [f"P{number}" for number in range(1000)]
-    for step in range(HISTORY_ENTRIES_MAX // 1000 + 1):
-        save(cache, NOW + 1000.0 + step, *(known(name, step) for name in names))
-    assert len(lines(cache)) == HISTORY_ENTRIES_MAX
-    log = whole(P0=7).wait(9.0).change("P0", 8).wait(1.0).beat()
-    imported(log.write(tmp_path / "flight.tlog"), cache=cache)
-    found = lines(cache)
-    assert len(found) == HISTORY_ENTRIES_MAX
-    assert found == sorted(found, key=lambda each: float(str(each[4])))
-    assert found[0][4] == 1001.0
-
-
 # The command line
-
-
-def test_the_command_line_reads_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = whole(A=1, B=2).wait(300.0).change("B", 4).write(tmp_path / "flight.tlog")
-    began = time.monotonic()
-    assert run(["fetch", f"replay:{path}", "--json"]) == 0
-    assert time.monotonic() - began < 60.0  # less than the minutes of the log
-    fetched = json.loads(capsys.readouterr().out)
-    assert (fetched["count"], fetched["params"]["B"]["value"], fetched["bytes_sent"]) == (2, 4, 0)
-    assert run(["show", f"replay:{path}", "--json"]) == 0
-    [table] = json.loads(capsys.readouterr().out)["components"]
-    assert (table["uid"], table["params"]["B"]["value"]) == (UID, 4)
-    assert run(["get", f"replay:{path}", "A"]) == 2
-    assert "the client only listens" in capsys.readouterr().err
-    capsys.readouterr()
-    for names in ([], ["B"]):
-        assert run(["watch", f"replay:{path}?speed=100", *names]) == 0  # ends with the log
-        reported = capsys.readouterr().out.splitlines()
-        assert reported == ["2023-11-14T22:18:21.000Z  B  2 -> 4  (vehicle)"], "with the time of the log"
-    assert run(["watch", f"replay:{path}?speed=100", "A"]) == 0
-    assert capsys.readouterr().out == ""
-    assert run(["show", f"replay:{path}.gone"]) == 4
-    assert "cannot open" in capsys.readouterr().err
-
-
-def test_the_command_line_imports_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cache = tmp_path / "cache"
-    good = whole(A=1, B=2).write(tmp_path / "flight.tlog")
-    empty = Log().beat().write(tmp_path / "empty.tlog")
-    (tmp_path / "bad.tlog").write_bytes(b"nothing")
-    files = [str(tmp_path / "bad.tlog"), str(empty), str(good)]
-    assert run(["import", *files, "--cache", str(cache), "--json"]) == 2
-    reported = capsys.readouterr()
-    [table] = json.loads(reported.out)["tables"]
-    assert (table["file"], table["key"], table["params"], table["complete"]) == (str(good), KEY, 2, True)
-    assert "bad.tlog: not imported: a text file, and no log" in reported.err
-    assert "empty.tlog has no parameters" in reported.err
-    assert run(["import", str(good), "--cache", str(cache)]) == 0
-    assert "flight.tlog  1/1        generic         2  yes" in capsys.readouterr().out
-    assert run(["show", "1", "--cache", str(cache)]) == 0
-    assert run(["import"]) == 2
-
-
-def test_earlier_states_are_unchanged_when_a_log_completes_the_history(tmp_path: Path) -> None:
-    """Lines of history are renumbered then, also those after which names have appeared."""
-    cache = tmp_path / "cache"
-    later = Log(NOW + 1000.0).beat().identify().list(A=1, B=2).wait(10.0).change("A", 3)
-    later.wait(10.0).list(C=4).wait(10.0).change("B", 5).wait(1.0).beat()
-    imported(later.write(tmp_path / "later.tlog"), cache=cache)
-    moments = [NOW + 1005.0, NOW + 1015.0, NOW + 1025.0, NOW + 1035.0]
-
-    def reported() -> list[dict[str, object]]:
-        with ParamCache(cache) as kept:
-            states = [kept.state_at(KEY, 1, at) for at in moments]
-        return [{name: param.value for name, param in state.items()} for state in states]
-
-    before = reported()
-    assert before == [{"A": 1, "B": 2}, {"A": 3, "B": 2}, {"A": 3, "B": 2, "C": 4}, {"A": 3, "B": 5, "C": 4}]
-    earlier = whole(A=7, B=8).wait(9.0).change("A", 9).wait(1.0).beat()
-    imported(earlier.write(tmp_path / "earlier.tlog"), cache=cache)
-    assert [each[:3] for each in lines(cache)] == [("A", 7, 9), ("A", 1, 3), ("B", 2, 5)]
-    assert reported() == before

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from paramclient.model.defaults import DefaultSource, add_default, add_defaults, default_of
-from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Param, ParamType, WireValue, bits_of
 
@@ -39,13 +38,6 @@ def test_a_decimal_default_is_rounded_as_the_vehicle_rounds_it() -> None:
     assert add_default(held, 0.1).is_changed is False
 
 
-@pytest.mark.parametrize(("kind", "described"), [(ParamType.INT8, 300), (ParamType.INT32, 0.5), (77, 1)])
-def test_a_default_that_the_type_cannot_hold_is_not_known(kind: ParamType | int, described: float) -> None:
-    value: WireValue = b"abcd" if kind == 77 else 1
-    assert default_of(param("P", value, kind), described) is None
-    assert add_default(param("P", value, kind), described).is_changed is None
-
-
 def test_a_set_keeps_its_own_defaults_and_those_without_one_get_them() -> None:
     params = ParamSet(
         {
@@ -58,12 +50,3 @@ def test_a_set_keeps_its_own_defaults_and_those_without_one_get_them() -> None:
     filled = add_defaults(params, {"A": 9, "B": 2, "C": 8})
     assert {name: each.default for name, each in filled.items()} == {"A": 5, "B": 2.0, "C": 8, "D": None}
     assert add_defaults(params, {}) is params
-
-
-def test_changed_takes_defaults_of_metadata() -> None:
-    table = ParamMap(
-        {each.name: each for each in (param("A", 1.0, default=2.0), param("B", 1.0), param("C", 1.0))}
-    )
-    assert list(table.changed()) == ["A"]
-    found = table.changed({"A": 1.0, "B": 3, "C": 1})
-    assert {name: each.default for name, each in found.items()} == {"A": 2.0, "B": 3.0}

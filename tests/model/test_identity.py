@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from paramclient.model.identity import PX4_SITL_UID, Identity, autopilot_name, is_sitl_uid
+from paramclient.model.identity import PX4_SITL_UID, Identity, is_sitl_uid
 from tests.recordings import identity_in
 
 
@@ -33,30 +33,11 @@ def test_ardupilot_git_hash_is_text_and_uid2_is_the_hardware_id() -> None:
     assert identity.key == "uid:336431323139633763346335343034616100"
 
 
-def test_uid2_takes_precedence_over_uid() -> None:
-    both = Identity.from_version(
-        system=1, link="x", autopilot=3, vehicle_type=2, uid=7, uid2=b"\x01" + bytes(17)
-    )
-    older = Identity.from_version(system=1, link="x", autopilot=3, vehicle_type=2, uid=7, uid2=bytes(18))
-    none = Identity.from_version(system=1, link="x", autopilot=3, vehicle_type=2)
-    assert (both.uid, older.uid, none.uid) == ("01" + "00" * 17, "0000000000000007", None)
-    assert (older.key, none.key) == ("uid:0000000000000007", "system:1@x")
-    assert none.git_hash == ""
-
-
 def test_key_is_the_hardware_id_or_else_system_and_link() -> None:
     with_id = Identity(1, "udpin:a", uid="abcd")
     assert replace(with_id, system=9, link="tcp:b").key == with_id.key
     without = Identity(1, "udpin:a")
     assert len({without.key, replace(without, system=2).key, replace(without, link="udpin:b").key}) == 3
-
-
-@pytest.mark.parametrize(
-    ("number", "name"),
-    [(0, "generic"), (3, "ardupilot"), (8, "no autopilot"), (12, "px4"), (77, "autopilot 77")],
-)
-def test_autopilot_name(number: int, name: str) -> None:
-    assert autopilot_name(number) == name
 
 
 def test_same_hardware_id_is_the_same_vehicle() -> None:

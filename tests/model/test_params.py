@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-import copy
-import gc
-import pickle
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from paramclient.model.params import (
-    CACHED,
-    COMPACT_NO_INDEX,
     ParamMap,
     Params,
     as_params,
-    compact_param,
-    has_index,
     is_listed,
-    pack_fields,
-    param_of,
-    same_compact,
-    with_index,
-    with_trust_number,
 )
 from paramclient.model.values import Encoding, Param, ParamType, Trust, decode_value, known_type
-from paramclient.protocol.params.change import Change
 
 
 def test_a_param_map_is_a_live_read_only_view() -> None:
@@ -116,51 +102,3 @@ def test_params_can_be_changed_and_copied() -> None:
     assert "A" not in params.defaults
     with pytest.raises(KeyError):
         params["A"]
-
-
-def test_setting_index_or_trust_changes_nothing_else() -> None:
-    param = Param("A", -5, ParamType.INT16, 300, 0xFFFB, Trust.VERIFIED)
-    held = compact_param(param)
-    assert param_of("A", with_index(held, 7)) == Param("A", -5, ParamType.INT16, 7, 0xFFFB, Trust.VERIFIED)
-    assert param_of("A", with_index(held, COMPACT_NO_INDEX)).index is None
-    assert has_index(with_index(held, 7), 7)
-    assert not has_index(with_index(held, 7), 8)
-    assert param_of("A", with_trust_number(held, CACHED)) == param.with_trust(Trust.CACHED)
-    assert same_compact(held, with_trust_number(with_index(held, 9), CACHED))
-
-
-@given(
-    number=st.integers(1, 10),
-    one=st.integers(0, 2**32 - 1) | st.sampled_from([0, 0x80000000]),
-    other=st.integers(0, 2**32 - 1) | st.sampled_from([0, 0x80000000]),
-    raw=st.sampled_from([(False, False), (True, False)]),
-)
-def test_same_held_agrees_with_same_value_of_params(
-    number: int, one: int, other: int, raw: tuple[bool, bool]
-) -> None:
-    one, other = (each & ((1 << 8 * min(ParamType(number).size, 4)) - 1) for each in (one, other))
-    first, second = pack_fields(one, number, raw[0], 0, 1), pack_fields(other, number, raw[1], 1, 2)
-    assert same_compact(first, second) == param_of("A", first).same_value(param_of("A", second))
-
-
-def test_the_garbage_collector_does_not_track_compact_params() -> None:
-    params = Params()
-    for at in range(100):
-        params[f"P{at}"] = Param(f"P{at}", 1.5, ParamType.REAL32, at, 0x3FC00000, default=2.5)
-    assert not any(map(gc.is_tracked, (*params.compact.values(), *params.defaults.values())))
-
-
-def test_changes_compare_by_content_and_can_be_copied() -> None:
-    old = Param("A", 1, ParamType.INT8, 0, 1, default=3)
-    new = Param("A", 2, ParamType.INT8, 0, 2, Trust.CACHED, 4)
-    change = Change("A", old, new, "us")
-    same = Change("A", Param("A", 1, ParamType.INT8, 0, 1), new, "us")
-    assert change == same
-    assert not change != same  # noqa: SIM202 - tests __ne__, which tuple defines itself
-    assert hash(change) == hash(same)
-    assert change != Change("A", old, new, "vehicle")
-    for copied in (copy.copy(change), copy.deepcopy(change), pickle.loads(pickle.dumps(change))):
-        assert copied == change
-        assert copied.old is not None
-        assert copied.new is not None
-        assert (copied.old.default, copied.new.default) == (3, 4)

@@ -15,8 +15,6 @@ from paramclient.provision import CATEGORIES, MISSING, WRONG, Plan, PlanStatus, 
 from paramclient.provision.apply_rules import OUT_OF_RANGE, READ_ONLY
 from paramclient.sim.param_table import SimParam, ardupilot_table, px4_table
 
-SECTIONS = ("left_out", "frame", "resets", "brings_any", "last", "system_id", "reboot")
-
 
 @dataclass(frozen=True)
 class Info:
