@@ -787,6 +787,7 @@ class Sessions(RuleBasedStateMachine):
 SETTINGS = settings(
     max_examples=40,
     stateful_step_count=20,
+    derandomize=True,
     deadline=None,
     print_blob=True,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],

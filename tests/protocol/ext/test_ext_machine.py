@@ -224,8 +224,9 @@ class Extended(RuleBasedStateMachine):
 
 
 Extended.TestCase.settings = settings(
-    max_examples=40,
-    stateful_step_count=25,
+    max_examples=15,
+    stateful_step_count=20,
+    derandomize=True,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
