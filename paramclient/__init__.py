@@ -119,7 +119,6 @@ if TYPE_CHECKING:
     from paramclient.protocol.ftp import DirectoryEntry
     from paramclient.protocol.params.change import Added, Change, Changed, FirstValue, Removed
     from paramclient.protocol.params.fetch_result import FetchResult, FetchSource, Policy, Progress
-    from paramclient.protocol.params.sampling import Sample
     from paramclient.protocol.params.sync import ComponentState, SyncState
     from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, SetStatus
     from paramclient.protocol.params.writes import SetResult
@@ -239,7 +238,6 @@ __all__ = [
     "Renames",
     "ResetResult",
     "Resynced",
-    "Sample",
     "SetFailed",
     "SetManyResult",
     "SetOutcome",
@@ -429,7 +427,6 @@ _HOMES: Final = {
         "Policy",
         "Progress",
     ),
-    "paramclient.protocol.params.sampling": ("Sample",),
     "paramclient.protocol.params.sync": ("ComponentState", "SyncState"),
     "paramclient.protocol.params.write_batch": (
         "SetManyResult",

@@ -36,7 +36,14 @@ class Outcome:
 def run_one(number: int, *, sessions: int = PER_SEED, shrinks: bool = False) -> Outcome:
     """Run the sessions of one seed; with `shrinks`, look for the shortest one that fails."""
     phases = (Phase.generate, Phase.shrink) if shrinks else (Phase.generate,)
-    chosen = settings(SETTINGS, max_examples=sessions, stateful_step_count=30, derandomize=False, database=None, phases=phases)
+    chosen = settings(
+        SETTINGS,
+        max_examples=sessions,
+        stateful_step_count=30,
+        derandomize=False,
+        database=None,
+        phases=phases,
+    )
     before = Sessions.begun_sessions
     failure = ""
 

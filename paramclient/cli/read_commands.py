@@ -6,11 +6,10 @@ import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final
 
 import anyio
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
 from paramclient.cli.default_sources import find_defaults, report_no_defaults, say_sources
 from paramclient.cli.every_vehicle import (
@@ -63,7 +62,6 @@ from paramclient.model.patterns import NameChoice, is_pattern
 from paramclient.model.values import Param, Trust, format_value, type_name
 from paramclient.model.wording import first_of
 from paramclient.protocol.params.fetch_result import FetchResult, Policy, Progress
-from paramclient.protocol.params.sampling import SAMPLE_SIZE, Sample
 
 __all__ = ["fetch", "get", "watch"]
 
@@ -84,8 +82,6 @@ async def fetch(
     only: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
     refresh: bool = False,
     changed: bool = False,
-    accept: Literal["verified", "sampled"] = "verified",
-    sample: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
     policy: Policy = Policy.AUTO,
     metadata: MetadataChoice = None,
     extended: bool = False,
@@ -105,9 +101,6 @@ async def fetch(
         refresh: Download all parameters even if the cache is up to date.
         changed: Print only parameters that differ from the firmware's defaults: those of the vehicle, else
             those of its metadata.
-        accept: With "sampled", a cached table of a vehicle without a hash is accepted if a sample of it
-            matches; the probability that the sample detects a change is printed.
-        sample: Number of parameters in the sample. Default: 30.
         policy: Requests that may be sent to the vehicle: all that are needed, only for its hash, or none.
         metadata: A file with the firmware's defaults; or vehicle, to download the vehicle's own metadata.
             Default: the stored metadata of the firmware; else, with --changed, that of the vehicle if it can
@@ -125,10 +118,8 @@ async def fetch(
             f"`paramclient fetch {url} --only {given}` fetches all and prints some"
         )
     check_choice(extended=extended, plain=plain)
-    if sample is not None and accept != "sampled":
-        raise UsageError("--sample needs --accept sampled")
     from_option = from_file(metadata)
-    fetching = _Fetching(refresh, accept, sample or SAMPLE_SIZE, policy)
+    fetching = _Fetching(refresh, policy)
 
     async def described(fetched: _Fetched) -> _Fetched:
         """Add the defaults of the metadata, if they are shown."""
@@ -148,8 +139,6 @@ async def fetch(
         return _show_fleet(fleet, only, options, changed=changed)
     async with connect(url, options, policy=policy) as session:
         if await is_extended_session(session, extended=extended, plain=plain or changed):
-            if accept != "verified":
-                raise UsageError("--accept is for plain parameters; add --plain")
             return await fetch_extended(session, only)
         with progress_bar(f"fetching {session.label}") as progress:
             fetched = await fetching.fetch(session, progress)
@@ -302,8 +291,6 @@ class _Fetching:
     """How parameters are fetched."""
 
     refresh: bool
-    accept: Literal["verified", "sampled"]
-    sample: int
     policy: Policy
 
     async def fetch(
@@ -312,8 +299,6 @@ class _Fetching:
         """Fetch the table of a vehicle, and the values that its hash does not cover."""
         result = await session.component.fetch_all(
             refresh=self.refresh,
-            accept=self.accept,
-            sample=self.sample,
             timeout=session.deadline.left(),
             progress=progress,
         )
@@ -327,7 +312,7 @@ class _Fetched:
     """The parameters that were received or confirmed in this session.
 
     A value that is only cached is left out, and its index counts as missing. If the policy prevents its
-    request, or a sample confirms the table, it is included and named in `cached`. `described` has defaults of
+    request, it is included and named in `cached`. `described` has defaults of
     the metadata, by name.
     """
 
@@ -346,7 +331,7 @@ class _Fetched:
         params = by_index(session.component.params.values())
         cached = [param for param in params if param.trust is Trust.CACHED]
         missing = set(result.missing)
-        if policy is Policy.AUTO and result.sample is None:
+        if policy is Policy.AUTO:
             if result.source == "cache":
                 missing = {param.index for param in cached if param.index is not None}
             params = [param for param in params if param.trust is not Trust.CACHED]
@@ -390,8 +375,7 @@ class _Fetched:
     @property
     def notes(self) -> list[str]:
         """Remarks for the user."""
-        sample = self.result.sample
-        return [*self.result.notes, *([] if sample is None else [_confidence(sample)])]
+        return [*self.result.notes]
 
     @property
     def incomplete(self) -> str:
@@ -482,21 +466,9 @@ async def _fetch_all(session: CommandSession, *, draws: bool = True) -> FetchRes
         return await session.component.fetch_all(timeout=session.deadline.left(), progress=progress)
 
 
-def _confidence(sample: Sample) -> str:
-    """Return the probabilities that the sample would have shown a change, in words."""
-    chances = " and ".join(f"{sample.confidence(each):.0%} for {each}" for each in _ASSUMED_CHANGES)
-    return (
-        f"{sample.size} of {sample.count} parameters were read and agreed. If other parameters had changed, "
-        f"the probability that the sample shows it is {chances} of them."
-    )
-
-
 def _index_text(indices: Sequence[int]) -> str:
     return f"{'index' if len(indices) == 1 else 'indices'} {first_of(indices, INDICES_SHOWN_MAX)}"
 
-
-_ASSUMED_CHANGES: Final = (1, 10, 100)
-"""Numbers of changed parameters for which the probability is given that a sample detects the change."""
 
 # get
 

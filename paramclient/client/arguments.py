@@ -14,7 +14,6 @@ __all__ = [
     "PROGRESS_CALL_INTERVAL",
     "SETTLE_MAX",
     "address_in_words",
-    "check_accepted",
     "check_requested_name",
     "check_portable_name",
     "check_settle",
@@ -71,18 +70,6 @@ def check_writes(
             raise UsageError(f"{HASH_CHECK} is read-only: it is the hash of the parameters, not a parameter")
         checked.append((name, check_value(value)))
     return checked
-
-
-def check_accepted(accept: str, sample: int) -> None:
-    """Check the arguments `accept` and `sample` of a fetch.
-
-    Raises:
-        UsageError: `accept` is neither "verified" nor "sampled", or `sample` is less than 1.
-    """
-    if accept not in ("verified", "sampled"):
-        raise UsageError(f'accept must be "verified" or "sampled", not {accept!r}')
-    if sample < 1:
-        raise UsageError(f"sample must be at least 1 parameter, not {sample}")
 
 
 def check_settle(settle: float) -> float:

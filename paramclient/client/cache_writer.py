@@ -536,7 +536,6 @@ class CacheWriter:
                 placed=cached.complete or (is_same and cached.count is not None),
                 moments=self._moments(cached),
             )
-            machine.fetches.is_same_firmware = is_same
             if is_same and machine.fetches.file_works is None:
                 machine.fetches.file_works = cached.file_works
             kept.synced_at = cached.synced_at

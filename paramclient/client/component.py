@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from typing import Literal
 
 import anyio
 
@@ -18,7 +17,6 @@ from paramclient.model.params import ParamMap
 from paramclient.model.values import Encoding, Param, Settable, WireValue
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
-from paramclient.protocol.params.sampling import SAMPLE_SIZE
 from paramclient.protocol.params.sync import ComponentState, SyncState
 from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome
 from paramclient.protocol.params.writes import SetResult
@@ -304,9 +302,6 @@ class Component(ABC):
         self,
         *,
         refresh: bool = False,
-        accept: Literal["verified", "sampled"] = "verified",
-        sample: int = SAMPLE_SIZE,
-        seed: int | None = None,
         timeout: float | None = None,
         progress: Callable[[Progress], None] | None = None,
     ) -> FetchResult:
@@ -328,12 +323,6 @@ class Component(ABC):
 
         Args:
             refresh: download even if the hash would confirm the cached table.
-            accept: "verified", or "sampled": for a vehicle without a hash, accept the cached table if a
-                sample of it matches (name, value, index and count), and the hardware id, firmware version and
-                git hash are equal. `sample` of the result then quantifies the remaining risk, and no value
-                counts as verified.
-            sample: number of parameters to read for "sampled".
-            seed: seed of the random sample; None for a different sample each time.
             timeout: seconds after which the partial table is returned with `missing`; None: no limit, except
                 20 s if the client only listens.
             progress: called about ten times a second, from this task.
@@ -342,8 +331,8 @@ class Component(ABC):
             The parameters with their source, the missing indices and notes.
 
         Raises:
-            UsageError: `accept` is unknown, the sample is empty, or `refresh` is given and the policy of the
-                client allows no download, or the client only listens.
+            UsageError: `refresh` is given and the policy of the client allows no download, or the client only
+                listens.
             CacheError: nothing is cached, and the policy allows no download.
             NoReply: no response arrived, or the component is lost.
             ContestedAddress: several vehicles use its address.

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import random
 import weakref
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import wraps
-from typing import Any, Concatenate, Literal, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import anyio
 
 from paramclient.client.arguments import (
     PROGRESS_CALL_INTERVAL,
     address_in_words,
-    check_accepted,
     check_requested_name,
     check_settle,
     check_writes,
@@ -38,9 +36,8 @@ from paramclient.protocol.no_reply_hint import hint_of_component
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import check_author
 from paramclient.protocol.params.fetch import Fetch
-from paramclient.protocol.params.fetch_result import FetchResult, Progress, Sampled
+from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.params.passive import PASSIVE_TIMEOUT
-from paramclient.protocol.params.sampling import SAMPLE_SIZE
 from paramclient.protocol.params.sync import ComponentState, SyncState
 from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome
 from paramclient.protocol.params.writes import SetResult
@@ -304,26 +301,19 @@ class LinkComponent(LocalComponent):
         self,
         *,
         refresh: bool = False,
-        accept: Literal["verified", "sampled"] = "verified",
-        sample: int = SAMPLE_SIZE,
-        seed: int | None = None,
         timeout: float | None = None,
         progress: Callable[[Progress], None] | None = None,
     ) -> FetchResult:
         """See `Component.fetch_all`."""
         self.client.check_open()
         self.client.station.check_refresh(refresh)
-        check_accepted(accept, sample)
-        sampled = None
-        if accept == "sampled" and not refresh:
-            sampled = Sampled(sample, random.getrandbits(32) if seed is None else seed)
         timeout = fetch_timeout(self.client.station, timeout)
         began = anyio.current_time()
         if not refresh:
             with anyio.move_on_after(timeout):
                 await self.wait_for_cache()
         machine = self.machine
-        fetch = machine.begin_fetch(anyio.current_time(), refresh=refresh, sampled=sampled)
+        fetch = machine.begin_fetch(anyio.current_time(), refresh=refresh)
         try:
             result = await self.wait_for_fetch(fetch, None if timeout is None else began + timeout, progress)
         finally:

@@ -27,7 +27,7 @@ class ClientStats:
         reads, writes: parameters read one by one, and written.
         retries: retransmitted requests of these reads and writes.
         downloads: fetches that downloaded a complete table.
-        cache_hits: fetches served from the cache, because the vehicle's hash or a sample matched.
+        cache_hits: fetches served from the cache, because the vehicle's hash matched.
         round_trips: smoothed round-trip time in seconds, by (system, component), of each component that has
             responded to a request.
     """

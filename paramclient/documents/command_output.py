@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from paramclient.client.events import Contested, Found, Lost, Resynced
 from paramclient.documents.component import ContestDoc
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from paramclient.model.paramset import ParamSet
     from paramclient.model.values import Param, WireValue
     from paramclient.protocol.params.fetch_result import FetchResult
-    from paramclient.protocol.params.sampling import Sample
     from paramclient.protocol.params.write_batch import SetOutcome
 
 __all__ = [
@@ -56,31 +55,9 @@ __all__ = [
     "WritesOutputDoc",
     "SigningOutputDoc",
     "SilenceLineDoc",
-    "TrustedSampleDoc",
     "VehicleReadDoc",
     "VehicleWritesDoc",
 ]
-
-ASSUMED_CHANGES: Final = (1, 10, 100)
-"""Numbers of changed parameters for which the probability is given that a sample detects the change."""
-
-
-class TrustedSampleDoc(Document):
-    """A sample that agreed with the cache.
-
-    `confidence` is the probability that the sample would have shown a change, by the number of parameters
-    that changed.
-    """
-
-    size: int
-    count: int
-    confidence: dict[str, float]
-
-    @classmethod
-    def of(cls, sample: Sample) -> TrustedSampleDoc:
-        """Return the document of a `Sample`."""
-        confidence = {str(each): round(sample.confidence(each), 4) for each in ASSUMED_CHANGES}
-        return cls(size=sample.size, count=sample.count, confidence=confidence)
 
 
 class FetchOutputDoc(Document):
@@ -99,7 +76,6 @@ class FetchOutputDoc(Document):
     hash: str | None
     missing: list[int]
     cached: list[str]
-    sample: TrustedSampleDoc | None
     lost: int
     repeated: int
     round_trip_s: float | None
@@ -144,7 +120,6 @@ class FetchOutputDoc(Document):
             hash=hash_text(result.hash),
             missing=missing,
             cached=cached,
-            sample=None if result.sample is None else TrustedSampleDoc.of(result.sample),
             lost=result.lost,
             repeated=result.repeated,
             round_trip_s=rounded(result.round_trip),

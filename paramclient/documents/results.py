@@ -12,31 +12,16 @@ from paramclient.model.values import ParamType
 
 if TYPE_CHECKING:
     from paramclient.protocol.params.fetch_result import FetchResult
-    from paramclient.protocol.params.sampling import Sample
     from paramclient.protocol.params.writes import SetResult
 
 __all__ = [
     "FetchResultDoc",
     "FetchedAllDoc",
     "NotSetDoc",
-    "SampleDoc",
     "SetManyDoc",
     "SetResultDoc",
     "SilentDoc",
 ]
-
-
-class SampleDoc(Document):
-    """The result of a sample of a cached table; see `Sample`."""
-
-    size: int
-    count: int
-    differing: list[str]
-
-    @classmethod
-    def of(cls, sample: Sample) -> SampleDoc:
-        """Return the document of a `Sample`."""
-        return cls(size=sample.size, count=sample.count, differing=list(sample.differing))
 
 
 class FetchResultDoc(Document):
@@ -56,7 +41,6 @@ class FetchResultDoc(Document):
     lost: int
     repeated: int
     round_trip_s: float | None
-    sample: SampleDoc | None
 
     @classmethod
     def of(cls, result: FetchResult, *, link: str) -> FetchResultDoc:
@@ -76,7 +60,6 @@ class FetchResultDoc(Document):
             lost=result.lost,
             repeated=result.repeated,
             round_trip_s=rounded(result.round_trip),
-            sample=None if result.sample is None else SampleDoc.of(result.sample),
         )
 
 

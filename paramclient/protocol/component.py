@@ -33,7 +33,7 @@ from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch import Check, Fetch
 from paramclient.protocol.params.fetch_queue import Fetches
-from paramclient.protocol.params.fetch_result import FetchContext, FetchResult, Policy, Sampled
+from paramclient.protocol.params.fetch_result import FetchContext, FetchResult, Policy
 from paramclient.protocol.params.reads import Key, Read, Reads
 from paramclient.protocol.params.sync import ComponentState, Sync, SyncSettings, SyncState
 from paramclient.protocol.params.table import NameQuota, Table
@@ -449,7 +449,7 @@ class ComponentMachine:
             if self.identification.version(message, now):
                 self._vehicle_replaced(now)
             elif before not in (None, self.identification.firmware):
-                self.fetches.updated(now)
+                self.fetches.updated()
         elif isinstance(message, ParamError):
             addressee = (message.target_system, message.target_component)
             if message.param_index < 0 and not is_portable_name(message.param_id):
@@ -836,7 +836,6 @@ class ComponentMachine:
         listed: bool = False,
         by_list: bool = False,
         check: Check | None = None,
-        sampled: Sampled | None = None,
     ) -> Fetch:
         """Begin a fetch, or join the one in progress; give it back with `end_fetch`.
 
@@ -846,7 +845,6 @@ class ComponentMachine:
             listed: the list was requested already, of all components at once.
             by_list: download by list even if the vehicle serves the file.
             check: the options of a fetch that only the watch has requested.
-            sampled: the sample that may confirm a table without a hash, or None.
 
         Raises:
             ContestedAddress: several vehicles use its address.
@@ -856,9 +854,7 @@ class ComponentMachine:
         self.reschedule()
         if self.fetch is None and self._fetch_policy is not Policy.CACHE_ONLY:
             self.check_present(f"the parameters of {self.system}/{self.component}", now)
-        return self.fetches.begin(
-            now, refresh=refresh, listed=listed, by_list=by_list, check=check, sampled=sampled
-        )
+        return self.fetches.begin(now, refresh=refresh, listed=listed, by_list=by_list, check=check)
 
     def end_fetch(self, fetch: Fetch, now: float) -> None:
         """Give a fetch back. The last holder cancels it."""

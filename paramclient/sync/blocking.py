@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from paramclient.cache import ParamCache, SnapshotSummary
 from paramclient.client import events as asynchronous
@@ -34,7 +34,6 @@ from paramclient.protocol.ext.writes import ExtSetResult
 from paramclient.protocol.ftp import FILE_SIZE_MAX, DirectoryEntry
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch_result import FetchResult, Policy, Progress
-from paramclient.protocol.params.sampling import SAMPLE_SIZE
 from paramclient.protocol.params.sync import ComponentState, SyncState
 from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome
 from paramclient.protocol.params.writes import SetResult
@@ -728,9 +727,6 @@ class Component(Wrapper[AsyncComponent]):
         self,
         *,
         refresh: bool = False,
-        accept: Literal["verified", "sampled"] = "verified",
-        sample: int = SAMPLE_SIZE,
-        seed: int | None = None,
         timeout: float | None = None,
         progress: Callable[[Progress], None] | None = None,
     ) -> FetchResult:
@@ -752,12 +748,6 @@ class Component(Wrapper[AsyncComponent]):
 
         Args:
             refresh: download even if the hash would confirm the cached table.
-            accept: "verified", or "sampled": for a vehicle without a hash, accept the cached table if a
-                sample of it matches (name, value, index and count), and the hardware id, firmware version and
-                git hash are equal. `sample` of the result then quantifies the remaining risk, and no value
-                counts as verified.
-            sample: number of parameters to read for "sampled".
-            seed: seed of the random sample; None for a different sample each time.
             timeout: seconds after which the partial table is returned with `missing`; None: no limit, except
                 20 s if the client only listens.
             progress: called about ten times a second, in the calling thread.
@@ -766,8 +756,8 @@ class Component(Wrapper[AsyncComponent]):
             The parameters with their source, the missing indices and notes.
 
         Raises:
-            UsageError: `accept` is unknown, the sample is empty, or `refresh` is given and the policy of the
-                client allows no download, or the client only listens.
+            UsageError: `refresh` is given and the policy of the client allows no download, or the client only
+                listens.
             CacheError: nothing is cached, and the policy allows no download.
             NoReply: no response arrived, or the component is lost.
             ContestedAddress: several vehicles use its address.
@@ -777,9 +767,6 @@ class Component(Wrapper[AsyncComponent]):
             partial(
                 self._wrapped.fetch_all,
                 refresh=refresh,
-                accept=accept,
-                sample=sample,
-                seed=seed,
                 timeout=timeout,
             ),
             progress,

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from typing import Literal
 
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
-from paramclient.protocol.params.sampling import SAMPLE_SIZE
 from paramclient.sync.blocking import Component
 from paramclient.sync.client_thread import ReportingCall
 from paramclient.sync.wrappers import thread_of, wrapped_by
@@ -24,7 +22,7 @@ class FetchIterator(Iterator[Progress]):
 
     Args:
         component: the component.
-        refresh, accept, sample, seed, timeout: as in `Component.fetch_all`.
+        refresh, timeout: as in `Component.fetch_all`.
 
     Raises:
         ClientClosed: the client is not open.
@@ -35,17 +33,11 @@ class FetchIterator(Iterator[Progress]):
         component: Component,
         *,
         refresh: bool = False,
-        accept: Literal["verified", "sampled"] = "verified",
-        sample: int = SAMPLE_SIZE,
-        seed: int | None = None,
         timeout: float | None = None,
     ) -> None:
         fetch = partial(
             wrapped_by(component).fetch_all,
             refresh=refresh,
-            accept=accept,
-            sample=sample,
-            seed=seed,
             timeout=timeout,
         )
         self._call: ReportingCall[Progress, FetchResult] = thread_of(component).begin_reporting(fetch)

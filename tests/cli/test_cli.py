@@ -620,17 +620,6 @@ def test_show_prints_parameters_that_differ_from_the_defaults(command: Command, 
     assert len(command("show", "--cache", cache).words) == 1383
 
 
-# fetch with a sample
-
-
-def test_sample_needs_accept_sampled(command: Command) -> None:
-    refused = command("fetch", "sim:ardupilot", "--sample", 5, "--no-cache")
-    assert (refused.code, refused.out) == (2, "")
-    assert "--accept sampled" in refused.err
-    for words in (["--accept", "sampled", "--sample", "0"], ["--accept", "guessed"]):
-        assert command("fetch", "sim:ardupilot", "--no-cache", *words).code == 2
-
-
 # watch
 
 

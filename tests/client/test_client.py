@@ -10,7 +10,6 @@ import os
 import re
 import socket
 import threading
-import time
 from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any
@@ -1566,17 +1565,6 @@ async def test_an_invalid_index_is_refused_and_later_reads_work(index: Any) -> N
         with pytest.raises(UsageError, match=f"parameter index {index}: indices are 0 to 32767"):
             await component.get(index)
         assert (await component.get(0)).index == 0
-
-
-@in_simulated_time
-async def test_invalid_options_of_accept_and_sample_are_refused() -> None:
-    async with a_client(generic()) as client:
-        component = await client.component()
-        with pytest.raises(UsageError, match='accept must be "verified" or "sampled", not \'all\''):
-            await component.fetch_all(accept="all")  # type: ignore[arg-type]
-        with pytest.raises(UsageError, match="sample must be at least 1 parameter, not 0"):
-            await component.fetch_all(accept="sampled", sample=0)
-        assert (await component.fetch_all(accept="sampled", sample=10**9, seed=time.time_ns())).complete
 
 
 @in_simulated_time

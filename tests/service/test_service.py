@@ -454,7 +454,7 @@ async def test_a_fetch_that_fails_says_why() -> None:
         vehicle.is_deaf = True
         reported = problem(await browser.post(f"{C}/fetch", json={}), 504, "no-reply")
         assert reported["attempts"] > 1
-        answer = await browser.post(f"{C}/fetch", json={"sample": 0})
+        answer = await browser.post(f"{C}/fetch", json={"timeout_s": -1})
         problem(answer, 422, "invalid-request")
 
 

@@ -2,7 +2,7 @@
 
 `change`: a change of one parameter.
 `change_origin`: the author of a change.
-`fetch`: one fetch: cache, file, list or sample.
+`fetch`: one fetch: cache, file or list.
 `fetch_notes`: the sentences of `FetchResult.notes`.
 `fetch_queue`: the fetches of a component, one at a time.
 `fetch_result`: policy, progress and result of a fetch.
@@ -12,7 +12,6 @@
 `list_stream`: progress, pace, losses and end of a running list.
 `passive`: tables from the traffic of other stations, and from logs.
 `reads`: PARAM_REQUEST_READ.
-`sampling`: check of a cached table by a random sample.
 `sync`: detection of changes that were missed.
 `table`: the parameters, their trust and their hash.
 `value_check`: values that may be older than a change.

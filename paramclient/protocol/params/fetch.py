@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -18,8 +17,6 @@ from paramclient.protocol.params.fetch_notes import (
     NOT_REFRESHED,
     NOT_REQUESTED,
     NOT_RESUMED,
-    NOT_SAMPLED,
-    SAMPLED,
     UNPROVEN,
     UNSETTLED,
 )
@@ -30,13 +27,11 @@ from paramclient.protocol.params.fetch_result import (
     FetchSource,
     Policy,
     Progress,
-    Sampled,
 )
 from paramclient.protocol.params.file_download import FileDownload
 from paramclient.protocol.params.hash_check import HashCheck
 from paramclient.protocol.params.list_download import ListDownload, present_of
 from paramclient.protocol.params.reads import Read
-from paramclient.protocol.params.sampling import Sampling
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.retry import FETCH_RESTARTS_MAX, OpenRetries
 from paramclient.protocol.wire import HASH_CHECK, ParamRequestRead, ParamValue
@@ -64,8 +59,7 @@ class Fetch(Operation[FetchResult]):
     """One fetch: by the hash if the cached table has one; otherwise, or on a mismatch, by file or list.
 
     The file is preferred where the component serves it: it is exact, has the firmware's defaults, and is
-    faster. When it fails, the list follows, and `notes` says why. Without a hash, a sample may confirm a
-    cached table, if the caller requested one.
+    faster. When it fails, the list follows, and `notes` says why.
 
     The list is requested in parallel to the file when the opening of the file stays unanswered, and when
     another station has a file open. As soon as the file is opened after all, the list's gaps are left to it.
@@ -101,7 +95,6 @@ class Fetch(Operation[FetchResult]):
         policy: Policy,
         may_use_file: Callable[[], bool],
         check: Check | None = None,
-        sampled: Sampled | None,
     ) -> None:
         super().__init__(now)
         self._fetch_context = fetch_context
@@ -116,7 +109,6 @@ class Fetch(Operation[FetchResult]):
         self._was_in_use = False  # the server's session was in use when the list was requested
         self._is_cancelled = False
         self._has_begun = self._had_no_file = self._file_was_silent = False
-        self._sampling: Sampling | None = None
         self._hash_read: Read | None = None
         self._proof = HashCheck(table)
         self._was_requested_meanwhile = False
@@ -136,18 +128,15 @@ class Fetch(Operation[FetchResult]):
         self.file_failed: bool | None = None
         self._notes: tuple[str, ...] = ()
         self._left_out_before = table.left_out
-        self._choose_source(announced, sampled, now, is_download=refresh or listed)
+        self._choose_source(announced, now, is_download=refresh or listed)
 
-    def _choose_source(
-        self, announced: Announcement | None, sampled: Sampled | None, now: float, *, is_download: bool
-    ) -> None:
+    def _choose_source(self, announced: Announcement | None, now: float, *, is_download: bool) -> None:
         """Begin in the cheapest reliable way: with the cached table if the vehicle confirms it.
 
         In this order:
 
         - A download, if the caller requests one (`_begin_download`, which chooses between file and list). If
           the policy forbids downloads, `_begin_download` ends with the cached table.
-        - A sample, if the caller accepts one, the table is complete, and the vehicle has no hash (`_sample`).
         - The rest of an interrupted download, or all of it, if the table has no hash or is incomplete
           (`_begin_or_resume`).
         - The cached table, if its hash equals the vehicle's (`_compare`). The hash is requested if it was not
@@ -155,15 +144,12 @@ class Fetch(Operation[FetchResult]):
 
         Args:
             announced: the vehicle's last `_HASH_CHECK`.
-            sampled: the options of a sample that the caller accepts.
             now: the time.
             is_download: whether the caller requests a download.
         """
         table = self._table
         if self._fetch_policy is Policy.CACHE_ONLY or is_download:
             self._begin_download(now)
-        elif sampled is not None and table.complete and table.count and not self._context.expects_hash:
-            self._sample(sampled, table.count, now)
         elif table.hash is None or not table.complete:
             self._begin_or_resume(announced, now)
         elif announced is not None and announced.is_fresh(now):
@@ -242,14 +228,9 @@ class Fetch(Operation[FetchResult]):
         return not self._has_begun or (self.download is not None and self.download.resumed > 0)
 
     @property
-    def is_sampling(self) -> bool:
-        """Whether a sample is being read that may confirm the table."""
-        return self._sampling is not None
-
-    @property
     def is_receiving(self) -> bool:
         """Whether parameters were received, which are stale if the vehicle restarts."""
-        return self._has_begun or self.is_sampling
+        return self._has_begun
 
     def restart(self, now: float) -> None:
         """Start again: the vehicle has restarted or is another one, so the received values are invalid."""
@@ -347,26 +328,6 @@ class Fetch(Operation[FetchResult]):
         received, total = (0, self._table.count) if self.download is None else self.download.progress
         downloaded = received - (0 if self.download is None else self.download.resumed)
         return Progress.after(received, total, downloaded, now - self.first_value_at)
-
-    def _sample(self, sampled: Sampled, count: int, now: float) -> None:
-        """Check the cached table by a sample of its parameters."""
-        table = self._table
-        sampling = self._sampling = Sampling(
-            self._reads, table.params, table.encoding, count, now, size=sampled.size, seed=sampled.seed
-        )
-
-        def ended() -> None:
-            self._sampling = None
-            sample = sampling.result
-            if sample is not None and sample.agrees:
-                result = self._result("cache", count, (), None, sampling.ended_at, (SAMPLED,))
-                self.finish(replace(result, sample=sample), sampling.ended_at)
-            else:
-                why = str(sampling.error) if sample is None else sample.differing[0]
-                self._notes += (NOT_SAMPLED.format(why),)
-                self._begin_download(sampling.ended_at)
-
-        sampling.on_done.append(ended)
 
     def _ask_hash(self, on_read: Callable[[Read], None], now: float) -> None:
         read = self._hash_read = self._reads.ask(HASH_CHECK, now)
@@ -688,9 +649,6 @@ class Fetch(Operation[FetchResult]):
 
     def _drop(self, now: float) -> None:
         self._drop_hash_read()
-        sampling, self._sampling = self._sampling, None
-        if sampling is not None:
-            sampling.cancel()
         self._drop_file(now)
         self._drop_download()
 

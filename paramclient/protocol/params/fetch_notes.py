@@ -11,9 +11,7 @@ __all__ = [
     "NOT_CONFIRMED",
     "NOT_REFRESHED",
     "NOT_RESUMED",
-    "NOT_SAMPLED",
     "NO_FILE",
-    "SAMPLED",
     "NO_HASH_BEFORE_DOWNLOAD",
     "UNPROVEN",
     "UNSETTLED",
@@ -43,8 +41,6 @@ FILE_IN_USE = (
     "The parameters were downloaded as a list: the file could not be opened, because another station reads "
     "one or has left one open."
 )
-SAMPLED = "A sample of the cached table matches the vehicle; no other values were requested."
-NOT_SAMPLED = "The sample does not match the cached table: {}."
 NOT_REFRESHED = "The values outside the hash were not read again, because the policy is hash-only."
 UNSETTLED = "The number of parameters kept changing during the download."
 NOT_RESUMED = (

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Final
 
 from paramclient.protocol.params.fetch import Check, Fetch
-from paramclient.protocol.params.fetch_result import FetchContext, FetchResult, Policy, Sampled
+from paramclient.protocol.params.fetch_result import FetchContext, FetchResult
 from paramclient.protocol.params.passive import PassiveFetch, PassiveTable
 from paramclient.protocol.params.sync import Sync, SyncSettings
 from paramclient.protocol.requests.machine import Machine
@@ -31,7 +31,6 @@ class Fetches(Machine):
     Attributes:
         last: the result of the last fetch, or None.
         file_works: whether this vehicle, with this firmware, serves its table as a file: None while unknown.
-        is_same_firmware: whether the cache belongs to this very vehicle with this very firmware.
         passive_table: the table from the traffic of other stations, where nothing may be requested; otherwise
             None.
     """
@@ -47,7 +46,6 @@ class Fetches(Machine):
         self._current: Fetch | None = None
         self.last: FetchResult | None = None
         self.file_works: bool | None = None
-        self.is_same_firmware = False
         self._fetch_context = fetch_context
         self._sync = sync
         self._fetch_policy = sync_settings.policy
@@ -82,7 +80,6 @@ class Fetches(Machine):
         listed: bool = False,
         by_list: bool = False,
         check: Check | None = None,
-        sampled: Sampled | None = None,
     ) -> Fetch:
         """Begin a fetch, or join the one in progress; give it back with `end`.
 
@@ -93,16 +90,12 @@ class Fetches(Machine):
             by_list: download by list even if the vehicle serves the file.
             check: the options of a fetch that only the watch has requested; a caller that joins ends the
                 check.
-            sampled: the sample that may confirm a table without a hash, or None.
         """
         fetch = self.current
         if fetch is not None and check is None:
             fetch.check = None
-        if fetch is not None and (
-            (refresh and fetch.may_end_with_cache) or (sampled is None and fetch.is_sampling)
-        ):
+        if fetch is not None and refresh and fetch.may_end_with_cache:
             fetch.restart(now)
-        may_sample = self.is_same_firmware and self._fetch_policy is Policy.AUTO and not self._sync.is_doubted
         if fetch is None and self.passive_table is not None:
             fetch = self.current = PassiveFetch(self._fetch_context, self.passive_table, now)
             if fetch.done:
@@ -120,7 +113,6 @@ class Fetches(Machine):
                 policy=self._fetch_policy,
                 may_use_file=self.may_use_file,
                 check=check,
-                sampled=sampled if may_sample else None,
             )
             if fetch.done:
                 self._fetch_ended(fetch)
@@ -175,14 +167,11 @@ class Fetches(Machine):
         if self.passive_table is not None:
             self.passive_table.forget()
         self.file_works = None
-        self.is_same_firmware = False
 
-    def updated(self, now: float) -> None:
-        """Forget what depends on the firmware, as samples of the old one do: it has changed."""
+    def updated(self) -> None:
+        """Forget what depends on the firmware: it has changed."""
         self._fetch_context.table.forget_defaults()
         self.forget()
-        if self.current is not None and self.current.is_sampling:
-            self.current.restart(now)
 
     def over(self, now: float) -> None:
         """End the passive fetch: nothing more is received."""

@@ -12,13 +12,12 @@ from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch_notes import CHANGED_MEANWHILE
 from paramclient.protocol.params.reads import Read, Reads
-from paramclient.protocol.params.sampling import Sample
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.scheduler import ListAdmission
 from paramclient.protocol.wire import ParamValue
 
-__all__ = ["Announcement", "FetchResult", "FetchContext", "FetchSource", "Policy", "Progress", "Sampled"]
+__all__ = ["Announcement", "FetchResult", "FetchContext", "FetchSource", "Policy", "Progress"]
 
 FetchSource: TypeAlias = Literal["cache", "ftp", "stream"]
 """Where a fetch has the values from: the cache, the packed file (MAVFTP) or the list."""
@@ -60,19 +59,6 @@ class FetchContext:
     files: FileTransfers
     changed: Callable[[list[Change]], None]
     doubt: Callable[[float], None]
-
-
-@dataclass(frozen=True, slots=True)
-class Sampled:
-    """The sample of a cached table that may end a fetch of a vehicle without a hash.
-
-    Attributes:
-        size: parameters to read.
-        seed: of the draw.
-    """
-
-    size: int
-    seed: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +115,8 @@ class FetchResult:
     Attributes:
         system, component: the component's address.
         params: all known parameters by name, as they were at the end of the fetch.
-        source: "cache" when the vehicle's hash confirmed the cached table, when the policy allows only the
-            cache, or when a sample matched; "ftp" for the packed file, "stream" for the list.
+        source: "cache" when the vehicle's hash confirmed the cached table, or when the policy allows only the
+            cache; "ftp" for the packed file, "stream" for the list.
         count: parameters that the component says it has.
         received: how many of them are known.
         missing: indices that were not received, rising. Empty when the fetch is complete.
@@ -143,8 +129,6 @@ class FetchResult:
             from the cache.
         repeated: values received more than once; 0 from the cache.
         round_trip: the component's measured round trip in seconds, smoothed, or None.
-        sample: the sample that confirmed the cached table, where one ended the fetch: then nothing is
-            *verified*, and `sample.confidence` says how far it can be trusted. Otherwise None.
     """
 
     system: int
@@ -161,16 +145,10 @@ class FetchResult:
     lost: int = 0
     repeated: int = 0
     round_trip: float | None = None
-    sample: Sample | None = None
 
     @property
     def complete(self) -> bool:
         return not self.missing
-
-    @property
-    def sampled(self) -> bool:
-        """Whether a sample of the cached table ended the fetch, so that nothing is *verified*."""
-        return self.sample is not None
 
     @property
     def may_be_mixed(self) -> bool:

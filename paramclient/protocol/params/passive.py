@@ -181,7 +181,6 @@ class PassiveFetch(Fetch):
             listed=False,
             policy=Policy.CACHE_ONLY,
             may_use_file=lambda: False,
-            sampled=None,
         )
 
     def table_received(self, result: FetchResult, now: float) -> None:

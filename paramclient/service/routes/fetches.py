@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 import anyio
 from fastapi import APIRouter, Request, Response
@@ -13,7 +13,6 @@ from paramclient.documents.document import Body
 from paramclient.documents.job import JobDoc, JobsDoc
 from paramclient.documents.results import FetchedAllDoc, FetchResultDoc, SilentDoc
 from paramclient.errors import NoReply, ParamClientError
-from paramclient.protocol.params.sampling import SAMPLE_SIZE
 from paramclient.service.hub import Hub
 from paramclient.service.jobs import FETCHES, Job
 from paramclient.service.problems import problem_of
@@ -39,9 +38,6 @@ class FetchRequest(Body):
     """Options of a fetch; see `Component.fetch_all`. With `wait` false, the response is a job."""
 
     refresh: bool = False
-    accept: Literal["verified", "sampled"] = "verified"
-    sample: Annotated[int, Field(ge=1, le=65_535)] = SAMPLE_SIZE
-    seed: Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)] | None = None
     timeout_s: Seconds = None
     wait: bool = True
 
@@ -68,9 +64,6 @@ async def fetch(
         author_of(request),
         holder_of(request),
         refresh=body.refresh,
-        accept=body.accept,
-        sample=body.sample,
-        seed=body.seed,
         timeout=body.timeout_s,
     )
     if not body.wait:
