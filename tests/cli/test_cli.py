@@ -1531,24 +1531,6 @@ def test_progress_is_drawn_on_a_terminal(tmp_path: Path) -> None:
     assert not re.search(r"\x1b\[(3|9)[0-9]m", plain.out)
 
 
-@pytest.mark.parametrize(("encoding", "strip"), [("utf-8", "[▁-█▒·]{40}"), ("ascii", "[_:=+*%#?.-]{40}")])
-def test_fetch_draws_what_the_radio_does(encoding: str, strip: str) -> None:
-    url = "sim:px4?loss=0.2&delay=0.05&seed=1"
-    environment = {"COLUMNS": "40", "PYTHONIOENCODING": encoding}
-    shown = on_terminal("fetch", url, "--no-cache", **environment)
-    assert shown.code == 0
-    lines = screen(shown.out).split("\n")
-    drawn = [line for line in lines if re.fullmatch(strip, line)]
-    assert len(drawn) > 5
-    assert any(re.search(r" [0-9]+ requested again$", line) for line in lines)
-    full, again, missing = ("█", "▒", "·") if encoding == "utf-8" else ("#", "?", ".")
-    assert again in "".join(drawn)
-    assert drawn[0].count(missing) > 20
-    assert drawn[-1].count(full) > 30
-    assert drawn[-1].count(missing) == 0
-    assert "\x1b[33m" in shown.out  # yellow, and not only another character
-
-
 def test_no_progress_is_drawn_for_a_cache_hit(warm: Path) -> None:
     shown = on_terminal("fetch", "sim:px4", "--cache", warm)
     assert shown.code == 0
