@@ -10,7 +10,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import yaml
 
 pytestmark = pytest.mark.slow
 
@@ -102,33 +101,6 @@ def test_runs(name: str, tmp_path: Path) -> None:
     for line in PRINTED[name]:
         assert re.search(line, printed), f"{line!r} is not in\n{printed}"
     assert "\x1b" not in printed
-
-
-def test_the_check_of_parameter_files_finds_what_does_not_fit(tmp_path: Path) -> None:
-    """The commands of the workflow, as GitHub would run them, on files of which one has a mistyped name."""
-    text = (EXAMPLES / "check-parameters.yml").read_text(encoding="utf-8")
-    [script] = [step["run"] for step in yaml.safe_load(text)["jobs"]["check"]["steps"] if "name" in step]
-    command = tmp_path / "bin/paramclient"
-    command.parent.mkdir()
-    command.write_text(f'#!/bin/sh\nexec {sys.executable} -m paramclient "$@"\n')
-    command.chmod(0o755)
-    for path, line in {"px4/a.param": "MC_ROLL_P,6.5", "ardupilot/b.param": "RTL_ALTT,2500"}.items():
-        (tmp_path / "parameters" / path).parent.mkdir(parents=True)
-        (tmp_path / "parameters" / path).write_text(f"{line}\n")
-    done = subprocess.run(
-        ["bash", "-e", "-c", script],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "PATH": f"{command.parent}:{os.environ['PATH']}"},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        encoding="utf-8",
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 1
-    first, second = done.stdout.split("== parameters/ardupilot/b.param\n")
-    assert re.search(r"^MC_ROLL_P .* set$", first, re.MULTILINE)
-    assert "not on this vehicle (did you mean RTL_ALT" in second
 
 
 def test_the_demo_ends_quietly_if_its_reader_ends() -> None:

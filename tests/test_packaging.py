@@ -62,11 +62,6 @@ def test_the_wheel_has_the_package_and_nothing_else(wheel: dict[str, bytes]) -> 
     assert "paramclient/service/page/index.html" in SERVED
 
 
-def test_the_command_is_an_entry_point(wheel: dict[str, bytes]) -> None:
-    (name,) = (name for name in wheel if name.endswith(".dist-info/entry_points.txt"))
-    assert "paramclient = paramclient.__main__:main" in wheel[name].decode()
-
-
 def test_pytest_finds_the_plugin(wheel: dict[str, bytes], tmp_path: Path) -> None:
     """Not installed by default: the files of the wheel, where Python looks for libraries."""
     for name, content in wheel.items():
@@ -113,18 +108,6 @@ def test_the_sdist_can_be_built_and_tested(sdist: set[str]) -> None:
 def test_the_changelog_knows_the_version() -> None:
     text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.findall(r"^## \[([^]]+)\]", text, re.MULTILINE)[0] == paramclient.__version__
-
-
-def test_the_dependencies_of_the_library_and_its_extras(metadata: Message) -> None:
-    """The library alone brings nothing of the command's."""
-    requirements = metadata.get_all("Requires-Dist", [])
-    always = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra ==" not in each}
-    command = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra == 'cli'" in each}
-    serial = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra == 'serial'" in each}
-    assert always == {"anyio", "fastcrc", "filelock", "platformdirs", "pydantic", "pymavlink"}
-    assert command == {"cyclopts", "rich"}
-    assert serial == {"serialx"}
-    assert metadata["Requires-Python"] == ">=3.11"
 
 
 def test_make_uses_an_existing_environment_and_replaces_a_broken_one(tmp_path: Path) -> None:
