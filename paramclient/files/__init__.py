@@ -4,7 +4,7 @@
 - `conversion`, `disk`: from and to bytes, reading and replacing a file.
 - `line_formats`, `param_pck`, `json_format`: lists of ground stations, packed files, JSON.
 - `rename_file`: files of names that firmware versions have changed.
-- `text`, `includes`: lines and bad lines, `@include` lines.
+- `text`, `includes`, `json_reader`: lines and bad lines, `@include` lines, fields of JSON.
 """
 
 from paramclient.files.conversion import LARGEST_FILE, dumps, loads

@@ -20,16 +20,16 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from collections.abc import Set as AbstractSet
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import datetime
-from typing import Any, Final, NoReturn, TypeAlias
+from typing import Final
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import FileFormat
+from paramclient.files.json_reader import Checks, Place, Reader, between, found, read_json_text, typed
 from paramclient.files.param_file import ParamFile, TooManyParams
-from paramclient.files.text import Problems, as_type, excerpt, is_plain, time_of
+from paramclient.files.text import as_type, is_plain, time_of
 from paramclient.model.ext_params import (
     EXT_VALUE_SIZE,
     ExtParam,
@@ -61,7 +61,6 @@ __all__ = [
     "ext_param_of_fields",
     "read_ext_json",
     "read_json",
-    "read_json_text",
     "write_ext_json",
     "write_json",
 ]
@@ -72,14 +71,6 @@ _KEY: Final = "paramclient"
 """The key with the version of a document of plain parameters."""
 _EXT_KEY: Final = "paramclient_extended"
 """The key with the version of a document of extended parameters."""
-PROBLEM_LENGTH_MAX: Final = 300
-"""Characters of one problem in an error, so that a long field does not make the error unreadable."""
-
-_Place: TypeAlias = tuple[str | int, ...]
-"""Position in a document: keys and list indices from the top."""
-_Checks: TypeAlias = Mapping[str, Callable[[Any], Any]]
-"""By the name of a field, a function that returns the field's content, or raises UsageError."""
-
 _NUMBER_EXPECTED: Final = "expected a number (or NaN, Infinity, 0x and 8 digits for raw bytes)"
 _WORDS: Final = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 _raw: Final = re.compile(r"0x([0-9a-fA-F]{8})").fullmatch
@@ -101,22 +92,16 @@ def read_json(text: str, source: str, params_max: int | None = None) -> ParamFil
     content = read_json_text(text, source)
     if isinstance(content, dict) and _EXT_KEY in content:
         raise FileError("it has extended parameters, and plain ones are expected", source=source)
-    reader = _Reader(text, source)
+    reader = Reader(text, source)
     document = reader.fields(content, (), _DOCUMENT, {_KEY, "sets"})
-    found = content.get("sets") if isinstance(content, dict) else None
-    sets = [
-        reader.param_set(each, ("sets", place), params_max)
-        for place, each in enumerate(found if isinstance(found, list) else [])
-    ]
+    raw_sets = document.get("sets", [])
+    named = [each.get("params") for each in raw_sets if isinstance(each, dict)]
+    TooManyParams.check(sum(len(each) for each in named if isinstance(each, dict)), params_max, source)
+    sets = tuple(_set(reader, each, ("sets", place)) for place, each in enumerate(raw_sets))
     reader.problems.raise_if_any()
     if not any(sets):
         raise FileError("the file contains no parameters", source=source)
-    return ParamFile(
-        tuple(each for each in sets if each is not None),
-        FileFormat.JSON,
-        source,
-        tuple(document.get("header", [])),
-    )
+    return ParamFile(sets, FileFormat.JSON, source, tuple(document.get("header", [])))
 
 
 def read_ext_json(text: str, source: str) -> ExtParamSet:
@@ -128,7 +113,7 @@ def read_ext_json(text: str, source: str) -> ExtParamSet:
     content = read_json_text(text, source)
     if not isinstance(content, dict) or _EXT_KEY not in content:
         raise FileError(f"no extended parameters: the key {_EXT_KEY} is missing", source=source)
-    reader = _Reader(text, source)
+    reader = Reader(text, source)
     known = {key: each for key, each in content.items() if key in _EXT_DOCUMENT}
     head = reader.fields(known, (), _EXT_DOCUMENT, {"params"})
     params = {}
@@ -143,105 +128,38 @@ def read_ext_json(text: str, source: str) -> ExtParamSet:
     return ExtParamSet(params, head.get("system"), head.get("component"), head.get("at"), source)
 
 
-def read_json_text(text: str, source: str) -> object:
-    """Return the content of a JSON text without repeated keys.
+def _set(reader: Reader, content: object, place: Place) -> ParamSet:
+    """Return the set at a position, without invalid fields."""
+    fields = reader.fields(content, place, _SET, {"params"})
+    params = {}
+    for name, each in fields.get("params", {}).items():
+        param = _param(reader, name, each, (*place, "params", name))
+        if param is not None:
+            params[name] = param
+    identity = None
+    if "identity" in fields:
+        known = reader.fields(fields["identity"], (*place, "identity"), _IDENTITY, {"system"})
+        identity = Identity(**known) if "system" in known else None
+    system, component = fields.get("system"), fields.get("component")
+    return ParamSet(params, component, system, identity, fields.get("at"), reader.problems.source)
 
-    Raises:
-        FileError: invalid JSON, or a repeated key.
-    """
+
+def _param(reader: Reader, name: str, content: object, place: Place) -> WrittenParam | None:
+    before = reader.problems.count
+    fields = reader.fields(content, place, _PARAM, {"value"})
+    if reader.problems.count > before:
+        return None
+    value, kind, default = fields["value"], fields.get("type"), fields.get("default")
     try:
-        content: object = json.loads(
-            text,
-            object_pairs_hook=_unique,
-            parse_constant=_no_constant,
-            parse_float=_finite,
-            parse_int=_whole,
-        )
-    except json.JSONDecodeError as error:
-        raise FileError(
-            f"expected JSON: {error.msg} (column {error.colno})",
-            source=source,
-            line=error.lineno,
-            expected="JSON",
-        ) from None
-    except RecursionError:
-        raise FileError("the document is nested too deep", source=source) from None
-    except ValueError as error:
-        line = _line_of(text, error.args[1], last=True) if len(error.args) > 1 else None
-        raise FileError(str(error.args[0]), source=source, line=line) from None
-    return content
-
-
-class _Reader:
-    """Reads the fields of one document, and collects the problems."""
-
-    def __init__(self, text: str, source: str) -> None:
-        self.problems = Problems(source)
-        self._text = text
-        self._params = 0
-
-    def problem(self, place: _Place, what: str) -> None:
-        """Add a problem at a position of the document."""
-        line = None
-        if "params" in place[:-1] and not self.problems.is_full:
-            line = _line_of(self._text, str(place[place.index("params") + 1]))
-        described = f"{'.'.join(map(str, place)) or 'the document'}: {what}"
-        is_short = len(described) <= PROBLEM_LENGTH_MAX
-        self.problems.add(line, described if is_short else f"{described[:PROBLEM_LENGTH_MAX]}…")
-
-    def fields(
-        self, content: object, place: _Place, checks: _Checks, required: AbstractSet[str]
-    ) -> dict[str, Any]:
-        """Return the valid fields of an object; add a problem for each other field."""
-        if not isinstance(content, dict):
-            self.problem(place, f"it should be an object{_found(content)}")
-            return {}
-        found = {}
-        for key, each in content.items():
-            check = checks.get(key)
-            try:
-                if check is None:
-                    raise UsageError("unknown field")
-                found[key] = check(each)
-            except UsageError as error:
-                self.problem((*place, key), str(error))
-        for key in sorted(required - content.keys()):
-            self.problem((*place, key), "the field is missing")
-        return found
-
-    def param_set(self, content: object, place: _Place, params_max: int | None) -> ParamSet | None:
-        """Return the set at a position; None if one of its own fields is invalid."""
-        fields = self.fields(content, place, _SET, {"params"})
-        self._params += len(fields.get("params", {}))
-        TooManyParams.check(self._params, params_max, self.problems.source)
-        params = {}
-        for name, each in fields.get("params", {}).items():
-            param = self._param(name, each, (*place, "params", name))
-            if param is not None:
-                params[name] = param
-        identity = None
-        if fields.get("identity") is not None:
-            known = self.fields(fields["identity"], (*place, "identity"), _IDENTITY, {"system"})
-            identity = Identity(**known) if "system" in known else None
-        system, component = fields.get("system"), fields.get("component")
-        return ParamSet(params, component, system, identity, fields.get("at"), self.problems.source)
-
-    def _param(self, name: str, content: object, place: _Place) -> WrittenParam | None:
-        before = self.problems.count
-        fields = self.fields(content, place, _PARAM, {"value"})
-        if self.problems.count > before:
-            return None
-        value, kind, default = fields["value"], fields.get("type"), fields.get("default")
-        try:
-            if kind is not None:
-                value = as_type(value, kind)
-                default = None if default is None else as_type(default, kind)
-            if fields.get("bits") is not None:
-                value = _with_bits(value, kind, fields["bits"])
-            return WrittenParam(check_name(name), value, kind, default, fields.get("comment", ""))
-        except UsageError as error:
-            self.problem(place, str(error))
-            return None
+        if kind is not None:
+            value = as_type(value, kind)
+            default = None if default is None else as_type(default, kind)
+        if "bits" in fields:
+            value = _with_bits(value, kind, fields["bits"])
+        return WrittenParam(check_name(name), value, kind, default, fields.get("comment", ""))
+    except UsageError as error:
+        reader.problem(place, str(error))
+        return None
 
 
 def ext_param_of_fields(name: str, fields: object) -> ExtParam:
@@ -272,97 +190,25 @@ def ext_param_of_fields(name: str, fields: object) -> ExtParam:
     return ExtParam.of(name, encode_ext_value(check_ext_value(value), number), number, None, Trust.CACHED)
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    content: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in content:
-            raise ValueError(f"{excerpt(key)} occurs twice", key)
-        content[key] = value
-    return content
-
-
-def _no_constant(word: str) -> NoReturn:
-    raise ValueError(f"{word} is not valid JSON; write it as text: {json.dumps(word)}")
-
-
-def _finite(text: str) -> float:
-    number = float(text)
-    if math.isinf(number):
-        raise ValueError(f"{excerpt(text)} is beyond the range of a double")
-    return number
-
-
-def _whole(text: str) -> int:
-    try:
-        return int(text)
-    except ValueError:  # Python limits the digits of an int
-        raise ValueError(f"{excerpt(text)} is beyond the range of every type") from None
-
-
-def _line_of(text: str, key: str, *, last: bool = False) -> int | None:
-    """Return the line of a key, if the key occurs once or the last occurrence is meant."""
-    found = [match.start() for match in re.finditer(rf'"{re.escape(key)}"[ \t]*:', text)]
-    return text.count("\n", 0, found[-1]) + 1 if found and (last or len(found) == 1) else None
-
-
-# Fields
-
-
-def _found(content: object) -> str:
-    return "" if isinstance(content, dict | list) else f", found {content!r}"
-
-
-def _optional(check: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    return lambda content: None if content is None else check(content)
-
-
-def _version(content: object) -> int:
-    if content is True or content != VERSION:
-        raise UsageError(f"it should be {VERSION}, the version of the format{_found(content)}")
-    return VERSION
-
-
-def _text(content: object) -> str:
-    if not isinstance(content, str):
-        raise UsageError(f"it should be text{_found(content)}")
-    return content
+_text: Final = typed(str, "text")
+_list: Final = typed(list, "a list")
+_object: Final = typed(dict, "an object")
+_count: Final = between(0, math.inf, "a whole number from 0")
+_id: Final = between(1, 255, "an id from 1 to 255")
+_version: Final = between(VERSION, VERSION, f"{VERSION}, the version of the format")
 
 
 def _texts(content: object) -> list[str]:
     return [_text(each) for each in _list(content)]
 
 
-def _list(content: object) -> list[Any]:
-    if not isinstance(content, list):
-        raise UsageError(f"it should be a list{_found(content)}")
-    return content
-
-
-def _object(content: object) -> dict[str, Any]:
-    if not isinstance(content, dict):
-        raise UsageError(f"it should be an object{_found(content)}")
-    return content
-
-
-def _count(content: object) -> int:
-    if not isinstance(content, int) or isinstance(content, bool) or content < 0:
-        raise UsageError(f"it should be a whole number from 0{_found(content)}")
-    return content
-
-
-def _id(content: object) -> int:
-    if not 1 <= _count(content) <= 255:
-        raise UsageError(f"systems and components have ids from 1 to 255{_found(content)}")
-    return _count(content)
-
-
 def _time(content: object) -> float:
     if not isinstance(content, str) or not _date(content):  # a number could be seconds or milliseconds
-        raise UsageError(f"a time is written as 2026-01-31T12:00:00Z{_found(content)}")
+        raise UsageError(f"a time is written as 2026-01-31T12:00:00Z{found(content)}")
     try:
         moment = datetime.fromisoformat(content.upper())
     except ValueError as error:
-        raise UsageError(f"{error}{_found(content)}") from None
+        raise UsageError(f"{error}{found(content)}") from None
     if moment.tzinfo is None:
         raise UsageError("the time needs its zone, as in 2026-01-31T12:00:00Z")
     return moment.timestamp()
@@ -387,7 +233,7 @@ def _number(content: object) -> WireValue:
             return _WORDS[content]
         if match := _raw(content):
             return int(match[1], 16).to_bytes(4, "little")
-    raise UsageError(f"{_NUMBER_EXPECTED}{_found(content)}")
+    raise UsageError(f"{_NUMBER_EXPECTED}{found(content)}")
 
 
 def _with_bits(value: WireValue, kind: ParamType | int | None, text: str) -> WireValue:
@@ -407,36 +253,36 @@ def _with_bits(value: WireValue, kind: ParamType | int | None, text: str) -> Wir
     return exact
 
 
-_DOCUMENT: Final[_Checks] = {_KEY: _version, "header": _texts, "sets": _list}
-_SET: Final[_Checks] = {
-    "system": _optional(_id),
-    "component": _optional(_id),
-    "identity": _optional(_object),
-    "at": _optional(_time),
+_DOCUMENT: Final[Checks] = {_KEY: _version, "header": _texts, "sets": _list}
+_SET: Final[Checks] = {
+    "system": _id,
+    "component": _id,
+    "identity": _object,
+    "at": _time,
     "source": _text,
     "params": _object,
 }
-_IDENTITY: Final[_Checks] = {
+_IDENTITY: Final[Checks] = {
     "system": _id,
     "link": _text,
-    "uid": _optional(_text),
+    "uid": _text,
     "git_hash": _text,
     **dict.fromkeys(
         ("autopilot", "vehicle_type", "firmware", "board", "vendor_id", "product_id", "capabilities"), _count
     ),
 }
-_PARAM: Final[_Checks] = {
+_PARAM: Final[Checks] = {
     "value": _number,
-    "type": _optional(_type),
-    "bits": _optional(_text),
-    "default": _optional(_number),
+    "type": _type,
+    "bits": _text,
+    "default": _number,
     "comment": _text,
 }
-_EXT_DOCUMENT: Final[_Checks] = {
+_EXT_DOCUMENT: Final[Checks] = {
     _EXT_KEY: _version,
-    "system": _optional(_id),
-    "component": _optional(_id),
-    "at": _optional(_time),
+    "system": _id,
+    "component": _id,
+    "at": _time,
     "params": _object,
 }
 
