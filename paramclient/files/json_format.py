@@ -42,6 +42,7 @@ from paramclient.model.ext_params import (
 )
 from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
+from paramclient.model.notation import value_json, value_written
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import (
     TYPES_BY_NAME,
@@ -49,11 +50,9 @@ from paramclient.model.values import (
     Trust,
     WireValue,
     check_name,
-    format_value,
     from_bits,
     is_portable_name,
     known_type,
-    shortest_float,
     type_name,
 )
 
@@ -344,7 +343,7 @@ def _rows(params: Mapping[str, Mapping[str, object]], indent: str) -> Iterator[s
 
 
 def _fields(param: WrittenParam) -> dict[str, object]:
-    fields: dict[str, object] = {"value": _scalar(param.settable, param.type_number)}
+    fields: dict[str, object] = {"value": value_written(param.settable, param)}
     if param.type_number is not None:
         is_wide = param.type is not None and param.type.size == 8
         fields["type"] = type_name(param.type_number)
@@ -352,7 +351,7 @@ def _fields(param: WrittenParam) -> dict[str, object]:
     elif isinstance(param.value, float) and not is_plain(param.value):
         raise UsageError(f"{param.name} is a NaN with payload bits, and has no type for them")
     if param.default is not None:
-        fields["default"] = _scalar(param.default, param.type_number)
+        fields["default"] = value_written(param.default, param)
     if param.comment:
         fields["comment"] = _encodable(param.comment)
     return fields
@@ -365,19 +364,10 @@ def _ext_fields(param: ExtParam) -> dict[str, object]:
     if isinstance(value, bytes):
         return {"hex": param.raw.hex(), "type": kind}
     if isinstance(value, float):
-        value = _scalar(value, ParamType.REAL32 if param.type == ExtParamType.REAL32 else None)
+        value = value_json(value, ParamType(param.type))
         if isinstance(value, str) and encode_ext_value(_WORDS[value], param.type) != param.raw:
             return {"hex": param.raw.hex(), "type": kind}  # a NaN with payload bits
     return {"value": value, "type": kind}
-
-
-def _scalar(value: WireValue, kind: ParamType | int | None) -> int | float | str:
-    if isinstance(value, bytes):
-        return format_value(value)
-    if isinstance(value, int) or math.isfinite(value):
-        is_float32 = isinstance(value, float) and kind == ParamType.REAL32
-        return shortest_float(value) if is_float32 else value
-    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
 
 
 def _encodable(text: str) -> str:

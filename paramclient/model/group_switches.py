@@ -6,7 +6,7 @@ from typing import Final
 
 from paramclient.model.patterns import NameChoice
 
-__all__ = ["ARDUPILOT_SWITCHES", "PX4_SWITCHES", "is_group_switch", "precedes_group"]
+__all__ = ["ARDUPILOT_SWITCHES", "PX4_SWITCHES", "is_group_switch"]
 
 PX4_SWITCHES: Final = ("*_EN", "*_ENABLE", "CA_ROTOR_COUNT", "CA_SV_CS_COUNT", "CAL_*_ID", "UAVCAN_ENABLE")
 """Patterns of parameters of PX4 that bring others into use: PX4 then lists them."""
@@ -28,11 +28,3 @@ def is_group_switch(name: str, autopilot: str) -> bool:
         autopilot: "px4" or "ardupilot"; for any other one, the parameters of both count.
     """
     return _CHOICES.get(autopilot, _OF_BOTH).has(name)
-
-
-def precedes_group(name: str) -> bool:
-    """Return whether the parameter may be a switch that the list has directly before its group.
-
-    That is the order of ArduPilot's list (`AP_Param::next_group`). PX4 sorts its list by name.
-    """
-    return is_group_switch(name, "ardupilot")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -16,9 +15,8 @@ from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Renames
-from paramclient.model.values import Param, ParamType, Trust, check_name
+from paramclient.model.values import Param, ParamType, Trust
 from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.wire import HASH_CHECK
 from paramclient.provision.planning import ParamInfo, Plan, check_component, plan
 from paramclient.provision.runner import Runner, run_here
 from paramclient.provision.vehicle_params import set_maker
@@ -359,10 +357,3 @@ def _in_no_hidden_group(table: Mapping[str, Param], wanted: Iterable[str]) -> fr
 def _group_prefixes(switch: str) -> Iterator[str]:
     """Return the prefixes that the names of a switch's group may have: its name up to each underscore."""
     return (switch[:at] for at, letter in enumerate(switch) if letter == "_" and at > 0)
-
-
-def _is_name(name: str) -> bool:
-    """Return whether a parameter can have this name."""
-    with suppress(UsageError):
-        return check_name(name) != HASH_CHECK
-    return False

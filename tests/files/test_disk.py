@@ -21,7 +21,6 @@ from paramclient import (
     read_file,
     write_file,
 )
-from paramclient.errors import UsageError
 from paramclient.files import LARGEST_FILE, dumps, loads
 from paramclient.files.formats import ENDINGS
 from paramclient.files.includes import FILES_MAX
@@ -49,17 +48,6 @@ def test_the_extension_selects_the_format_to_write(ending: str, form: FileFormat
     assert (file.file_format, file.source, file.choose().source) == (form, str(path), str(path))
     assert file.choose()["A"].value == 5
     assert listed(tmp_path) == [path.name]
-
-
-def test_a_given_format_overrides_the_extension(tmp_path: Path) -> None:
-    path = tmp_path / "quad.json"
-    assert write_file(str(path), PARAMS, file_format="mission-planner") is FileFormat.MISSION_PLANNER
-    assert path.read_bytes().endswith(b"\nA,5\nB,0.5\n")
-    assert read_file(str(path), file_format="parm").file_format is FileFormat.PARM
-    with pytest.raises(UsageError, match="unknown file format 'exe'"):
-        write_file(path, PARAMS, file_format="exe")
-    with pytest.raises(UsageError, match="unknown file format 'exe'"):
-        read_file(path, file_format="exe")
 
 
 def test_an_unknown_extension_is_rejected(tmp_path: Path) -> None:
@@ -186,22 +174,6 @@ def test_a_too_large_file_is_rejected(tmp_path: Path) -> None:
     with path.open("wb") as file:
         file.truncate(LARGEST_FILE + 1)
     assert f"a parameter file has at most {LARGEST_FILE} bytes" in str(refused(lambda: read_file(path)))
-
-
-def test_the_largest_table_fits_in_the_largest_file() -> None:
-    """As many parameters as an index can count, in the longest format, with every field."""
-    from paramclient.files import dumps
-
-    names = [f"P{at:015d}" for at in range(1000)]
-    params = ParamSet(
-        {
-            name: WrittenParam(name, -1.2345678e-38, ParamType.REAL32, -1.2345678e-38, "x" * 60)
-            for name in names
-        },
-        1,
-        1,
-    )
-    assert len(dumps(params, file_format="json")) * 65.535 < LARGEST_FILE
 
 
 def test_a_list_has_a_header_that_names_the_vehicle(tmp_path: Path) -> None:
