@@ -655,7 +655,9 @@ def fill_fleet(place: Path, vehicles: int, names: int) -> None:
             identity = Identity(1 + vehicle % 250, "a", f"{vehicle:036x}", 12, 2, 17_891_392, "a70a5583")
             for add in (0, 1_000_000):
                 params = [
-                    StoredParam(Param(f"P{number:03}", value, ParamType.INT32, number, value), at + add / 1e6)
+                    StoredParam.of(
+                        Param(f"P{number:03}", value, ParamType.INT32, number, value), at + add / 1e6
+                    )
                     for number in range(names)
                     for value in (add + vehicle * names + number,)
                 ]

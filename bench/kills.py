@@ -242,11 +242,8 @@ class Rounds:
                 loaded = cache.load(table.key, table.component)
                 assert loaded is not None
                 values |= {name: int(param.value) for name, param in loaded.params.items() if name in NAMES}
-                lines |= {
-                    (line.name, int(line.new.value)) for line in loaded.history() if line.new is not None
-                }
-            if cache.offline_reason is not None:
-                found.lost.append(f"{kind} {number}: {cache.offline_reason}")
+                changes = cache.history(table.key)
+                lines |= {(line.name, int(line.new.value)) for line in changes if line.new is not None}
             found.lost += [f"{kind} {number}: {note}" for note in cache.notes]
         last = {each.name: each.value for each in acknowledged}
         for each in acknowledged:

@@ -34,7 +34,7 @@ def look(key: str) -> None:
         for name in list(table.params)[:5]:
             age = time.time() - table.heard_at[name]
             print(f"  {table.params[name]}, received {age:.0f} s ago")
-        for entry in table.history(limit=5):
+        for entry in cache.history(table.key, table.component, limit=5):
             print(f"  {entry.old} -> {entry.new}, by {entry.by}")
 
 

@@ -21,24 +21,17 @@ from paramclient.version import __version__
 
 if TYPE_CHECKING:
     from paramclient.cache import (
-        AddedTable,
         CachedComponent,
         CachedExtTable,
         CachedVehicle,
         ExtHistoryEntry,
         ExtSnapshot,
-        FleetDiff,
-        FleetValue,
-        FleetVehicle,
         HistoryEntry,
-        Holder,
-        NameSpread,
         ParamCache,
         Snapshot,
         SnapshotSummary,
     )
-    from paramclient.cache.records import CacheChange, CachedSummary
-    from paramclient.cache.transfer import CopyResult
+    from paramclient.cache.records import CachedSummary
     from paramclient.client.client import ParamClient
     from paramclient.client.component import Component
     from paramclient.client.events import (
@@ -139,14 +132,12 @@ if TYPE_CHECKING:
         SigningStream,
     )
 __all__ = [
-    "AddedTable",
     "Added",
     "Address",
     "AlreadyRestored",
     "AmbiguousVehicle",
     "AnotherVehicle",
     "AutopilotVersion",
-    "CacheChange",
     "CacheError",
     "CachedComponent",
     "CachedExtTable",
@@ -166,7 +157,6 @@ __all__ = [
     "Contest",
     "Contested",
     "ContestedAddress",
-    "CopyResult",
     "Difference",
     "DirectoryEntry",
     "Encoding",
@@ -196,15 +186,11 @@ __all__ = [
     "FileFormat",
     "FileTransferError",
     "FirstValue",
-    "FleetDiff",
-    "FleetValue",
-    "FleetVehicle",
     "Found",
     "Ftp",
     "Discovered",
     "Heartbeat",
     "HistoryEntry",
-    "Holder",
     "Identity",
     "InvalidParameters",
     "LinkError",
@@ -213,7 +199,6 @@ __all__ = [
     "MessageTraffic",
     "MetadataError",
     "ChangedSide",
-    "NameSpread",
     "NoReply",
     "NotDurable",
     "NotInCache",
@@ -280,27 +265,17 @@ __all__ = [
 
 _HOMES: Final = {
     "paramclient.cache": (
-        "AddedTable",
         "CachedComponent",
         "CachedExtTable",
         "CachedVehicle",
         "ExtHistoryEntry",
         "ExtSnapshot",
-        "FleetDiff",
-        "FleetValue",
-        "FleetVehicle",
         "HistoryEntry",
-        "Holder",
-        "NameSpread",
         "ParamCache",
         "Snapshot",
         "SnapshotSummary",
     ),
-    "paramclient.cache.records": (
-        "CacheChange",
-        "CachedSummary",
-    ),
-    "paramclient.cache.transfer": ("CopyResult",),
+    "paramclient.cache.records": ("CachedSummary",),
     "paramclient.client.client": ("ParamClient",),
     "paramclient.client.component": ("Component",),
     "paramclient.client.events": (

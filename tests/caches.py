@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import paramclient
-from paramclient.cache import BY_VEHICLE, ParamCache, StoredParam, TableState, TableUpdate
-from paramclient.cache.sqlite_file import APPLICATION_ID
+from paramclient.cache import BY_VEHICLE, HistoryEntry, ParamCache, StoredParam, TableState, TableUpdate
+from paramclient.cache.sqlite import APPLICATION_ID
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, ParamType, from_bits
 
@@ -57,21 +57,7 @@ def stored(
     """One parameter to keep, given by its bits."""
     number = ParamType(type) if 1 <= type <= 10 else type
     param = Param(name, from_bits(bits, number, is_raw=is_raw), number, index, bits)
-    return StoredParam(param, at, volatile, by)
-
-
-def cells(
-    name: str,
-    type: int,  # noqa: A002  # the attribute's name
-    bits: int,
-    is_raw: int,
-    index: int | None,
-    volatile: int,
-    at: float,
-    default_bits: int | None = None,
-) -> StoredParam:
-    """One stored parameter, given by its cells."""
-    return StoredParam._make((name, type, bits, is_raw, index, volatile, at, default_bits, ""))
+    return StoredParam.of(param, at, volatile, by)
 
 
 def update(*params: StoredParam, identity: Identity = PX4, component: int = 1, **more: Any) -> TableUpdate:
@@ -95,6 +81,12 @@ def values(cache: ParamCache, identity: Identity = PX4, component: int = 1) -> d
     """The values of one table; none where there is no table."""
     found = cache.load(identity.key, component)
     return {} if found is None else {name: param.value for name, param in found.params.items()}
+
+
+def changes(cache: ParamCache, name: str | None = None) -> list[HistoryEntry]:
+    """The history of the only table, or of one of its parameters."""
+    table = cache.component()
+    return cache.history(table.key, table.component, name)
 
 
 def rubbish(size: int, seed: int = 1) -> bytes:

@@ -33,7 +33,9 @@ def _programs() -> Path | None:
     """Where `initdb` and `postgres` are. pgserver is not imported: it makes files and users of its own."""
     found = importlib.util.find_spec("pgserver")
     places = [Path(each) / "pginstall" / "bin" for each in (found and found.submodule_search_locations) or ()]
-    places += sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
+    debian = sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
+    # as another user than root, which may not reach the folder of pgserver
+    places = [*debian, *places] if os.geteuid() == 0 else [*places, *debian]
     return next((place for place in places if (place / "initdb").exists()), None)
 
 

@@ -14,6 +14,7 @@ from typing import Any, ParamSpec, TypeVar
 from unittest import mock
 
 import anyio
+import anyio.to_thread
 
 from paramclient import Component, Param, ParamClient, ParamType
 from paramclient.client import cache_writer
@@ -137,20 +138,26 @@ def in_simulated_time(test: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, 
 
     @functools.wraps(test)
     def run(*args: P.args, **kwargs: P.kwargs) -> T:
-        in_thread = Worker.run
+        def counted(in_thread: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[Any]]:
+            async def run_in_thread(*args: Any, **kwargs: Any) -> Any:
+                simulated_time_loop().threads += 1
+                try:
+                    return await in_thread(*args, **kwargs)
+                finally:
+                    simulated_time_loop().threads -= 1
 
-        async def counted(worker: Any, work: Callable[[], Any]) -> Any:
-            simulated_time_loop().threads += 1
-            try:
-                return await in_thread(worker, work)
-            finally:
-                simulated_time_loop().threads -= 1
+            return run_in_thread
 
+        in_worker, in_thread = counted(Worker.run), counted(anyio.to_thread.run_sync)
         with asyncio.Runner(loop_factory=SimulatedTimeLoop) as runner:
             loop = runner.get_loop()
             assert isinstance(loop, SimulatedTimeLoop)
             clock = SimpleNamespace(time=lambda: loop.now + loop.ahead)
-            with mock.patch.object(Worker, "run", counted), mock.patch.object(cache_writer, "time", clock):
+            with (
+                mock.patch.object(Worker, "run", in_worker),
+                mock.patch.object(anyio.to_thread, "run_sync", in_thread),
+                mock.patch.object(cache_writer, "time", clock),
+            ):
                 return runner.run(test(*args, **kwargs))
 
     return run

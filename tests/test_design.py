@@ -68,7 +68,6 @@ LIBRARIES = {
     "trio": ("client",),
     "serialx": ("links",),
     "psycopg": ("cache",),
-    "psycopg_pool": ("cache",),
     "pyulog": ("logs",),
     "httpx": (),
     **dict.fromkeys(["rich", "cyclopts"], ("cli", "__main__")),
@@ -77,7 +76,6 @@ LIBRARIES = {
 """The rooms or modules that may import a library."""
 
 SHARED_NAMES = {
-    "MIGRATIONS",
     *("ParamClient", "Component", "ExtParams", "Ftp", "Events", "Changes", "ExtChanges", "ParamInfo"),
     *("Discovered", "Lost", "Found", "Rebooted", "Resynced", "Contested", "Uncontested"),
 }

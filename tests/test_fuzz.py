@@ -15,7 +15,7 @@ from paramclient.protocol.params import reads, table
 
 ROOT = Path(__file__).parent.parent
 FUZZ = ROOT / "fuzz"
-TARGETS = ("cache", "component", "files", "framer", "metadata", "pack", "signing", "tlog")
+TARGETS = ("component", "files", "framer", "metadata", "pack", "signing", "tlog")
 LARGEST_CORPUS = 300_000
 """Bytes of all inputs together: they are read at each test run, and by everyone who looks at a change."""
 

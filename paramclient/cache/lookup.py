@@ -1,4 +1,4 @@
-"""Vehicles in the cache by name: system id, address, nickname, kind, hardware id or key.
+"""Vehicles in the cache by name: system id, address, kind, hardware id or key.
 
 The only place that decides which vehicle a name means. In this order:
 
@@ -6,18 +6,16 @@ The only place that decides which vehicle a name means. In this order:
 2. One to three decimal digits: a system id, and nothing else. With `/` and a component id: an address. A
    vehicle with an autopilot has priority over a camera or another payload that has the same system id and a
    hardware id of its own.
-3. A nickname.
-4. `px4` or `ardupilot`: the only vehicle with this autopilot.
-5. `uid:` and at least six hexadecimal digits: the beginning of a hardware id. `/` and a system id may follow
+3. `px4` or `ardupilot`: the only vehicle with this autopilot.
+4. `uid:` and at least six hexadecimal digits: the beginning of a hardware id. `/` and a system id may follow
    for a hardware id that many vehicles share.
-6. Four or more hexadecimal digits: a hardware id in full, also when all of its digits are decimal.
+5. Four or more hexadecimal digits: a hardware id in full, also when all of its digits are decimal.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import Final
 
 from paramclient.cache.records import CachedVehicle
@@ -41,7 +39,6 @@ _ADDRESS: Final = re.compile(r"([0-9]{1,3})/([0-9]{1,3})")
 _NAME: Final = re.compile(
     rf"uid:.*|system:.*|[0-9]+|{_ADDRESS.pattern}|[0-9a-f]{{4,}}(/[0-9]*)?|{'|'.join(KINDS)}", re.IGNORECASE
 )
-_NO_NICKNAMES: Final[Mapping[str, str]] = MappingProxyType({})
 
 
 def is_vehicle_name(text: str) -> bool:
@@ -62,7 +59,6 @@ def find_vehicle(
     place: str,
     system: int | None = None,
     component: int | None = None,
-    nicknames: Mapping[str, str] = _NO_NICKNAMES,
 ) -> CachedVehicle:
     """Return the only vehicle of the cache that fits.
 
@@ -72,13 +68,12 @@ def find_vehicle(
         place: the cache, for messages.
         system: only a vehicle with this system id.
         component: only a vehicle of which the table of this component is kept.
-        nicknames: keys of vehicles by nickname.
 
     Raises:
         UnknownVehicle: none fits, or the name can be no vehicle's.
         AmbiguousVehicle: several fit.
     """
-    named, problem = (kept, None) if name is None else _named(kept, name, nicknames)
+    named, problem = (kept, None) if name is None else _named(kept, name)
     fits = [
         known
         for known in named
@@ -104,9 +99,7 @@ def find_vehicle(
     )
 
 
-def _named(
-    kept: Sequence[CachedVehicle], name: str, nicknames: Mapping[str, str]
-) -> tuple[Sequence[CachedVehicle], str | None]:
+def _named(kept: Sequence[CachedVehicle], name: str) -> tuple[Sequence[CachedVehicle], str | None]:
     """Return the vehicles that a name fits, and why it fits none where the name itself is the reason."""
     if same := [known for known in kept if known.key == name]:
         return same, None
@@ -118,10 +111,6 @@ def _named(
         fits = [known for known in kept if known.identity.system == address[0]]
         problem = f"no vehicle has system id {address[0]} and a table of component {address[1]}"
         return [known for known in fits if address[1] in known.components], problem
-    key = next((each for nickname, each in nicknames.items() if nickname.lower() == name.lower()), None)
-    if key is not None:
-        problem = f"{name} is the nickname of {key}, which it does not hold"
-        return [known for known in kept if known.key == key], problem
     if name.lower() in KINDS:
         fits = [known for known in kept if autopilot_name(known.identity.autopilot) == name.lower()]
         return fits, f"no vehicle has the autopilot {name.lower()}"

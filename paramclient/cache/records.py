@@ -1,41 +1,154 @@
-"""Records that the cache stores and returns. All times are in unix seconds and given by the caller."""
+"""Records that the cache stores and returns. All times are in unix seconds."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from itertools import compress
-from types import MappingProxyType
-from typing import Final
+from typing import Final, NamedTuple
 
-from paramclient.cache.param_columns import StoredParam, StoredTable
+from paramclient.model.ext_params import ExtParam
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity, autopilot_name
-from paramclient.model.params import ParamMap
+from paramclient.model.params import CACHED, COMPACT_NO_INDEX, CompactParam, ParamMap, Params
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param, is_portable_name
+from paramclient.model.values import Param, ParamType, Trust, WireValue, bits_of, from_bits, same_bits
 
 __all__ = [
     "BY_US",
-    "CacheChange",
+    "BY_VEHICLE",
     "CachedComponent",
+    "CachedExtTable",
     "CachedSummary",
     "CachedVehicle",
+    "ExtHistoryEntry",
+    "ExtSnapshot",
     "HistoryEntry",
     "Snapshot",
     "SnapshotSummary",
+    "StoredParam",
+    "StoredValue",
     "TableState",
     "TableUpdate",
     "by_station",
 ]
 
+BY_VEHICLE: Final = "vehicle"
+"""Author of a change by the vehicle, and of a change that a download has shown."""
 BY_US: Final = "us"
 """Author of a change by a write of this client; `us for NAME` if the write names a user."""
+BITS_SIZE: Final = 8
+"""Bytes of a stored plain value: `Param.bits`, little-endian, in the size of the largest type."""
 
 
 def by_station(system: int, component: int) -> str:
     """Return the author of a change by another ground station: `station 254/190`."""
     return f"station {system}/{component}"
+
+
+class StoredValue(NamedTuple):
+    """A value as it is stored, plain or extended.
+
+    Attributes:
+        type: number of the type.
+        value: `Param.bits` in 8 bytes, little-endian; or `ExtParam.raw`.
+        is_raw: 1 if a plain value is only known as the four bytes of the message.
+    """
+
+    type: int
+    value: bytes
+    is_raw: int
+
+    def is_same(self, other: StoredValue) -> bool:
+        """Return whether both are the same value in the same type (−0 equals 0)."""
+        if self == other:
+            return True
+        if (self.type, self.is_raw) != (other.type, other.is_raw):
+            return False
+        return same_bits(
+            self.type, int.from_bytes(self.value, "little"), int.from_bytes(other.value, "little")
+        )
+
+    def param(self, name: str, index: int | None = None, default: bytes | None = None) -> Param:
+        """Return it as a plain parameter, with trust CACHED."""
+        bits = int.from_bytes(self.value, "little")
+        value = from_bits(bits, self.type, is_raw=bool(self.is_raw))
+        return Param(name, value, self.type, index, bits, Trust.CACHED, default_value(default, self.type))
+
+    def ext_param(self, name: str, index: int | None = None) -> ExtParam:
+        """Return it as an extended parameter, with trust CACHED."""
+        return ExtParam.of(name, self.value, self.type, index, Trust.CACHED)
+
+
+class StoredParam(NamedTuple):
+    """One observation of a parameter to store, or one stored parameter. Create it by `of` or `of_ext`.
+
+    Attributes:
+        name: param_id.
+        stored: the value.
+        param_index: index, or None. None does not change a stored index, except in a whole table.
+        volatile: 1 if the vehicle's hash excludes the parameter; None does not change the stored flag.
+        heard_at: time of the observation. The later of two observations of a parameter counts.
+        default: the firmware's default in the form of the value, or None.
+        by: author, if the value is a change: `BY_US`, `us for NAME`, `BY_VEHICLE` or `by_station(…)`.
+    """
+
+    name: str
+    stored: StoredValue
+    param_index: int | None
+    volatile: int | None
+    heard_at: float
+    default: bytes | None = None
+    by: str = BY_VEHICLE
+
+    @classmethod
+    def of(
+        cls, param: Param, heard_at: float, volatile: bool | None = None, by: str = BY_VEHICLE
+    ) -> StoredParam:
+        """Return an observation of a plain parameter; its trust is not stored."""
+        number = int(param.type_number)
+        return cls(
+            param.name,
+            StoredValue(number, _bits_cell(param.bits), int(param.is_raw)),
+            param.index,
+            None if volatile is None else int(volatile),
+            heard_at,
+            None if param.default is None else _bits_cell(bits_of(param.default, number)),
+            by,
+        )
+
+    @classmethod
+    def of_compact(
+        cls,
+        name: str,
+        compact: CompactParam,
+        default: WireValue | None,
+        volatile: int | None,
+        heard_at: float,
+        by: str,
+    ) -> StoredParam:
+        """Return an observation of a live table's parameter, without creating a `Param`."""
+        number, is_raw, index = compact[8], compact[9], int.from_bytes(compact[11:], "little", signed=True)
+        return cls(
+            name,
+            StoredValue(number, compact[:BITS_SIZE], is_raw),
+            None if index == COMPACT_NO_INDEX else index,
+            volatile,
+            heard_at,
+            None if default is None else _bits_cell(bits_of(default, number)),
+            by,
+        )
+
+    @classmethod
+    def of_ext(cls, param: ExtParam, heard_at: float, by: str = BY_VEHICLE) -> StoredParam:
+        """Return an observation of an extended parameter."""
+        value = StoredValue(int(param.type), param.raw, 0)
+        return cls(param.name, value, param.index, None, heard_at, None, by)
+
+    @property
+    def hashed(self) -> StoredValue | None:
+        """The value if the vehicle's hash covers it; None if the parameter is volatile or not in use."""
+        return None if self.volatile or self.param_index is None else self.stored
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +162,6 @@ class TableState:
         volatile_known: whether the set of volatile parameters was verified by computing the hash.
         synced_at: time of the last verification of the table against the vehicle.
         file_works: whether the vehicle, with this firmware, serves the table as a file; None if unknown.
-        source: the file from which the table was added, see `ParamCache.add`. None does not change the stored
-            one, except in a state with `synced_at`: then the vehicle has replaced or confirmed the values.
     """
 
     hash: int | None = None
@@ -59,7 +170,6 @@ class TableState:
     volatile_known: bool = False
     synced_at: float | None = None
     file_works: bool | None = None
-    source: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,10 +184,10 @@ class TableUpdate:
         table: the state of the table after this update. None does not change it, with one exception: a change
             of a value that the hash covers removes the hash.
         params: parameters to insert or change, in the order of reception.
-        removed: names that the vehicle no longer has.
-        removed_at: times at which names were found missing; `at` for all others.
+        removed: names that the vehicle no longer has, with the times at which they were found missing.
         replace: whether `params` are the whole table: other names are removed.
         whole_at: time at which the vehicle was found to have no other names; None for `at`.
+        extended: whether these are the extended parameters of the component.
     """
 
     identity: Identity
@@ -86,17 +196,10 @@ class TableUpdate:
     at: float
     table: TableState | None = None
     params: Sequence[StoredParam] = ()
-    removed: Sequence[str] = ()
-    removed_at: Mapping[str, float] = field(default_factory=dict)
+    removed: Mapping[str, float] = field(default_factory=dict)
     replace: bool = False
     whole_at: float | None = None
-
-    def removal_time(self, name: str) -> float:
-        """Return the time at which a name that this update removes was found missing."""
-        at = self.removed_at.get(name)
-        if at is None:
-            at = self.whole_at if self.replace and name not in self.removed else None
-        return self.at if at is None else at
+    extended: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +223,18 @@ class HistoryEntry:
     by: str
 
 
+@dataclass(frozen=True, slots=True)
+class ExtHistoryEntry:
+    """One change of an extended value, with the attributes of `HistoryEntry`."""
+
+    at: float
+    component: int
+    name: str
+    old: ExtParam
+    new: ExtParam | None
+    by: str
+
+
 @dataclass(frozen=True, slots=True, repr=False)
 class SnapshotSummary:
     """A snapshot of a table, without its parameters.
@@ -133,6 +248,8 @@ class SnapshotSummary:
         size: number of parameters.
         hash: the vehicle's hash of this table; None if unknown.
         complete: whether it has every parameter that the vehicle had.
+        ended: for a snapshot that an `apply` or `restore` has stored before its first write, whether that
+            operation has ended. False: it was interrupted, or is still running. None: another snapshot.
     """
 
     id: int
@@ -143,14 +260,14 @@ class SnapshotSummary:
     size: int
     hash: int | None
     complete: bool
+    ended: bool | None = None
 
     def __repr__(self) -> str:
-        at = datetime.fromtimestamp(self.at, UTC)
-        what = f"{self.id} of {self.key}/{self.component}: {self.size} params, {at:%Y-%m-%d %H:%MZ}"
+        what = f"{self.id} of {self.key}/{self.component}: {self.size} params, {_minute(self.at)}"
         return f"<{type(self).__name__} {what}, {self.reason!r}>"
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True, repr=False, kw_only=True)
 class Snapshot(SnapshotSummary):
     """A snapshot of a table.
 
@@ -161,17 +278,15 @@ class Snapshot(SnapshotSummary):
     params: ParamSet = field(hash=False)
 
 
-@dataclass(frozen=True, slots=True)
-class CacheChange:
-    """A write of another station to a table.
+@dataclass(frozen=True, slots=True, repr=False, kw_only=True)
+class ExtSnapshot(SnapshotSummary):
+    """A snapshot of a table of extended parameters. Its `hash` is None.
 
     Attributes:
-        key: key of the vehicle in the cache.
-        component: component id.
+        params: its parameters, and the identity of the vehicle at that time.
     """
 
-    key: str
-    component: int
+    params: ExtParamSet = field(hash=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,10 +309,9 @@ class CachedVehicle:
     def __str__(self) -> str:
         components = ", ".join(map(str, self.components))
         autopilot = autopilot_name(self.identity.autopilot)
-        seen = f"{datetime.fromtimestamp(self.last_seen, UTC):%Y-%m-%d %H:%MZ}"
         return (
             f"{self.key} (system {self.identity.system}, {autopilot}, components {components}, "
-            f"last seen {seen})"
+            f"last seen {_minute(self.last_seen)})"
         )
 
 
@@ -212,8 +326,6 @@ class CachedSummary:
         autopilot: MAV_AUTOPILOT of this component's heartbeat.
         size: number of cached parameters.
         hash, count, complete, volatile_known, synced_at, file_works: as in `TableState`.
-        source: the file from which the table was added; None if the vehicle sent it, or the vehicle has
-            confirmed it since.
         updated_at: time of the last write to the table.
     """
 
@@ -229,7 +341,6 @@ class CachedSummary:
     synced_at: float | None
     updated_at: float
     file_works: bool | None
-    source: str | None
 
     @property
     def system(self) -> int:
@@ -238,14 +349,12 @@ class CachedSummary:
 
     def __repr__(self) -> str:
         of = f" of {self.count}" if self.count is not None and not self.complete else ""
-        synced = "not synced"
-        if self.synced_at is not None:
-            synced = f"synced {datetime.fromtimestamp(self.synced_at, UTC):%Y-%m-%d %H:%MZ}"
+        synced = "not synced" if self.synced_at is None else f"synced {_minute(self.synced_at)}"
         address = f"{self.system}/{self.component} {autopilot_name(self.autopilot)}"
         return f"<{type(self).__name__} {address} {self.size}{of} params {synced}>"
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True, repr=False, kw_only=True)
 class CachedComponent(CachedSummary):
     """The cached table of one component, usable without a link.
 
@@ -253,50 +362,62 @@ class CachedComponent(CachedSummary):
         params: parameters by name, ordered by index, then name; those without an index last. Trust is CACHED.
         volatile: known names outside the vehicle's hash.
         heard_at: by name, time of the last observation of the value.
-        left_out: names written by an earlier version that no parameter file can hold. They are not in
-            `params`, and are removed with the next whole table.
     """
 
     params: ParamMap = field(hash=False)
     volatile: frozenset[str]
     heard_at: Mapping[str, float] = field(hash=False)
-    left_out: tuple[str, ...]
-    _history: Callable[[str | None, int | None], list[HistoryEntry]] = field(compare=False)
 
-    @classmethod
-    def of(
-        cls,
-        summary: CachedSummary,
-        table: StoredTable,
-        *,
-        history: Callable[[str | None, int | None], list[HistoryEntry]],
-    ) -> CachedComponent:
-        """Return a table as it is stored.
 
-        Raises:
-            Damaged: a parameter is not valid.
-        """
-        params = table.params()
-        left_out = tuple(name for name in params.compact if not is_portable_name(name))
-        for name in left_out:
-            del params[name]
-        return cls(
-            **{each.name: getattr(summary, each.name) for each in fields(summary)},
-            params=ParamMap(params),
-            volatile=frozenset(compress(table, table.column("volatile"))),
-            heard_at=MappingProxyType(dict(zip(table, table.column("heard_at"), strict=True))),
-            left_out=left_out,
-            _history=history,
+@dataclass(frozen=True, slots=True)
+class CachedExtTable:
+    """The cached extended parameters of one component.
+
+    Attributes:
+        key: key of the vehicle in the cache.
+        component: component id.
+        params: the parameters by name, with trust CACHED, in the order of their indices.
+        heard_at: time of the last observation of each value, by name.
+        count: param_count of the component, or None.
+        complete: whether the table has every index below the count.
+    """
+
+    key: str
+    component: int
+    params: Mapping[str, ExtParam]
+    heard_at: Mapping[str, float]
+    count: int | None
+    complete: bool
+
+
+def plain_params(rows: Mapping[str, StoredParam]) -> Params:
+    """Return stored parameters as plain ones, with trust CACHED."""
+    params = Params()
+    for name, row in rows.items():
+        index = COMPACT_NO_INDEX if row.param_index is None else row.param_index
+        number, value, is_raw = row.stored
+        params.compact[name] = (
+            value + bytes((number, is_raw, CACHED)) + index.to_bytes(4, "little", signed=True)
         )
+        default = default_value(row.default, number)
+        if default is not None:
+            params.defaults[name] = default
+    return params
 
-    def history(self, name: str | None = None, limit: int | None = None) -> list[HistoryEntry]:
-        """Return the changes of its values, newest last. Empty after the table was removed from the cache.
 
-        Args:
-            name: only changes of this parameter.
-            limit: maximum number of changes, the newest.
+def default_value(default: bytes | None, number: int) -> WireValue | None:
+    """Return a stored default as a value of its type."""
+    return None if default is None else from_bits(int.from_bytes(default, "little"), number)
 
-        Raises:
-            CacheError: the cache cannot be read, or is closed.
-        """
-        return self._history(name, limit)
+
+def written_value(number: ParamType | int, bits: int, *, is_raw: bool) -> StoredValue:
+    """Return a plain value as it is stored."""
+    return StoredValue(int(number), _bits_cell(bits), int(is_raw))
+
+
+def _bits_cell(bits: int) -> bytes:
+    return bits.to_bytes(BITS_SIZE, "little")
+
+
+def _minute(at: float) -> str:
+    return f"{datetime.fromtimestamp(at, UTC):%Y-%m-%d %H:%MZ}"

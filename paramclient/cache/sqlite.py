@@ -1,242 +1,290 @@
-"""The cache in a SQLite file."""
+"""The cache in a SQLite file, which several processes may use.
+
+SQLite runs in WAL mode with synchronous=NORMAL: committed transactions survive a killed process; a power loss
+may lose the last ones, but does not damage the file. A durable transaction is committed with
+synchronous=FULL, which syncs all earlier ones too (SQLite, "PRAGMA synchronous").
+"""
 
 from __future__ import annotations
 
+import itertools
+import logging
+import os
 import sqlite3
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar, Final, TypeVar
+from typing import Any, Final, TypeVar
 
-from paramclient.cache.cells import Damaged, cells
-from paramclient.cache.operations import StoreOperation
-from paramclient.cache.packed_table import Packed, packed_row, row_checksum
-from paramclient.cache.param_columns import StoredParam, StoredTable, checksum
-from paramclient.cache.records import CacheChange
-from paramclient.cache.sqlite_file import Database
-from paramclient.cache.transaction import Transaction
+from paramclient.cache.schema import SCHEMA_VERSION, TABLES, Transaction
+from paramclient.errors import CacheError, ParamClientError
 
-__all__ = ["SqliteTransaction", "SqliteStore"]
+__all__ = ["SqliteStore"]
 
-_EMPTY_CHECKSUM: Final = checksum({})
-"""Checksum of a table without parameters, which has no packed row."""
-VARIABLES_MAX: Final = 999
-"""Values of one statement that every SQLite takes (before 3.32.0, SQLITE_MAX_VARIABLE_NUMBER was 999)."""
-_NAME_SETS_MAX: Final = 16
-"""Maximum number of name sets with cached positions: a fleet has a few firmwares. Each takes 100 kB."""
+APPLICATION_ID: Final = 0x5041524D
+"""Application id of paramclient in the header of the file: `PARM`."""
+LOCK_WAIT_MAX: Final = 5.0
+"""Seconds for which a call waits while another process writes. Transactions take milliseconds."""
+CALL_ATTEMPTS_MAX: Final = 3
+"""Attempts of one call: the file may be set aside, and another process may replace it, once each."""
+WAL_SWITCH_INTERVAL: Final = 0.01
+"""Seconds between two attempts to switch a new file to WAL mode: SQLite does not wait for other processes."""
 
+_PARTS: Final = ("", "-wal", "-shm")
+_DAMAGE: Final = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
+# Error codes if no -wal or -shm can be created: the folder is read-only, or the disk is full.
+_UNWRITABLE: Final = frozenset(
+    {
+        sqlite3.SQLITE_CANTOPEN,
+        sqlite3.SQLITE_IOERR_SHMSIZE,
+        sqlite3.SQLITE_READONLY_DIRECTORY,
+    }
+)
+_SYNTAX: Final = {"id": "INTEGER PRIMARY KEY AUTOINCREMENT", "clustered": " WITHOUT ROWID"}
+
+logger = logging.getLogger("paramclient.cache")
 T = TypeVar("T")
 
 
+class _Unusable(Exception):
+    """The file is no cache of this version. Its argument is the kind of file, a part of its new name."""
+
+
+class _Replaced(Exception):
+    """The open file is no longer the one under the path."""
+
+
 class SqliteStore:
-    """A cache in one file of this computer, see `Store` and `Database`.
+    """A cache in a file, opened by the first call; see `Store`. Reading creates no file.
+
+    A file that is damaged, of another version of paramclient or no cache is renamed, with a warning in the
+    log, and a new one is created. No file is deleted.
 
     Args:
-        path: the file, absolute, with resolved symbolic links.
-        link: the symbolic link that was given as path, or None.
-
-    Attributes:
-        path: the file.
-        place: the file, for messages.
+        path: the file, absolute.
     """
 
-    def __init__(self, path: Path, *, link: Path | None = None) -> None:
-        self.path = path
+    def __init__(self, path: Path) -> None:
         self.place = str(path)
-        self._database = Database(path, link=link)
+        self.notes: list[str] = []
+        self.replacements = 0
+        self._path = path
+        self._lock = threading.Lock()
+        self._connection: sqlite3.Connection | None = None
+        self._file: tuple[int, int] | None = None  # device and inode of the open file
+        self._is_read_only = False  # whether the file is opened as one that nobody writes
+        self._is_closed = False
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """See `Store.notes`."""
-        return tuple(self._database.notes)
-
-    @property
-    def replacements(self) -> int:
-        """See `Store.replacements`."""
-        return self._database.replacements
-
-    @property
-    def offline_reason(self) -> None:
-        """Always None: a file has no local copy."""
-        return
-
-    def follow(self, key: str, component: int) -> None:
-        """Do nothing: the file has every table."""
-
-    def subscribe(self, callback: Callable[[CacheChange], None]) -> Callable[[], None]:
-        """Do nothing: a file has no notifications."""
-        return _nothing
-
-    def read(self, work: Callable[[Transaction], T]) -> T:
-        """See `Store.read`."""
-        return self._database.read(lambda connection: work(SqliteTransaction(connection)))
-
-    def do(self, operation: StoreOperation[T]) -> T:
-        """See `Store.do`."""
-
-        def work(connection: sqlite3.Connection) -> T:
-            return operation.do(SqliteTransaction(connection))
-
-        return self._database.write(work, durable=operation.is_durable)
-
-    def limit_lock_waits(self, seconds: float) -> None:
-        """See `Store.limit_lock_waits`."""
-        self._database.limit_lock_waits(seconds)
+    def run(self, work: Callable[[Transaction], T], *, writing: bool, durable: bool = False) -> T:
+        """See `Store.run`."""
+        with self._lock:
+            if self._is_closed:
+                raise CacheError(f"the cache {self.place} is closed")
+            for _ in range(CALL_ATTEMPTS_MAX):
+                if self._file is not None and self._which() != self._file:  # deleted, renamed or replaced
+                    self._drop()
+                    self._file = None
+                    self.replacements += 1
+                try:
+                    if not writing and not self._path.exists():
+                        return _read_nothing(work)
+                    return self._transact(work, writing=writing, durable=durable)
+                except _Replaced:
+                    self._drop()
+                except _Unusable as error:
+                    self._set_aside(str(error))
+                except sqlite3.DatabaseError as error:
+                    self._drop()
+                    if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGE:
+                        self._set_aside("damaged")
+                        continue
+                    is_unwritable = getattr(error, "sqlite_errorcode", 0) in _UNWRITABLE
+                    if is_unwritable and not writing and not self._is_read_only:
+                        self._is_read_only = True
+                        continue
+                    raise CacheError(f"the cache {self.place} cannot be used: {error}") from error
+                except OSError as error:
+                    self._drop()
+                    raise CacheError(f"the cache {self.place} cannot be used: {error}") from error
+                except ParamClientError:
+                    self._drop()
+                    raise
+                except Exception:  # a value that was not written by this program
+                    if self._is_sound():
+                        raise
+                    self._set_aside("damaged")
+                except BaseException:
+                    self._drop()
+                    raise
+            raise CacheError(f"the cache {self.place} was replaced {CALL_ATTEMPTS_MAX} times during one call")
 
     def close(self) -> None:
-        """Close the file."""
-        self._database.close()
+        """See `Store.close`."""
+        with self._lock:
+            self._is_closed = True
+            self._drop()
 
+    def _transact(self, work: Callable[[Transaction], T], *, writing: bool, durable: bool) -> T:
+        """Run one attempt. After an error, closing the connection rolls the transaction back."""
+        if writing and self._is_read_only:
+            self._drop()
+            self._is_read_only = False
+        if self._connection is None:
+            self._connection = self._open(writing=writing)
+        connection = self._connection
+        if durable:
+            connection.execute("PRAGMA synchronous = FULL")
+        connection.execute("BEGIN IMMEDIATE" if writing else "BEGIN")
+        is_empty = not _has_tables(connection)
+        if is_empty and not writing:
+            connection.execute("COMMIT")
+            return _read_nothing(work)
+        if is_empty:
+            _create(connection)
+        result = work(_SqliteTransaction(connection))
+        if durable:  # a transaction without a write would not sync; this writes the unchanged version
+            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        connection.execute("COMMIT")
+        if durable:
+            connection.execute("PRAGMA synchronous = NORMAL")
+        if writing and self._which() != self._file:
+            raise _Replaced
+        return result
 
-class SqliteTransaction(Transaction):
-    """One transaction in a file. A write transaction holds the file's only write lock."""
+    def _open(self, *, writing: bool) -> sqlite3.Connection:
+        if writing:
+            self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            os.close(os.open(self._path, os.O_RDWR | os.O_CREAT, 0o600))
+        self._file = self._which()
+        if self._is_read_only:
+            return _connect(f"{self._path.as_uri()}?mode=ro&immutable=1")
+        connection = _connect(f"{self._path.as_uri()}?mode=rw")
+        connection.execute("PRAGMA foreign_keys = ON")
+        connection.execute("PRAGMA synchronous = NORMAL")
+        if writing:
+            _has_tables(connection)  # nothing is changed in a file that is no cache
+            _switch_to_wal(connection)
+        return connection
 
-    SIZE: ClassVar[str] = "ifnull((SELECT size FROM packed WHERE owner = c.id), 0)"
+    def _is_sound(self) -> bool:
+        """Return whether SQLite finds the open file undamaged, and close it."""
+        try:
+            return self._connection is None or self._connection.execute(
+                "PRAGMA quick_check(1)"
+            ).fetchall() == [("ok",)]
+        except sqlite3.Error:
+            return False
+        finally:
+            self._drop()
 
-    def __init__(self, connection: sqlite3.Connection, *, is_shared: bool = False) -> None:
-        self.connection = connection
-        self.is_shared = is_shared
-        self._places_of: dict[bytes, Mapping[str, int]] = {}
+    def _which(self) -> tuple[int, int] | None:
+        """Return device and inode of the file under the path; None if there is none."""
+        with suppress(FileNotFoundError):
+            status = self._path.stat()
+            return status.st_dev, status.st_ino
+        return None
 
-    def columns(self, owner: int) -> StoredTable:
-        packed = self._packed(owner)
-        return StoredTable.of({}) if packed is None else packed.table()
+    def _part(self, suffix: str) -> Path:
+        return self._path.with_name(self._path.name + suffix)
 
-    def table(self, owner: int) -> dict[str, StoredParam]:
-        return self.columns(owner).rows()
-
-    def put_table(
-        self, owner: int, before: Mapping[str, StoredParam] | None, after: Mapping[str, StoredParam]
-    ) -> None:
-        if not after:
-            self._do("DELETE FROM packed WHERE owner = ?", (owner,))
-            self.update_component(owner, checksum=_EMPTY_CHECKSUM)
+    def _set_aside(self, kind: str) -> None:
+        """Rename the file that was open, with its -wal and -shm; unless another process has done so."""
+        self._drop()
+        if self._which() != self._file:
             return
-        row = packed_row(after)
-        # updated in place: for a blob of equal length, only changed pages are written
-        self._do(
-            "INSERT INTO packed (owner, size, heard_last, params) VALUES (?, ?, ?, ?)"
-            " ON CONFLICT (owner) DO UPDATE SET (size, heard_last, params)"
-            " = (excluded.size, excluded.heard_last, excluded.params)",
-            (owner, *row),
-        )
-        self.update_component(owner, checksum=row_checksum(*row))
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        names = (f"{self._path.name}.{kind}-{stamp}-{number}" for number in itertools.count(1))
+        name = next(each for each in names if not self._path.with_name(each).exists())
+        try:
+            for suffix in reversed(_PARTS):
+                with suppress(FileNotFoundError):
+                    self._part(suffix).rename(self._path.with_name(name + suffix))
+        except OSError as error:
+            raise CacheError(f"the cache {self.place} is {kind}, and cannot be renamed: {error}") from error
+        self.notes.append(f"the cache {self.place} is {_KINDS[kind]}. It is kept as {name}; a new one begins")
+        logger.warning("%s", self.notes[-1])
 
-    def heard_last(self, owner: int) -> float:
-        found = self._all("SELECT heard_last FROM packed WHERE owner = ?", (owner,))
-        return max((at for row in found for at in cells(row, "f")), default=float("-inf"))
+    def _drop(self) -> None:
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            with suppress(sqlite3.Error):
+                connection.close()
 
-    def names_between(self, component: int, first: str, end: str) -> list[str]:
-        owners = self._all("SELECT id FROM component WHERE component = ?", (component,))
-        names: set[str] = set()
-        seen: set[bytes] = set()
-        for packed in filter(None, (self._packed(owner) for (owner,) in owners)):
-            if packed.named not in seen:
-                seen.add(packed.named)
-                names.update(self._places(packed))
-        return [name for name in names if first <= name < end]
 
-    def holders(self, owners: Sequence[int], names: Sequence[str]) -> Mapping[tuple[Any, ...], list[int]]:
-        found: defaultdict[tuple[Any, ...], list[int]] = defaultdict(list)
-        for owner in owners:
-            packed = self._packed(owner)
-            if packed is not None:
-                places = self._places(packed)
-                for value in packed.values((name, places[name]) for name in names if name in places):
-                    found[value].append(owner)
-        return found
+_KINDS: Final = {
+    "damaged": "damaged",
+    "foreign": "a database of another program",
+    "newer": "of a newer version of paramclient",
+    "older": "of an earlier, unreleased version of paramclient",
+}
 
-    def value_dates(self, named: Mapping[int, Sequence[str]]) -> list[tuple[int, str, str, int, float]]:
-        found: list[tuple[int, str, str, int, float]] = []
-        for owner, names in named.items():
-            marks = ", ".join("?" * len(names))
-            begins = self.connection.execute(
-                "SELECT known_since FROM component WHERE id = ? AND known_since IS NOT NULL", (owner,)
-            )
-            found.extend((owner, "", "known", 0, *cells(row, "f")) for row in begins)
-            packed = self._packed(owner)
-            if packed is not None:
-                places = self._places(packed)
-                there = [name for name in names if name in places]
-                times = packed.heard_at(places[name] for name in there)
-                found.extend((owner, name, "heard", 0, at) for name, at in zip(there, times, strict=True))
-            for what, select, end in (
-                ("line", "SELECT name, max(id), at FROM history", " GROUP BY name"),
-                ("birth", "SELECT name, max(line), at FROM birth", " GROUP BY name"),
-            ):
-                for row in self.connection.execute(
-                    f"{select} WHERE owner = ? AND name IN ({marks}){end}", (owner, *names)
-                ):
-                    name, line, observed_at = cells(row, "sif")
-                    found.append((owner, name, what, line, observed_at))
-        return found
 
-    def _packed(self, owner: int) -> Packed | None:
-        """Return the parameters of a table, or None if it has none.
+class _SqliteTransaction:
+    """See `Transaction`."""
 
-        Raises:
-            Damaged: the checksum does not match.
-        """
-        [(expected, *row)] = self._all(
-            "SELECT checksum, size, heard_last, params FROM component LEFT JOIN packed ON owner = id"
-            " WHERE id = ?",
-            (owner,),
-        )
-        blob = row[-1]
-        if not isinstance(blob, bytes | None):
-            raise Damaged(f"a table is {blob!r:.40}")
-        if expected != (_EMPTY_CHECKSUM if blob is None else row_checksum(*row)):
-            raise Damaged("a table is not what was written")
-        return None if blob is None else Packed(blob)
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self._connection = connection
 
-    def _places(self, packed: Packed) -> Mapping[str, int]:
-        """Return the positions of a table's names, which are usually equal for one firmware."""
-        found = self._places_of.get(packed.named)
-        if found is None:
-            if len(self._places_of) >= _NAME_SETS_MAX:
-                self._places_of.clear()
-            found = self._places_of[packed.named] = packed.places()
-        return found
+    def all(self, sql: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
+        return self._connection.execute(sql, values).fetchall()
 
-    def _all(self, sql: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
-        return self.connection.execute(sql, values).fetchall()
+    def do(self, sql: str, values: Sequence[object] = ()) -> int:
+        return self._connection.execute(sql, values).rowcount
 
-    def _do(self, sql: str, values: Sequence[object] = ()) -> int:
-        return self.connection.execute(sql, values).rowcount
+    def many(self, sql: str, rows: Iterable[Sequence[object]]) -> None:
+        self._connection.executemany(sql, rows)
 
-    def _many(self, sql: str, rows: Iterable[Sequence[object]]) -> None:
-        """See `Transaction`. Inserts rows by one statement: beside a busy event loop, each may take 5 ms."""
-        if " VALUES (" not in sql:
-            self.connection.executemany(sql, rows)
+
+def _connect(uri: str) -> sqlite3.Connection:
+    return sqlite3.connect(
+        uri, uri=True, timeout=LOCK_WAIT_MAX, isolation_level=None, check_same_thread=False
+    )
+
+
+def _switch_to_wal(connection: sqlite3.Connection) -> None:
+    deadline = time.monotonic() + LOCK_WAIT_MAX
+    while True:
+        try:
+            connection.execute("PRAGMA journal_mode = WAL")
             return
-        head, marks, tail = _around_values(sql)
-        pending = list(rows)
-        size = VARIABLES_MAX // sql.count("?")
-        for at in range(0, len(pending), size):
-            some = pending[at : at + size]
-            values = ", ".join([marks] * len(some))
-            self.connection.execute(f"{head}{values}{tail}", [value for row in some for value in row])
-
-    def _insert(self, sql: str, values: Sequence[object]) -> int:
-        self.connection.execute(sql, values)
-        [(number,)] = self.connection.execute("SELECT last_insert_rowid()")
-        return int(number)
-
-    def _numbers(self, count: int) -> Sequence[int]:
-        [(last,)] = self.connection.execute("SELECT ifnull(max(id), 0) FROM history")
-        return range(last + 1, last + 1 + count)
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > deadline:
+                raise
+            time.sleep(WAL_SWITCH_INTERVAL)
 
 
-def _around_values(sql: str) -> tuple[str, str, str]:
-    """Return an INSERT in three parts: the text before its list of values, the list, the text after it."""
-    begin = sql.index(" VALUES (") + len(" VALUES ")
-    depth = 0
-    for end, character in enumerate(sql[begin:], begin + 1):
-        depth += (character == "(") - (character == ")")
-        if not depth:
-            return sql[:begin], sql[begin:end], sql[end:]
-    raise AssertionError(f"unclosed list of values: {sql}")
+def _has_tables(connection: sqlite3.Connection) -> bool:
+    """Return whether the file has the tables of a cache, or none at all.
+
+    Raises:
+        _Unusable: it has others.
+    """
+    [(application,)] = connection.execute("PRAGMA application_id")
+    [(version,)] = connection.execute("PRAGMA user_version")
+    if (application, version) == (APPLICATION_ID, SCHEMA_VERSION):
+        return True
+    [(tables,)] = connection.execute("SELECT count(*) FROM sqlite_master")
+    if not tables:
+        return False
+    if application != APPLICATION_ID:
+        raise _Unusable("foreign")
+    raise _Unusable("newer" if version > SCHEMA_VERSION else "older")
 
 
-def _nothing() -> None:
-    return
+def _create(connection: sqlite3.Connection) -> None:
+    for statement in TABLES:
+        connection.execute(statement.format(**_SYNTAX))
+    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+
+
+def _read_nothing(work: Callable[[Transaction], T]) -> T:
+    """Run a function that reads on an empty cache."""
+    connection = _connect("file::memory:")
+    try:
+        _create(connection)
+        return work(_SqliteTransaction(connection))
+    finally:
+        connection.close()

@@ -179,7 +179,6 @@ _cache: Final = App(
         "cache list",
         "cache path",
         "cache remove 1",
-        "cache copy field.sqlite3 postgresql://me@office/fleet",
     ),
 )
 
@@ -353,4 +352,3 @@ _add(_metadata, "metadata_files:metadata_remove")
 _add(_cache, "offline:cache_list")
 _add(_cache, "offline:cache_path")
 _add(_cache, "offline:cache_remove")
-_add(_cache, "offline:cache_copy")

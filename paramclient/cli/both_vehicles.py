@@ -52,8 +52,7 @@ async def resolve_both(url: str, options: LinkOptions) -> tuple[ParamSet, ParamS
             first, second = (each.system for each in vehicles[:2])
             raise AmbiguousVehicle(
                 f"{len(words)} vehicles on this link: {', '.join(words)}. `paramclient fetch {url} --all` "
-                f"stores them all; then `paramclient diff {first} {second}` compares two, and `paramclient "
-                "fleet diff '*'` all of them",
+                f"stores them all; then `paramclient diff {first} {second}` compares two",
                 vehicles=words,
             )
 

@@ -62,7 +62,7 @@ async def check(
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
-        vehicle: The vehicle to measure: 4 or 4/1, px4 or ardupilot, or a nickname, hardware id or key of the
+        vehicle: The vehicle to measure: 4 or 4/1, px4 or ardupilot, or a hardware id or key of the
             cache. Instead of --system.
         system: The system to measure, 1 to 255. Default: the first one received.
         component: The component to measure, 1 to 255. Default: the autopilot.

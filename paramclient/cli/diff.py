@@ -57,7 +57,7 @@ async def diff(
     Exit code 0: both have the same names with the same values. Exit code 1: they differ.
 
     Args:
-        left: A parameter file; a vehicle in the cache, as 4, px4 or ardupilot, a nickname, its hardware id
+        left: A parameter file; a vehicle in the cache, as 4, px4 or ardupilot, its hardware id
             (in full, or uid: and at least 6 digits), its key, or cache:VEHICLE; or a link.
         right: A file, a vehicle in the cache, or a link, like LEFT. With one link as LEFT and RIGHT, the two
             vehicles on it are compared.

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from paramclient.cache import HistoryEntry, InterruptedSetup, ParamCache, SetupNotes, SnapshotSummary
+from paramclient.cache import HistoryEntry, ParamCache, SnapshotSummary
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import history_extended
 from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson
@@ -46,7 +46,7 @@ def history(
     --snapshots, print the snapshots of the vehicle's tables instead, each with its number.
 
     Args:
-        vehicle: A vehicle in the cache: 4 or 4/1, px4 or ardupilot, a nickname, its hardware id (in full, or
+        vehicle: A vehicle in the cache: 4 or 4/1, px4 or ardupilot, its hardware id (in full, or
             uid: and at least 6 digits), or its key.
         names: Print only these parameters: names in upper or lower case, or patterns such as "MC_*".
         cached: The vehicle, instead of the first argument; then all arguments are names.
@@ -59,9 +59,7 @@ def history(
     """
     vehicle, names = chosen_vehicle(cached, vehicle, names)
     if vehicle is None:
-        raise UsageError(
-            "VEHICLE is missing: a vehicle in the cache, by system id, hardware id, nickname or key"
-        )
+        raise UsageError("VEHICLE is missing: a vehicle in the cache, by system id, hardware id or key")
     begin = None if since is None else parse_time(since, time.time())
     if begin is not None and not options.json:
         say(f"since {local_time(begin)}")
@@ -79,16 +77,7 @@ def history(
         else:
             entries = _entries(cache, key, component, name_patterns, begin)
             entries = entries[-limit:] if limit else entries
-            oldest = entries[0].at if limit and len(entries) == limit else begin
-            notes = [] if name_patterns else SetupNotes.beside(cache.path).cut_off()
-            cut_off = [
-                note
-                for note in notes
-                if note.key == key
-                and component in (None, note.component)
-                and (oldest is None or note.at >= oldest)
-            ]
-            _print_entries(entries, cut_off, options)
+            _print_entries(entries, options)
     return ExitCode.DONE
 
 
@@ -114,16 +103,11 @@ def _entries(
     return [entry for entry in entries if entry.name in chosen and (begin is None or entry.at >= begin)]
 
 
-def _print_entries(
-    entries: Sequence[HistoryEntry], cut_off: Sequence[InterruptedSetup], options: CacheOptions
-) -> None:
+def _print_entries(entries: Sequence[HistoryEntry], options: CacheOptions) -> None:
     if options.json:
         print_json({"history": [HistoryLineJson.of(each) for each in entries]})
         return
-    rows = [(entry.at, _entry_cells(entry)) for entry in entries]
-    rows += [(note.at, _cut_off_cells(note)) for note in cut_off]
-    rows.sort(key=lambda row: row[0])
-    print_table(["time", "component", "name", "old", "new", "by"], (cells for _, cells in rows))
+    print_table(["time", "component", "name", "old", "new", "by"], map(_entry_cells, entries))
 
 
 def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> None:
@@ -145,13 +129,11 @@ def _entry_cells(entry: HistoryEntry) -> tuple[object, ...]:
     return local_time(entry.at), entry.component, entry.name, _value(entry.old), new, entry.by
 
 
-def _cut_off_cells(note: InterruptedSetup) -> tuple[object, ...]:
-    progress = f"{note.done} of {note.total} values" if note.total else "nothing written"
-    return local_time(note.at), note.component, f"({note.kind} cut off)", None, progress, note.requested_by
-
-
 def _reason(each: SnapshotSummary) -> str:
-    return each.reason if each.complete else f"{each.reason} (not complete)"
+    notes = [] if each.complete else ["not complete"]
+    if each.ended is False:
+        notes.append("interrupted, or still running")
+    return f"{each.reason} ({', '.join(notes)})" if notes else each.reason
 
 
 def _value(param: Param) -> str:

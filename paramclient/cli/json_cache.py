@@ -26,7 +26,6 @@ class TableJson(Json):
     uid: str | None
     hash: str | None
     synced_at: str | None
-    source: str | None = None
     params: dict[str, ParamJson]
 
     @classmethod
@@ -39,7 +38,6 @@ class TableJson(Json):
             uid=table.identity.uid,
             hash=hash_text(table.hash),
             synced_at=time_or_none(table.synced_at),
-            source=table.source,
             params=dict(params),
         )
 
@@ -59,7 +57,6 @@ class SummaryJson(Json):
     hash: str | None
     synced_at: str | None
     updated_at: str | None
-    source: str | None = None
     extended: int | None = None
 
     @classmethod
@@ -77,7 +74,6 @@ class SummaryJson(Json):
             hash=hash_text(summary.hash),
             synced_at=time_or_none(summary.synced_at),
             updated_at=time_or_none(summary.updated_at),
-            source=summary.source,
             extended=extended,
         )
 

@@ -99,7 +99,7 @@ def _kind_of(path: Path) -> str | None:
     if not begin:
         return "the file is empty"
     if begin.startswith(SQLITE_MAGIC):
-        return "an SQLite database, and no log. `paramclient cache copy` copies a cache"
+        return "an SQLite database, and no log"
     with suppress(ParamClientError):
         file_format = read_file(path).file_format
         return f"a parameter file ({file_format}), and no log. `paramclient cache add VEHICLE {path}` adds it"

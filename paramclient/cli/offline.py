@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
-from paramclient.cache.database_url import is_address
 from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import is_extended_source, show_extended
@@ -34,7 +31,6 @@ from paramclient.cli.output import (
     print_line,
     print_table,
     printable,
-    report,
     say,
 )
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
@@ -48,10 +44,8 @@ from paramclient.model.paramset import ParamSet
 from paramclient.model.patterns import NameChoice
 from paramclient.model.values import Param, format_value, type_name
 from paramclient.model.wording import counted
-from paramclient.provision.vehicle_params import left_out_note
 
 __all__ = [
-    "cache_copy",
     "cache_list",
     "cache_path",
     "cache_remove",
@@ -78,7 +72,7 @@ def show(
     With --changed, exit code 1: the firmware's defaults are not known.
 
     Args:
-        vehicle: A parameter file; a vehicle in the cache: 4 or 4/1, px4 or ardupilot, a nickname, its
+        vehicle: A parameter file; a vehicle in the cache: 4 or 4/1, px4 or ardupilot, its
             hardware id (in full, or uid: and at least 6 digits) or its key, also with the prefix cache:; or
             replay:FILE, a telemetry log.
         cached: The vehicle in the cache, instead of the first argument; then all arguments are names.
@@ -166,7 +160,7 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
     """Remove a vehicle from the cache: its tables and their history.
 
     Args:
-        vehicle: A vehicle in the cache: 4 or 4/1, px4 or ardupilot, a nickname, its hardware id (in full, or
+        vehicle: A vehicle in the cache: 4 or 4/1, px4 or ardupilot, its hardware id (in full, or
             uid: and at least 6 digits), or its key.
         component: Remove only the table of this component.
     """
@@ -177,38 +171,6 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
         print_json({"key": key, "removed": removed})
     else:
         print_line(f"removed {counted(removed, 'table')} of {key}")
-    return ExitCode.DONE
-
-
-def cache_copy(source: str, target: str, /, *, json: bool = False) -> ExitCode:
-    """Copy every table of a cache to another one, with history and snapshots, and verify the copy.
-
-    Tables in both caches are merged: for each parameter, the later value is kept. Nothing is duplicated.
-    After an interruption, run the same command again to continue.
-
-    Args:
-        source: The cache to copy: a file, or the postgresql:// URL of a shared cache.
-        target: The cache to copy to.
-        json: Print JSON.
-    """
-    if not is_address(source) and not Path(source).is_file():
-        raise NotInCache(f"there is no cache {source}")
-
-    def show_progress(key: str, number: int, count: int) -> None:
-        if sys.stderr.isatty():
-            say(f"{number} of {count}: {printable(key)}")
-
-    with ParamCache(source) as old, ParamCache(target) as new:
-        done = old.copy_to(new, progress=show_progress)
-        place = new.place
-    if json:
-        print_json({"path": place, **asdict(done)})
-    else:
-        print_line(
-            f"copied {counted(done.tables, 'table')} to {printable(place)}, {done.unchanged} were there "
-            f"already; in all {done.params} parameters, {done.lines} lines of history, {done.snapshots} "
-            "snapshots, verified"
-        )
     return ExitCode.DONE
 
 
@@ -259,11 +221,7 @@ def _open(options: CacheOptions) -> ParamCache:
 
 def _load(cache: ParamCache, summaries: Sequence[CachedSummary]) -> list[CachedComponent]:
     loaded = (cache.load(each.key, each.component) for each in summaries)
-    tables = [table for table in loaded if table is not None]  # another process may have removed one
-    for table in tables:
-        if table.left_out:
-            report(left_out_note(table))
-    return tables
+    return [table for table in loaded if table is not None]  # another process may have removed one
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,9 +298,7 @@ def _print_summaries(summaries: Sequence[CachedSummary], extended: Mapping[tuple
 
 
 def _synced(table: CachedSummary) -> str | None:
-    """Return when a table was verified last, or the file that it was added from."""
-    if table.source is not None:
-        return f"file {table.source}"
+    """Return when a table was verified last."""
     return None if table.synced_at is None else local_time(table.synced_at)
 
 
@@ -369,8 +325,6 @@ def _print_table(view: _View) -> None:
     if view.names:
         return
     synced = "never complete" if table.synced_at is None else f"synced {local_time(table.synced_at)}"
-    if table.source is not None:
-        synced = f"added from the file {table.source}, not confirmed by the vehicle"
     crc = "" if table.hash is None else f"; hash {hash_text(table.hash)}"
     vehicle = f"{table.system}/{table.component} {autopilot_name(table.autopilot)} ({table.key})"
     if changed:

@@ -154,7 +154,7 @@ class LinkOptions(TrafficOptions):
 
     vehicle: str | None = None
     """The vehicle: 4 or 4/1 (system and component id), px4 or ardupilot if only one vehicle has that
-    autopilot, or a nickname, hardware id or key of the cache. Instead of --system."""
+    autopilot, or a hardware id or key of the cache. Instead of --system."""
 
     system: Id = None
     """System id of the vehicle, 1 to 255. Default: the first one received; for writes, the only one."""

@@ -71,8 +71,8 @@ async def save(
 
     Args:
         where: The link, such as udpin:0.0.0.0:14550 or sim:px4; an on-board log (.bin, .ulg), for the values
-            at its end, or another parameter file; or a vehicle in the cache: 4 or 4/1, px4 or ardupilot, a
-            nickname, its hardware id (in full, or uid: and at least 6 digits), or its key.
+            at its end, or another parameter file; or a vehicle in the cache: 4 or 4/1, px4 or ardupilot, its
+            hardware id (in full, or uid: and at least 6 digits), or its key.
         file: The file. Its extension determines the file format: .params, .parm, .param, .pck, .json.
         file_format: The file format, if the extension does not determine it.
         changed: Write only parameters that differ from the firmware's defaults: those of the vehicle, else

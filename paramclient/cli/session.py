@@ -228,7 +228,7 @@ async def unheard_in_words(session: CommandSession) -> list[str]:
     for each in known:
         at = max(each.updated_at, each.synced_at or 0.0)
         is_recent = now - at <= UNHEARD_AGE_MAX
-        if each.autopilot == MAV_AUTOPILOT_INVALID or each.source is not None or not is_recent:
+        if each.autopilot == MAV_AUTOPILOT_INVALID or not is_recent:
             continue
         if each.identity.link != link or each.system in heard:
             continue

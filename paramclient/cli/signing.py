@@ -38,7 +38,7 @@ class SigningTarget(KeyOptions):
     """Confirm that no other person or program can read this link: a USB cable, a wire. Default: ask."""
 
     vehicle: str | None = None
-    """The vehicle: 4 or 4/1, px4 or ardupilot, or a nickname, hardware id or key of the cache. Instead of
+    """The vehicle: 4 or 4/1, px4 or ardupilot, or a hardware id or key of the cache. Instead of
     --system."""
 
     system: Id = None

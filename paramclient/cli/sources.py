@@ -56,7 +56,7 @@ __all__ = [
 
 SOURCES: Final = f"""\
   FILE                a parameter file, or an on-board log (.bin, .ulg), that exists
-  cache:VEHICLE       the cached table of a vehicle: 4 or 4/1, px4 or ardupilot, a nickname, its hardware id
+  cache:VEHICLE       the cached table of a vehicle: 4 or 4/1, px4 or ardupilot, its hardware id
                       (in full, or uid: and at least 6 digits), or its key; cache: may be left out
 {FORMS}"""
 """The accepted sources, for messages."""
@@ -139,18 +139,13 @@ def is_file(text: str) -> bool:
 
 
 def names_vehicle(text: str, cache: str | None = None) -> bool:
-    """Return whether an argument has the form of a name of a vehicle in the cache, or is a nickname.
+    """Return whether an argument has the form of a name of a vehicle in the cache.
 
     Args:
         text: the argument.
         cache: the option --cache.
     """
-    if text.startswith(_CACHED) or is_vehicle_name(text):
-        return True
-    if not text.replace("_", "").replace("-", "").isalnum():  # no nickname, but a link or a file
-        return False
-    with ParamCache(cache) as opened:
-        return text.lower() in map(str.lower, opened.nicknames)
+    return text.startswith(_CACHED) or is_vehicle_name(text)
 
 
 def check_link(text: str) -> None:

@@ -1,4 +1,4 @@
-"""The vehicle that --vehicle names: by address, kind, nickname, hardware id or key."""
+"""The vehicle that --vehicle names: by address, kind, hardware id or key."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["VehicleName", "check_kind", "check_uid", "wait_for_kind"]
 KIND_POLL_INTERVAL: Final = 0.05
 """Seconds between two checks whether a vehicle of a kind was heard."""
 UID_TIMEOUT: Final = 5.0
-"""Seconds to wait for the hardware id of a vehicle that is named by nickname or hardware id: several attempts
+"""Seconds to wait for the hardware id of a vehicle that is named by its hardware id: several attempts
 of the request on a link that loses half of the packets."""
 
 _SYSTEM_ID: Final = re.compile(r"[0-9]{1,3}")
@@ -66,13 +66,11 @@ class VehicleName:
             return cls(kind=text.lower())
         if not uses_cache:
             raise UsageError(
-                f"--vehicle {text} is neither an address, such as 4 or 4/1, nor px4 or ardupilot; nicknames "
-                "and hardware ids are looked up in the cache, which is not used"
+                f"--vehicle {text} is neither an address, such as 4 or 4/1, nor px4 or ardupilot; "
+                "hardware ids are looked up in the cache, which is not used"
             )
         with ParamCache(cache) as opened:
-            found = find_vehicle(
-                opened.vehicles(), text, place=opened.place, nicknames=opened.nicknames
-            ).identity
+            found = find_vehicle(opened.vehicles(), text, place=opened.place).identity
         return cls(system=found.system, uid=found.uid)
 
     @classmethod

@@ -9,6 +9,7 @@
 - `loop_scheduler`: CPU time and list downloads shared among the links of one event loop.
 - `extended_params`: `ExtParams`, the public interface of extended parameters.
 - `events`: public events and their stream.
+- `file_ownership`: owner and access rights of files with secrets.
 - `fetch_all`: fetches of several components in parallel.
 - `files`: MAVFTP calls.
 - `forwarding`: frames to and from one other program.

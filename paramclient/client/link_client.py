@@ -132,7 +132,6 @@ class LinkClient(LocalClient):
             owned=self.cache is not options.cache,
             identity_of=self.station.identity_of,
             is_doubted=self.station.is_doubted,
-            renewed=self._dispatch,
             detect_suspend=lambda: self.link_task.detect_suspend(),
         )
         self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()

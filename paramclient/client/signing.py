@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from paramclient.cache.file_ownership import (
+from paramclient.client.file_ownership import (
     GROUP_READS,
     OF_OTHERS,
     has_trusted_owner,

@@ -12,18 +12,15 @@ from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import hash_text, time_or_none, time_text
 
 if TYPE_CHECKING:
-    from paramclient.cache import AddedTable, CachedComponent, CachedSummary, CachedVehicle, HistoryEntry
+    from paramclient.cache import CachedComponent, CachedSummary, CachedVehicle, HistoryEntry
     from paramclient.metadata import Metadata, ParamInfo
     from paramclient.model.values import Param
 
 __all__ = [
-    "AddedDoc",
     "CachedListDoc",
     "CachedSummaryDoc",
-    "NicknameDoc",
     "CachedTableDoc",
     "CachedTablesDoc",
-    "CopiedDoc",
     "FoundDoc",
     "FoundParamDoc",
     "KnownValueDoc",
@@ -49,19 +46,14 @@ class CachedSummaryDoc(Document):
     hash: str | None
     synced_at: str | None
     updated_at: str | None
-    source: Maybe[str] = None
-    nickname: Maybe[str] = None
     extended: Maybe[int] = None
 
     @classmethod
-    def of(
-        cls, summary: CachedSummary, nickname: str | None = None, extended: int | None = None
-    ) -> CachedSummaryDoc:
+    def of(cls, summary: CachedSummary, extended: int | None = None) -> CachedSummaryDoc:
         """Return the document of a `CachedSummary`.
 
         Args:
             summary: the table.
-            nickname: the nickname of the vehicle, or None.
             extended: the number of extended parameters of the component, or None.
         """
         return cls(
@@ -76,17 +68,8 @@ class CachedSummaryDoc(Document):
             hash=hash_text(summary.hash),
             synced_at=time_or_none(summary.synced_at),
             updated_at=time_or_none(summary.updated_at),
-            source=summary.source,
-            nickname=nickname,
             extended=extended,
         )
-
-
-class NicknameDoc(Document):
-    """The nickname of a vehicle in the cache; null if it was removed."""
-
-    key: str
-    nickname: str | None
 
 
 class CachedListDoc(Document):
@@ -105,7 +88,6 @@ class CachedTableDoc(Document):
     uid: str | None
     hash: str | None
     synced_at: str | None
-    source: Maybe[str] = None
     params: dict[str, ParamDoc]
 
     @classmethod
@@ -144,7 +126,6 @@ class CachedTableDoc(Document):
             uid=table.identity.uid,
             hash=hash_text(table.hash),
             synced_at=time_or_none(table.synced_at),
-            source=table.source,
             params=members,
         )
 
@@ -190,46 +171,6 @@ class PlaceDoc(Document):
     """The place of the cache."""
 
     path: str
-
-
-class CopiedDoc(Document):
-    """The result of copying a cache; see `CopyResult`."""
-
-    path: str
-    tables: int
-    unchanged: int
-    params: int
-    lines: int
-    snapshots: int
-
-
-class AddedDoc(Document):
-    """The result of adding a file to the cache; see `AddedTable`."""
-
-    file: str
-    key: str
-    system: int
-    component: int
-    size: int
-    complete: bool
-    hash: str | None
-    at: str
-    notes: list[str]
-
-    @classmethod
-    def of(cls, added: AddedTable, file: str) -> AddedDoc:
-        """Return the document of an `AddedTable`."""
-        return cls(
-            file=file,
-            key=added.key,
-            system=added.system,
-            component=added.component,
-            size=added.size,
-            complete=added.complete,
-            hash=hash_text(added.hash),
-            at=time_text(added.at),
-            notes=list(added.notes),
-        )
 
 
 class FoundParamDoc(Document):

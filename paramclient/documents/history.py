@@ -1,4 +1,4 @@
-"""Documents of the history: changes of values, snapshots, and interrupted set-ups."""
+"""Documents of the history: changes of values, and snapshots."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from paramclient.model.notation import bits_text, hash_text, time_text, value_js
 from paramclient.model.values import type_name
 
 if TYPE_CHECKING:
-    from paramclient.cache import HistoryEntry, InterruptedSetup, SnapshotSummary
+    from paramclient.cache import HistoryEntry, SnapshotSummary
     from paramclient.model.paramset import ParamSet
 
 __all__ = [
-    "InterruptedSetupDoc",
     "ExactDoc",
     "HistoryDoc",
     "HistoryEntryDoc",
@@ -68,43 +67,11 @@ class HistoryEntryDoc(Document):
         )
 
 
-class InterruptedSetupDoc(Document):
-    """A set-up that was interrupted by the end of the service; see `InterruptedSetup`.
-
-    `at` (unix seconds) is the last time at which it was known to run.
-    """
-
-    time: str
-    component: int
-    kind: str
-    by: str
-    done: int
-    total: int
-    at: float
-
-    @classmethod
-    def of(cls, note: InterruptedSetup) -> InterruptedSetupDoc:
-        """Return the document of an `InterruptedSetup`."""
-        return cls(
-            time=time_text(note.at),
-            component=note.component,
-            kind=note.kind,
-            by=note.requested_by,
-            done=note.done,
-            total=note.total,
-            at=round(note.at, 3),
-        )
-
-
 class HistoryDoc(Document):
-    """Changes of values, the newest last. `before` is the argument of a request for earlier changes.
-
-    `cut_off` has the interrupted set-ups of this time, if there are any.
-    """
+    """Changes of values, the newest last. `before` is the argument of a request for earlier changes."""
 
     history: list[HistoryEntryDoc]
     before: Maybe[float] = None
-    cut_off: Maybe[list[InterruptedSetupDoc]] = None
 
     @classmethod
     def of(
@@ -113,13 +80,11 @@ class HistoryDoc(Document):
         *,
         exact: bool = False,
         before: float | None = None,
-        cut_off: Iterable[InterruptedSetup] = (),
     ) -> HistoryDoc:
         """Lines of history."""
         return cls(
             history=[HistoryEntryDoc.of(entry, exact=exact) for entry in entries],
             before=before,
-            cut_off=[InterruptedSetupDoc.of(note) for note in cut_off] or None,
         )
 
 

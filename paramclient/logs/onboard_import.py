@@ -56,14 +56,14 @@ def _store(log: OnboardLog, cache: ParamCache) -> ImportedTable:
     types = _types(log, cache)
     update = partial(TableUpdate, identity=identity, component=AUTOPILOT, autopilot=identity.autopilot)
     at = log.boot_time + log.began
-    initial = [StoredParam(_param(written, types), at) for written in log.initial.values()]
+    initial = [StoredParam.of(_param(written, types), at) for written in log.initial.values()]
     updates = [update(at=at, params=initial)]
     for change in log.changes:
         first = log.initial.get(change.name, WrittenParam(change.name, change.value))
         at = log.boot_time + change.time
         changed = WrittenParam(change.name, change.value, first.type_number, first.default)
         param = _param(changed, types)
-        updates.append(update(at=at, params=[StoredParam(param, at)]))
+        updates.append(update(at=at, params=[StoredParam.of(param, at)]))
     cache.merge(updates)
     notes = log.notes
     if untyped := sum(param.type_number is None and name not in types for name, param in log.initial.items()):

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from typing import Final
@@ -12,7 +11,7 @@ from typing import Final
 import anyio
 import anyio.lowlevel
 
-from paramclient.cache import CachedComponent, CachedExtTable, ExtTableUpdate, ParamCache, TableUpdate
+from paramclient.cache import CachedComponent, CachedExtTable, ParamCache, TableUpdate
 from paramclient.client.cache_writer import CACHE_FLUSH_INTERVAL, CacheWriter
 from paramclient.links.replay import LOG_PEER
 from paramclient.links.tlog import Record, open_log, read_records
@@ -190,44 +189,38 @@ class _LogWriter(CacheWriter):
         super().__init__(
             cache, owned=False, identity_of=identity_of, is_doubted=is_doubted, clock=clock, now=clock
         )
-        self._kept_tables = cache
+        self._tables_in = cache
+        self._log_time = clock
         self._updates: list[TableUpdate] = []
-        self._ext_updates: list[ExtTableUpdate] = []
         self._based_on: dict[tuple[str, int], float] = {}
         self._loaded: set[tuple[str, int]] = set()
         self._has_values: set[tuple[str, int]] = set()
 
     async def merge(self) -> None:
         """Write all collected updates."""
-        work = partial(self._kept_tables.merge, self._updates, based_on=self._based_on)
-        await self._worker.run(work)
-        await self._worker.run(partial(self._kept_tables.save_ext, self._ext_updates, clock=time.time))
+        await self.run_in_thread(partial(self._tables_in.merge, self._updates, based_on=self._based_on))
 
-    async def _load(
-        self, machine: ComponentMachine, identity: Identity
+    async def load_tables(
+        self, identity: Identity, component: int
     ) -> tuple[CachedComponent | None, CachedExtTable | None]:
         """Return the cached table if it is older; only once, as later updates are not written yet.
 
         Extended parameters need no cached table: they are compared with it when they are written.
         """
-        key = (identity.key, machine.component)
+        key = (identity.key, component)
         if key in self._loaded:
             return None, None
         self._loaded.add(key)
-        cached = await self._worker.run(partial(self._kept_tables.load, *key))
-        if cached is None or cached.updated_at >= self._clock():
+        cached = await self.run_in_thread(partial(self._tables_in.load, *key))
+        if cached is None or cached.updated_at >= self._log_time():
             return None, None
         self._based_on[key] = cached.updated_at
         return cached, None
 
-    async def _save_extended(self, cache: ParamCache, updates: list[ExtTableUpdate]) -> bool:
-        self._ext_updates += updates
-        return True
-
-    async def _save(self, cache: ParamCache, updates: list[TableUpdate]) -> bool:
+    def save_updates(self, cache: ParamCache, updates: Sequence[TableUpdate], *, durable: bool) -> None:
+        """Collect updates, but not of a table of which the log has no value."""
         for update in updates:
             key = (update.identity.key, update.component)
             if update.params or key in self._based_on or key in self._has_values:
                 self._updates.append(update)
                 self._has_values.add(key)
-        return True

@@ -15,6 +15,7 @@ from paramclient.client.component import Component
 from paramclient.client.local import local
 from paramclient.errors import (
     AnotherVehicle,
+    CacheError,
     InvalidParameters,
     LinkError,
     NoReply,
@@ -155,6 +156,7 @@ class ApplyRun:
         self._written_before_reboot: set[str] = set()  # values that the last reboot should have kept
         self._next_system_id: int | None = None  # the vehicle's system id after the next reboot
         self._error: ParamClientError | None = None
+        self._snapshot: int | None = None  # number of the snapshot of the state before
 
     async def prepare(self) -> None:
         """Inspect the vehicle, plan, and store its state. A failure is raised before the first write."""
@@ -202,6 +204,7 @@ class ApplyRun:
             if self._pending_stages():
                 local(self._component).machine.sync.drop_check(anyio.current_time())
             await self._write_and_verify()
+        await self._record_end()
 
     async def _write_and_verify(self) -> None:
         """Do what `write_and_verify` says, while no check of the table begins."""
@@ -585,7 +588,7 @@ class ApplyRun:
         cache = client.cache
         if cache is not None and self.plan.steps:
             await client.cache_writer.write_all()  # the history then has the values from before the change
-            await client.cache_writer.run_in_thread(
+            snapshot = await client.cache_writer.run_in_thread(
                 lambda: cache.store_snapshot(
                     component.identity,
                     component.component,
@@ -593,8 +596,18 @@ class ApplyRun:
                     reason=self._options.reason,
                     hash=inspection.hash,
                     complete=inspection.complete,
+                    is_of_operation=True,
                 )
             )
+            self._snapshot = snapshot.id
+
+    async def _record_end(self) -> None:
+        """Record in the cache that the run was not interrupted."""
+        client, number = local(self._component).client, self._snapshot
+        cache = client.cache
+        if cache is not None and number is not None:
+            with suppress(CacheError):  # the warning of the cache writer says so
+                await client.cache_writer.run_in_thread(lambda: cache.end_operation(number))
 
     # Progress and rows
 

@@ -36,7 +36,6 @@ __all__ = [
     "collect_defaults",
     "select_non_defaults",
     "incomplete_error",
-    "left_out_note",
     "cached_param_set",
     "collect_set",
     "fetch_set",
@@ -214,18 +213,7 @@ def load_cached_set(
         vehicle = f"{table.system}/{component} ({key})"
         of = "" if table.count is None else f" of {table.count}"
         raise NotInCache(f"the cache has {table.size}{of} parameters of {vehicle}, not all; fetch them first")
-    if table.left_out and note is not None:
-        note(left_out_note(table))
     return cached_param_set(table)
-
-
-def left_out_note(table: CachedComponent) -> str:
-    """Return the sentence about names of a cached table that are left out of a set."""
-    names = first_of([*map(repr, table.left_out)], NAMES_SHOWN_MAX)
-    return (
-        f"{table.system}/{table.component} ({table.key}): skipped, because no parameter file can contain the "
-        f"name: {names}; the next full fetch removes it from the cache"
-    )
 
 
 def select_non_defaults(whole: ParamSet, described: Mapping[str, int | float]) -> ParamSet:

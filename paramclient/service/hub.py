@@ -16,19 +16,16 @@ import anyio
 import anyio.abc
 import anyio.lowlevel
 
-from paramclient.cache import SetupNotes
 from paramclient.client.arguments import address_in_words
 from paramclient.client.cache_writer import choose_cache
 from paramclient.client.client import ParamClient, local_client
 from paramclient.client.worker_thread import Worker
 from paramclient.documents.component import ProgressDoc
 from paramclient.documents.extended_results import ExtFetchResultDoc
-from paramclient.documents.job import progress_text
 from paramclient.documents.results import FetchResultDoc
 from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata.metadata_cache import MetadataStore
-from paramclient.model.notation import time_text
 from paramclient.protocol.no_reply_hint import hint_of_link
 from paramclient.protocol.vehicle_selection import LOOK_TIME, VehicleChoice
 from paramclient.service.event_feed import EventFeed
@@ -45,7 +42,7 @@ from paramclient.service.quota import (
 )
 
 if TYPE_CHECKING:
-    from paramclient.cache import InterruptedSetup, ParamCache, RunningSetup
+    from paramclient.cache import ParamCache
     from paramclient.sim import Endpoint
 
 __all__ = ["Hub"]
@@ -88,7 +85,6 @@ class Hub:
         long_requests: quota of long requests.
         waiting_requests: quotas of requests that wait for a vehicle, the cache or a comparison, by whether
             the client may write: no number of readers can keep a writer out.
-        fleet_comparisons: limits the fleet comparisons in the thread of the cache to one.
 
     Raises:
         UsageError: a link or option is invalid, or two links have one name.
@@ -125,10 +121,8 @@ class Hub:
             )
             for may_write in (False, True)
         }
-        self.fleet_comparisons = anyio.Semaphore(1)
         self._closing = anyio.Event()
         self.metadata_store = None if self.cache is None else MetadataStore.beside(self.cache.path)
-        self._setups = None if self.cache is None else SetupNotes.beside(self.cache.path)
         self._tasks: anyio.abc.TaskGroup | None = None
         self._link_tasks: anyio.abc.TaskGroup | None = None
         for link in links:
@@ -162,7 +156,6 @@ class Hub:
         tasks = self._tasks = anyio.create_task_group()
         await tasks.__aenter__()
         self.jobs.open(tasks)
-        await self._load_interrupted_setups()
         tasks.start_soon(self.feed.wake_listeners, name="paramclient feed")
         link_tasks = self._link_tasks = anyio.create_task_group()
         await link_tasks.__aenter__()
@@ -178,8 +171,6 @@ class Hub:
         assert link_tasks is not None
         self.feed.end()
         self._closing.set()
-        if self._owns_cache and self.cache is not None:
-            self.cache.limit_lock_waits(CLOSING_LOCK_WAIT)
         self._reader.drop(_closing)
         self._encoder.drop(_closing)
         try:
@@ -204,31 +195,6 @@ class Hub:
         """
         self._check_open()
         return await self._worker.run(work)
-
-    async def record_setup(self, job: Job) -> RunningSetup | None:
-        """Record in the cache that a set-up starts. None without a cache.
-
-        Raises:
-            CacheError: the record cannot be written.
-        """
-        notes = self._setups
-        if notes is None:
-            return None
-        (system, component), key = job.followed.address, job.followed.key
-        begin = partial(
-            notes.begin, system=system, component=component, requested_by=job.requested_by, key=key
-        )
-        return await self.run_in_thread(lambda: begin(job.id, job.kind, link=job.followed.link.name))
-
-    async def end_setup_record(self, note: RunningSetup, *, is_cut_off: bool) -> None:
-        """Record that a set-up has ended, or is interrupted by the end of the service. Not interrupted by
-        cancellation."""
-        with anyio.CancelScope(shield=True):
-            await self._worker.run(note.cut_off if is_cut_off else note.end)
-
-    async def interrupted_setups(self) -> list[InterruptedSetup]:
-        """Return the recorded set-ups that were interrupted."""
-        return [] if self._setups is None else await self.run_in_thread(self._setups.cut_off)
 
     async def run_in_file_thread(self, work: Callable[[], Result]) -> Result:
         """Run work on received data in a thread of its own: parsing or comparing can take seconds, and must
@@ -448,20 +414,6 @@ class Hub:
         if self._fetches and is_due and not client.station.listens_only:
             with suppress(ServiceError):  # the maximum number of jobs is running
                 self.start_fetch(followed, SERVICE_AUTHOR)
-
-    async def _load_interrupted_setups(self) -> None:
-        """Load the set-ups that the end of the last run interrupted, and log them."""
-        notes = self._setups
-        if notes is None:
-            return
-        self.jobs.cut_off = await self._worker.run(lambda: notes.cut_off(mark_reported=True))
-        for each in self.jobs.cut_off:
-            if not each.is_reported:
-                logger.warning(
-                    "%s of %d/%d on %s, started by %s at %s, was cut off %s by the end of the service",
-                    *("a restore" if each.kind == "restore" else "an apply", each.system, each.component),
-                    *(each.link, each.requested_by, time_text(each.began), progress_text(each)),
-                )
 
     async def _load_cached(self, followed: FollowedComponent) -> None:
         """Load the times of cached values and the descriptions of the parameters."""

@@ -6,7 +6,6 @@ import logging
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Final, Literal
 
 import anyio
@@ -18,7 +17,6 @@ from paramclient.errors import ParamClientError
 from paramclient.service.problems import ServiceError, problem_of
 
 if TYPE_CHECKING:
-    from paramclient.cache import InterruptedSetup
     from paramclient.service.event_feed import EventFeed
     from paramclient.service.followed_component import FollowedComponent
 
@@ -133,13 +131,9 @@ class Jobs:
 
     Args:
         feed: the event feed.
-
-    Attributes:
-        cut_off: set-ups that were interrupted by the end of an earlier run of the service.
     """
 
     def __init__(self, feed: EventFeed) -> None:
-        self.cut_off: Sequence[InterruptedSetup] = ()
         self._feed = feed
         self._jobs: dict[str, Job] = {}
         self._tasks: anyio.abc.TaskGroup | None = None
@@ -157,8 +151,7 @@ class Jobs:
     def document_factories(self) -> list[Callable[[], JobDoc]]:
         """Return functions that create the documents of all jobs for a list, the oldest first; see
         `Job.document_factory`."""
-        cut_off = [partial(JobDoc.of_cut_off, note) for note in self.cut_off]
-        return [*cut_off, *(job.document_factory(in_list=True) for job in self._jobs.values())]
+        return [job.document_factory(in_list=True) for job in self._jobs.values()]
 
     def document_factory(self, name: str) -> Callable[[], JobDoc]:
         """Return a function that creates the document of the job with this id.
@@ -166,9 +159,6 @@ class Jobs:
         Raises:
             ServiceError: the job is unknown.
         """
-        for note in self.cut_off:
-            if note.id == name:
-                return partial(JobDoc.of_cut_off, note)
         return self.find(name).document_factory()
 
     def start(

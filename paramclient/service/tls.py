@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NoReturn
 
-from paramclient.cache.file_ownership import OTHERS_WRITE, has_trusted_owner, mode_of, open_regular
+from paramclient.client.file_ownership import OTHERS_WRITE, has_trusted_owner, mode_of, open_regular
 from paramclient.errors import UsageError
 
 __all__ = ["Tls", "tls_of"]

@@ -58,7 +58,7 @@ def keep(
 ) -> None:
     """Store a table in the cache."""
     params = [
-        StoredParam(
+        StoredParam.of(
             Param(
                 name, value, number, index, bits_of(value, number), default=default[0] if default else None
             ),

@@ -1,4 +1,4 @@
-"""--vehicle and nicknames: a vehicle by address, kind, nickname or hardware id, on links and in the cache."""
+"""--vehicle: a vehicle by address, kind or hardware id, on links and in the cache."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from typing import Any
 
 import pytest
 
-from paramclient import CacheError, ParamCache, UnknownVehicle, UsageError
-from paramclient.cache.nicknames import Nicknames, check_nickname
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
 from tests.commands import Command, Put, behind, in_process, leaping
 
@@ -104,7 +102,7 @@ def test_kinds_and_addresses_in_the_cache(command: Command, put: Put) -> None:
         (["--vehicle", "4/300"], "system and component ids are 1 to 255"),
         (["--vehicle", "0"], "system and component ids are 1 to 255"),
         (["--vehicle", "tractor"], "vehicle tractor is not in the cache"),
-        (["--vehicle", "tractor", "--no-cache"], "nicknames and hardware ids are looked up in the cache"),
+        (["--vehicle", "tractor", "--no-cache"], "hardware ids are looked up in the cache"),
     ],
 )
 def test_names_that_name_nothing(command: Command, put: Put, words: list[str], reason: str) -> None:
@@ -117,38 +115,3 @@ def test_history_needs_a_vehicle(command: Command) -> None:
     failed = command("history")
     assert (failed.code, failed.out) == (2, "")
     assert "VEHICLE is missing: a vehicle in the cache" in failed.err
-
-
-@pytest.mark.parametrize(
-    "text", ["", "1a", "a b", "a:b", "a" * 33, "cafe", "Beef00", "PX4", "ardupilot", "system", "é"]
-)
-def test_names_that_are_no_nickname(text: str) -> None:
-    with pytest.raises(UsageError, match="nickname"):
-        check_nickname(text)
-
-
-@pytest.mark.parametrize("text", ["a", "tractor", "T-2_b", "caf", "z" * 32])
-def test_names_that_may_be_a_nickname(text: str) -> None:
-    assert check_nickname(text) == text
-
-
-@pytest.mark.parametrize("content", ["", "[]", '{"a": 1}', "{"])
-def test_a_damaged_file_of_nicknames_is_kept_and_reported(cache: Path, content: str) -> None:
-    path = cache.with_suffix(".nicknames")
-    path.write_text(content)
-    names = Nicknames.beside(cache)
-    with pytest.raises(CacheError, match=r"cache\.nicknames"):
-        names.set("uid:1", "tractor")
-    assert path.read_text() == content
-    with ParamCache(cache) as kept, pytest.raises(CacheError):
-        kept.components("tractor")
-
-
-def test_the_file_of_nicknames_is_private(cache: Path) -> None:
-    names = Nicknames.beside(cache)
-    names.set("uid:1", "tractor")
-    assert names.load() == {"tractor": "uid:1"}
-    assert names.path.stat().st_mode & 0o077 == 0
-    assert [each.name for each in cache.parent.iterdir()] == ["cache.nicknames"]
-    with ParamCache(cache) as kept, pytest.raises(UnknownVehicle):
-        kept.set_nickname("4", "plough")

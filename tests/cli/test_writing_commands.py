@@ -71,7 +71,7 @@ def words(tmp_path: Path, cache: Path) -> Callable[[str], list[str]]:
     key.chmod(0o600)
     source = Identity(9, URL, "beef000000000009")
     values = [
-        StoredParam(Param(name, 7.5, ParamType.REAL32, index, bits_of(7.5, ParamType.REAL32)), NOW)
+        StoredParam.of(Param(name, 7.5, ParamType.REAL32, index, bits_of(7.5, ParamType.REAL32)), NOW)
         for index, name in enumerate(TABLE)
     ]
     with ParamCache(cache) as kept:

@@ -122,19 +122,19 @@ async def test_values_that_could_not_be_written_are_written_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "cache"
-    do = SqliteStore.do
+    run = SqliteStore.run
 
-    def fail(*_: object) -> None:
+    def fail(*_: object, **options: object) -> None:
         raise CacheError("the disk is full")
 
     async with ParamClient(Camera(TABLE), cache=path) as client:
         ext = (await client.component(1, 100)).ext
         await anyio.sleep(3.0)  # it is known which vehicle it is
-        monkeypatch.setattr(SqliteStore, "do", fail)
+        monkeypatch.setattr(SqliteStore, "run", fail)
         await ext.fetch_all()
         await ext.set("CAM_MODE", 2)
         assert not await local(await client.component(1, 100)).client.cache_writer.flush()
-        monkeypatch.setattr(SqliteStore, "do", do)
+        monkeypatch.setattr(SqliteStore, "run", run)
     assert kept(path).params["CAM_MODE"].value == 2
     assert [record.levelno for record in caplog.records if record.name.startswith("paramclient.cl")] == [
         logging.WARNING
@@ -145,13 +145,13 @@ async def test_values_that_could_not_be_written_are_written_later(
 async def test_values_that_were_never_written_are_logged_at_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def fail(*_: object) -> None:
+    def fail(*_: object, **options: object) -> None:
         raise CacheError("the disk is full")
 
     async with ParamClient(Camera(TABLE), cache=tmp_path / "cache") as client:
-        monkeypatch.setattr(SqliteStore, "do", fail)
+        monkeypatch.setattr(SqliteStore, "run", fail)
         await (await client.component(1, 100)).ext.fetch_all()
-    assert "3 values and 0 earlier values" in caplog.records[-1].message
+    assert "the last values are lost" in caplog.records[-1].message
 
 
 @in_simulated_time

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
 
 from paramclient import Param, ParamCache, ParamType
-from paramclient.cache import HistoryEntry, UnixTimes
+from paramclient.cache import HistoryEntry
 from paramclient.client import suspend_detection
 from paramclient.client.cache_writer import CacheWriter
 from paramclient.client.link_task import LinkTask
@@ -148,17 +148,6 @@ def test_sleep_that_the_clock_leaves_out_makes_everything_older() -> None:
 
 
 # On the way to the cache
-
-
-def test_moments_become_unix_times() -> None:
-    times = UnixTimes(NOW + 10.0, NOW)
-    assert [times(moment) for moment in (1.0, 10.0, 11.0)] == [NOW + 1.0, NOW + 10.0, NOW + 10.0]
-    assert times(-2 * NOW) == 0.0
-
-
-def test_after_a_small_step_of_the_clock_nothing_is_older_than_what_was_written() -> None:
-    times = UnixTimes(NOW + 10.0, NOW - 1.0, since=8.0, not_before=NOW + 8.0)
-    assert [times(moment) for moment in (7.0, 8.0, 8.5, 9.5)] == [NOW + 6.0, NOW + 8.0, NOW + 8.0, NOW + 8.5]
 
 
 def test_an_interruption_between_two_clocks_is_no_difference() -> None:
@@ -350,7 +339,7 @@ class Programs(RuleBasedStateMachine):
             assert self.so_at(name, at) == param.value, f"{name} was not {param.value!r} at {at - NOW}"
             assert at >= NOW + self.reported.get(name, 0.0) - 1e-6, "the latest observation counts"
         for name in NAMES:
-            self.check_lines(name, cached.history(name))
+            self.check_lines(name, self.opened[0].history(cached.key, name=name))
 
     def check_lines(self, name: str, lines: Sequence[HistoryEntry]) -> None:
         before: int | None = None

@@ -20,9 +20,8 @@ import anyio.lowlevel
 import pytest
 
 from paramclient import ParamCache, ParamClient
-from paramclient.cache import CachedComponent, TableUpdate
-from paramclient.client import cache_writer, link_task, loop_scheduler
-from paramclient.client.cache_writer import DOWNLOAD_INTERVAL, NEW_SHARE_MIN
+from paramclient.cache import CachedComponent
+from paramclient.client import link_task, loop_scheduler
 from paramclient.client.fetch_all import FleetFetch
 from paramclient.client.link_task import LOOP_LATENCY_MIN, TIMEOUT_DELAY_MAX, LinkTask
 from paramclient.client.loop_scheduler import TURN_MAX
@@ -666,36 +665,6 @@ async def test_a_link_that_was_closed_leaves_nothing_behind_whichever_of_its_tas
         assert readers.most_lists("another", 0, anyio.current_time()) == math.inf
 
 
-class Portions(ParamCache):
-    """One that notes what it is given at once."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self.given: list[dict[int, int]] = []
-
-    def save(self, update: object, *, clock: Callable[[], float] | None = None) -> None:
-        assert isinstance(update, list)
-        updates: list[TableUpdate] = update
-        self.given.append({each.identity.system: len(each.params) for each in updates})
-        super().save(updates, clock=clock)
-
-
-@in_simulated_time
-async def test_new_tables_are_written_in_portions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No transaction begins another table when it has enough: to gather one takes the loop's time."""
-    monkeypatch.setattr(cache_writer, "TRANSACTION_PARAMS", 200)
-    monkeypatch.setattr(cache_writer, "CACHE_FLUSH_INTERVAL", 1000.0)  # everything on closing
-    vehicles = [small(system) for system in range(1, 8)]
-    cache = Portions(tmp_path / "cache.sqlite3")
-    with cache:
-        async with ParamClient(Air.symmetric(vehicles), cache=cache) as client:
-            await client.fetch_all()
-            assert not cache.given
-        assert [sum(each.values()) for each in cache.given] == [300, 300, 300, 150]
-        assert sorted(system for each in cache.given for system in each) == [*range(1, 8)]
-        assert len(cache.components()) == 7
-
-
 class Busy(Tap):
     """A vehicle that does nothing for a while when its parameters are requested: it has others to see to.
 
@@ -755,28 +724,3 @@ async def test_a_component_without_heartbeats_is_waited_for_until_it_is_lost() -
         everything = await client.fetch_all()
         assert everything.complete
         assert everything.results.keys() == {(1, 1), (2, 1), (3, 1)}
-
-
-@pytest.mark.parametrize("few", [0, 8])
-@pytest.mark.parametrize("seconds", [5, 40])
-@in_simulated_time
-async def test_tables_that_are_fetched_in_numbers_are_written_once_or_in_growing_parts(
-    tmp_path: Path, seconds: int, few: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each part costs as much as all of the table: so half of it must be new."""
-    monkeypatch.setattr(cache_writer, "UNBATCHED_FETCHES_MAX", few)
-    vehicles: list[Vehicle] = []
-    for system in range(1, 13):
-        table = [SimParam(f"P_{index:03}", ParamType.INT32, index) for index in range(200)]
-        vehicles.append(PX4Vehicle(system=system, table=table, burst=1, period=seconds / 200))
-    cache = Portions(tmp_path / "cache.sqlite3")
-    with cache:
-        async with ParamClient(Air.symmetric(vehicles), cache=cache) as client:
-            assert (await client.fetch_all()).complete
-    for system in range(1, 13):
-        sizes = [each[system] for each in cache.given if each.get(system)]
-        assert sizes[-1] == 200, "all of it, when it was fetched"
-        parts = sizes[:-1]
-        assert bool(parts) == (seconds > DOWNLOAD_INTERVAL)
-        for number, part in enumerate(parts):
-            assert part >= NEW_SHARE_MIN * sum(parts[: number + 1])

@@ -185,7 +185,9 @@ async def test_two_programs_share_vehicles_and_a_cache(tmp_path: Path) -> None:
             assert {name: param.bits for name, param in cached.params.items()} == {
                 name: param.bits for name, param in vehicle.params.items()
             }
-            changes = [(line.name, line.old.value, line.new and line.new.value) for line in cached.history()]
+            changes = [
+                (line.name, line.old.value, line.new and line.new.value) for line in cache.history(cached.key)
+            ]
             for name, before, after in (("P_100", 100, 9), ("P_200", 200, 19)):
                 steps = [change[1:] for change in changes if change[0] == name]
                 assert steps[0][0] == before

@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from paramclient import ParamCache, ParamClient, UsageError
-from paramclient.cache import TableState
+from paramclient import ParamClient, UsageError
 from paramclient.errors import FileError
 from paramclient.files import FileFormat, dumps, loads
 from paramclient.model.paramset import ParamSet as Parameters
@@ -16,7 +15,6 @@ from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import ParamType, is_portable_name
 from paramclient.protocol.wire import NO_INDEX, ParamError, ParamSetMessage, ParamValue, encode
 from paramclient.sim import ArduPilotVehicle, GenericVehicle
-from tests.caches import stored, update
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import in_simulated_time
 from tests.simulation import PEER, Simulation, known, param_value
@@ -149,33 +147,6 @@ def test_a_forged_value_blocks_no_export(command: Command, put: Put, tmp_path: P
         saved = command("save", put(vehicle), path := tmp_path / form, "--format", form, "--no-cache")
         assert saved.code == 0, saved.err
         assert [*loads(path.read_bytes()).sets[0]] == ["A", "B"]
-
-
-def test_an_unusable_name_in_the_cache_blocks_no_export_and_leaves_with_the_next_fetch(
-    command: Command, put: Put, tmp_path: Path
-) -> None:
-    path = tmp_path / "cache.sqlite3"
-    vehicle = GenericVehicle({"A": (ParamType.INT32, 1), "B": (ParamType.INT32, 2)})
-    assert command("fetch", put(vehicle), "--cache", path).code == 0
-    with ParamCache(path) as cache:
-        [known_vehicle] = cache.vehicles()
-        identity = known_vehicle.identity
-        at = known_vehicle.last_seen
-        state = TableState(count=2, complete=True)
-        cache.save(update(stored("A\nB", 5, at=at), identity=identity, autopilot=0, at=at, table=state))
-        made = cache.snapshot(identity.key, 1, reason="test")
-        kept = cache.component()
-        assert ([*kept.params], kept.left_out, kept.complete) == (["A", "B"], ("A\nB",), True)
-        assert [*cache.state_at(identity.key, 1, made.id)] == ["A", "B"]
-    saved = command("save", "cache:1", tmp_path / "a.params", "--cache", path)
-    assert (saved.code, [*loads((tmp_path / "a.params").read_bytes()).sets[0]]) == (0, ["A", "B"])
-    assert "skipped, because no parameter file can contain the name: 'A\\nB'" in saved.err
-    assert r"'A\nB'" in command("show", "1", "--cache", path).err
-    assert command("fetch", put(vehicle), "--refresh", "--cache", path).code == 0
-    with ParamCache(path) as cache:
-        assert cache.component().left_out == ()
-        [line] = cache.history(identity.key, name="A\nB")
-        assert line.new is None
 
 
 def test_a_check_names_them(command: Command, put: Put) -> None:

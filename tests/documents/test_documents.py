@@ -15,17 +15,11 @@ from pathlib import Path
 import pytest
 
 from paramclient.cache import (
-    FleetDiff,
-    FleetValue,
-    FleetVehicle,
     HistoryEntry,
-    Holder,
-    NameSpread,
     SnapshotSummary,
 )
 from paramclient.documents.diff import DiffDoc
 from paramclient.documents.document import Document
-from paramclient.documents.fleet import FleetDiffDoc
 from paramclient.documents.history import HistoryDoc, HistoryEntryDoc, SnapshotDoc
 from paramclient.documents.param import InfoDoc, InfosDoc, ParamDoc, ReadOutputDoc, WrittenParamDoc
 from paramclient.documents.paramset import FileDoc, FormatDoc, SetDoc, UploadedDoc
@@ -210,11 +204,6 @@ def documents() -> Iterator[Document]:
     yield HistoryDoc.of(
         [HistoryEntry(1.5, 1, "A", param("A", 1.0), param("A", b"\0\0\0\1", 99), "us")], exact=True
     )
-    vehicle = FleetVehicle(PX4.key, 1, True)
-    spread = NameSpread(
-        "A", left["B"], (FleetValue(param("A", 1.0), (Holder(vehicle, 1.5),), False),), (), ()
-    )
-    yield FleetDiffDoc.of(FleetDiff(1, (vehicle,), (spread,)))
     planned = plan(
         {"A": param("A", 1.0), "M": param("M", 3, ParamType.INT8)},
         ParamSet({each.name: each for each in (left["A"], left["B"], WrittenParam("M", 4.5))}),

@@ -31,7 +31,7 @@ def cache(tmp_path: Path) -> ParamCache:
 def hold(cache: ParamCache, param: Param, at: float, key: str = KEY) -> None:
     identity = Identity(7, "udpin:x", key.removeprefix("uid:"), autopilot=3, vehicle_type=2)
     cache.save(
-        [TableUpdate(identity=identity, component=1, autopilot=3, at=at, params=[StoredParam(param, at)])]
+        [TableUpdate(identity=identity, component=1, autopilot=3, at=at, params=[StoredParam.of(param, at)])]
     )
 
 
@@ -45,7 +45,7 @@ def test_values_and_changes_have_the_times_of_the_log(cache: ParamCache, tmp_pat
     assert table.params["ATC_RAT_RLL_P"].default == pytest.approx(0.135)
     assert table.heard_at["ATC_RAT_RLL_P"] == pytest.approx(BOOT + 60, abs=0.01)
     assert table.heard_at["ARMING_CHECK"] == pytest.approx(BOOT + 1, abs=0.01)
-    (line,) = table.history()
+    (line,) = cache.history(KEY)
     assert line.name == "ATC_RAT_RLL_P"
     assert line.old.value == pytest.approx(0.135)
     assert line.at == pytest.approx(BOOT + 60, abs=0.01)
@@ -63,7 +63,7 @@ def test_later_values_in_the_cache_are_kept_and_repetition_changes_nothing(
         assert table is not None
         assert table.params["ATC_RAT_RLL_P"].value == pytest.approx(0.3)
         assert table.params["ARMING_CHECK"].value == 1
-        states.append((dict(table.params), table.history()))
+        states.append((dict(table.params), cache.history(KEY)))
     assert states[0] == states[1]
 
 
@@ -81,7 +81,7 @@ def test_types_are_from_the_cached_table_then_from_other_vehicles(cache: ParamCa
         "ATC_RAT_RLL_P": ParamType.REAL32,
     }
     assert isinstance(table.params["SYSID_THISMAV"].value, int)
-    assert table.history() == []
+    assert cache.history(KEY) == []
     assert result.notes == ("the log has no types: 1 parameters that no cached table has are REAL32",)
 
 

@@ -291,7 +291,7 @@ def test_the_order_of_logs_does_not_matter(is_reversed: bool, tmp_path: Path) ->
 
 def save(cache: Path, at: float, *params: Param, by: str = BY_US, firmware: int = 8) -> None:
     identity = Identity(1, "udp", UID, firmware=firmware)
-    stored = [StoredParam(each, at, by=by) for each in params]
+    stored = [StoredParam.of(each, at, by=by) for each in params]
     with ParamCache(cache) as kept:
         kept.save(TableUpdate(identity=identity, component=1, autopilot=12, at=at, params=stored))
 
@@ -325,7 +325,7 @@ def test_a_name_removed_later_is_not_restored(tmp_path: Path) -> None:
     log = whole(A=1, OLD=2).write(tmp_path / "flight.tlog")
     save(cache, NOW + 100.0, known("A", 1), known("OLD", 2))
     who = Identity(1, "udp", UID)
-    gone = TableUpdate(identity=who, component=1, autopilot=12, at=NOW + 200.0, removed=("OLD",))
+    gone = TableUpdate(identity=who, component=1, autopilot=12, at=NOW + 200.0, removed={"OLD": NOW + 200.0})
     with ParamCache(cache) as kept:
         kept.save(gone)
     before = lines(cache)

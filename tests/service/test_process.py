@@ -116,7 +116,7 @@ async def test_serve_waits_for_a_vehicle_and_ends_cleanly(tmp_path: Path) -> Non
     with ParamCache(tmp_path / "cache") as cache:
         kept = cache.component(system=1)
         assert kept.params["PARAM_01"].value == 77
-        assert [each.by for each in kept.history("PARAM_01")] == ["us for local"]
+        assert [each.by for each in cache.history(kept.key, name="PARAM_01")] == ["us for local"]
 
 
 @pytest.mark.asyncio

@@ -17,8 +17,7 @@ import httpx
 import pytest
 
 from paramclient import ParamCache
-from paramclient.cache import FleetDiff, TableState, TableUpdate
-from paramclient.documents.fleet import FleetDiffDoc
+from paramclient.cache import TableState, TableUpdate
 from paramclient.files import FileFormat, dumps, loads
 from paramclient.links import SimLink
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -27,7 +26,6 @@ from paramclient.protocol import wire
 from paramclient.service import AccessSettings, Hub, Settings, Tokens, create_app
 from paramclient.service.body_limits import LINE_BYTES_MAX, PARAM_FILE_BYTES_MAX
 from paramclient.service.quota import LONG_REQUESTS_OF_HOLDER_MAX
-from paramclient.service.routes import history as history_room
 from paramclient.service.routes.param_files import file_response
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.sim.vehicle import Vehicle
@@ -722,61 +720,6 @@ async def test_without_a_cache_nothing_is_known_of_earlier_times() -> None:
         for path in (f"{HERE}/history", f"{HERE}/snapshots", f"{HERE}/state?at=5", "/api/v1/vehicles"):
             assert (await service.get(path, 409))["type"] == "urn:paramclient:no-cache"
         assert (await service.post(f"{HERE}/restore", {}, 409))["type"] == "urn:paramclient:no-cache"
-
-
-@in_simulated_time
-async def test_vehicles_are_compared_with_each_other(tmp_path: Path) -> None:
-    async with serving(px4(), px4(system=2), px4(system=3), place=tmp_path) as service:
-        await service.ask("PUT", f"{HERE}/params/MODE", json={"value": 5})
-        spread = await service.post("/api/v1/fleet/diff", {"names": ["MODE", "TUNE_0?"]})
-        odd = [each for each in spread["names"] if each["different"]]
-        assert [each["name"] for each in odd] == ["MODE"]
-        assert [(value["value"], value["agrees"]) for value in odd[0]["values"]] == [(3, True), (5, False)]
-        wanted = await service.post("/api/v1/fleet/diff", {"values": {"MODE": 5}})
-        assert [len(value["vehicles"]) for value in wanted["names"][0]["values"]] == [2, 1]
-        file = await service.post("/api/v1/fleet/diff", {"file": {"name": "a.param", "text": "MODE,3\n"}})
-        assert file["different"] is True
-        assert (await service.post("/api/v1/fleet/diff", {}, 422))["status"] == 422
-
-
-@pytest.mark.parametrize(
-    "requested",
-    [{"names": ["TUNE_0?", "MODE", "T*_02"]}, {"values": {"TUNE_03": 1, "MODE": 5, "NO_SUCH": 2}}],
-)
-@in_simulated_time
-async def test_vehicles_are_compared_in_parts(
-    requested: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As a whole and name by name gives the same; what is too large is not even begun."""
-    parts: list[int] = []
-
-    def noted(*given: Any, **options: Any) -> FleetDiff:
-        found = compare(*given, **options)
-        parts.append(len(found.names))
-        return found
-
-    compare = ParamCache.fleet_diff
-    monkeypatch.setattr(ParamCache, "fleet_diff", noted)
-    async with serving(px4(), px4(system=2), px4(system=3), place=tmp_path) as service:
-        await service.ask("PUT", f"{HERE}/params/MODE", json={"value": 5})
-        whole = await service.post("/api/v1/fleet/diff", requested)
-        count = len(whole["names"])
-        assert count >= 3
-        assert parts == [count]
-        with ParamCache(tmp_path / "cache.sqlite3") as cache:
-            wanted = requested.get("names") or ParamSet(
-                {name: WrittenParam(name, value) for name, value in requested["values"].items()}
-            )
-            assert whole == FleetDiffDoc.of(compare(cache, wanted)).as_json()
-        parts.clear()
-        monkeypatch.setattr(history_room, "FLEET_CELLS_OF_PART", 5)
-        assert await service.post("/api/v1/fleet/diff", requested) == whole
-        assert parts == [1] * count
-        parts.clear()
-        monkeypatch.setattr(history_room, "FLEET_CELLS_MAX", 3 * count - 1)
-        reported = await service.post("/api/v1/fleet/diff", requested, 413)
-        assert f"At most {count - 1} names can be compared among 3 vehicles" in reported["detail"]
-        assert not parts
 
 
 # descriptions

@@ -400,24 +400,16 @@ def _begin(
             if progress.row is not None:
                 rows[progress.row.name] = progress.row.so_far
             job.progress = ApplyProgressDoc.of(progress)
-            if note is not None and not hub.is_closing:  # failures after this are not recorded
-                note.note(done=progress.done, total=progress.total, key=target.key)
             now = anyio.current_time()
             if progress.phase != published_phase or now >= published_at + SETUP_PROGRESS_INTERVAL:
                 published_at, published_phase = now, progress.phase
                 hub.jobs.publish(job)
 
-        note = await hub.record_setup(job)
-        is_whole = False
         try:
             result = await work(publish_progress)
-            is_whole = result.error is None
         except anyio.get_cancelled_exc_class():
             job.result = InterruptedDoc.of(rows.values(), system=system, component=component)
             raise
-        finally:
-            if note is not None:
-                await hub.end_setup_record(note, is_cut_off=hub.is_closing and not is_whole)
         vehicle = ReceiverDoc.at(system, component, target.component.identity)
         problem = None if result.error is None else problem_of(result.error)
         return ApplyResultDoc.of(

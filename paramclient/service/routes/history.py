@@ -3,47 +3,37 @@ cache."""
 
 from __future__ import annotations
 
-import glob
-import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from paramclient.cache import HISTORY_ENTRIES_MAX, FleetDiff, HistoryEntry, InterruptedSetup
+from paramclient.cache import HISTORY_ENTRIES_MAX, HistoryEntry
 from paramclient.documents.cached import CachedTableDoc, VehicleDoc, VehiclesDoc
-from paramclient.documents.document import Body, InParts
+from paramclient.documents.document import Body
 from paramclient.documents.extended_output import ExtHistoryDoc
-from paramclient.documents.fleet import FleetDiffDoc, NameSpreadDoc
 from paramclient.documents.history import HistoryDoc, SnapshotDoc, SnapshotsDoc, WholeSnapshotDoc
 from paramclient.documents.paramset import SetDoc, StateDoc
-from paramclient.errors import UsageError
 from paramclient.files import FileFormat
-from paramclient.files.param_file import AUTOPILOT
-from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import check_name
 from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.hub import Hub
 from paramclient.service.param_sources import (
     EarlierState,
-    LimitedPatterns,
     Timestamp,
-    UploadedFile,
     flush_cache,
     load_cached_state,
     load_cached_table,
     load_last_restore_point,
     load_state,
     read_cache,
-    read_file,
     require_cache,
     wait_for_key,
 )
 from paramclient.service.problems import ServiceError
-from paramclient.service.request_body import BodyRoute, long_request
-from paramclient.service.responses import document_response, pack_entries, packed_response
+from paramclient.service.request_body import BodyRoute
+from paramclient.service.responses import document_response
 from paramclient.service.route_context import HubArgument, Target, require_write, run_until_disconnect
 from paramclient.service.routes.param_files import Format, From, file_response, parse_state
 
@@ -55,14 +45,6 @@ HISTORY_PAGE_LINES_MAX: Final = 1_000
 """Maximum number of lines of history in a response."""
 HISTORY_PAGE_LINES: Final = 100
 """Default number of lines of history in a response."""
-FLEET_NAMES_MAX: Final = 1_000
-"""Maximum number of names and patterns of a fleet comparison."""
-FLEET_CELLS_MAX: Final = 160_000
-"""Maximum of names times vehicles of a fleet comparison: its response has up to 31 MB, and our client reads
-32 MiB."""
-FLEET_CELLS_OF_PART: Final = 10_000
-"""Names times vehicles that are compared at once: they take 10 MB."""
-
 Key = Annotated[str, Path(max_length=400, description="Key of the vehicle in /vehicles, percent-encoded.")]
 Id = Annotated[int, Path(ge=1, le=255)]
 Snapshot = Annotated[int, Path(ge=1, lt=1 << 62)]
@@ -83,30 +65,6 @@ class SnapshotRequest(Body):
     """Reason of a snapshot."""
 
     reason: Annotated[str, Field(min_length=1, max_length=200)]
-
-
-class FleetDiffRequest(Body):
-    """Names and patterns to compare, or the wanted values in a file or in `values`."""
-
-    names: (
-        Annotated[
-            tuple[Annotated[str, Field(min_length=1, max_length=64)], ...],
-            Field(max_length=FLEET_NAMES_MAX, fail_fast=True),
-            LimitedPatterns,
-        ]
-        | None
-    ) = None
-    file: UploadedFile | None = None
-    values: (
-        Annotated[dict[str, int | float], InParts, Field(min_length=1, max_length=FLEET_NAMES_MAX)] | None
-    ) = None
-    component: Annotated[int, Field(ge=1, le=255)] | None = None
-
-    @model_validator(mode="after")
-    def _is_one(self) -> FleetDiffRequest:
-        if sum(each is not None for each in (self.names, self.file, self.values)) != 1:
-            raise ValueError("a fleet comparison needs exactly one of `names`, `file` and `values`")
-        return self
 
 
 # connected components
@@ -289,56 +247,6 @@ async def kept_file(
     return await file_response(hub, await load_cached_state(hub, key, component, when), file_format)
 
 
-@router.post("/fleet/diff", response_model=FleetDiffDoc)
-async def fleet_diff(request: Request, hub: HubArgument, body: FleetDiffRequest) -> Response:
-    """Compare all vehicles in the cache with each other, or with wanted values."""
-    with long_request(request):
-        return await run_until_disconnect(request, lambda: _fleet_diff(hub, body))
-
-
-async def _fleet_diff(hub: Hub, body: FleetDiffRequest) -> Response:
-    cache = require_cache(hub)
-    wanted: dict[str, WrittenParam] | None = None
-    number = body.component or AUTOPILOT
-    if body.file is not None:
-        chosen = (await read_file(hub, body.file.read)).choose(body.component)
-        number = body.component or chosen.component or AUTOPILOT
-        wanted = dict(chosen)
-    elif body.values is not None:
-        wanted = {name: WrittenParam(check_name(name), value) for name, value in body.values.items()}
-    requested = tuple(wanted if wanted is not None else map(check_name, body.names or ()))
-    if not requested:
-        raise UsageError("give the names of the parameters to compare")
-    await flush_cache(hub)
-    await hub.run_in_thread(cache.components)  # raises an error for an unreadable cache
-    patterns = requested if wanted is None else ()
-    vehicles, names = await read_cache(hub, lambda: cache.fleet_names(patterns, component=number))
-    names = names if wanted is None else list(wanted)
-    if vehicles * len(names) > FLEET_CELLS_MAX:
-        few = FLEET_CELLS_MAX // vehicles
-        what = f"At most {few} names can be compared among {vehicles} vehicles."
-        raise ServiceError(413, "too-large", what, most=FLEET_CELLS_MAX)
-
-    def compare(some: list[str]) -> FleetDiff:
-        if wanted is None:
-            return cache.fleet_diff(map(glob.escape, some), component=number)
-        return cache.fleet_diff(ParamSet({name: wanted[name] for name in some}), component=number)
-
-    is_different, parts = False, []
-    size = max(1, FLEET_CELLS_OF_PART // vehicles)
-    for start in range(0, len(names), size):
-        async with hub.fleet_comparisons:  # other accesses to the cache wait for one part at most
-            found = await read_cache(hub, partial(compare, names[start : start + size]))
-        is_different = is_different or found.differs
-        parts.append(await hub.run_in_file_thread(partial(_pack, found)))
-    head = FleetDiffDoc(component=number, vehicles=vehicles, different=is_different, names=[])
-    return packed_response(head, parts)
-
-
-def _pack(found: FleetDiff) -> bytes:
-    return pack_entries(map(NameSpreadDoc.of, found.names))
-
-
 async def _key(hub: Hub, target: FollowedComponent) -> str:
     """Return the key of a component with a table in the cache, after all received values are in the cache.
 
@@ -380,11 +288,8 @@ async def _page(
     if before is not None:
         lines = [line for line in lines if line.at < before]
     page = lines[-limit:]
-    cut_off = [] if name is not None else await _cut_off(hub, key, component, since, before)
     if len(page) == len(lines):
-        return await document_response(
-            hub.run_in_thread, partial(HistoryDoc.of, page, exact=True, cut_off=cut_off)
-        )
+        return await document_response(hub.run_in_thread, partial(HistoryDoc.of, page, exact=True))
     if before is None and lines[0].at == page[0].at:  # older lines may have the same time
         lines = await hub.run_in_thread(
             lambda: cache.history(key, component, name, HISTORY_ENTRIES_MAX, since)
@@ -392,25 +297,8 @@ async def _page(
     oldest = page[0].at
     page = [*_same_moment(lines[: len(lines) - len(page)], oldest), *page]
     if len(page) == len(lines):
-        return await document_response(
-            hub.run_in_thread, partial(HistoryDoc.of, page, exact=True, cut_off=cut_off)
-        )
-    cut_off = [note for note in cut_off if note.at >= oldest]
-    return await document_response(
-        hub.run_in_thread, partial(HistoryDoc.of, page, exact=True, before=oldest, cut_off=cut_off)
-    )
-
-
-async def _cut_off(
-    hub: Hub, key: str, component: int, since: float | None, before: float | None
-) -> list[InterruptedSetup]:
-    """Return the interrupted set-ups of a component within a period."""
-    begin, end = -math.inf if since is None else since, math.inf if before is None else before
-    return [
-        note
-        for note in await hub.interrupted_setups()
-        if (note.key, note.component) == (key, component) and begin <= note.at < end
-    ]
+        return await document_response(hub.run_in_thread, partial(HistoryDoc.of, page, exact=True))
+    return await document_response(hub.run_in_thread, partial(HistoryDoc.of, page, exact=True, before=oldest))
 
 
 def _same_moment(lines: Sequence[HistoryEntry], at: float) -> Sequence[HistoryEntry]:

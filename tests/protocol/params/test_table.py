@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 
-from paramclient.cache import ObservedParams, StoredParam, UnixTimes
 from paramclient.model.px4_hash import hash_params
 from paramclient.model.values import Encoding, Param, ParamType, Trust, as_reported
 from paramclient.protocol.params import table as room
@@ -393,12 +392,10 @@ HALF = 0x3F000000
 """The bits of 0.5."""
 
 
-def rows_of(table: Table) -> dict[str, int | None]:
-    """The defaults that the cache makes of all that it is given of a table."""
-    overwritten = [StoredParam(each.param, 1.0, by=each.by) for each in table.overwritten]
-    times = UnixTimes(1.0)
-    received = ObservedParams(table.params.copy(), times, volatile=None, by={}, overwritten=overwritten)
-    return {f"{item.name} {item.type}": item.default_bits for item in received}
+def rows_of(table: Table) -> dict[str, float | None]:
+    """The defaults of all values that the cache is given of a table, by name and type."""
+    params = [each.param for each in table.overwritten] + list(table.params.values())
+    return {f"{param.name} {param.type_number}": param.default for param in params}
 
 
 def test_an_overwritten_value_keeps_the_default_of_its_type() -> None:
@@ -410,13 +407,13 @@ def test_an_overwritten_value_keeps_the_default_of_its_type() -> None:
     assert change.new is not None
     assert (change.old.default, change.new.default) == (None, 0.5)
     assert [(each.param.value, each.param.default) for each in table.overwritten] == [(5, None)]
-    assert rows_of(table) == {"A 2": None, "A 9": HALF}
+    assert rows_of(table) == {"A 2": None, "A 9": 0.5}
     change = table.store_value(param_value("A", 6, index=0, kind=ParamType.INT8), "us")
     assert change is not None
     assert change.old is not None
     assert change.old.default == 0.5
     table.overwritten = table.overwritten[1:]
-    assert rows_of(table) == {"A 9": HALF, "A 2": None}
+    assert rows_of(table) == {"A 9": 0.5, "A 2": None}
 
 
 def test_a_default_of_an_older_file_with_another_type_is_ignored() -> None:

@@ -1,0 +1,245 @@
+"""History of tables: lines of changes, earlier states, and the insertion of earlier observations by time.
+
+A line connects two observations: of the old value, last at `old_at`, and of the new one, first at `at`. A
+name that appears in a table that was complete before has a line without an old value, which readers of the
+history do not see. Each function runs in a transaction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from operator import attrgetter, itemgetter
+from typing import Any, Final, NamedTuple
+
+from paramclient.cache.records import BY_VEHICLE, ExtHistoryEntry, HistoryEntry, StoredParam, StoredValue
+from paramclient.cache.schema import Transaction
+
+__all__ = [
+    "HISTORY_ENTRIES_MAX",
+    "Line",
+    "add_lines",
+    "insert_observations",
+    "last_removal",
+    "load_history",
+    "load_lines",
+    "values_at",
+]
+
+HISTORY_ENTRIES_MAX: Final = 10_000
+"""Maximum number of history lines of each table, the newest: about 1 MB, and years of tuning by hand."""
+SAME_CHANGE_MAX: Final = 2.0
+"""Maximum seconds between the times of one change in the cache and in a log: the cache may have received it
+later, or from another link."""
+
+_OLD: Final = "old_type, old_value, old_is_raw"
+_LINE: Final = f"at, name, author, old_at, {_OLD}, new_type, new_value, new_is_raw"
+
+
+class Line(NamedTuple):
+    """A line of history as it is stored.
+
+    Attributes:
+        at: time of the first observation of the new value.
+        name: param_id.
+        by: author of the change.
+        old_at: time of the last observation of the old value, or None.
+        old: the old value; None if the name appeared in a complete table.
+        new: the new value; None if the vehicle no longer has the parameter.
+    """
+
+    at: float
+    name: str
+    by: str
+    old_at: float | None
+    old: StoredValue | None
+    new: StoredValue | None
+
+
+def add_lines(tx: Transaction, owner: int, lines: Iterable[Line]) -> None:
+    """Add history lines, and delete the oldest beyond `HISTORY_ENTRIES_MAX`."""
+    rows = [
+        (owner, line.at, line.name, line.by, line.old_at, *(line.old or _NO_VALUE), *(line.new or _NO_VALUE))
+        for line in sorted(lines, key=attrgetter("at"))
+    ]
+    if not rows:
+        return
+    tx.many(f"INSERT INTO history (owner, {_LINE}) VALUES (?{', ?' * 10})", rows)
+    found = tx.all(
+        "SELECT at FROM history WHERE owner = ? ORDER BY at DESC, id DESC"
+        f" LIMIT 1 OFFSET {HISTORY_ENTRIES_MAX}",
+        (owner,),
+    )
+    for (at,) in found:
+        tx.do("DELETE FROM history WHERE owner = ? AND at <= ?", (owner, at))
+        tx.do(
+            "UPDATE component SET known_since = ? WHERE id = ? AND known_since < ?",
+            (at, owner, at),
+        )
+
+
+def load_lines(tx: Transaction, owner: int, name: str | None = None) -> list[Line]:
+    """Return the history lines of a table, or of one of its parameters, in the order of their times."""
+    where, values = ("", (owner,)) if name is None else (" AND name = ?", (owner, name))
+    found = tx.all(
+        f"SELECT {_LINE} FROM history WHERE owner = ?{where} ORDER BY at, id",
+        values,
+    )
+    return [_line(row) for row in found]
+
+
+def load_history(
+    tx: Transaction,
+    key: str,
+    component: int | None,
+    name: str | None,
+    limit: int | None,
+    since: float | None,
+    *,
+    extended: bool,
+) -> list[tuple[int, Line]]:
+    """Return the changes of a vehicle's values with their component ids, newest last."""
+    given = {"c.component = ?": component, "h.name = ?": name, "h.at >= ?": since}
+    conditions = {condition: value for condition, value in given.items() if value is not None}
+    found = tx.all(
+        f"SELECT {_LINE}, component"
+        " FROM history h JOIN component c ON c.id = h.owner"
+        " WHERE c.vehicle = ? AND c.extended = ? AND h.old_type IS NOT NULL"
+        f"{''.join(f' AND {condition}' for condition in conditions)}"
+        f" ORDER BY h.at DESC, h.id DESC{'' if limit is None or limit < 0 else f' LIMIT {int(limit)}'}",
+        (key, int(extended), *conditions.values()),
+    )
+    return [(component, _line(row)) for *row, component in reversed(found)]
+
+
+def plain_entry(component: int, line: Line) -> HistoryEntry:
+    """Return a line of a plain parameter as users see it."""
+    assert line.old is not None
+    new = None if line.new is None else line.new.param(line.name)
+    return HistoryEntry(line.at, component, line.name, line.old.param(line.name), new, line.by)
+
+
+def extended_entry(component: int, line: Line) -> ExtHistoryEntry:
+    """Return a line of an extended parameter as users see it."""
+    assert line.old is not None
+    new = None if line.new is None else line.new.ext_param(line.name)
+    return ExtHistoryEntry(line.at, component, line.name, line.old.ext_param(line.name), new, line.by)
+
+
+def last_removal(tx: Transaction, owner: int, name: str) -> float:
+    """Return the time of the last removal of a parameter; minus infinity if it was never removed."""
+    [(at,)] = tx.all(
+        "SELECT max(at) FROM history WHERE owner = ? AND name = ? AND new_type IS NULL", (owner, name)
+    )
+    return -math.inf if at is None else float(at)
+
+
+def values_at(
+    tx: Transaction, owner: int, rows: Mapping[str, StoredParam], when: float
+) -> dict[str, StoredValue]:
+    """Return the values that a table had at a time since which its states are known."""
+    values = {name: row.stored for name, row in rows.items()}
+    later = f"SELECT name, {_OLD} FROM history WHERE owner = ? AND at > ? ORDER BY at DESC, id DESC"
+    for name, *old in tx.all(later, (owner, when)):
+        value = _value(old)
+        if value is None:
+            values.pop(name, None)
+        else:
+            values[name] = value
+    return values
+
+
+def insert_observations(
+    tx: Transaction, owner: int, rows: Mapping[str, StoredParam], earlier: Sequence[StoredParam]
+) -> None:
+    """Insert observations that are earlier than the stored ones into the history, by time.
+
+    The lines of each parameter are computed anew from all of its observations: those of its lines, the stored
+    one, and these. Repeating the call changes nothing.
+
+    Args:
+        tx: the transaction.
+        owner: id of the table.
+        rows: its parameters.
+        earlier: the observations.
+    """
+    [(known_since,)] = tx.all("SELECT known_since FROM component WHERE id = ?", (owner,))
+    by_name: dict[str, list[StoredParam]] = {}
+    for item in earlier:
+        by_name.setdefault(item.name, []).append(item)
+    new_lines: list[Line] = []
+    for name, items in by_name.items():
+        lines, row = load_lines(tx, owner, name), rows.get(name)
+        if row is None and not lines:  # a name that the vehicle no longer had when its table was stored
+            continue
+        merged = _merged(name, lines, row, items, math.inf if known_since is None else known_since)
+        if merged != lines:
+            tx.do("DELETE FROM history WHERE owner = ? AND name = ?", (owner, name))
+            new_lines += merged
+    add_lines(tx, owner, new_lines)
+
+
+class _Point(NamedTuple):
+    """An observation of a parameter: its value, or None where it was missing."""
+
+    at: float
+    value: StoredValue | None
+    by: str
+
+
+def _merged(
+    name: str,
+    lines: Sequence[Line],
+    row: StoredParam | None,
+    items: Sequence[StoredParam],
+    known_since: float,
+) -> list[Line]:
+    """Return the lines of one parameter with further observations."""
+    points: list[_Point] = []
+    known: list[tuple[_Point, float]] = []  # and within how many seconds an observation is the same
+    first_value = lines[0].old if lines else row and row.stored
+    if first_value is not None and known_since < (lines[0].at if lines else math.inf):
+        points.append(_Point(known_since, first_value, BY_VEHICLE))  # the table was complete with it
+    for line in lines:
+        if line.old is not None and line.old_at is not None:
+            points.append(_Point(line.old_at, line.old, BY_VEHICLE))
+            known.append((points[-1], 0.0))
+        points.append(_Point(line.at, line.new, line.by))
+        known.append((points[-1], SAME_CHANGE_MAX))
+    if row is not None:
+        points.append(_Point(row.heard_at, row.stored, BY_VEHICLE))
+    points += [
+        _Point(item.heard_at, item.stored, item.by)
+        for item in items
+        if not any(
+            _is_same(point.value, item.stored) and abs(point.at - item.heard_at) <= tolerance
+            for point, tolerance in known
+        )
+    ]
+    points.sort(key=itemgetter(0))
+    has_appeared = bool(lines) and lines[0].old is None
+    first, *later = points
+    merged = [Line(first.at, name, first.by, None, None, first.value)] if has_appeared else []
+    last = first
+    for point in later:
+        if not _is_same(last.value, point.value):
+            old_at = None if last.value is None else last.at
+            merged.append(Line(point.at, name, point.by, old_at, last.value, point.value))
+        last = point
+    return merged
+
+
+def _is_same(one: StoredValue | None, other: StoredValue | None) -> bool:
+    return one is other or (one is not None and other is not None and one.is_same(other))
+
+
+def _line(cells: Sequence[Any]) -> Line:
+    at, name, author, old_at, *values = cells
+    return Line(at, name, author, old_at, _value(values[:3]), _value(values[3:]))
+
+
+def _value(cells: Sequence[Any]) -> StoredValue | None:
+    return None if cells[0] is None else StoredValue(*cells)
+
+
+_NO_VALUE: Final = (None, None, None)
