@@ -122,15 +122,9 @@ if TYPE_CHECKING:
         TrafficReport,
     )
     from paramclient.protocol.vehicle.address_contest import Contest
-    from paramclient.protocol.wire import (
-        AutopilotVersion,
-        Heartbeat,
-        Refusal,
-        SigningKey,
-        SigningPolicy,
-        SigningReport,
-        SigningStream,
-    )
+    from paramclient.wire.messages import AutopilotVersion, Heartbeat
+from paramclient.wire.signing import Refusal, SigningKey, SigningPolicy, SigningReport, SigningStream
+
 __all__ = [
     "Added",
     "Address",

@@ -22,7 +22,8 @@ from paramclient.client.local import local
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.identity import autopilot_name
 from paramclient.protocol.stats.traffic import ComponentTraffic, TrafficReport
-from paramclient.protocol.wire import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, enum_word
+from paramclient.wire.frames import enum_word
+from paramclient.wire.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS
 
 __all__ = ["link"]
 

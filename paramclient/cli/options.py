@@ -16,7 +16,7 @@ from paramclient.cli.vehicle_name import VehicleName
 from paramclient.client.signing import Signing, key_from_environment, read_key
 from paramclient.errors import UsageError
 from paramclient.model.values import Encoding
-from paramclient.protocol.wire import SigningKey, SigningPolicy
+from paramclient.wire.signing import SigningKey, SigningPolicy
 
 __all__ = [
     "CacheOptions",

@@ -29,7 +29,7 @@ from paramclient.protocol.no_reply_hint import hint_of_link
 from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.vehicle.kinds import kind_in_words
 from paramclient.protocol.vehicle_selection import LOOK_TIME
-from paramclient.protocol.wire import MAV_AUTOPILOT_INVALID
+from paramclient.wire.messages import MAV_AUTOPILOT_INVALID
 
 __all__ = [
     "Deadline",

@@ -31,19 +31,20 @@ from paramclient.errors import (
     VehicleError,
 )
 from paramclient.metadata.download import announced_metadata
-from paramclient.protocol.ftp import param_pck
+from paramclient.protocol import param_pck
 from paramclient.protocol.params.fetch_result import Progress
 from paramclient.protocol.params.file_download import PARAMETER_FILE, WITH_DEFAULTS
 from paramclient.protocol.stats.traffic import ComponentTraffic
-from paramclient.protocol.wire import (
-    AUTOPILOT_VERSION_ID,
+from paramclient.wire.frames import enum_word
+from paramclient.wire.messages import (
     CAPABILITY_FTP,
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_INVALID,
     MAV_CMD_REQUEST_MESSAGE,
     MAV_TYPE_GCS,
-    enum_word,
+    AutopilotVersion,
+    message_id,
 )
 
 __all__ = ["check_vehicle"]
@@ -177,7 +178,9 @@ class _Diagnosis:
             if not left:
                 break
             began = anyio.current_time()
-            command = machine.commands.begin(MAV_CMD_REQUEST_MESSAGE, (float(AUTOPILOT_VERSION_ID),), began)
+            command = machine.commands.begin(
+                MAV_CMD_REQUEST_MESSAGE, (float(message_id(AutopilotVersion)),), began
+            )
             what = f"COMMAND_ACK of {component.system}/{component.component}"
             try:
                 await self._local.wait(command, left, lambda what=what: (what, 0))  # type: ignore[misc]

@@ -11,11 +11,12 @@ from pydantic import Field
 from paramclient.documents.document import Document
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import rounded
-from paramclient.protocol.wire import MAV_TYPE_GCS, enum_word
+from paramclient.wire.frames import enum_word
+from paramclient.wire.messages import MAV_TYPE_GCS
 
 if TYPE_CHECKING:
     from paramclient.protocol.stats.traffic import ComponentTraffic, TrafficReport
-    from paramclient.protocol.wire import SigningReport
+    from paramclient.wire.signing import SigningReport
 
 __all__ = ["ComponentTrafficDoc", "MessageTrafficDoc", "RadioDoc", "SigningDoc", "TrafficDoc"]
 

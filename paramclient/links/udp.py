@@ -43,7 +43,8 @@ from paramclient.links.clock_offset import seconds_ahead
 from paramclient.links.link import OPEN_TIMEOUT, Address, Peer, SocketLink, claim
 from paramclient.links.names import LinkSpec
 from paramclient.links.refusals import reason
-from paramclient.protocol.wire import HEARTBEAT_ID, Framer
+from paramclient.wire.frames import Framer
+from paramclient.wire.messages import Heartbeat, message_id
 
 __all__ = ["UdpIn", "UdpOut"]
 
@@ -129,7 +130,7 @@ class UdpLink(SocketLink):
         # Addresses that have sent only other frames.
         self._unproven: dict[Address, _PeerState] = {}
         self._stranger_served_at = -math.inf
-        self._framer = Framer((HEARTBEAT_ID,), stream=False)
+        self._framer = Framer((message_id(Heartbeat),), stream=False)
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`. Returns at most `DATAGRAMS_PER_READ` datagrams; skips empty ones."""

@@ -27,7 +27,8 @@ from paramclient.protocol.events import (
 )
 from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.station import Address, Station
-from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, HEARTBEAT_ID, Framer
+from paramclient.wire.frames import Framer
+from paramclient.wire.messages import AutopilotVersion, Heartbeat, message_id
 
 __all__ = ["import_log"]
 
@@ -59,7 +60,7 @@ async def import_log(path: str | os.PathLike[str], cache: ParamCache) -> tuple[I
 
 async def _first_introductions(records: Iterator[Record]) -> dict[int, dict[Address, bytes]]:
     """Return the first HEARTBEAT and AUTOPILOT_VERSION of each component, by message, as in the log."""
-    found: dict[int, dict[Address, bytes]] = {HEARTBEAT_ID: {}, AUTOPILOT_VERSION_ID: {}}
+    found: dict[int, dict[Address, bytes]] = {message_id(Heartbeat): {}, message_id(AutopilotVersion): {}}
     framer = Framer(set(found), stream=False)
     for number, record in enumerate(records):
         for frame in framer.receive(record.data):
@@ -82,8 +83,8 @@ class _Import:
     def __init__(
         self, name: str, introductions: Mapping[int, Mapping[Address, bytes]], cache: ParamCache
     ) -> None:
-        self._heartbeats = introductions[HEARTBEAT_ID]
-        self._versions = introductions[AUTOPILOT_VERSION_ID]
+        self._heartbeats = introductions[message_id(Heartbeat)]
+        self._versions = introductions[message_id(AutopilotVersion)]
         self._at = 0.0
         self._station = Station(
             link=name, is_stream=False, sync_settings=SyncSettings.chosen(None, "auto", is_log=True)

@@ -22,7 +22,7 @@ from paramclient.errors import MetadataError, UsageError
 from paramclient.metadata.formats import PACKED_SIZE_MAX, json_of, read_content, unpacked
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.metadata_cache import MetadataStore, has_checksum
-from paramclient.protocol.wire import ComponentMetadata
+from paramclient.wire.messages import ComponentMetadata
 
 __all__ = ["announced_metadata", "metadata_of"]
 

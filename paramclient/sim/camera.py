@@ -16,10 +16,10 @@ from paramclient.model.ext_params import (
     encode_ext_value,
 )
 from paramclient.model.values import Encoding, check_name
-from paramclient.protocol import wire
 from paramclient.sim.generic import BytewiseVehicle
 from paramclient.sim.param_table import Table, as_table
 from paramclient.sim.vehicle import VehicleOptions
+from paramclient.wire import frames, messages
 
 __all__ = ["Camera", "ExtEntries", "camera_table"]
 
@@ -119,10 +119,10 @@ class Camera(BytewiseVehicle):
             system=system,
             component=component,
             encoding=Encoding.BYTEWISE,
-            heartbeat=wire.Heartbeat(
-                MAV_TYPE_CAMERA, wire.MAV_AUTOPILOT_INVALID, system_status=wire.MAV_STATE_ACTIVE
+            heartbeat=messages.Heartbeat(
+                MAV_TYPE_CAMERA, messages.MAV_AUTOPILOT_INVALID, system_status=messages.MAV_STATE_ACTIVE
             ),
-            version=wire.AutopilotVersion(8192, uid=0xCA3E_0000 + system),
+            version=messages.AutopilotVersion(8192, uid=0xCA3E_0000 + system),
             burst=burst,
             period=period,
             **options,
@@ -177,26 +177,26 @@ class Camera(BytewiseVehicle):
         del self._ext[self.ext_param(name).name]
         self._ext = {each.name: each.with_index(index) for index, each in enumerate(self._ext.values())}
 
-    def _on_request(self, message: wire.Message, sender: wire.Frame) -> None:
-        if isinstance(message, wire.ParamExtRequestRead):
+    def _on_request(self, message: messages.Message, sender: frames.Frame) -> None:
+        if isinstance(message, messages.ParamExtRequestRead):
             self._on_ext_read(message)
-        elif isinstance(message, wire.ParamExtRequestList):
+        elif isinstance(message, messages.ParamExtRequestList):
             if self._ext:
                 self._ext_position = 0
                 self._ext_burst_at = max(self._now, self._on_at + self._boot_time)
-        elif isinstance(message, wire.ParamExtSet):
+        elif isinstance(message, messages.ParamExtSet):
             self._on_ext_set(message)
         else:
             super()._on_request(message, sender)
 
-    def _on_ext_read(self, request: wire.ParamExtRequestRead) -> None:
+    def _on_ext_read(self, request: messages.ParamExtRequestRead) -> None:
         found = self._ext.get(request.param_id)
         if request.param_index >= 0:
             found = next((each for each in self._ext.values() if each.index == request.param_index), None)
         if found is not None:
             self._send_ext(found)
 
-    def _on_ext_set(self, request: wire.ParamExtSet) -> None:
+    def _on_ext_set(self, request: messages.ParamExtSet) -> None:
         known = self._ext.get(request.param_id)
         if known is None:
             return
@@ -215,7 +215,7 @@ class Camera(BytewiseVehicle):
             self._acknowledge(self._store(known.name, wanted.raw), ExtAckResult.ACCEPTED)
 
     def _acknowledge(self, param: ExtParam, result: ExtAckResult) -> None:
-        self._send(wire.ParamExtAck(param.name, param.raw, param.type, result))
+        self._send(messages.ParamExtAck(param.name, param.raw, param.type, result))
 
     def _store(self, name: str, raw: bytes) -> ExtParam:
         known = self._ext[name]
@@ -229,7 +229,7 @@ class Camera(BytewiseVehicle):
 
     def _send_ext(self, param: ExtParam) -> None:
         index = 0 if param.index is None else param.index
-        self._send(wire.ParamExtValue(param.name, param.raw, param.type, len(self._ext), index))
+        self._send(messages.ParamExtValue(param.name, param.raw, param.type, len(self._ext), index))
 
     def _switch_on(self, at: float) -> None:
         self._at_work.clear()

@@ -22,7 +22,7 @@ from paramclient.model.values import (
     from_bits,
     known_type,
 )
-from paramclient.protocol.ftp.param_pck import PACKABLE, PackedParam
+from paramclient.protocol.param_pck import PACKABLE, PackedParam
 
 __all__ = [
     "Entry",

@@ -39,7 +39,6 @@ from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.stats.traffic import TrafficReport
 from paramclient.protocol.vehicle.address_contest import Contest
-from paramclient.protocol.wire import SigningKey, SigningReport
 from paramclient.sync.client_thread import ClientThread
 from paramclient.sync.wrappers import (
     BlockingClient,
@@ -51,6 +50,7 @@ from paramclient.sync.wrappers import (
     own_values,
     wrapped_by,
 )
+from paramclient.wire.signing import SigningKey, SigningReport
 
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint

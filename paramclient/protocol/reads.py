@@ -1,0 +1,129 @@
+"""Read single parameters: PARAM_REQUEST_READ and PARAM_EXT_REQUEST_READ, and what silence means."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Final
+
+import anyio
+
+from paramclient.errors import (
+    NoReply,
+    ParamClientError,
+    ParamErrorCode,
+    Refused,
+    UnknownParameter,
+)
+from paramclient.model.similar_names import did_you_mean, nearest_names
+from paramclient.model.values import Param
+from paramclient.protocol.dialect import ReportedValue
+from paramclient.protocol.session import Session
+from paramclient.wire.messages import HASH_CHECK, Message, ParamError
+
+__all__ = ["read", "read_many", "refusal"]
+
+CONTROL_ATTEMPTS: Final = 8
+"""Attempts of the control read that decides whether a silent component answers reads at all."""
+
+
+async def read(session: Session, which: str | int) -> ReportedValue:
+    """Read one parameter, by name or index. Its value is in the table then.
+
+    A component that leaves this read unanswered and answers another one has no such parameter: PX4 before
+    1.18 and ArduPilot before 4.7 say nothing of an unknown name.
+
+    Raises:
+        UnknownParameter: the component has no such parameter.
+        Refused: it gave another reason.
+        NoReply: it answered nothing.
+        LinkError: the link is closed for good.
+    """
+    channel, dialect = session.channel, session.dialect
+    what = f"parameter {which} of {channel.system}/{channel.component}"
+
+    def accept(message: Message) -> ReportedValue | None:
+        if isinstance(message, ParamError):
+            raise refusal(session, which, message.error)
+        return message if isinstance(message, dialect.value) else None
+
+    request = dialect.request_read(channel.target, which)
+    async with channel.window:
+        with channel.inbox((dialect.value, which)) as inbox:
+            try:
+                return await channel.exchange(request, inbox, accept, what=what)
+            except NoReply:
+                if which == HASH_CHECK or not await _answers_reads(session, which):
+                    raise
+    raise _unknown(session, which)
+
+
+async def read_many(
+    session: Session, names: Iterable[str], done: Callable[[str, Param | ParamClientError], None]
+) -> None:
+    """Read several parameters, as many at once as the component serves.
+
+    Args:
+        session: the component's.
+        names: of the parameters.
+        done: called with each parameter or its error, as it arrives.
+
+    Raises:
+        LinkError: the link is closed for good.
+    """
+
+    async def read_one(name: str) -> None:
+        try:
+            message = await read(session, name)
+        except ParamClientError as error:
+            done(name, error)
+        else:
+            done(name, session.table.params[message.param_id])
+
+    async with anyio.create_task_group() as tasks:
+        for name in names:
+            tasks.start_soon(read_one, name)
+
+
+def refusal(session: Session, which: str | int, code: int) -> UnknownParameter | Refused:
+    """Return the error for a PARAM_ERROR with this code."""
+    if code == ParamErrorCode.DOES_NOT_EXIST:
+        return _unknown(session, which)
+    system, component = session.channel.target
+    name, index = (which, None) if isinstance(which, str) else (None, which)
+    return Refused(
+        f"{system}/{component} refused {which}: {ParamErrorCode.name_of(code)}",
+        system=system,
+        component=component,
+        code=code,
+        name=name,
+        index=index,
+    )
+
+
+async def _answers_reads(session: Session, which: str | int) -> bool:
+    """Return whether the component answers a read of something that it certainly has."""
+    channel, dialect, table = session.channel, session.dialect, session.table
+    known = next((name for name in table.moments if name != which), None)
+    control: str | int = HASH_CHECK if session.identification.is_px4 else 0 if known is None else known
+    with channel.inbox((dialect.value, control)) as inbox:
+        request = dialect.request_read(channel.target, control)
+        try:
+            return await channel.exchange(
+                request, inbox, lambda message: True, what="a control read", attempts=CONTROL_ATTEMPTS
+            )
+        except NoReply:
+            return False
+
+
+def _unknown(session: Session, which: str | int) -> UnknownParameter:
+    system, component = session.channel.target
+    name, index = (which, None) if isinstance(which, str) else (None, which)
+    nearest = () if name is None else nearest_names(name, session.table.params)
+    return UnknownParameter(
+        f"{system}/{component} has no {'' if name else 'parameter with index '}{which}.{did_you_mean(nearest)}",
+        system=system,
+        component=component,
+        name=name,
+        index=index,
+        nearest=nearest,
+    )
