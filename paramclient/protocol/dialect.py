@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from paramclient.model.ext_params import decode_ext_value, encode_ext_value, own_bytes
@@ -29,10 +30,28 @@ from paramclient.wire.messages import (
     ParamValue,
 )
 
-__all__ = ["EXTENDED", "PLAIN", "Dialect", "ReportedValue"]
+__all__ = ["EXTENDED", "PLAIN", "Dialect", "Digest", "ReportedValue"]
 
 ReportedValue: TypeAlias = ParamValue | ParamExtValue
 """The message with a value, in either protocol."""
+
+
+@dataclass(frozen=True, slots=True)
+class Digest:
+    """What a vehicle announced of its table.
+
+    Attributes:
+        hash: PX4's.
+        count: of the parameters.
+    """
+
+    hash: int
+    count: int
+
+    @classmethod
+    def of(cls, message: ReportedValue) -> Digest:
+        """Return the digest in a `_HASH_CHECK`."""
+        return cls(int.from_bytes(message.raw, "little"), message.param_count)
 
 
 class Dialect(ABC):

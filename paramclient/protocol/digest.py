@@ -5,33 +5,13 @@ PX4 announces a hash, `_HASH_CHECK`. Other vehicles have no answer, and their ta
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from paramclient.errors import NoReply, UnknownParameter
-from paramclient.protocol.dialect import ReportedValue
+from paramclient.protocol.dialect import Digest
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK
 
-__all__ = ["Digest", "is_current", "request_digest"]
-
-
-@dataclass(frozen=True, slots=True)
-class Digest:
-    """What a vehicle announced of its table.
-
-    Attributes:
-        hash: PX4's.
-        count: of the parameters.
-    """
-
-    hash: int
-    count: int
-
-    @classmethod
-    def of(cls, message: ReportedValue) -> Digest:
-        """Return the digest in a `_HASH_CHECK`."""
-        return cls(int.from_bytes(message.raw, "little"), message.param_count)
+__all__ = ["is_current", "request_digest"]
 
 
 async def request_digest(session: Session) -> Digest | None:

@@ -12,7 +12,8 @@ import anyio
 from paramclient.errors import NoReply
 from paramclient.model.params import ParamMap
 from paramclient.model.values import Param
-from paramclient.protocol.digest import Digest, is_current, request_digest
+from paramclient.protocol.dialect import Digest
+from paramclient.protocol.digest import is_current, request_digest
 from paramclient.protocol.file_download import FileUnavailable, download_file
 from paramclient.protocol.list_download import ListResult, download_list
 from paramclient.protocol.reads import read_many

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import anyio
 
 from paramclient.protocol.channel import Inbox
-from paramclient.protocol.digest import Digest
+from paramclient.protocol.dialect import Digest
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK, Message
 

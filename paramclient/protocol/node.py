@@ -11,7 +11,7 @@ from paramclient.model.identity import hardware_id
 from paramclient.model.values import Encoding
 from paramclient.protocol.addresses import Peer
 from paramclient.protocol.channel import Channel, Gate
-from paramclient.protocol.dialect import EXTENDED, PLAIN
+from paramclient.protocol.dialect import EXTENDED, PLAIN, Digest
 from paramclient.protocol.events import (
     Change,
     ComponentEvent,
@@ -25,6 +25,7 @@ from paramclient.protocol.identity import Identification
 from paramclient.protocol.presence import Presence
 from paramclient.protocol.session import Session, Shared, Spawn
 from paramclient.wire.messages import (
+    HASH_CHECK,
     AutopilotVersion,
     Heartbeat,
     HighLatency2,
@@ -123,6 +124,8 @@ class Node:
         match message:
             case ParamValue():
                 self.plain.table.store(message, now)
+                if message.param_id == HASH_CHECK:
+                    self.plain.announced = Digest.of(message)
             case ParamExtValue():
                 self.extended.table.store(message, now)
             case ParamExtAck(param_id=name, raw=raw, param_type=number, param_result=result):

@@ -9,7 +9,7 @@ from typing import Any, Final, Generic, TypeVar
 import anyio
 
 from paramclient.protocol.channel import Channel
-from paramclient.protocol.dialect import Dialect
+from paramclient.protocol.dialect import Dialect, Digest
 from paramclient.protocol.events import Change
 from paramclient.protocol.identity import Identification
 from paramclient.protocol.table import Table
@@ -109,6 +109,7 @@ class Session:
         fetching: the fetch that is in progress, shared by all callers.
         writing: the authors of the writes in progress, by name.
         serves_file: whether the parameter file was served on this link; None while unknown.
+        announced: the last PX4 hash that was received, also in another station's list, or None.
         written_at: when the last write ended; minus infinity before the first.
         observers: called with the parameters received and their number, while a fetch runs.
     """
@@ -130,6 +131,7 @@ class Session:
         self.fetching: Shared[Any] = Shared(spawn)
         self.writing: dict[str, str] = {}
         self.serves_file: bool | None = None
+        self.announced: Digest | None = None
         self.written_at = -math.inf
         self.observers: set[Callable[[int, int | None], None]] = set()
         self._locks: dict[str, anyio.Lock] = {}
