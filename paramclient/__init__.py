@@ -33,25 +33,24 @@ if TYPE_CHECKING:
     )
     from paramclient.cache.records import CachedSummary
     from paramclient.client.client import ParamClient
-    from paramclient.client.component import Component
+    from paramclient.client.component import Component, ComponentState
     from paramclient.client.events import (
         Contested,
         Discovered,
         Event,
-        Events,
         Found,
         Lost,
         Rebooted,
         Resynced,
         Uncontested,
     )
-    from paramclient.client.extended_params import ExtChanges, ExtParams
-    from paramclient.client.fetch_all import FetchedAll
     from paramclient.client.files import Ftp
+    from paramclient.client.fleet_fetch import FetchedAll
     from paramclient.client.reset import ResetResult
     from paramclient.client.signing import Signing, key_from_environment, read_key
     from paramclient.client.stats import ClientStats
-    from paramclient.client.subscription import Changes
+    from paramclient.client.streams import Changes, Events
+    from paramclient.client.traffic import ComponentTraffic, MessageTraffic, RadioStatus, TrafficReport
     from paramclient.errors import (
         AlreadyRestored,
         AmbiguousVehicle,
@@ -105,23 +104,12 @@ if TYPE_CHECKING:
     from paramclient.model.renames import Rename, Renames
     from paramclient.model.values import Encoding, Param, ParamType, Settable, Trust, Value, WireValue
     from paramclient.protocol.addresses import Address
-    from paramclient.protocol.ext.change import ExtChange
-    from paramclient.protocol.ext.fetch import ExtFetchResult
-    from paramclient.protocol.ext.write_batch import ExtSetManyResult, ExtSetOutcome
-    from paramclient.protocol.ext.writes import ExtSetResult
+    from paramclient.protocol.events import Change
+    from paramclient.protocol.fetch import FetchResult, FetchSource, Policy, Progress
     from paramclient.protocol.ftp import DirectoryEntry
-    from paramclient.protocol.params.change import Added, Change, Changed, FirstValue, Removed
-    from paramclient.protocol.params.fetch_result import FetchResult, FetchSource, Policy, Progress
-    from paramclient.protocol.params.sync import ComponentState, SyncState
-    from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, SetStatus
-    from paramclient.protocol.params.writes import SetResult
-    from paramclient.protocol.stats.traffic import (
-        ComponentTraffic,
-        MessageTraffic,
-        RadioStatus,
-        TrafficReport,
-    )
+    from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
     from paramclient.protocol.vehicle.address_contest import Contest
+    from paramclient.protocol.watch import SyncState
     from paramclient.wire.messages import AutopilotVersion, Heartbeat
 from paramclient.wire.signing import Refusal, SigningKey, SigningPolicy, SigningReport, SigningStream
 
@@ -157,18 +145,18 @@ __all__ = [
     "Event",
     "Events",
     "ExtAckResult",
-    "ExtChange",
-    "ExtChanges",
-    "ExtFetchResult",
+    "Change",
+    "Changes",
+    "FetchResult",
     "ExtHistoryEntry",
     "ExtParam",
     "ExtParamSet",
     "ExtParamType",
-    "ExtParams",
-    "ExtSetManyResult",
-    "ExtSetOutcome",
+    "Component",
+    "SetManyResult",
+    "SetOutcome",
     "ExtSetRefused",
-    "ExtSetResult",
+    "SetResult",
     "ExtSettable",
     "ExtSnapshot",
     "ExtValue",
@@ -284,8 +272,8 @@ _HOMES: Final = {
         "Uncontested",
     ),
     "paramclient.client.extended_params": (
-        "ExtChanges",
-        "ExtParams",
+        "Changes",
+        "Component",
     ),
     "paramclient.client.fetch_all": ("FetchedAll",),
     "paramclient.client.files": ("Ftp",),
@@ -375,13 +363,13 @@ _HOMES: Final = {
         "WireValue",
     ),
     "paramclient.protocol.addresses": ("Address",),
-    "paramclient.protocol.ext.change": ("ExtChange",),
-    "paramclient.protocol.ext.fetch": ("ExtFetchResult",),
+    "paramclient.protocol.ext.change": ("Change",),
+    "paramclient.protocol.ext.fetch": ("FetchResult",),
     "paramclient.protocol.ext.write_batch": (
-        "ExtSetManyResult",
-        "ExtSetOutcome",
+        "SetManyResult",
+        "SetOutcome",
     ),
-    "paramclient.protocol.ext.writes": ("ExtSetResult",),
+    "paramclient.protocol.ext.writes": ("SetResult",),
     "paramclient.protocol.ftp": ("DirectoryEntry",),
     "paramclient.protocol.params.change": (
         "Added",

@@ -57,7 +57,7 @@ from paramclient.cli.targets import (
 from paramclient.client.component import Component
 from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.metadata import Metadata
-from paramclient.protocol.params.fetch_result import Progress
+from paramclient.protocol.fetch import Progress
 from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, verify_all
 from paramclient.provision import apply_all as apply_to_all
 from paramclient.provision import restore_all as restore_to_all

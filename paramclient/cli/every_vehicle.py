@@ -15,7 +15,7 @@ from paramclient.cli.output import report
 from paramclient.cli.session import CommandSession, connect, unheard_in_words
 from paramclient.cli.targets import find_vehicles
 from paramclient.errors import ParamClientError, UsageError
-from paramclient.protocol.params.fetch_result import Policy
+from paramclient.protocol.fetch import Policy
 
 __all__ = [
     "Done",

@@ -56,8 +56,7 @@ from paramclient.model.patterns import NameChoice, is_pattern
 from paramclient.model.similar_names import did_you_mean, nearest_names
 from paramclient.model.values import check_name
 from paramclient.model.wording import counted, first_of
-from paramclient.protocol.ext.write_batch import ExtSetOutcome
-from paramclient.protocol.params.write_batch import SetStatus
+from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.protocol.vehicle.extended_kinds import expects_extended
 from paramclient.provision import ExtApplyResult, ExtPlan, load_extended_state
 from paramclient.provision import apply_extended as write_extended_set
@@ -278,7 +277,7 @@ async def set_extended(
             raise error
     unknown = {error.name: error for error in errors if isinstance(error, UnknownParameter)}
     values = [(name, value_of(name, text, found[name].type)) for name, text in pairs if name in found]
-    written: Iterable[ExtSetOutcome] = ()
+    written: Iterable[SetOutcome] = ()
     if values:
         result = await session.component.ext.set_many(
             values, timeout=session.deadline.left(), durable=durable
@@ -286,7 +285,7 @@ async def set_extended(
         written = result.outcomes
     left = iter(written)
     outcomes = [
-        next(left) if name in found else ExtSetOutcome(name, text, SetStatus.REFUSED, error=unknown[name])
+        next(left) if name in found else SetOutcome(name, text, SetStatus.REFUSED, error=unknown[name])
         for name, text in pairs
     ]
     _print_outcomes(session, outcomes)
@@ -677,7 +676,7 @@ def _print_plan(session: CommandSession, plan: ExtPlan, *, is_dry: bool) -> None
     say(printable(f"{len(plan.changes)} of {session.label} {verb}"))
 
 
-def _print_outcomes(session: CommandSession, outcomes: Sequence[ExtSetOutcome]) -> None:
+def _print_outcomes(session: CommandSession, outcomes: Sequence[SetOutcome]) -> None:
     if session.options.json:
         from paramclient.documents.extended_output import ExtWritesOutputDoc  # only here: loads pydantic
 
@@ -699,6 +698,6 @@ def _print_outcomes(session: CommandSession, outcomes: Sequence[ExtSetOutcome]) 
             report(f"{each.name}: {each.error}")
 
 
-def _code_of_outcomes(outcomes: Iterable[ExtSetOutcome]) -> ExitCode:
+def _code_of_outcomes(outcomes: Iterable[SetOutcome]) -> ExitCode:
     errors = [each.error for each in outcomes if each.error is not None]
     return max((code_of(error) for error in errors), default=ExitCode.DONE)

@@ -25,7 +25,7 @@ from paramclient.model.notation import (
     value_written,
 )
 from paramclient.model.values import Param, ParamType, format_value, type_name
-from paramclient.protocol.vehicle.kinds import kind_in_words
+from paramclient.protocol.kinds import kind_in_words
 
 if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler, TypeAdapter
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from paramclient.client.component import Component
     from paramclient.metadata import Metadata, ParamInfo
     from paramclient.model.paramset import ParamSet, WrittenParam
-    from paramclient.protocol.params.fetch_result import FetchResult
-    from paramclient.protocol.params.write_batch import SetOutcome
+    from paramclient.protocol.fetch import FetchResult
+    from paramclient.protocol.set_results import SetOutcome
 
 __all__ = [
     "ExtParamJson",

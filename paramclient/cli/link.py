@@ -19,9 +19,9 @@ from paramclient.cli.session import Deadline, listen, received_in_words
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.client.local import local
+from paramclient.client.traffic import ComponentTraffic, TrafficReport
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.identity import autopilot_name
-from paramclient.protocol.stats.traffic import ComponentTraffic, TrafficReport
 from paramclient.wire.frames import enum_word
 from paramclient.wire.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from paramclient.cli.block_characters import Marks, Piece
+from paramclient.client.traffic import ComponentTraffic, TrafficReport
 from paramclient.protocol.requests.round_trip import RoundTrip
-from paramclient.protocol.stats.traffic import ComponentTraffic, TrafficReport
 
 __all__ = ["HISTORY_LENGTH", "LOSS", "ROUND_TRIP", "HistoryRow", "LinkHistory", "history_lines", "sparkline"]
 

@@ -61,7 +61,7 @@ from paramclient.model.notation import hash_text
 from paramclient.model.patterns import NameChoice, is_pattern
 from paramclient.model.values import Param, Trust, format_value, type_name
 from paramclient.model.wording import first_of
-from paramclient.protocol.params.fetch_result import FetchResult, Policy, Progress
+from paramclient.protocol.fetch import FetchResult, Policy, Progress
 
 __all__ = ["fetch", "get", "watch"]
 

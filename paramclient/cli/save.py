@@ -38,7 +38,7 @@ from paramclient.model.defaults import default_of
 from paramclient.model.paramset import ParamSet
 from paramclient.model.patterns import NameChoice
 from paramclient.model.wording import counted
-from paramclient.protocol.params.fetch_result import FetchResult
+from paramclient.protocol.fetch import FetchResult
 from paramclient.provision.vehicle_params import NO_DEFAULTS, cached_param_set, select_non_defaults
 
 __all__ = ["save"]

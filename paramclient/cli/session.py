@@ -25,10 +25,9 @@ from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, UsageError
 from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.model.identity import version_text
 from paramclient.model.wording import counted, first_of
-from paramclient.protocol.no_reply_hint import hint_of_link
-from paramclient.protocol.params.fetch_result import Policy
-from paramclient.protocol.vehicle.kinds import kind_in_words
-from paramclient.protocol.vehicle_selection import LOOK_TIME
+from paramclient.protocol.fetch import Policy
+from paramclient.protocol.kinds import kind_in_words
+from paramclient.protocol.selection import LOOK_TIME, hint_of_link
 from paramclient.wire.messages import MAV_AUTOPILOT_INVALID
 
 __all__ = [

@@ -35,7 +35,7 @@ from paramclient.links import FORMS, parse_link
 from paramclient.logs.onboard import is_onboard_log, read_onboard_log
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
-from paramclient.protocol.params.fetch_result import FetchResult
+from paramclient.protocol.fetch import FetchResult
 from paramclient.provision.vehicle_params import FetchedSet, collect_set, incomplete_error, load_cached_set
 
 __all__ = [

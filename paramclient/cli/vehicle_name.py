@@ -13,7 +13,7 @@ from paramclient.cache.lookup import KINDS, address_of, find_vehicle
 from paramclient.client.client import ParamClient, local_client
 from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, AnotherVehicle, NoReply, UsageError
-from paramclient.protocol.vehicle_selection import LOOK_TIME
+from paramclient.protocol.selection import LOOK_TIME
 
 __all__ = ["VehicleName", "check_kind", "check_uid", "wait_for_kind"]
 

@@ -14,21 +14,18 @@ from paramclient.client.events import (
     Contested,
     Discovered,
     Event,
-    Events,
     Found,
     Lost,
     Rebooted,
     Resynced,
     Uncontested,
 )
-from paramclient.client.extended_params import ExtChanges
-from paramclient.client.subscription import Changes
+from paramclient.client.streams import Changes, Events
 from paramclient.model.ext_params import ExtParam, ExtValue, format_ext_value
 from paramclient.model.notation import hash_text, time_text, value_json
 from paramclient.model.patterns import NameChoice
 from paramclient.model.values import Param, format_value
-from paramclient.protocol.ext.change import ExtChange
-from paramclient.protocol.params.change import Added, Change
+from paramclient.protocol.events import Change
 
 __all__ = ["HEX", "ext_value_text", "print_changes_and_events"]
 
@@ -40,7 +37,7 @@ _ComponentEvent: TypeAlias = Lost | Found | Rebooted | Resynced | Contested | Un
 
 async def print_changes_and_events(
     session: CommandSession,
-    changes: Changes | ExtChanges,
+    changes: Changes | Changes,
     events: Events,
     known: set[str] | None,
     choice: NameChoice | None,
@@ -57,7 +54,7 @@ async def print_changes_and_events(
     """
     async with aclosing(_merged(changes, events)) as merged:
         async for each in merged:
-            if isinstance(each, Change | ExtChange):
+            if isinstance(each, Change | Change):
                 is_first = each.old is None and not _is_added(each)
                 if is_first and (known is None or each.name in known):
                     known = known and known - {each.name}
@@ -76,13 +73,11 @@ async def print_changes_and_events(
                 print_line(f"{local_time(at)}  {text}")
 
 
-async def _merged(
-    changes: Changes | ExtChanges, events: Events
-) -> AsyncGenerator[Change | ExtChange | Event]:
+async def _merged(changes: Changes | Changes, events: Events) -> AsyncGenerator[Change | Change | Event]:
     """Yield changes and events in the order of their arrival."""
-    waiting: dict[asyncio.Future[Change | ExtChange | Event], Changes | ExtChanges | Events] = {}
+    waiting: dict[asyncio.Future[Change | Change | Event], Changes | Changes | Events] = {}
 
-    def wait(feed: Changes | ExtChanges | Events) -> None:
+    def wait(feed: Changes | Changes | Events) -> None:
         waiting[asyncio.ensure_future(anext(feed))] = feed
 
     try:
@@ -101,9 +96,9 @@ async def _merged(
                 each.exception()  # both end with the link; one error is reported
 
 
-def _line(item: Change | ExtChange | _ComponentEvent, at: float) -> dict[str, object]:
+def _line(item: Change | Change | _ComponentEvent, at: float) -> dict[str, object]:
     """Return the JSON of a change or an event."""
-    if isinstance(item, Change | ExtChange):
+    if isinstance(item, Change | Change):
         old, new = (None if param is None else _value_json(param) for param in (item.old, item.new))
         kind = "removed" if item.new is None else "added" if _is_added(item) else "changed"
         return {"time": time_text(at), "name": item.name, "old": old, "new": new, "by": item.by, "kind": kind}
@@ -129,7 +124,7 @@ def _value_json(param: Param | ExtParam) -> object:
     return value_json(param.settable, param.type_number)
 
 
-def _change_text(change: Change | ExtChange) -> str:
+def _change_text(change: Change | Change) -> str:
     if isinstance(change, Change):
         old, new = (
             "none" if param is None else format_value(param.settable, param.type_number)
@@ -147,8 +142,8 @@ def _change_text(change: Change | ExtChange) -> str:
     return f"{change.name}  {old} -> {new}  ({change.by})"
 
 
-def _is_added(change: Change | ExtChange) -> bool:
-    return change.is_added if isinstance(change, ExtChange) else isinstance(change, Added)
+def _is_added(change: Change | Change) -> bool:
+    return change.is_added if isinstance(change, Change) else isinstance(change, Added)
 
 
 def _event_text(event: _ComponentEvent) -> str:

@@ -23,6 +23,7 @@ from paramclient.client.signing import Signing, refused_in_words
 from paramclient.client.signing_timestamps import TimestampKeeper
 from paramclient.client.streams import Events, Subscribers
 from paramclient.client.taps import LinkTaps
+from paramclient.client.traffic import TrafficReport
 from paramclient.errors import AnotherVehicle, NoReply, ParamClientError, UsageError
 from paramclient.links import Link, ReplayLink, SimLink, create_link
 from paramclient.model.values import Encoding
@@ -81,6 +82,7 @@ class ParamClient:
             disables the checks. See `Component.sync_state`.
         policy: which requests may update tables, see `Policy`: "auto", "hash-only" or "cache-only". Any value
             but "auto" also disables the checks of `watch_interval`.
+        traffic: whether to count all frames for `traffic_report`. This takes time for each frame.
         listen_only: send nothing, not even a heartbeat. Tables fill from responses to other stations.
         forward: link to one other program, by name or as an object, such as `udpout:127.0.0.1:14551`. The
             program receives every received frame, and its frames are sent to the vehicles.
@@ -109,6 +111,7 @@ class ParamClient:
         encoding: Encoding | None = None,
         watch_interval: float | None = None,
         policy: Policy | str = Policy.AUTO,
+        traffic: bool = False,
         listen_only: bool = False,
         forward: str | Link | None = None,
         tlog: str | os.PathLike[str] | None = None,
@@ -137,7 +140,7 @@ class ParamClient:
         self.core = ClientCore(
             opened,
             CacheWriter(self.cache, owned=self.cache is not cache),
-            LinkTaps(tlog, forward, is_stream=opened.is_stream),
+            LinkTaps(tlog, forward, is_stream=opened.is_stream, counts_traffic=traffic),
             None if signing is None else TimestampKeeper(signing),
             partial(
                 Station,
@@ -435,6 +438,19 @@ class ParamClient:
             if system in (None, each.system) and each.node.identification.has_parameters
         }
         return await fetch_components(chosen, refresh=refresh, timeout=timeout, progress=progress)
+
+    def traffic_report(self) -> TrafficReport:
+        """Return the traffic statistics of the link: components, message rates, packet loss.
+
+        Raises:
+            UsageError: the client was made without `traffic=True`.
+            LinkError: the link failed, or the client was closed.
+        """
+        traffic = self.core.taps.traffic
+        if traffic is None:
+            raise UsageError("this client does not count traffic; use ParamClient(..., traffic=True)")
+        self.core.check_open()
+        return traffic.report(anyio.current_time())
 
     def signing_report(self) -> SigningReport | None:
         """Return the signing statistics of the link: signed frames, and refused frames with the reasons.

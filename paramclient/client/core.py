@@ -34,7 +34,7 @@ class ClientCore:
         ended: called when a log has ended.
 
     Attributes:
-        link_task, station, cache_writer: the parts.
+        link_task, station, cache_writer, taps: the parts.
         is_over: whether a log has ended.
     """
 
@@ -52,7 +52,7 @@ class ClientCore:
         self.is_over = False
         self.link_task = LinkTask(link, taps=taps.taps, ended=self._log_ended)
         self.station = self.link_task.station = new_station(send=self.link_task.queue, spawn=self.spawn)
-        self._taps = taps
+        self.taps = taps
         self._keeper = keeper
         self._ended = ended
         self._io: anyio.abc.TaskGroup | None = None
@@ -103,7 +103,7 @@ class ClientCore:
         try:
             await self.link.open()
             await self.cache_writer.open()
-            await self._taps.open()
+            await self.taps.open()
             if self._keeper is not None:
                 self.station.begin_signing(*await self._keeper.open())
         except BaseException:
@@ -116,7 +116,7 @@ class ClientCore:
         self._io.start_soon(self.link_task.read, name="paramclient reader")
         self._io.start_soon(self.link_task.send, name="paramclient sender")
         self._io.start_soon(self.cache_writer.run, name="paramclient cache writer")
-        self._taps.start(self._io)
+        self.taps.start(self._io)
         if self._keeper is not None:
             self._io.start_soon(self._keeper.run, name="paramclient timestamp keeper")
         self.spawn(self.station.send_heartbeats)
@@ -147,7 +147,7 @@ class ClientCore:
 
     async def _release(self) -> None:
         with anyio.CancelScope(shield=True):
-            for close in (self.cache_writer.close, self._taps.close, self.link.close):
+            for close in (self.cache_writer.close, self.taps.close, self.link.close):
                 try:
                     await close()
                 except ParamClientError as error:

@@ -12,6 +12,7 @@ import anyio
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.client.local import LocalComponent, local
+from paramclient.client.traffic import ComponentTraffic
 from paramclient.diagnosis.report import (
     FileService,
     HashService,
@@ -32,9 +33,8 @@ from paramclient.errors import (
 )
 from paramclient.metadata.download import announced_metadata
 from paramclient.protocol import param_pck
-from paramclient.protocol.params.fetch_result import Progress
-from paramclient.protocol.params.file_download import PARAMETER_FILE, WITH_DEFAULTS
-from paramclient.protocol.stats.traffic import ComponentTraffic
+from paramclient.protocol.fetch import Progress
+from paramclient.protocol.file_download import PARAM_FILE, WITH_DEFAULTS
 from paramclient.wire.frames import enum_word
 from paramclient.wire.messages import (
     CAPABILITY_FTP,
@@ -298,7 +298,7 @@ class _Diagnosis:
         is_serving = False
         try:
             began = anyio.current_time()
-            data = await ftp.read(PARAMETER_FILE + WITH_DEFAULTS, timeout=self._left(float("inf")))
+            data = await ftp.read(PARAM_FILE + WITH_DEFAULTS, timeout=self._left(float("inf")))
             elapsed = anyio.current_time() - began
             is_serving = True
             size = len(data)

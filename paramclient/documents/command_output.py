@@ -15,7 +15,7 @@ from paramclient.model.defaults import DefaultSource
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import hash_text, rounded, time_text, typed, value_json
 from paramclient.model.values import ParamType
-from paramclient.protocol.params.change import Added, Change, Removed
+from paramclient.protocol.events import Change
 
 if TYPE_CHECKING:
     from paramclient.client.component import Component
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from paramclient.metadata import AddedMetadata, Metadata, ParamInfo
     from paramclient.model.paramset import ParamSet
     from paramclient.model.values import Param, WireValue
-    from paramclient.protocol.params.fetch_result import FetchResult
-    from paramclient.protocol.params.write_batch import SetOutcome
+    from paramclient.protocol.fetch import FetchResult
+    from paramclient.protocol.set_results import SetOutcome
 
 __all__ = [
     "AddedMetadataDoc",

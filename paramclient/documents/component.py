@@ -9,9 +9,8 @@ from paramclient.model.notation import hash_text, rounded
 
 if TYPE_CHECKING:
     from paramclient.client.component import Component
-    from paramclient.client.extended_params import ExtParams
     from paramclient.model.identity import Identity
-    from paramclient.protocol.params.fetch_result import FetchResult, Progress
+    from paramclient.protocol.fetch import FetchResult, Progress
     from paramclient.protocol.vehicle.address_contest import Contest
 
 __all__ = [
@@ -85,7 +84,7 @@ class ContestDoc(Document):
 
 
 class ExtendedStateDoc(Document):
-    """The state of the extended parameters of a component; see `ExtParams`. `params` is their number."""
+    """The state of the extended parameters of a component; see `Component`. `params` is their number."""
 
     is_spoken: bool
     is_expected: bool
@@ -94,7 +93,7 @@ class ExtendedStateDoc(Document):
     params: int
 
     @classmethod
-    def of(cls, ext: ExtParams) -> ExtendedStateDoc:
+    def of(cls, ext: Component) -> ExtendedStateDoc:
         """Return the document of the present state."""
         return cls(
             is_spoken=ext.is_spoken,

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from paramclient.cache import ExtHistoryEntry
     from paramclient.files import FileFormat
     from paramclient.model.ext_paramset import ExtParamSet
-    from paramclient.protocol.ext.change import ExtChange
-    from paramclient.protocol.ext.fetch import ExtFetchResult
-    from paramclient.protocol.ext.write_batch import ExtSetOutcome
+    from paramclient.protocol.events import Change
+    from paramclient.protocol.fetch import FetchResult
+    from paramclient.protocol.set_results import SetOutcome
 
 __all__ = [
     "ExtChangeDoc",
@@ -57,7 +57,7 @@ class ExtFetchOutputDoc(Document):
     extended: dict[str, ExtParamDoc]
 
     @classmethod
-    def of(cls, result: ExtFetchResult, params: Iterable[ExtParam]) -> ExtFetchOutputDoc:
+    def of(cls, result: FetchResult, params: Iterable[ExtParam]) -> ExtFetchOutputDoc:
         """Return the document of a fetch."""
         return cls(
             system=result.system,
@@ -86,7 +86,7 @@ class ExtWriteDoc(Document):
     reason: Maybe[str] = None
 
     @classmethod
-    def of(cls, outcome: ExtSetOutcome) -> ExtWriteDoc:
+    def of(cls, outcome: SetOutcome) -> ExtWriteDoc:
         """Return the document of an outcome."""
         result = outcome.result
         return cls(
@@ -106,7 +106,7 @@ class ExtWritesOutputDoc(Document):
     results: list[ExtWriteDoc]
 
     @classmethod
-    def of(cls, outcomes: Iterable[ExtSetOutcome]) -> ExtWritesOutputDoc:
+    def of(cls, outcomes: Iterable[SetOutcome]) -> ExtWritesOutputDoc:
         """Return the document of outcomes."""
         return cls(results=[ExtWriteDoc.of(each) for each in outcomes])
 
@@ -168,7 +168,7 @@ class ExtChangeLineDoc(Document):
     kind: Literal["changed", "added", "removed"]
 
     @classmethod
-    def of(cls, change: ExtChange, at: float) -> ExtChangeLineDoc:
+    def of(cls, change: Change, at: float) -> ExtChangeLineDoc:
         """Return the document of a change that was received `at` this unix time in seconds."""
         return cls(
             time=time_text(at),

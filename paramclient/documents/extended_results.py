@@ -12,8 +12,8 @@ from paramclient.model.ext_params import ExtParamType
 
 if TYPE_CHECKING:
     from paramclient.model.ext_paramset import ExtParamSet
-    from paramclient.protocol.ext.fetch import ExtFetchResult
-    from paramclient.protocol.ext.writes import ExtSetResult
+    from paramclient.protocol.fetch import FetchResult
+    from paramclient.protocol.set_results import SetResult
     from paramclient.provision import ExtPlan
 
 __all__ = [
@@ -28,7 +28,7 @@ __all__ = [
 
 
 class ExtFetchResultDoc(Document):
-    """The result of a fetch of extended parameters; see `ExtFetchResult`.
+    """The result of a fetch of extended parameters; see `FetchResult`.
 
     The parameters are in the component's table. `count` is null if the component has not announced it.
     """
@@ -44,8 +44,8 @@ class ExtFetchResultDoc(Document):
     notes: list[str]
 
     @classmethod
-    def of(cls, result: ExtFetchResult, *, link: str) -> ExtFetchResultDoc:
-        """Return the document of an `ExtFetchResult`, without the parameters."""
+    def of(cls, result: FetchResult, *, link: str) -> ExtFetchResultDoc:
+        """Return the document of an `FetchResult`, without the parameters."""
         return cls(
             link=link,
             system=result.system,
@@ -60,7 +60,7 @@ class ExtFetchResultDoc(Document):
 
 
 class ExtSetResultDoc(Document):
-    """The result of a write of an extended parameter: accepted, or adjusted; see `ExtSetResult`.
+    """The result of a write of an extended parameter: accepted, or adjusted; see `SetResult`.
 
     `requested` and `actual` are null for bytes that are no text; `param` has the bytes of the actual value.
     """
@@ -73,8 +73,8 @@ class ExtSetResultDoc(Document):
     param: ExtParamDoc
 
     @classmethod
-    def of(cls, result: ExtSetResult) -> ExtSetResultDoc:
-        """Return the document of an `ExtSetResult`."""
+    def of(cls, result: SetResult) -> ExtSetResultDoc:
+        """Return the document of an `SetResult`."""
         return cls(
             name=result.name,
             status=result.status,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from paramclient.documents.document import Document
 from paramclient.model.identity import autopilot_name, version_text
-from paramclient.protocol.vehicle.kinds import kind_in_words
+from paramclient.protocol.kinds import kind_in_words
 
 if TYPE_CHECKING:
     from paramclient.client.component import Component

@@ -11,8 +11,8 @@ from paramclient.model.notation import hash_text, rounded, value_json
 from paramclient.model.values import ParamType
 
 if TYPE_CHECKING:
-    from paramclient.protocol.params.fetch_result import FetchResult
-    from paramclient.protocol.params.writes import SetResult
+    from paramclient.protocol.fetch import FetchResult
+    from paramclient.protocol.set_results import SetResult
 
 __all__ = [
     "FetchResultDoc",

@@ -15,7 +15,7 @@ from paramclient.wire.frames import enum_word
 from paramclient.wire.messages import MAV_TYPE_GCS
 
 if TYPE_CHECKING:
-    from paramclient.protocol.stats.traffic import ComponentTraffic, TrafficReport
+    from paramclient.client.traffic import ComponentTraffic, TrafficReport
     from paramclient.wire.signing import SigningReport
 
 __all__ = ["ComponentTrafficDoc", "MessageTrafficDoc", "RadioDoc", "SigningDoc", "TrafficDoc"]

@@ -11,6 +11,7 @@ from typing import Final
 
 import anyio
 
+from paramclient.client.arguments import check_author
 from paramclient.client.component import Component
 from paramclient.client.local import local
 from paramclient.errors import (
@@ -29,9 +30,8 @@ from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
 from paramclient.model.values import WireValue
-from paramclient.protocol.params.change_origin import check_author
-from paramclient.protocol.params.write_batch import SetOutcome, SetStatus
 from paramclient.protocol.requests.write_window import WRITES_IN_FLIGHT_MAX
+from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
 from paramclient.provision.inspection import (
     POLL_INTERVAL,

@@ -13,7 +13,7 @@ from paramclient.client.component import Component
 from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.model.ext_params import ExtParam
 from paramclient.model.ext_paramset import ExtParamSet
-from paramclient.protocol.ext.write_batch import ExtSetOutcome
+from paramclient.protocol.set_results import SetOutcome
 from paramclient.provision.apply_restore import BEFORE_RESTORE
 from paramclient.provision.restore_point import choose_restore_point
 from paramclient.provision.runner import call_and_wait
@@ -79,7 +79,7 @@ class ExtApplyResult:
     """
 
     plan: ExtPlan
-    outcomes: tuple[ExtSetOutcome, ...]
+    outcomes: tuple[SetOutcome, ...]
     before: ExtParamSet
     snapshot: int | None
     current: Mapping[str, ExtParam] | None
@@ -143,7 +143,7 @@ async def apply_extended(
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
     author: str | None = None,
-    progress: Callable[[ExtSetOutcome], None] | None = None,
+    progress: Callable[[SetOutcome], None] | None = None,
     before_writing: Callable[[], object] | None = None,
 ) -> ExtApplyResult:
     """Write the wanted values that differ to a component, and verify them by another download.
@@ -193,7 +193,7 @@ async def restore_extended(
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
     author: str | None = None,
-    progress: Callable[[ExtSetOutcome], None] | None = None,
+    progress: Callable[[SetOutcome], None] | None = None,
     before_writing: Callable[[], object] | None = None,
 ) -> ExtApplyResult:
     """Restore an earlier state of a component: `apply_extended` with a snapshot *before restore*.
@@ -248,7 +248,7 @@ async def _write(
     backup: str | os.PathLike[str] | None,
     timeout: float | None,
     author: str | None,
-    progress: Callable[[ExtSetOutcome], None] | None,
+    progress: Callable[[SetOutcome], None] | None,
     before_writing: Callable[[], object] | None,
 ) -> ExtApplyResult:
     began = anyio.current_time()

@@ -16,7 +16,7 @@ from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Renames
 from paramclient.model.values import Param, ParamType, Trust
-from paramclient.protocol.params.fetch_result import FetchResult
+from paramclient.protocol.fetch import FetchResult
 from paramclient.provision.planning import ParamInfo, Plan, check_component, plan
 from paramclient.provision.runner import Runner, run_here
 from paramclient.provision.vehicle_params import set_maker

@@ -24,7 +24,7 @@ from paramclient.provision.runner import Runner, run_here
 if TYPE_CHECKING:
     from paramclient.cache import CachedComponent, ParamCache
     from paramclient.client.component import Component
-    from paramclient.protocol.params.fetch_result import FetchResult, Progress
+    from paramclient.protocol.fetch import FetchResult, Progress
 
 __all__ = [
     "BEFORE_APPLY",

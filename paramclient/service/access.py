@@ -19,8 +19,8 @@ from typing import Any, Final, TypeAlias
 
 import anyio
 
+from paramclient.client.arguments import AUTHOR_LENGTH_MAX
 from paramclient.errors import UsageError
-from paramclient.protocol.params.change_origin import AUTHOR_LENGTH_MAX
 from paramclient.service.body_limits import METADATA_BYTES_MAX, SESSION_BODY_BYTES_MAX
 from paramclient.service.body_memory import BodyMemory, BodyReservation
 from paramclient.service.client_address import is_in_networks, is_loopback, parse_network

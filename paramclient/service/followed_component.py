@@ -12,13 +12,13 @@ import anyio
 
 from paramclient.client.component import Component
 from paramclient.client.local import local
-from paramclient.client.subscription import Changes
+from paramclient.client.streams import Changes
 from paramclient.documents.component import ComponentDoc, ProgressDoc
 from paramclient.documents.param import ParamDoc
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.params import CACHED, as_params, compact_param, trust_of
 from paramclient.model.values import Param, Trust
-from paramclient.protocol.params.change import Added, Change
+from paramclient.protocol.events import Change
 from paramclient.service.event_feed import change_members
 from paramclient.service.followed_extended import FollowedExtended
 

@@ -10,12 +10,12 @@ from typing import Any, Final
 
 import anyio
 
-from paramclient.client.extended_params import ExtChanges
 from paramclient.client.local import LocalComponent
+from paramclient.client.streams import Changes
 from paramclient.documents.component import ProgressDoc
 from paramclient.documents.extended_param import ExtParamDoc
 from paramclient.model.ext_params import ExtParam
-from paramclient.protocol.ext.change import ExtChange
+from paramclient.protocol.events import Change
 from paramclient.service.event_feed import change_members
 
 __all__ = ["FollowedExtended", "ext_param_json"]
@@ -113,7 +113,7 @@ class FollowedExtended:
         """Stop following."""
         self.ext.ignore(self._forwarder)
 
-    def handle_change(self, change: ExtChange) -> None:
+    def handle_change(self, change: Change) -> None:
         """Handle a change of a value."""
         if change.new is None:
             self._published.pop(change.name, None)
@@ -138,14 +138,14 @@ class FollowedExtended:
         self._publish("extended_change", write)
 
 
-class _ExtChangeForwarder(ExtChanges):
+class _ExtChangeForwarder(Changes):
     """Forwards changes immediately and in order, in place of queueing them for a task."""
 
     def __init__(self, owner: FollowedExtended) -> None:
         super().__init__()
         self._owner = owner
 
-    def push(self, item: ExtChange) -> None:
+    def push(self, item: Change) -> None:
         self._owner.handle_change(item)
 
 

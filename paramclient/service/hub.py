@@ -26,8 +26,7 @@ from paramclient.documents.results import FetchResultDoc
 from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata.metadata_cache import MetadataStore
-from paramclient.protocol.no_reply_hint import hint_of_link
-from paramclient.protocol.vehicle_selection import LOOK_TIME, VehicleChoice
+from paramclient.protocol.selection import LOOK_TIME, hint_of_link, only_vehicle
 from paramclient.service.event_feed import EventFeed
 from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.jobs import Job, Jobs
@@ -331,7 +330,7 @@ class Hub:
         """
         self._check_link(link)
         chosen = [each for each in self.links.values() if link in (None, each.name)]
-        choice = VehicleChoice(system, component, spans_links=len(chosen) > 1)
+        choice = only_vehicle(system, component, spans_links=len(chosen) > 1)
         began = anyio.current_time()
         with anyio.move_on_after(timeout):
             while True:

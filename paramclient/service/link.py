@@ -15,7 +15,6 @@ from paramclient.client.events import (
     Contested,
     Discovered,
     Event,
-    Events,
     Found,
     Lost,
     Rebooted,
@@ -23,6 +22,7 @@ from paramclient.client.events import (
     Uncontested,
 )
 from paramclient.client.reconnect_delays import Backoff
+from paramclient.client.streams import Events
 from paramclient.documents.link import LinkDoc, StatsDoc
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.model.notation import hash_text, rounded

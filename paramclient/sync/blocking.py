@@ -14,12 +14,14 @@ from paramclient.client import events as asynchronous
 from paramclient.client.arguments import COMPONENT_TIMEOUT
 from paramclient.client.client import ParamClient as AsyncParamClient
 from paramclient.client.component import Component as AsyncComponent
-from paramclient.client.extended_params import ExtParams as AsyncExtParams
-from paramclient.client.fetch_all import FetchedAll
+from paramclient.client.component import Component as AsyncExtParams
+from paramclient.client.component import ComponentState
 from paramclient.client.files import Ftp as AsyncFtp
+from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.reset import ResetResult
 from paramclient.client.signing import Signing
 from paramclient.client.stats import ClientStats
+from paramclient.client.traffic import TrafficReport
 from paramclient.links import Link
 from paramclient.model.ext_params import ExtParam, ExtSettable
 from paramclient.model.ext_paramset import ExtParamSet
@@ -27,18 +29,12 @@ from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
 from paramclient.model.values import Encoding, Param, Settable, WireValue
 from paramclient.protocol.addresses import Address
-from paramclient.protocol.ext.change import ExtChange
-from paramclient.protocol.ext.fetch import ExtFetchResult
-from paramclient.protocol.ext.write_batch import ExtSetManyResult, ExtSetOutcome
-from paramclient.protocol.ext.writes import ExtSetResult
+from paramclient.protocol.events import Change
+from paramclient.protocol.fetch import FetchResult, Policy, Progress
 from paramclient.protocol.ftp import FILE_SIZE_MAX, DirectoryEntry
-from paramclient.protocol.params.change import Change
-from paramclient.protocol.params.fetch_result import FetchResult, Policy, Progress
-from paramclient.protocol.params.sync import ComponentState, SyncState
-from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome
-from paramclient.protocol.params.writes import SetResult
-from paramclient.protocol.stats.traffic import TrafficReport
+from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.vehicle.address_contest import Contest
+from paramclient.protocol.watch import SyncState
 from paramclient.sync.client_thread import ClientThread
 from paramclient.sync.wrappers import (
     BlockingClient,
@@ -63,7 +59,7 @@ __all__ = [
     "Event",
     "Events",
     "ExtChanges",
-    "ExtParams",
+    "Component",
     "Found",
     "Ftp",
     "Lost",
@@ -470,14 +466,14 @@ class Component(Wrapper[AsyncComponent]):
         return self._thread.read(lambda: self._wrapped.encoding_reason)
 
     @property
-    def ext(self) -> ExtParams:
+    def ext(self) -> Component:
         """The extended parameters of the component (PARAM_EXT_*), with their own calls.
 
         Raises:
             UsageError: the client is connected to a service of an earlier version without extended
                 parameters.
         """
-        return ExtParams.of(self._thread, self._thread.read(lambda: self._wrapped.ext))
+        return Component.of(self._thread, self._thread.read(lambda: self._wrapped.ext))
 
     @property
     def count(self) -> int | None:
@@ -851,7 +847,7 @@ class Component(Wrapper[AsyncComponent]):
         return Changes(self._thread, self._wrapped.changes)
 
 
-class ExtParams(Wrapper[AsyncExtParams]):
+class Component(Wrapper[AsyncExtParams]):
     """The extended parameters of a component (PARAM_EXT_*); see `Component.ext`.
 
     Cameras, gimbals and companion computers have them: values of up to 128 bytes, with text and 64-bit types.
@@ -918,7 +914,7 @@ class ExtParams(Wrapper[AsyncExtParams]):
         timeout: float | None = None,
         durable: bool = False,
         author: str | None = None,
-    ) -> ExtSetResult:
+    ) -> SetResult:
         """Write one parameter with PARAM_EXT_SET, and return when the component has acknowledged the value.
 
         An unknown type is read from the component first. While the component reports progress, the call
@@ -956,11 +952,11 @@ class ExtParams(Wrapper[AsyncExtParams]):
         self,
         values: Mapping[str, ExtSettable] | Iterable[tuple[str, ExtSettable]],
         *,
-        progress: Callable[[ExtSetOutcome], None] | None = None,
+        progress: Callable[[SetOutcome], None] | None = None,
         timeout: float | None = None,
         durable: bool = False,
         author: str | None = None,
-    ) -> ExtSetManyResult:
+    ) -> SetManyResult:
         """Write many parameters in one call, each as `set` does.
 
         Several writes are in flight at a time. A value that is refused does not stop the others. If the
@@ -993,7 +989,7 @@ class ExtParams(Wrapper[AsyncExtParams]):
 
     def fetch_all(
         self, *, timeout: float | None = None, progress: Callable[[Progress], None] | None = None
-    ) -> ExtFetchResult:
+    ) -> FetchResult:
         """Download all parameters with PARAM_EXT_REQUEST_LIST, and read the values that the list lacks.
 
         The protocol has no hash, so a cached table cannot be confirmed without a download. A client whose
@@ -1275,7 +1271,7 @@ class Changes(BlockingStream[Change]):
     """
 
 
-class ExtChanges(BlockingStream[ExtChange]):
+class ExtChanges(BlockingStream[Change]):
     """Stream of the changes of one component's extended parameters since its creation.
 
     A slow consumer receives several changes of one parameter as one.

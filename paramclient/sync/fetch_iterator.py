@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
-from paramclient.protocol.params.fetch_result import FetchResult, Progress
+from paramclient.protocol.fetch import FetchResult, Progress
 from paramclient.sync.blocking import Component
 from paramclient.sync.client_thread import ReportingCall
 from paramclient.sync.wrappers import thread_of, wrapped_by

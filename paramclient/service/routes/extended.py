@@ -29,8 +29,7 @@ from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.patterns import NameChoice
 from paramclient.model.similar_names import did_you_mean, nearest_names
 from paramclient.model.values import check_name
-from paramclient.protocol.ext.write_batch import ExtSetManyResult, ExtSetOutcome
-from paramclient.protocol.params.write_batch import SetStatus
+from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetStatus
 from paramclient.provision import (
     ExtApplyResult,
     apply_extended,
@@ -261,7 +260,7 @@ async def write_many_extended(request: Request, target: Target, body: ExtWriteMa
             status = SetStatus.REFUSED if isinstance(error, UsageError) else SetStatus.NOT_TRIED
             results[name] = NotSetDoc(status=status, problem=problem_of(error))
 
-    async def work() -> ExtSetManyResult:
+    async def work() -> SetManyResult:
         async with anyio.create_task_group() as tasks:
             for name in body.values:
                 tasks.start_soon(resolve, name)
@@ -383,7 +382,7 @@ async def _read(
     return Response(target.extended.json_of(param), media_type=JSON)
 
 
-def _document_of(outcome: ExtSetOutcome) -> ExtSetResultDoc | NotSetDoc:
+def _document_of(outcome: SetOutcome) -> ExtSetResultDoc | NotSetDoc:
     if outcome.error is not None:
         return NotSetDoc(status=outcome.status, problem=problem_of(outcome.error))
     assert outcome.result is not None

@@ -24,7 +24,7 @@ from paramclient.model.params import copy_params
 from paramclient.model.patterns import NameChoice
 from paramclient.model.similar_names import did_you_mean, nearest_names
 from paramclient.model.values import Param, WireValue
-from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, SetStatus
+from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetStatus
 from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.param_sources import PATTERNS_MAX, REQUEST_VALUES_MAX, Pattern
 from paramclient.service.problems import problem_of
