@@ -323,6 +323,8 @@ def _same(a: WrittenParam, b: WrittenParam) -> bool:
     """Return whether two values are equal as written: 1 and 1.0 are, −0.0 and 0.0 are not."""
     if a.type_number != b.type_number or a.is_raw or b.is_raw:
         return a.type_number == b.type_number and a.settable == b.settable
+    if not (isinstance(a.value, int | float) and isinstance(b.value, int | float)):
+        return a.value == b.value
     if math.isnan(a.value) or math.isnan(b.value):
         return math.isnan(a.value) and math.isnan(b.value)
     return a.value == b.value and math.copysign(1, a.value) == math.copysign(1, b.value)

@@ -216,8 +216,8 @@ def _multiplied(value: WireValue, kind: ParamType | int | None, ratio: Fraction)
     Raises:
         UsageError: the value is raw bytes.
     """
-    if isinstance(value, bytes):
-        raise UsageError("its value is raw bytes, which cannot be multiplied")
+    if isinstance(value, bytes | str):
+        raise UsageError("its value is no number, and cannot be multiplied")
     if isinstance(value, float) and not math.isfinite(value):
         return math.copysign(value, value * (1 if ratio > 0 else -1))
     if isinstance(value, float) and kind != ParamType.REAL64:

@@ -373,6 +373,8 @@ def encode_value(value: WireValue, number: int, encoding: Encoding) -> bytes:
     """
     if isinstance(value, bytes):
         return value
+    if isinstance(value, str):
+        raise UsageError(f"{value!r} is text, and the parameter is a number")
     if not 1 <= number <= ParamType.REAL64:
         raise UsageError(f"{type_name(number)} is not a type that MAVLink defines; give the 4 raw bytes")
     kind = ParamType(number)
@@ -445,6 +447,8 @@ def bits_of(value: WireValue, number: int) -> int:
         UsageError: the value does not fit the type.
     """
     value = check_value(value)
+    if isinstance(value, str):
+        return int.from_bytes(value.encode(), "little")
     if number in (ParamType.UINT64, ParamType.INT64) and not isinstance(value, bytes):
         kind = ParamType(number)
         low, high = kind.bounds
@@ -477,7 +481,7 @@ def format_value(value: WireValue, number: int = ParamType.REAL32) -> str:
     """Return the shortest text that parses to the same value: floats as float32, raw bytes as hexadecimal."""
     if isinstance(value, bytes):
         return f"0x{int.from_bytes(value, 'little'):08x}"
-    if isinstance(value, int):
+    if isinstance(value, int | str):
         return str(value)
     return repr(shortest_float(value) if number == ParamType.REAL32 else value)
 
