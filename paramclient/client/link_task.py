@@ -126,7 +126,7 @@ class LinkTask:
         self._read_at = -math.inf
         self._due = math.inf  # next deadline of the sender
         self._sender_late_at = -math.inf  # last time at which the sender ran late by more than `READ_GAP_MIN`
-        self._arrived_at = -math.inf  # arrival time of the last chunk of a link that does not report it
+        self._arrived_at = -math.inf  # arrival time of the last chunk
         self._unseen = 0.0  # seconds of suspend since the last read that the loop's clock has left out
         self._is_processing = False  # whether the reader processes data, or waits for its turn to do so
         self._suspend = SuspendDetector()
@@ -187,10 +187,10 @@ class LinkTask:
     def _moments(self, count: int, drained_at: float, read_at: float, now: float) -> Sequence[float]:
         """Return the arrival time of each chunk of a read, by the clock of the event loop.
 
-        If the link does not report arrival times and the reader was late, the time is uncertain. Each chunk
-        then gets the time at which the link was last drained, so that no value counts as newer than a value
-        that another program has observed since. It is `ARRIVAL_STEP` later than that of the chunks before, if
-        it would be earlier: otherwise an older value of the same parameter could count as the newer one.
+        If the reader was late, the time is uncertain. Each chunk then gets the time at which the link was
+        last drained, so that no value counts as newer than a value that another program has observed since.
+        It is `ARRIVAL_STEP` later than that of the chunks before, if it would be earlier: otherwise an older
+        value of the same parameter could count as the newer one.
 
         Args:
             count: number of chunks.
@@ -199,9 +199,6 @@ class LinkTask:
         """
         longest = now - drained_at + self._unseen
         self._unseen = 0.0
-        arrived_at: Sequence[float] = getattr(self._link, "arrived_at", ())
-        if len(arrived_at) == count:
-            return [min(max(at, now - longest), now) for at in arrived_at]
         was_sender_late = now - self._sender_late_at < READ_GAP_MIN or now - self._due > READ_GAP_MIN
         is_late = was_sender_late or read_at - drained_at > READ_GAP_MIN
         at = now - longest if is_late else now
