@@ -45,13 +45,13 @@ if TYPE_CHECKING:
         Resynced,
         Uncontested,
     )
-    from paramclient.client.extended_params import ExtChanges, ExtParams
+    from paramclient.client.extended_params import ExtParams
     from paramclient.client.fetch_all import FetchedAll
     from paramclient.client.files import Ftp
     from paramclient.client.reset import ResetResult
     from paramclient.client.signing import Signing, key_from_environment, read_key
     from paramclient.client.stats import ClientStats
-    from paramclient.client.subscription import Changes
+    from paramclient.client.subscription import Changes, ExtChanges
     from paramclient.errors import (
         AlreadyRestored,
         AmbiguousVehicle,
@@ -289,10 +289,7 @@ _HOMES: Final = {
         "Resynced",
         "Uncontested",
     ),
-    "paramclient.client.extended_params": (
-        "ExtChanges",
-        "ExtParams",
-    ),
+    "paramclient.client.extended_params": ("ExtParams",),
     "paramclient.client.fetch_all": ("FetchedAll",),
     "paramclient.client.files": ("Ftp",),
     "paramclient.client.reset": ("ResetResult",),
@@ -302,7 +299,7 @@ _HOMES: Final = {
         "read_key",
     ),
     "paramclient.client.stats": ("ClientStats",),
-    "paramclient.client.subscription": ("Changes",),
+    "paramclient.client.subscription": ("Changes", "ExtChanges"),
     "paramclient.errors": (
         "AlreadyRestored",
         "AmbiguousVehicle",

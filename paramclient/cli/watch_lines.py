@@ -21,8 +21,7 @@ from paramclient.client.events import (
     Resynced,
     Uncontested,
 )
-from paramclient.client.extended_params import ExtChanges
-from paramclient.client.subscription import Changes
+from paramclient.client.subscription import Changes, ExtChanges
 from paramclient.model.ext_params import ExtParam, ExtValue, format_ext_value
 from paramclient.model.notation import hash_text, time_text, value_json
 from paramclient.model.patterns import NameChoice

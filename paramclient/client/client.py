@@ -1,39 +1,53 @@
-"""ParamClient: the public client for the components on a link.
-
-It forwards its calls to `LinkClient`.
-"""
+"""ParamClient: the public client for the components on a link."""
 
 from __future__ import annotations
 
+import logging
+import math
 import os
 from collections.abc import Callable, Mapping
-from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from types import MappingProxyType, TracebackType
+from typing import TYPE_CHECKING, Final, Self
+
+import anyio
 
 from paramclient.cache import ParamCache
-from paramclient.client.arguments import COMPONENT_TIMEOUT
+from paramclient.client.arguments import COMPONENT_TIMEOUT, address_in_words
+from paramclient.client.cache_writer import choose_cache
 from paramclient.client.client_task import ClientTask
-from paramclient.client.component import Component
+from paramclient.client.component import Component, fetch_timeout, successor_of
+from paramclient.client.core import ClientCore
+from paramclient.client.event_dispatch import EventDispatch
 from paramclient.client.events import Events
-from paramclient.client.fetch_all import FetchedAll
+from paramclient.client.fetch_all import FetchedAll, FleetFetch
 from paramclient.client.files import Ftp
-from paramclient.client.link_client import ClientOptions, LinkClient
-from paramclient.client.local import LocalClient
-from paramclient.client.short_traceback import shortened
-from paramclient.client.signing import Signing
+from paramclient.client.signing import Signing, refused_in_words
+from paramclient.client.signing_timestamps import TimestampKeeper
 from paramclient.client.stats import ClientStats
-from paramclient.errors import ParamClientError, UsageError
-from paramclient.links import Link
+from paramclient.client.taps import LinkTaps
+from paramclient.client.vehicle_search import VEHICLES_LISTENING_TIME, listen_for_vehicles
+from paramclient.errors import NoReply, UsageError
+from paramclient.links import Link, ReplayLink, SimLink, create_link
 from paramclient.model.values import Encoding
+from paramclient.model.wording import counted
 from paramclient.protocol.addresses import Address
+from paramclient.protocol.no_reply_hint import hint_of_link
 from paramclient.protocol.params.fetch_result import Policy, Progress
+from paramclient.protocol.params.sync import SyncSettings
+from paramclient.protocol.station import Station
 from paramclient.protocol.stats.traffic import TrafficReport
+from paramclient.protocol.vehicle_selection import LOOK_TIME, VehicleChoice
 from paramclient.protocol.wire import SigningKey, SigningReport
 
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint
 
-__all__ = ["ParamClient", "local_client"]
+__all__ = ["ParamClient"]
+
+LISTENING_TIME: Final = 1.2
+"""Seconds after opening in which every component has sent a message: each sends a heartbeat once a second."""
+
+protocol_logger = logging.getLogger("paramclient.protocol")
 
 
 class ParamClient:
@@ -112,31 +126,41 @@ class ParamClient:
         signing: Signing | SigningKey | None = None,
         split_peers: bool = False,
     ) -> None:
-        options = ClientOptions(
-            cache=cache,
+        for number in (system, component):
+            if not 1 <= number <= 255:
+                raise UsageError(f"the client's system and component ids must be 1 to 255, not {number}")
+        opened = create_link(link)
+        is_log = isinstance(opened, ReplayLink)
+        self.cache = choose_cache(cache, is_log=is_log)
+        station = Station(
+            link=opened.name,
+            is_stream=opened.is_stream,
             system=system,
             component=component,
             encoding=encoding,
-            watch_interval=watch_interval,
-            policy=policy,
-            traffic=traffic,
-            listen_only=listen_only,
-            forward=forward,
-            tlog=tlog,
-            signing=signing,
+            sync_settings=SyncSettings.chosen(watch_interval, policy, listen_only=listen_only, is_log=is_log),
             split_peers=split_peers,
+            counts_traffic=traffic,
+            trace=protocol_logger.debug,
         )
-        self._implementation = LinkClient(link, options)
-        self.cache = self._implementation.cache
+        signing = Signing(signing) if isinstance(signing, SigningKey) else signing
+        self.core = ClientCore(
+            opened,
+            station,
+            self.cache,
+            owns_cache=self.cache is not cache,
+            taps=LinkTaps(tlog, forward, is_stream=opened.is_stream),
+            keeper=None if signing is None else TimestampKeeper(signing),
+        )
+        self.dispatch = EventDispatch(self.core, splits_peers=split_peers)
+        self._splits_peers = split_peers
 
     def __repr__(self) -> str:
-        return repr(self._implementation)
+        count = counted(len(self.dispatch.components), "component")
+        return f"<ParamClient {self.link.name} {self.core.state}, {count}>"
 
     async def __aenter__(self) -> Self:
-        try:
-            await self._implementation.open()
-        except ParamClientError as error:
-            raise shortened(error)  # noqa: B904 - the same error
+        await self.core.open()
         self._is_entered = True
         return self
 
@@ -144,7 +168,7 @@ class ParamClient:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            await self._implementation.close(failed=kind is not None)
+            await self.core.close(failed=kind is not None)
         finally:
             self._is_entered = False
 
@@ -164,7 +188,7 @@ class ParamClient:
             LinkError: the link, or the link to the other program, cannot be opened.
             ClientClosed: `aclose` was called meanwhile.
         """
-        task = ClientTask(self._implementation, self.link.name)
+        task = ClientTask(self.core)
         if self._task is None and not self._is_entered:
             self._task = task
         await task.open()
@@ -194,37 +218,42 @@ class ParamClient:
         With `split_peers`, ids may occur several times. The keys are then the values of `Component.address`,
         which include the peer; the ids alone are not keys.
         """
-        return self._implementation.components
+        return MappingProxyType(self.dispatch.components)
 
     @property
     def autopilots(self) -> list[Component]:
         """The autopilot of each system, sorted by system id, without cameras, gimbals and the like."""
-        return self._implementation.autopilots
+        station = self.core.station
+        machines = dict.fromkeys(machine.vehicle for machine in station.components.values())
+        vehicles = sorted(machines, key=lambda vehicle: vehicle[0])
+        found = [station.autopilot_of(*vehicle) for vehicle in vehicles]
+        return [self.components[machine.address] for machine in found if machine is not None]
 
     @property
     def link(self) -> Link:
         """The link object of the client."""
-        return self._implementation.link
+        return self.core.link
 
     @property
     def listens_only(self) -> bool:
         """Whether the client sends nothing: because of `listen_only`, or because the link is a log."""
-        return self._implementation.listens_only
+        return self.core.station.listens_only
 
     @property
     def bytes_received(self) -> int:
         """Bytes received over the link."""
-        return self._implementation.bytes_received
+        return self.core.station.bytes_received
 
     @property
     def bytes_sent(self) -> int:
         """Bytes of all sent frames, including heartbeats."""
-        return self._implementation.bytes_sent
+        return self.core.station.bytes_sent
 
     @property
     def stats(self) -> ClientStats:
         """Counters of the client since its creation, also after it is closed."""
-        return self._implementation.stats
+        counts = self.dispatch
+        return ClientStats.of(self.core.station, downloads=counts.downloads, cache_hits=counts.cache_hits)
 
     def events(self) -> Events:
         """Return a stream of component events from now on: `async for event in client.events()`.
@@ -238,11 +267,12 @@ class ParamClient:
             LinkError: while iterating, after the queued events: the link failed permanently, or the client
                 was closed.
         """
-        return self._implementation.events()
+        self.dispatch.events.add(events := Events())
+        return events
 
     def ftp(self, component: Component) -> Ftp:
         """Return the MAVFTP file calls of a component."""
-        return self._implementation.ftp(component)
+        return Ftp(component.core)
 
     async def component(
         self,
@@ -272,7 +302,17 @@ class ParamClient:
             NoReply: no message of the component arrived in time.
             LinkError: the link failed, or the client was closed.
         """
-        return await self._implementation.component(system, component, peer=peer, timeout=timeout)
+        self.core.check_open()
+        began = anyio.current_time()
+        with anyio.move_on_after(timeout):
+            while (found := self._find(system, component, peer)) is None and not self.core.station.is_over:
+                await self.core.link_task.activity.wait()
+                self.core.check_open()
+            if found is not None:
+                await found.core.wait_for_cache()
+        if found is None:
+            raise self._not_received(address_in_words(system, component, peer), began)
+        return found
 
     async def find_autopilots(
         self, *, expect: int | None = None, timeout: float | None = COMPONENT_TIMEOUT
@@ -296,7 +336,23 @@ class ParamClient:
             UsageError: `expect` is below 1.
             LinkError: the link failed, or the client was closed.
         """
-        return await self._implementation.find_autopilots(expect=expect, timeout=timeout)
+        if expect is not None and expect < 1:
+            raise UsageError(f"expect must be a number of vehicles from 1 up, not {expect}")
+        began = anyio.current_time()
+        await self.component(timeout=timeout)
+        listening: float | None = VEHICLES_LISTENING_TIME
+        if expect is not None:
+            listening = None if timeout is None else began + timeout - anyio.current_time()
+        found = await listen_for_vehicles(
+            lambda: self.autopilots,
+            expect=expect,
+            timeout=listening,
+            began=began,
+            check_open=self.core.check_open,
+        )
+        for each in found:
+            await each.core.wait_for_cache()
+        return found
 
     async def only_component(
         self,
@@ -330,7 +386,40 @@ class ParamClient:
             NoReply: no message of the component arrived in time, or too late to exclude a second vehicle.
             LinkError: the link failed, or the client was closed.
         """
-        return await self._implementation.only_component(system, component, peer=peer, timeout=timeout)
+        if self._has_one_vehicle:
+            return await self.component(system, component, peer=peer, timeout=timeout)
+        self.core.check_open()
+        began = anyio.current_time()
+        choice = VehicleChoice(system, component, splits_peers=self._splits_peers)
+        station = self.core.station
+        machine = None
+        with anyio.move_on_after(timeout), station.looking_for_others():
+            while True:
+                activity, now = self.core.link_task.activity, anyio.current_time()
+                since = station.listening_since
+                machine = choice.look(station.at_peer(peer), now, listening_since=since)
+                if machine is not None or station.is_over:
+                    break
+                with anyio.move_on_after(None if choice.due == math.inf else choice.due - now):
+                    await activity.wait()
+                await self.core.link_task.wait_for_reader(choice.due)
+                self.core.check_open()
+            if machine is not None:
+                await self.components[machine.address].core.wait_for_cache()
+        if machine is not None:
+            return self.components[machine.address]
+        awaited = address_in_words(system, component, peer)
+        if choice.due < math.inf:
+            awaited += f", then {LOOK_TIME} s without another vehicle"
+            raise NoReply(awaited, attempts=0, waited=anyio.current_time() - began)
+        raise self._not_received(awaited, began)
+
+    def _not_received(self, awaited: str, began: float) -> NoReply:
+        """Return the error of a component that was not received, with what was received instead."""
+        refused = refused_in_words(self.signing_report())
+        hint = "" if refused else hint_of_link(self.core.station, self.link.name)
+        waited = anyio.current_time() - began
+        return NoReply(f"{awaited}{refused}", attempts=0, waited=waited, hint=hint)
 
     async def successor(
         self, component: Component, system: int, *, timeout: float | None = COMPONENT_TIMEOUT
@@ -352,7 +441,7 @@ class ParamClient:
             NoReply: no message with this id arrived in time, or the vehicle did not report its identity.
             LinkError: the link failed, or the client was closed.
         """
-        return await self._implementation.successor(component, system, timeout=timeout)
+        return await successor_of(component, system, timeout=timeout)
 
     async def fetch_all(
         self,
@@ -388,8 +477,15 @@ class ParamClient:
             NoReply: no component was found, or none responded.
             LinkError: the link failed, or the client was closed.
         """
-        return await self._implementation.fetch_all(
-            system, refresh=refresh, timeout=timeout, progress=progress
+        self.core.station.check_refresh(refresh)
+        timeout = fetch_timeout(self.core.station, timeout)
+        began = anyio.current_time()
+        together = FleetFetch(self.core, self.components, system, refresh=refresh)
+        return await together.run(
+            until=math.inf if timeout is None else began + timeout,
+            hear_until=began + (COMPONENT_TIMEOUT if timeout is None else timeout),
+            listen_until=self.core.opened_at + LISTENING_TIME,
+            progress=progress,
         )
 
     def traffic_report(self) -> TrafficReport:
@@ -399,16 +495,23 @@ class ParamClient:
             UsageError: the client was made without `traffic=True`.
             LinkError: the link failed, or the client was closed.
         """
-        return self._implementation.traffic_report()
+        if self.core.station.traffic is None:
+            raise UsageError("this client does not count traffic; use ParamClient(..., traffic=True)")
+        self.core.check_open()
+        return self.core.station.traffic.report(anyio.current_time())
 
     def signing_report(self) -> SigningReport | None:
         """Return the signing statistics of the link: signed frames, and refused frames with the reasons.
 
         None if the client has no key.
         """
-        return self._implementation.signing_report()
+        return None if self.core.station.verifier is None else self.core.station.verifier.report()
 
+    @property
+    def _has_one_vehicle(self) -> bool:
+        """Whether the choice of a vehicle cannot be wrong: there is only one, or nothing is sent."""
+        return self.listens_only or (isinstance(self.link, SimLink) and self.link.has_one_vehicle)
 
-def local_client(client: ParamClient) -> LocalClient:
-    """Return the internal interface of a client. For the modules of this package only."""
-    return client._implementation
+    def _find(self, system: int | None, component: int | None, peer: str | None) -> Component | None:
+        found = self.core.station.find(system, component, peer)
+        return None if found is None else self.components[found.address]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable, Coroutine
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import anyio
 
-from paramclient.client.short_traceback import shortened
+from paramclient.client.core import ClientCore
 from paramclient.errors import ClientClosed, LinkError
 
 __all__ = ["ClientTask"]
@@ -23,19 +23,6 @@ _running: set[ClientTask] = set()
 """The tasks that have not ended: asyncio itself holds only weak references to its tasks."""
 
 
-class Openable(Protocol):
-    """The part of a client's implementation that this module needs. See `LinkClient`."""
-
-    async def open(self) -> None:
-        """Open the client."""
-
-    async def close(self, *, failed: bool) -> None:
-        """Close the client."""
-
-    def check_open(self) -> None:
-        """Raise LinkError if the client is not open."""
-
-
 class ClientTask:
     """Opens and closes a client in one task of its own.
 
@@ -43,13 +30,12 @@ class ClientTask:
     may be different tasks. If the event loop ends first, it cancels the task, which then closes the client.
 
     Args:
-        client: the implementation to open and to close.
-        link: name of its link, for errors.
+        client: what to open and to close.
     """
 
-    def __init__(self, client: Openable, link: str) -> None:
+    def __init__(self, client: ClientCore) -> None:
         self._client = client
-        self._link = link
+        self._link = client.link.name
         self._scope = anyio.CancelScope()
         self._opened = anyio.Event()
         self._is_to_close = anyio.Event()
@@ -132,7 +118,7 @@ class ClientTask:
     def _raise_error(self) -> None:
         error, self._error = self._error, None
         if error is not None:
-            raise shortened(error)
+            raise error
 
 
 def _spawn(function: Callable[[], Coroutine[Any, Any, None]]) -> None:

@@ -3,30 +3,46 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Final
 
 import anyio
 
+from paramclient.client.arguments import check_requested_name, check_settle, check_writes
+from paramclient.client.batch_wait import wait_for_batch
+from paramclient.client.component_core import ComponentCore, Explanations
 from paramclient.client.extended_params import ExtParams
 from paramclient.client.reset import ResetChoice, ResetResult, read_unconfirmed
+from paramclient.client.signing import timestamp_now
 from paramclient.client.subscription import Changes
-from paramclient.errors import UsageError
-from paramclient.model.identity import Identity
+from paramclient.errors import NotDurable, UsageError
+from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.params import ParamMap
-from paramclient.model.values import Encoding, Param, Settable, WireValue
+from paramclient.model.values import Encoding, Param, Settable, WireValue, decode_value, known_type
 from paramclient.protocol.addresses import Address
+from paramclient.protocol.params.change_origin import check_author
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
+from paramclient.protocol.params.passive import PASSIVE_TIMEOUT
 from paramclient.protocol.params.sync import ComponentState, SyncState
 from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome
 from paramclient.protocol.params.writes import SetResult
+from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle.address_contest import Contest
-from paramclient.protocol.wire import SigningKey
+from paramclient.protocol.wire import MAV_MODE_FLAG_SAFETY_ARMED, NO_INDEX, ParamValue, SigningKey
 
-__all__ = ["Component"]
+__all__ = ["Component", "fetch_timeout", "successor_of"]
+
+REBOOT_TIMEOUT: Final = 60.0
+"""Default timeout in seconds for a vehicle to reboot and report its identity: small autopilot boards take up
+to 30 s, and boards that calibrate sensors first a little longer."""
+SETUP_SIGNING_COUNT: Final = 3
+"""Number of SETUP_SIGNING messages sent: they have no acknowledgement, and a frame may be lost."""
+SETUP_SIGNING_INTERVAL: Final = 0.1
+"""Seconds after each SETUP_SIGNING message."""
 
 
-class Component(ABC):
+class Component:
     """One component of a vehicle; see `ParamClient.component`.
 
     All calls may be cancelled at any point; later calls are not affected. While a link reconnects, calls wait
@@ -43,94 +59,108 @@ class Component(ABC):
             and follows the received messages.
     """
 
-    system: int
-    component: int
-    params: ParamMap
+    def __init__(self, core: ComponentCore, siblings: Mapping[Address, Component]) -> None:
+        self.core = core
+        self.siblings = siblings  # all components of the client, this one included
+        self.system = core.machine.system
+        self.component = core.machine.component
+        self.params = ParamMap(core.machine.table.params)
+        self._ext = ExtParams(core)
 
     @property
-    @abstractmethod
     def autopilot(self) -> str:
         """Autopilot of its heartbeat: px4, ardupilot, generic, …; "unknown" before the first heartbeat."""
+        number = self.core.machine.identification.autopilot
+        return "unknown" if number is None else autopilot_name(number)
 
     @property
-    @abstractmethod
     def identity(self) -> Identity:
         """Identity of the vehicle from AUTOPILOT_VERSION: hardware id, firmware, capabilities, if known."""
+        return self.core.settled_identity or self.core.machine.identity
 
     @property
-    @abstractmethod
     def encoding(self) -> Encoding:
         """Encoding of its parameter values in messages: bytewise or C cast."""
+        return self.core.machine.table.encoding
 
     @property
-    @abstractmethod
     def encoding_reason(self) -> str:
         """The reason for `encoding`, as text."""
+        return self.core.machine.identification.encoding_reason
 
     @property
-    @abstractmethod
     def ext(self) -> ExtParams:
         """The extended parameters of the component (PARAM_EXT_*), with their own calls."""
+        return self._ext
 
     @property
-    @abstractmethod
     def count(self) -> int | None:
         """The `param_count` of the component; None before its first PARAM_VALUE."""
+        return self.core.machine.table.count
 
     @property
-    @abstractmethod
     def hash(self) -> int | None:
         """The PX4 hash (`_HASH_CHECK`) of the complete table; None if it is not known."""
+        return self.core.machine.table.hash if self.core.machine.table.complete else None
 
     @property
-    @abstractmethod
     def state(self) -> ComponentState:
         """State of the table: new, cached, fetching, synced, partial, contested or lost."""
+        return self.core.machine.state
 
     @property
-    @abstractmethod
     def sync_state(self) -> SyncState:
         """Whether the table matches the vehicle, and the running check or update."""
+        return self.core.machine.sync_state
 
     @property
-    @abstractmethod
     def address(self) -> Address:
         """Its key in `ParamClient.components`: (system, component), with `split_peers` also the peer."""
+        return self.core.machine.address
 
     @property
-    @abstractmethod
     def peer(self) -> str:
         """Address and port from which its messages arrive, and to which requests go; empty if unknown."""
+        return self.core.machine.peer_in_words
 
     @property
-    @abstractmethod
     def contest(self) -> Contest | None:
         """The vehicles that share its address, and their differences; None if there is only one vehicle.
 
         During a contest, every call raises ContestedAddress, `params` does not change, and the cache receives
         nothing.
         """
+        return self.core.machine.peers.contest
 
     @property
-    @abstractmethod
     def is_armed(self) -> bool | None:
         """Whether the vehicle is armed, from `base_mode` of its last heartbeat.
 
         None if unknown: before the first heartbeat, while the component is lost, and in high-latency mode, in
         which a vehicle sends no heartbeats.
         """
+        presence = self.core.machine.presence
+        if presence.base_mode is None or presence.is_lost:
+            return None
+        return bool(presence.base_mode & MAV_MODE_FLAG_SAFETY_ARMED)
 
     @property
-    @abstractmethod
     def silence(self) -> float:
         """Seconds since its last message. After 5 s the component is lost, see `Lost`."""
+        return max(0.0, anyio.current_time() - self.core.machine.presence.received_at)
 
     @property
-    @abstractmethod
     def round_trip(self) -> float | None:
         """Smoothed round-trip time in seconds; None before the first response."""
+        return self.core.machine.round_trip.smoothed
 
-    @abstractmethod
+    def __repr__(self) -> str:
+        last = self.core.machine.fetches.last
+        origin = "" if last is None else f" from {last.source} in {last.elapsed:.2f} s"
+        of = f" of {self.count}" if self.count is not None and self.state in ("partial", "fetching") else ""
+        whose = f"{self.system}/{self.component} {self.autopilot}"
+        return f"<Component {whose} {self.state} {len(self.params)}{of} params{origin}>"
+
     async def get(self, name: str | int, *, timeout: float | None = None) -> Param:
         """Read one parameter from the vehicle with PARAM_REQUEST_READ.
 
@@ -153,8 +183,21 @@ class Component(ABC):
             ContestedAddress: several vehicles use its address.
             LinkError: the link failed, or the client was closed.
         """
+        check_requested_name(name)
+        core, machine = self.core, self.core.machine
+        core.client.check_open()
+        what = f"{name if isinstance(name, str) else f'parameter {name}'} of {core.label}"
+        with core.explained():
+            read = machine.read(name, anyio.current_time())
+        try:
+            message = await core.wait(read, timeout, lambda: (what, read.attempts))
+        finally:
+            machine.reads.release(read)
+        known = machine.table.params.get(message.param_id)
+        if known is None or (isinstance(name, int) and known.index != name):
+            return _param_of(message, machine.table.encoding)
+        return known
 
-    @abstractmethod
     async def set(
         self,
         name: str,
@@ -202,8 +245,24 @@ class Component(ABC):
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link failed, or the client was closed.
         """
+        ((name, checked),) = check_writes([(name, value)])
+        core, machine = self.core, self.core.machine
+        core.client.check_open()
+        machine.check_uncontested()
+        if durable:
+            await core.wait_until_kept()
+        now, by = anyio.current_time(), check_author(author)
+        with core.explained():
+            write = machine.write(name, checked, now, by, settle=check_settle(settle), force=force)
+        try:
+            what = f"PARAM_SET {name} to {core.label}"
+            result = await core.wait(write, timeout, lambda: (what, write.attempts))
+        finally:
+            machine.writes.cancel(write, anyio.current_time())
+        if durable:
+            await core.write_durably([name])
+        return result
 
-    @abstractmethod
     async def set_many(
         self,
         values: Mapping[str, Settable] | Iterable[tuple[str, Settable]],
@@ -248,6 +307,39 @@ class Component(ABC):
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link had failed already, or the client was closed.
         """
+        pairs = check_writes(values)
+        core, machine = self.core, self.core.machine
+        core.client.check_open()
+        machine.check_uncontested()
+        if durable:
+            await core.wait_until_kept()
+        began, by = anyio.current_time(), check_author(author)
+        explain = Explanations(core, began)
+
+        def report(outcome: SetOutcome) -> None:
+            if progress is not None:
+                progress(explain.outcome(outcome))
+
+        with core.explained():
+            batch = machine.write_many(pairs, began, by, settle=check_settle(settle), force=force)
+        try:
+            core.client.wake()
+            outcomes = await wait_for_batch(batch, timeout, report, self._unanswered_sets)
+        finally:
+            machine.write_batches.end(batch, anyio.current_time())
+        failure, outcomes = explain.error(batch.failure), tuple(map(explain.outcome, outcomes))
+        if durable and (done := [outcome.name for outcome in outcomes if outcome.is_set]):
+            try:
+                await core.write_durably(done)
+            except NotDurable as error:
+                failure = failure or error
+                outcomes = tuple(replace(each, error=error) if each.is_set else each for each in outcomes)
+        elapsed = anyio.current_time() - began
+        return SetManyResult(self.system, self.component, outcomes, failure, elapsed)
+
+    def _unanswered_sets(self, names: Sequence[str]) -> str:
+        what = f"PARAM_SET {names[0]}" if len(names) == 1 else f"{len(names)} PARAM_SETs"
+        return f"{what} to {self.core.label}"
 
     async def reset(
         self,
@@ -297,7 +389,6 @@ class Component(ABC):
         )
         return ResetResult(written, choice.unchanged, choice.without_default)
 
-    @abstractmethod
     async def fetch_all(
         self,
         *,
@@ -338,8 +429,24 @@ class Component(ABC):
             ContestedAddress: several vehicles use its address.
             LinkError: the link failed, or the client was closed.
         """
+        core, machine = self.core, self.core.machine
+        core.client.check_open()
+        core.client.station.check_refresh(refresh)
+        timeout = fetch_timeout(core.client.station, timeout)
+        began = anyio.current_time()
+        if not refresh:
+            with anyio.move_on_after(timeout):
+                await core.wait_for_cache()
+        with core.explained():
+            fetch = machine.begin_fetch(anyio.current_time(), refresh=refresh)
+        try:
+            result = await core.wait_for_fetch(fetch, None if timeout is None else began + timeout, progress)
+        finally:
+            machine.end_fetch(fetch, anyio.current_time())
+            core.client.wake()  # requests of other operations may have waited for this fetch
+            await core.wait_until_files_closed()
+        return replace(result, elapsed=anyio.current_time() - began)
 
-    @abstractmethod
     async def refreshed(self, *, timeout: float | None = None) -> None:
         """Wait until the values outside the hash have been read after `fetch_all`.
 
@@ -353,8 +460,11 @@ class Component(ABC):
             NoReply: the reads took longer than `timeout`.
             LinkError: the link failed, or the client was closed.
         """
+        self.core.client.check_open()
+        refresh = self.core.machine.refresh
+        if refresh is not None:
+            await self.core.wait(refresh, timeout, lambda: ("the values outside the hash", 0))
 
-    @abstractmethod
     async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
         """Send a new signing key to the vehicle with SETUP_SIGNING, or with None remove its key.
 
@@ -371,8 +481,22 @@ class Component(ABC):
             UsageError: `link_is_safe` is False, or the component uses MAVLink 1.
             LinkError: the link failed, or the client was closed.
         """
+        if not link_is_safe:
+            raise UsageError(
+                "SETUP_SIGNING sends the key unencrypted. Use a link that no other party can read, such as"
+                " USB, and pass link_is_safe=True"
+            )
+        if self.core.machine.version == 1:
+            raise UsageError(f"{self.system}/{self.component} uses MAVLink 1, which has no signing")
+        for _ in range(SETUP_SIGNING_COUNT):
+            self.core.client.check_open()
+            timestamp = 0 if key is None else timestamp_now()
+            self.core.client.station.send_setup_signing(
+                self.system, self.component, key, timestamp, peer=self.core.machine.vehicle[1]
+            )
+            self.core.client.wake()
+            await anyio.sleep(SETUP_SIGNING_INTERVAL)
 
-    @abstractmethod
     async def reboot(self, *, system: int | None = None, timeout: float | None = None) -> Component:
         """Reboot the vehicle, and wait until the same vehicle is back.
 
@@ -399,8 +523,22 @@ class Component(ABC):
             NoReply: the vehicle did not respond, or was not back in time.
             LinkError: the link failed, or the client was closed.
         """
+        self.core.client.check_open()
+        moves = system is not None and system != self.system
+        deadline = anyio.current_time() + (REBOOT_TIMEOUT if timeout is None else timeout)
+        machine = self.core.machine
+        with self.core.explained():
+            restart = machine.begin_reboot(anyio.current_time(), returns=not moves)
+        try:
+            left = deadline - anyio.current_time()
+            await self.core.wait(restart, left, lambda: (restart.stage, restart.attempts))
+        finally:
+            machine.end_reboot(restart, anyio.current_time())
+        if system is None or not moves:
+            return self
+        left = deadline - anyio.current_time()
+        return await successor_of(self, system, timeout=left)
 
-    @abstractmethod
     def changes(self) -> Changes:
         """Return a stream of parameter changes from now on: `async for change in component.changes()`.
 
@@ -414,3 +552,29 @@ class Component(ABC):
                 was closed.
             NoReply: while iterating: the component was lost and is no longer followed.
         """
+        self.core.listen(changes := Changes())
+        return changes
+
+
+async def successor_of(component: Component, system: int, *, timeout: float | None) -> Component:
+    """Return the component of the same vehicle under its new system id; see `ParamClient.successor`."""
+    found = component.siblings[await component.core.wait_for_successor(system, timeout=timeout)]
+    await found.core.wait_for_cache()
+    return found
+
+
+def fetch_timeout(station: Station, timeout: float | None) -> float | None:
+    """Return the timeout of a fetch in seconds, with a default if the client only listens.
+
+    Such a client cannot know whether another station will request a list. A log has an end, so it needs no
+    default.
+    """
+    is_open = timeout is None and station.listens_only and not station.is_log
+    return PASSIVE_TIMEOUT if is_open else timeout
+
+
+def _param_of(message: ParamValue, encoding: Encoding) -> Param:
+    """Return the parameter of a PARAM_VALUE outside the table: a hash, or a removed or duplicate name."""
+    value, bits = decode_value(message.raw, message.param_type, encoding)
+    index = None if message.param_index == NO_INDEX else message.param_index
+    return Param(message.param_id, value, known_type(message.param_type), index, bits)

@@ -1,55 +1,46 @@
-"""ExtParams: the extended parameters of one component, and their calls, over a link."""
+"""ExtParams: the extended parameters of one component, and their calls."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from functools import partial
+from types import MappingProxyType
 from typing import Final
 
-from paramclient.cache import SnapshotSummary
-from paramclient.client.subscription import Subscription
-from paramclient.model.ext_params import ExtParam, ExtSettable
+import anyio
+
+from paramclient.cache import ParamCache, SnapshotSummary
+from paramclient.client.arguments import check_portable_name, check_requested_name
+from paramclient.client.batch_wait import wait_for_batch
+from paramclient.client.component_core import ComponentCore
+from paramclient.client.subscription import ExtChanges
+from paramclient.errors import (
+    CacheError,
+    NoReply,
+    NotDurable,
+    NotInCache,
+    UnknownVehicle,
+    UsageError,
+)
+from paramclient.model.ext_params import ExtParam, ExtSettable, check_ext_value
 from paramclient.model.ext_paramset import ExtParamSet
-from paramclient.protocol.ext.change import ExtChange
-from paramclient.protocol.ext.fetch import ExtFetchResult
+from paramclient.model.identity import Identity
+from paramclient.protocol.ext.fetch import ExtFetch, ExtFetchResult
 from paramclient.protocol.ext.write_batch import ExtSetManyResult, ExtSetOutcome
 from paramclient.protocol.ext.writes import ExtSetResult
-from paramclient.protocol.params.fetch_result import Progress
+from paramclient.protocol.params.change_origin import check_author
+from paramclient.protocol.params.fetch_result import Policy, Progress
 
-__all__ = ["ExtChanges", "ExtParams"]
+__all__ = ["ExtParams"]
 
-QUEUED_EXT_CHANGES_MAX: Final = 10_000
-"""Maximum number of changes queued for a consumer, one for each name. Above it, the oldest are dropped."""
-
-
-class ExtChanges(Subscription[ExtChange]):
-    """Stream of the changes of one component's extended parameters since its creation.
-
-    A slow consumer receives several changes of one parameter as one.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._waiting: dict[str, ExtChange] = {}
-
-    def push(self, item: ExtChange) -> None:
-        """Add a change, or merge it with the queued change of the same parameter."""
-        earlier = self._waiting.pop(item.name, None)
-        if earlier is not None:
-            item = ExtChange(item.name, earlier.old, item.new, item.by, earlier.is_added)
-            old, new = item.old, item.new
-            if (old is None and new is None) or (old is not None and new is not None and old.same_value(new)):
-                return
-        self._waiting[item.name] = item
-        if len(self._waiting) > QUEUED_EXT_CHANGES_MAX:
-            del self._waiting[next(iter(self._waiting))]
-        self._arrived.set()
-
-    def _take(self) -> ExtChange | None:
-        return self._waiting.pop(next(iter(self._waiting))) if self._waiting else None
+EXT_IDENTITY_TIMEOUT: Final = 10.0
+"""Seconds to wait for the identity of a vehicle: longer than all attempts to request it."""
+EXT_TIMEOUT_NOTE = "The fetch of extended parameters ended at its timeout."
+"""Note of a partial result that a timeout ended."""
 
 
-class ExtParams(ABC):
+class ExtParams:
     """The extended parameters of a component (PARAM_EXT_*); see `Component.ext`.
 
     Cameras, gimbals and companion computers have them: values of up to 128 bytes, with text and 64-bit types.
@@ -61,32 +52,39 @@ class ExtParams(ABC):
         params: the known parameters by name. The mapping is read-only and follows the received messages.
     """
 
-    params: Mapping[str, ExtParam]
+    def __init__(self, core: ComponentCore) -> None:
+        self._core = core
+        self._machine = core.machine
+        self.params: Mapping[str, ExtParam] = MappingProxyType(core.machine.ext.table.params)
+
+    def __repr__(self) -> str:
+        machine = self._machine
+        of = "" if self.count is None or self.is_complete else f" of {self.count}"
+        return f"<ExtParams {machine.system}/{machine.component} {len(self.params)}{of} extended params>"
 
     @property
-    @abstractmethod
     def count(self) -> int | None:
         """The `param_count` of the component; None before its first PARAM_EXT_VALUE."""
+        return self._machine.ext.table.count
 
     @property
-    @abstractmethod
     def is_spoken(self) -> bool:
         """Whether the component has sent an extended parameter."""
+        return self._machine.ext.is_spoken
 
     @property
-    @abstractmethod
     def is_expected(self) -> bool:
         """Whether the component has sent an extended parameter, or is of a kind that usually has them.
 
         Cameras, gimbals, winches, illuminators and grippers, by MAV_TYPE or component id.
         """
+        return self._machine.expects_extended
 
     @property
-    @abstractmethod
     def is_complete(self) -> bool:
         """Whether `params` has a parameter for every index below `count`."""
+        return self._machine.ext.table.complete
 
-    @abstractmethod
     async def get(self, name: str | int, *, timeout: float | None = None) -> ExtParam:
         """Read one parameter with PARAM_EXT_REQUEST_READ.
 
@@ -104,8 +102,20 @@ class ExtParams(ABC):
             ContestedAddress: several vehicles use its address.
             LinkError: the link failed, or the client was closed.
         """
+        check_requested_name(name)
+        machine = self._machine
+        self._core.client.check_open()
+        read = machine.read_ext(name, anyio.current_time())
+        what = f"{name if isinstance(name, str) else f'extended parameter {name}'} of {self._core.label}"
+        try:
+            message = await self._core.wait(read, timeout, lambda: (what, read.attempts))
+        finally:
+            machine.ext.reads.release(read)
+        known = machine.ext.table.params.get(message.param_id)
+        if known is None or (isinstance(name, int) and known.index != name):
+            return ExtParam.of(message.param_id, message.raw, message.param_type)
+        return known
 
-    @abstractmethod
     async def set(
         self,
         name: str,
@@ -115,7 +125,7 @@ class ExtParams(ABC):
         durable: bool = False,
         author: str | None = None,
     ) -> ExtSetResult:
-        """Write one parameter with PARAM_EXT_SET, and return when the component has acknowledged the value.
+        """Write one parameter with PARAM_EXT_SET; return when the component has acknowledged the value.
 
         An unknown type is read from the component first. While the component reports progress, the call
         continues to wait. Writes to one name run in the order of the calls, writes to different names in
@@ -144,8 +154,23 @@ class ExtParams(ABC):
             NotDurable: with `durable`, the component has accepted the value, but it could not be written to
                 the disk.
         """
+        machine = self._machine
+        check_portable_name(name)
+        checked = check_ext_value(value)
+        self._core.client.check_open()
+        machine.check_uncontested()
+        if durable:
+            await self._core.wait_until_kept()
+        write = machine.write_ext(name, checked, anyio.current_time(), check_author(author))
+        what = f"PARAM_EXT_SET {name} to {self._core.label}"
+        try:
+            result = await self._core.wait(write, timeout, lambda: (what, write.attempts))
+        finally:
+            machine.ext.writes.cancel(write, anyio.current_time())
+        if durable:
+            await self._core.write_durably([name])
+        return result
 
-    @abstractmethod
     async def set_many(
         self,
         values: Mapping[str, ExtSettable] | Iterable[tuple[str, ExtSettable]],
@@ -178,8 +203,35 @@ class ExtParams(ABC):
             LinkError: the link had failed already, or the client was closed.
             CacheError: with `durable`, the cache cannot store values. Nothing was written.
         """
+        given = values.items() if isinstance(values, Mapping) else values
+        pairs = [(check_portable_name(name), check_ext_value(value)) for name, value in given]
+        machine = self._machine
+        self._core.client.check_open()
+        machine.check_uncontested()
+        if durable:
+            await self._core.wait_until_kept()
+        began = anyio.current_time()
+        batch = machine.write_many_ext(pairs, began, check_author(author))
+        try:
+            self._core.client.wake()
+            outcomes = await wait_for_batch(
+                batch,
+                timeout,
+                progress,
+                lambda names: f"PARAM_EXT_SET {', '.join(names)} to {self._core.label}",
+            )
+        finally:
+            machine.ext.batches.end(batch, anyio.current_time())
+        failure = batch.failure
+        if durable and (done := [outcome.name for outcome in outcomes if outcome.is_set]):
+            try:
+                await self._core.write_durably(done)
+            except NotDurable as error:
+                failure = failure or error
+                outcomes = tuple(replace(each, error=error) if each.is_set else each for each in outcomes)
+        elapsed = anyio.current_time() - began
+        return ExtSetManyResult(machine.system, machine.component, outcomes, failure, elapsed)
 
-    @abstractmethod
     async def fetch_all(
         self,
         *,
@@ -208,8 +260,20 @@ class ExtParams(ABC):
             ContestedAddress: several vehicles use its address.
             LinkError: the link failed, or the client was closed.
         """
+        client, machine = self._core.client, self._machine
+        client.check_open()
+        began = anyio.current_time()
+        deadline = None if timeout is None else began + timeout
+        station = client.station
+        if station.policy is not Policy.AUTO and not station.listens_only:
+            return self._known(station.policy)
+        fetch = machine.begin_ext_fetch(anyio.current_time())
+        try:
+            return await self._wait_for_fetch(fetch, deadline, progress)
+        finally:
+            machine.ext.fetches.end(fetch)
+            client.wake()
 
-    @abstractmethod
     async def store_snapshot(self, *, reason: str) -> int | None:
         """Store a snapshot of the known parameters in the cache, as a restore point.
 
@@ -226,8 +290,18 @@ class ExtParams(ABC):
             CacheError: the cache cannot store it.
             LinkError: the client was closed.
         """
+        client = self._core.client
+        client.check_open()
+        cache = client.cache
+        if cache is None:
+            return None
+        if not self.params:
+            raise UsageError(f"no extended parameter of {self._core.label} is known; fetch them first")
+        identity = await self._written_identity()
+        params, number = ExtParamSet(dict(self.params)), self._machine.component
+        store = partial(cache.store_ext_snapshot, identity, number, params, reason=reason)
+        return (await client.cache_writer.run_in_thread(partial(store, complete=self.is_complete))).id
 
-    @abstractmethod
     async def snapshots(self) -> list[SnapshotSummary]:
         """Return the snapshots of the component's extended parameters, the newest last.
 
@@ -236,8 +310,17 @@ class ExtParams(ABC):
             CacheError: the cache cannot be read.
             LinkError: the client was closed.
         """
+        cache = self._require_cache()
+        key, number = (await self._written_identity()).key, self._machine.component
 
-    @abstractmethod
+        def read() -> list[SnapshotSummary]:
+            try:
+                return cache.ext_snapshots(key, number)
+            except UnknownVehicle:  # no vehicle that was named, but one on the link
+                return []
+
+        return await self._core.client.cache_writer.run_in_thread(read)
+
     async def load_state(self, when: float) -> ExtParamSet:
         """Return an earlier state of the parameters, from the cache.
 
@@ -250,8 +333,18 @@ class ExtParams(ABC):
             CacheError: there is no such state, or the cache cannot be read.
             LinkError: the client was closed.
         """
+        cache = self._require_cache()
+        key, number = (await self._written_identity()).key, self._machine.component
 
-    @abstractmethod
+        def read() -> ExtParamSet:
+            try:
+                return cache.ext_state_at(key, number, when)
+            except UnknownVehicle:  # no vehicle that was named, but one on the link
+                what = f"the cache {cache.place} has no earlier state of {key}, component {number}"
+                raise NotInCache(what) from None
+
+        return await self._core.client.cache_writer.run_in_thread(read)
+
     def changes(self) -> ExtChanges:
         """Return a stream of changes from now on, like `Component.changes`.
 
@@ -260,3 +353,47 @@ class ExtParams(ABC):
                 was closed.
             NoReply: while iterating: the component was lost and is no longer followed.
         """
+        self._core.ext_changes.add(changes := ExtChanges())
+        return changes
+
+    def _require_cache(self) -> ParamCache:
+        self._core.client.check_open()
+        cache = self._core.client.cache
+        if cache is None:
+            raise UsageError("earlier states are in the cache, and the client has none; open it with a cache")
+        return cache
+
+    async def _written_identity(self) -> Identity:
+        """Return the identity of the vehicle, after all received values are in the cache."""
+        await self._core.wait_until_identified(EXT_IDENTITY_TIMEOUT)
+        await self._core.client.cache_writer.write_all()
+        return self._core.settled_identity or self._machine.identity
+
+    def _known(self, policy: Policy) -> ExtFetchResult:
+        """Return the known table where the policy allows no download."""
+        if not self.params:
+            raise CacheError(
+                f"no extended parameter of {self._core.label} is known, and the policy is {policy}: nothing"
+                " may be downloaded"
+            )
+        machine = self._machine
+        params = dict(self.params)
+        return ExtFetchResult(machine.system, machine.component, params, self.count, (), "cache", 0.0)
+
+    async def _wait_for_fetch(
+        self, fetch: ExtFetch, deadline: float | None, progress: Callable[[Progress], None] | None
+    ) -> ExtFetchResult:
+        """Wait until a fetch ends, or return its partial result at the deadline."""
+        fetches = self._machine.ext.fetches
+        report = None if progress is None else lambda: progress(fetches.progress(fetch, anyio.current_time()))
+        await self._core.until_done(fetch, deadline, report)
+        if not fetch.done:
+            now = anyio.current_time()
+            if not fetch.has_begun:
+                what = f"extended parameters of {self._core.label}"
+                raise NoReply(what, attempts=fetch.request.count, waited=now - fetch.begun_at)
+            return fetches.partial(fetch, now, EXT_TIMEOUT_NOTE)
+        if fetch.error is not None:
+            raise fetch.error
+        assert fetch.result is not None
+        return fetch.result

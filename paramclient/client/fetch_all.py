@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, TypeAlias
@@ -12,14 +12,15 @@ import anyio
 import anyio.lowlevel
 
 from paramclient.client.arguments import PROGRESS_CALL_INTERVAL
-from paramclient.client.link_component import TIMEOUT_NOTE
-from paramclient.client.local import LocalComponent
+from paramclient.client.component import Component
+from paramclient.client.component_core import TIMEOUT_NOTE
+from paramclient.client.core import ClientCore
 from paramclient.errors import CacheError, ContestedAddress, NoReply
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.no_reply_hint import hint_of_component, hint_of_link
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
-from paramclient.protocol.station import Address, Peer, Station
+from paramclient.protocol.station import Address, Peer
 
 __all__ = ["FleetFetch", "FetchedAll"]
 
@@ -64,7 +65,7 @@ class FleetFetch:
     """The fetches of all components of one system, or of every system.
 
     Args:
-        station: the protocol core.
+        client: the running parts of the client.
         components: all components of the link, a live mapping.
         system: id of the system to fetch, or None for every system.
         refresh: as in `Component.fetch_all`.
@@ -72,13 +73,14 @@ class FleetFetch:
 
     def __init__(
         self,
-        station: Station,
-        components: Mapping[Address, LocalComponent],
+        client: ClientCore,
+        components: Mapping[Address, Component],
         system: int | None,
         *,
         refresh: bool,
     ) -> None:
-        self._station = station
+        self._client = client
+        self._station = client.station
         self._components = components
         self._system = system
         self._refresh = refresh
@@ -90,9 +92,6 @@ class FleetFetch:
 
     async def run(
         self,
-        check: Callable[[], None],
-        wake: Callable[[], None],
-        closed: Callable[[ComponentMachine], Awaitable[None]],
         *,
         until: float,
         hear_until: float,
@@ -104,9 +103,6 @@ class FleetFetch:
         Cancellation ends the fetches and keeps the received values in the tables.
 
         Args:
-            check: raises an error if the link failed or the client was closed; called in each iteration.
-            wake: runs the sender.
-            closed: waits until the unused file session of a component is closed on board.
             until: deadline; at this time the partial results are returned.
             hear_until, listen_until: as in `is_worth_waiting`.
             progress: called about ten times a second.
@@ -117,12 +113,12 @@ class FleetFetch:
         began = anyio.current_time()
         try:
             while True:
-                check()
+                self._client.check_open()
                 now = anyio.current_time()
                 while self.join(now):
-                    wake()
+                    self._client.wake()
                     await anyio.lowlevel.checkpoint()
-                    check()
+                    self._client.check_open()
                     now = anyio.current_time()
                 is_worth_it = self.is_worth_waiting(now, listen_until=listen_until, hear_until=hear_until)
                 if now >= until or not is_worth_it:
@@ -132,11 +128,11 @@ class FleetFetch:
                     progress(self.progress(anyio.current_time()))
         finally:
             with anyio.CancelScope(shield=True):
-                await self._end(wake)
+                await self._end()
             for address in self._fetches:
                 machine = self._station.components.get(address)
                 if machine is not None:  # the station may have forgotten it since
-                    await closed(machine)
+                    await self._client.wait_until_files_closed(machine)
 
     def join(self, now: float) -> bool:
         """Start the fetches of components whose cached table is loaded. Return whether any was due.
@@ -146,14 +142,14 @@ class FleetFetch:
         self._is_cache_awaited = False
         ready: dict[tuple[int, Peer], list[ComponentMachine]] = {}
         for address, component in self._components.items():
-            machine = component.machine
+            machine = component.core.machine
             if address in self._fetches or not machine.identification.has_parameters:
                 continue
             if self._system not in (None, machine.system) or (machine.presence.is_lost and not machine.fetch):
                 continue
             if machine.peers.contest is not None:
                 continue
-            if self._refresh or component.is_cache_due(now):
+            if self._refresh or component.core.is_cache_due(now):
                 ready.setdefault(machine.vehicle, []).append(machine)
             else:
                 self._is_cache_awaited = True
@@ -234,10 +230,10 @@ class FleetFetch:
                 silent[address] = self._explained(error.with_traceback(None), address, now)
         for address, component in self._components.items():
             is_selected = self._system in (None, address[0])
-            contest = component.machine.peers.contest
+            contest = component.core.machine.peers.contest
             if is_selected and address not in self._fetches and contest is not None:
                 silent[address] = contest.error
-            elif is_selected and address not in self._fetches and component.machine.presence.is_lost:
+            elif is_selected and address not in self._fetches and component.core.machine.presence.is_lost:
                 what = f"the parameters of {address[0]}/{address[1]} (lost)"
                 silent[address] = NoReply(what, attempts=0, waited=component.silence)
         if not results:
@@ -260,16 +256,16 @@ class FleetFetch:
         since = -math.inf if fetch is None else fetch.begun_at
         return error.with_hint(hint_of_component(self._station, machine, since, now))
 
-    async def _end(self, wake: Callable[[], None]) -> None:
+    async def _end(self) -> None:
         """Release all fetches, the last ones first, so that no waiting fetch starts when another one ends."""
         for number, (address, fetch) in enumerate(reversed(self._fetches.items()), 1):
             machine = self._station.components.get(address)
             if machine is not None:  # the station may have forgotten it since
                 machine.end_fetch(fetch, anyio.current_time())
             if not number % ENDED_FETCHES_MAX:
-                wake()
+                self._client.wake()
                 await anyio.lowlevel.checkpoint()
-        wake()  # requests of other operations may have waited for these fetches
+        self._client.wake()  # requests of other operations may have waited for these fetches
 
     def _look(self, address: Address, fetch: Fetch, now: float) -> None:
         """Record the response time of a component, or the time at which its heartbeats were overdue."""

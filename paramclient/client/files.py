@@ -8,8 +8,7 @@ from typing import TypeVar
 
 import anyio
 
-from paramclient.client.component import Component
-from paramclient.client.local import local
+from paramclient.client.component_core import ComponentCore
 from paramclient.protocol.ftp import FILE_SIZE_MAX, DirectoryEntry, FileTransfers
 from paramclient.protocol.ftp.transfer_job import FileTransferJob
 
@@ -30,11 +29,11 @@ class Ftp:
         LinkError: the link failed, or the client was closed.
     """
 
-    def __init__(self, component: Component) -> None:
-        self._component = local(component)
+    def __init__(self, core: ComponentCore) -> None:
+        self._core = core
 
     def __repr__(self) -> str:
-        return f"<Ftp {self._component.system}/{self._component.component}>"
+        return f"<Ftp {self._core.label}>"
 
     async def read(
         self,
@@ -124,10 +123,10 @@ class Ftp:
             NoReply: the component is lost.
             LinkError: the link failed, or the client is not open.
         """
-        component, now = self._component, anyio.current_time()
-        component.client.check_open()
-        component.machine.check_present(f"{what} of {component.system}/{component.component}", now)
-        return component.machine.files, now
+        core, now = self._core, anyio.current_time()
+        core.client.check_open()
+        core.machine.check_present(f"{what} of {core.label}", now)
+        return core.machine.files, now
 
     async def _wait(
         self,
@@ -136,12 +135,11 @@ class Ftp:
         timeout: float | None,
         report: Callable[[], None] | None = None,
     ) -> Result:
-        component = self._component
+        core = self._core
         job.is_of_caller = True
-        awaited = f"{what} of {component.system}/{component.component}"
         try:
-            return await component.wait(job, timeout, lambda: (awaited, 0), report)
+            return await core.wait(job, timeout, lambda: (f"{what} of {core.label}", 0), report)
         finally:
-            component.machine.files.release(job, anyio.current_time())
-            component.wake()
-            await component.wait_until_files_closed()
+            core.machine.files.release(job, anyio.current_time())
+            core.client.wake()
+            await core.wait_until_files_closed()

@@ -1,63 +1,21 @@
-"""All vehicles on a link: how long is listened for them, and the error if fewer are heard than expected.
-
-`ParamClient.find_autopilots` and `--all` and `--expect` of the command line find vehicles in this way.
-"""
+"""The search for all vehicles on a link, or for an expected number of them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Final
 
 import anyio
 
 from paramclient.client.component import Component
-from paramclient.errors import NoReply, UsageError
+from paramclient.errors import NoReply
 
-__all__ = ["VEHICLES_LISTENING_TIME", "find_autopilots", "listen_for_vehicles"]
+__all__ = ["VEHICLES_LISTENING_TIME", "listen_for_vehicles"]
 
 VEHICLES_LISTENING_TIME: Final = 3.0
 """Seconds in which every vehicle is heard, even on a link that loses two of three heartbeats."""
 VEHICLES_POLL_INTERVAL: Final = 0.05
 """Seconds between two checks whether all expected vehicles have been heard."""
-
-
-class _VehicleSource(Protocol):
-    """What the search needs of a client."""
-
-    @property
-    def autopilots(self) -> list[Component]:
-        """See `ParamClient.autopilots`."""
-
-    def check_open(self) -> None:
-        """Raise the error of a client that is not open, or whose link failed."""
-
-    async def component(self, *, timeout: float | None) -> Component:
-        """See `ParamClient.component`."""
-
-
-async def find_autopilots(
-    client: _VehicleSource, *, expect: int | None, timeout: float | None
-) -> list[Component]:
-    """See `ParamClient.find_autopilots`.
-
-    Raises:
-        UsageError, NoReply, LinkError: as in `ParamClient.find_autopilots`.
-    """
-    if expect is not None and expect < 1:
-        raise UsageError(f"expect must be a number of vehicles from 1 up, not {expect}")
-    began = anyio.current_time()
-    await client.component(timeout=timeout)
-    if expect is None:
-        listening: float | None = VEHICLES_LISTENING_TIME
-    else:
-        listening = None if timeout is None else began + timeout - anyio.current_time()
-    return await listen_for_vehicles(
-        lambda: client.autopilots,
-        expect=expect,
-        timeout=listening,
-        began=began,
-        check_open=client.check_open,
-    )
 
 
 async def listen_for_vehicles(

@@ -1,6 +1,6 @@
 """The peers of a component: several paths to one vehicle, or several vehicles that contest its address.
 
-The text of the warning is `errors.ContestedAddress`; `client.link_client` logs it. `protocol.component`
+The text of the warning is `errors.ContestedAddress`; `client.event_dispatch` logs it. `protocol.component`
 refuses requests while an address is contested.
 """
 
