@@ -10,6 +10,7 @@
 #   make fuzz         each target of fuzz/ for SECONDS
 #   make soak         random sessions                make kills      programs killed while they write
 #   make attack       hostile clients and services   make fuzz-http  random requests to the service
+#   make sync         generates the types of the blocking client
 #   make clean        removes .venv and all other files that these commands create
 #   make pictures     the comparison with other clients as pictures, into docs/images
 #   make screenshots  screenshots of the web page, into docs/images
@@ -42,7 +43,7 @@ WORKERS ?= $(shell $(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 2)
 # the tests start several hundred processes; without bytecode, each of them would compile paramclient again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow test-all coverage soak kills live fuzz fuzz-http attack lint lint-platforms docs screenshots pictures bench cost peers dist clean
+.PHONY: demo test test-slow test-all coverage soak kills live fuzz fuzz-http attack lint lint-platforms docs screenshots pictures sync bench cost peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -105,6 +106,10 @@ docs: $(VENV)/with-docs
 
 screenshots: $(VENV)/with-test
 	$(BIN)/python -m tests.screenshots
+
+# the types of the blocking client; needed after each change of the asynchronous one, and a test compares
+sync: $(VENV)/with-test
+	$(BIN)/python -m tests.sync_stub
 
 # needed after each change of the table in the README; a test compares the result
 pictures: $(VENV)/made

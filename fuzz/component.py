@@ -19,7 +19,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.ftp import FileRead
 from paramclient.protocol.params import change_origin, table
 from paramclient.protocol.params.fetch import Fetch
-from paramclient.protocol.params.fetch_result import Policy, Sampled
+from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.params.passive import PassiveFetch
 from paramclient.protocol.params.reads import ValueRead
 from paramclient.protocol.params.sync import SyncSettings
@@ -377,10 +377,9 @@ class _Session:
     def fetch(self) -> None:
         machine, how = self.machine(), self.draw.number()
         if machine is not None:
-            sampled = Sampled(1 + how % 5, 0) if how & 16 else None
-            refresh = bool(how & 32) and sampled is None and self.sync_settings.policy is Policy.AUTO
+            refresh = bool(how & 32) and self.sync_settings.policy is Policy.AUTO
             with suppress(NoReply, UsageError):
-                self.keep(machine, machine.begin_fetch(self.now, refresh=refresh, sampled=sampled))
+                self.keep(machine, machine.begin_fetch(self.now, refresh=refresh))
 
     def fetch_several(self) -> None:
         system = self.draw.one_of(SYSTEMS)

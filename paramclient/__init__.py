@@ -111,7 +111,7 @@ if TYPE_CHECKING:
     from paramclient.protocol.vehicle.address_contest import Contest
     from paramclient.protocol.watch import SyncState
     from paramclient.wire.messages import AutopilotVersion, Heartbeat
-from paramclient.wire.signing import Refusal, SigningKey, SigningPolicy, SigningReport, SigningStream
+    from paramclient.wire.signing import Refusal, SigningKey, SigningPolicy, SigningReport, SigningStream
 
 __all__ = [
     "Added",
@@ -271,10 +271,7 @@ _HOMES: Final = {
         "Resynced",
         "Uncontested",
     ),
-    "paramclient.client.extended_params": (
-        "Changes",
-        "Component",
-    ),
+    "paramclient.client.extended_params": ("Component",),
     "paramclient.client.fetch_all": ("FetchedAll",),
     "paramclient.client.files": ("Ftp",),
     "paramclient.client.reset": ("ResetResult",),
@@ -284,7 +281,7 @@ _HOMES: Final = {
         "read_key",
     ),
     "paramclient.client.stats": ("ClientStats",),
-    "paramclient.client.subscription": ("Changes",),
+    "paramclient.client.subscription": ("Changes", "Changes"),
     "paramclient.errors": (
         "AlreadyRestored",
         "AmbiguousVehicle",

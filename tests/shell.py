@@ -18,7 +18,6 @@ import anyio.to_thread
 
 from paramclient import Component, Param, ParamClient, ParamType
 from paramclient.client import cache_writer
-from paramclient.client.local import local
 from paramclient.client.worker_thread import Worker
 from paramclient.errors import LinkError
 from paramclient.links import Peer, SimLink
@@ -373,7 +372,7 @@ def bits(params: Mapping[str, Param]) -> dict[str, int]:
 
 def machine_of(component: Component) -> ComponentMachine:
     """What stands behind a component, wherever its link is."""
-    return local(component).machine
+    return component.core.machine
 
 
 def residue(component: Component) -> list[object]:

@@ -244,15 +244,17 @@ def test_the_commands_of_the_recipes_print_what_the_page_shows(tmp_path: Path) -
 
 @pytest.mark.slow
 def test_the_commands_for_users_of_other_programs_run(tmp_path: Path) -> None:
-    """Each command of the tables, in the order of the page, in one folder."""
+    """Each command of the tables, in the order of the page; each table has its own folder."""
     page = (DOCS / "coming-from.md").read_text(encoding="utf-8")
-    for section in page.split("\n## ")[1:]:
+    for number, section in enumerate(page.split("\n## ")[1:]):
+        folder = tmp_path / str(number)
+        folder.mkdir()
         link = "sim:px4" if section.startswith("MAVSDK") else "sim:ardupilot"
-        assert run_command(f"paramclient fetch {link} --tlog flight.tlog", tmp_path).returncode == 0
-        assert run_command(f"paramclient save {link} other.parm", tmp_path).returncode == 0
+        assert run_command(f"paramclient fetch {link} --tlog flight.tlog", folder).returncode == 0
+        assert run_command(f"paramclient save {link} other.parm", folder).returncode == 0
         for command in re.findall(r"^\|[^|\n]*\| `(paramclient [^`|]*)`", section, re.MULTILINE):
             words = command.replace("LINK", link) + " --timeout 1" * (" watch " in command)
-            done = run_command(words, tmp_path)
+            done = run_command(words, folder)
             assert done.returncode == 0, command + done.stderr
 
 

@@ -18,7 +18,6 @@ from paramclient.cli.output import live_view, milliseconds, print_document, prin
 from paramclient.cli.session import Deadline, listen, received_in_words
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
-from paramclient.client.local import local
 from paramclient.client.traffic import ComponentTraffic, TrafficReport
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.identity import autopilot_name
@@ -124,7 +123,7 @@ async def _show(client: ParamClient, seconds: float | None) -> TrafficReport:
             report = client.traffic_report()
             if report.frames:
                 trips = {
-                    address: local(component).machine.round_trip
+                    address: component.core.machine.round_trip
                     for address, component in client.components.items()
                 }
                 history.take(report, trips, anyio.current_time())

@@ -17,7 +17,6 @@ from paramclient.cli.sources import choose, is_file, open_file
 from paramclient.cli.targets import PLACEHOLDERS, Address, Targets, check_pattern, fill_pattern
 from paramclient.cli.time_arguments import parse_when
 from paramclient.client.component import Component
-from paramclient.client.local import local
 from paramclient.errors import (
     AlreadyRestored,
     FileError,
@@ -189,7 +188,7 @@ def _loader(
 
     async def load_cached(vehicle: Component) -> StateToRestore:
         await wait_for_identity(vehicle)
-        await local(vehicle).client.cache_writer.write_all()
+        await vehicle.core.client.cache_writer.write_all()
         key, component = vehicle.identity.key, vehicle.component
         if moment is not None:
             return await anyio.to_thread.run_sync(lambda: _state_at(cache, key, component, moment))

@@ -19,7 +19,7 @@ from paramclient.cli.output import local_time, printable, report, say
 from paramclient.cli.vehicle_name import check_kind, check_uid, wait_for_kind
 from paramclient.cli.waiting import while_waiting
 from paramclient.client.arguments import address_in_words
-from paramclient.client.client import ParamClient, local_client
+from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, UsageError
 from paramclient.links import LinkKind, ReplayLink, parse_link
@@ -391,7 +391,7 @@ def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> P
 
 def received_in_words(client: ParamClient) -> str:
     """Return what was received so far on the link."""
-    return hint_of_link(local_client(client).station, client.link.name)
+    return hint_of_link(client.core.station, client.link.name)
 
 
 def _difference(found: Component, chosen: Component) -> str:

@@ -21,7 +21,7 @@ from paramclient.cli.session import (
     wait_for_firmware,
 )
 from paramclient.cli.sources import choose, is_file, open_file, resolve
-from paramclient.client.client import ParamClient, local_client
+from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.client.vehicle_search import VEHICLES_LISTENING_TIME, listen_for_vehicles
 from paramclient.errors import FileError, UsageError
@@ -245,7 +245,7 @@ async def find_vehicles(
         expect=expect,
         timeout=deadline.left(VEHICLES_LISTENING_TIME if expect is None else VEHICLE_TIMEOUT),
         began=anyio.current_time(),
-        check_open=local_client(client).check_open,
+        check_open=client.core.check_open,
     )
 
 

@@ -10,7 +10,7 @@ import anyio
 
 from paramclient.cache import ParamCache
 from paramclient.cache.lookup import KINDS, address_of, find_vehicle
-from paramclient.client.client import ParamClient, local_client
+from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, AnotherVehicle, NoReply, UsageError
 from paramclient.protocol.selection import LOOK_TIME
@@ -110,7 +110,7 @@ async def wait_for_kind(client: ParamClient, kind: str, timeout: float | None) -
     """
     with anyio.move_on_after(timeout):
         while not (found := _of_kind(client, kind)):
-            local_client(client).check_open()
+            client.core.check_open()
             await anyio.sleep(KIND_POLL_INTERVAL)
         await anyio.sleep(LOOK_TIME)
     return check_kind(client, kind) if found else None

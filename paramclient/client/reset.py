@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import anyio
 
@@ -13,13 +12,6 @@ from paramclient.model.values import Param, Trust, WireValue, bits_of, same_bits
 from paramclient.protocol.set_results import SetManyResult
 
 __all__ = ["ResetChoice", "ResetResult", "read_unconfirmed"]
-
-
-class Reader(Protocol):
-    """`Component.get`."""
-
-    async def __call__(self, name: str, *, timeout: float | None = None) -> Param:
-        """Read one parameter from the vehicle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +78,11 @@ class ResetResult:
 
 
 async def read_unconfirmed(
-    table: Mapping[str, Param], read: Reader, names: Iterable[str], *, timeout: float | None = None
+    table: Mapping[str, Param],
+    read: Callable[..., Awaitable[Param]],
+    names: Iterable[str],
+    *,
+    timeout: float | None = None,
 ) -> list[Param]:
     """Return parameters of a fetched table in the order of the names; read those that are only cached.
 

@@ -11,7 +11,6 @@ import anyio
 
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
-from paramclient.client.local import LocalComponent, local
 from paramclient.client.traffic import ComponentTraffic
 from paramclient.diagnosis.report import (
     FileService,
@@ -97,8 +96,6 @@ async def check_vehicle(
 class _Diagnosis:
     """One diagnosis: the measurements in their order."""
 
-    _local: LocalComponent
-
     def __init__(
         self, client: ParamClient, component: Component, timeout: float, progress: Callable[[str], None]
     ) -> None:
@@ -114,8 +111,8 @@ class _Diagnosis:
         component = self._component
         self._report_progress("listening")
         self._client.traffic_report()
-        self._local = local(component)
-        opened_at = self._local.client.opened_at
+        self._core = component.core
+        opened_at = self._core.client.opened_at
         await anyio.sleep(max(0.0, DIAGNOSIS_LISTENING_TIME - (anyio.current_time() - opened_at)))
         self._report_progress("identification")
         await self._wait_for_identity()
@@ -135,7 +132,7 @@ class _Diagnosis:
         self._report_progress("hash again")
         after = await self._within(self._read_hash)
         identity = component.identity
-        machine = self._local.machine
+        machine = self._core.machine
         return VehicleReport(
             system=component.system,
             component=component.component,
@@ -166,12 +163,12 @@ class _Diagnosis:
     async def _wait_for_identity(self) -> None:
         """Wait until AUTOPILOT_VERSION was received or finally refused, at most `VERSION_TIMEOUT`."""
         with anyio.move_on_after(self._left(VERSION_TIMEOUT)):
-            while not self._local.machine.identification.settled:
-                await self._local.client.link_task.activity.wait()
+            while not self._core.machine.identification.settled:
+                await self._core.client.link_task.activity.wait()
 
     async def _measure_round_trips(self) -> tuple[float, ...]:
         """Return the seconds from command to acknowledgement, for commands that were sent once, sorted."""
-        component, machine = self._component, self._local.machine
+        component, machine = self._component, self._core.machine
         round_trips: list[float] = []
         for _ in range(ROUND_TRIP_COUNT):
             left = self._left(MEASURE_TIMEOUT)
@@ -183,7 +180,7 @@ class _Diagnosis:
             )
             what = f"COMMAND_ACK of {component.system}/{component.component}"
             try:
-                await self._local.wait(command, left, lambda what=what: (what, 0))  # type: ignore[misc]
+                await self._core.wait(command, left, lambda what=what: (what, 0))  # type: ignore[misc]
             except CommandRefused:
                 pass  # a refusal is an acknowledgement too
             except NoReply:
@@ -201,7 +198,7 @@ class _Diagnosis:
 
     async def _read_hash(self) -> int | str:
         """Return the vehicle's present hash, or the reason why there is none."""
-        if self._local.machine.identification.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
+        if self._core.machine.identification.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
             return "ArduPilot has no parameter hash"
         try:
             param = await self._component.get(HASH_CHECK, timeout=self._left(MEASURE_TIMEOUT))
@@ -224,7 +221,7 @@ class _Diagnosis:
         indices = range(SINGLE_READ_COUNT, count, step)[:CONCURRENT_READ_COUNT]
         if not indices:
             return ReadService(median(single), None, 0, 0, 0)
-        reads = self._local.machine.reads
+        reads = self._core.machine.reads
         requests = reads.retries
         began = anyio.current_time()
         answered_at: list[float] = []
@@ -249,7 +246,7 @@ class _Diagnosis:
 
     async def _measure_list(self) -> ListService:
         """Measure one list download, also if a file download would be faster."""
-        machine = self._local.machine
+        machine = self._core.machine
         began = anyio.current_time()
         arrivals: list[tuple[float, int]] = []
 
@@ -262,10 +259,10 @@ class _Diagnosis:
         try:
             fetch = machine.begin_fetch(began, refresh=True, by_list=True)
             try:
-                result = await self._local.wait_for_fetch(fetch, deadline, progress)
+                result = await self._core.wait_for_fetch(fetch, deadline, progress)
             finally:
                 machine.end_fetch(fetch, anyio.current_time())
-                self._local.wake()
+                self._core.client.wake()
         except LinkError:
             raise
         except ParamClientError as error:
@@ -287,7 +284,7 @@ class _Diagnosis:
         )
 
     async def _check_files(self) -> FileService:
-        machine = self._local.machine
+        machine = self._core.machine
         capabilities = machine.identification.capabilities
         is_announced = None if capabilities is None else bool(capabilities & CAPABILITY_FTP)
         ftp = self._client.ftp(self._component)
@@ -330,14 +327,14 @@ class _Diagnosis:
         seconds = anyio.current_time() - began
         if isinstance(before, str):
             return HashService(None, None, seconds, None, before)
-        last = self._local.machine.fetches.last
+        last = self._core.machine.fetches.last
         confirms = None if last is None or last.missing else last.hash is not None
         return HashService(before, after if isinstance(after, int) else None, seconds, confirms, None)
 
     def _make_link_report(self, round_trips: tuple[float, ...]) -> LinkReport:
         client, component = self._client, self._component
         report = client.traffic_report()
-        own = self._local.client.station.own_address
+        own = self._core.client.station.own_address
         address = (component.system, component.component)
         mine = next((each for each in report.components if (each.system, each.component) == address), None)
         sent = 0 if mine is None else mine.frames - mine.repeated + mine.lost
@@ -350,7 +347,7 @@ class _Diagnosis:
             lost=0 if mine is None else max(mine.lost, 0),
             repeated=0 if mine is None else mine.repeated,
             damaged=report.damaged,
-            unusable_names=self._local.machine.table.left_out,
+            unusable_names=self._core.machine.table.left_out,
             unknown=report.unknown,
             other_bytes=report.other_bytes,
             bytes_received=report.bytes_received,

@@ -40,10 +40,6 @@ class Link(Protocol):
 
     One task may wait in `receive` and one in `send` at a time; a third may call `open` and `close`. Every
     call may be cancelled: data that had arrived by then stays for the next `receive`.
-
-    If the operating system reports arrival times, the link also has an attribute `arrived_at`: the arrival
-    time of each item of the last `receive`, in their order, on the event loop's clock; an empty list if
-    unknown.
     """
 
     @property

@@ -17,10 +17,6 @@ small buffer, thread with recvmmsg  1,891–2,000   512
 A thread waits for the interpreter's lock after each call, so it does not replace a large buffer. The link
 therefore requests the buffer, beyond the limit if the program is privileged, and `receive_buffer` is its
 actual size. If that is too small, `sysctl -w net.core.rmem_max=4194304` helps.
-
-Linux records the arrival time of each datagram, and reports that of the datagram read last (SIOCGSTAMP,
-socket(7)). One such call per read costs 0.6 µs; control messages (SO_TIMESTAMPNS) for each datagram would
-cost twice that. The datagrams of a read therefore get individual times only if the first of them has waited.
 """
 
 from __future__ import annotations
@@ -28,9 +24,7 @@ from __future__ import annotations
 import errno
 import math
 import socket
-import struct
 import sys
-import time
 from contextlib import suppress
 from typing import Final
 from zlib import crc32
@@ -39,12 +33,10 @@ import anyio
 import anyio.lowlevel
 
 from paramclient.errors import LinkError
-from paramclient.links.clock_offset import seconds_ahead
 from paramclient.links.link import OPEN_TIMEOUT, Address, Peer, SocketLink, claim
 from paramclient.links.names import LinkSpec
 from paramclient.links.refusals import reason
 from paramclient.wire.frames import Framer
-from paramclient.wire.messages import Heartbeat, message_id
 
 __all__ = ["UdpIn", "UdpOut"]
 
@@ -62,12 +54,8 @@ PEER_TIMEOUT: Final = 60.0
 """Seconds without a valid frame after which an address is forgotten."""
 
 FRAME_CHECK_INTERVAL: Final = 1.0
-"""Seconds after which the link checks another frame of an address that has sent heartbeats. The station
-checks every frame in any case."""
-
-UNKNOWN_PEER_INTERVAL: Final = 1.0
-"""Seconds between two heartbeats to addresses that have sent none, all of them together: a forged sender
-address causes no more traffic than that to another computer."""
+"""Seconds after which the link checks another frame of a known address. The station checks every frame in any
+case."""
 
 UNREACHABLE_TIMEOUT: Final = 3.0
 """Seconds without a route, after which the socket counts as dropped: three heartbeats. The socket keeps the
@@ -80,24 +68,6 @@ LOCAL_PORTS: Final = range(20480, 28672)
 """Local ports of `udpout`. Linux, macOS and Windows assign ports from 32768 on, so other programs rarely use
 one of these."""
 
-READ_DELAY_MAX: Final = 0.001
-"""Seconds between arrival and read of a datagram up to which it was read immediately: the later datagrams of
-the same read then get its arrival time."""
-
-
-class _PeerState:
-    """State of one address.
-
-    Attributes:
-        proven_at: time of its last valid frame.
-        served_at: time of the last heartbeat sent to it, if it has sent none.
-    """
-
-    __slots__ = ("proven_at", "served_at")
-
-    def __init__(self) -> None:
-        self.proven_at = self.served_at = -math.inf
-
 
 class UdpLink(SocketLink):
     """Base class of the UDP links: one socket, and the peers on it.
@@ -109,8 +79,6 @@ class UdpLink(SocketLink):
         receive_buffer: bytes that the kernel granted for unread datagrams, its own overhead included.
         lost_sends: datagrams that the operating system rejected: no route, full buffer, firewall. The
             protocol's retries replace them, like datagrams lost on the way.
-        arrived_at: when each datagram of the last `receive` arrived in the kernel's buffer, in their order,
-            on the event loop's clock; empty if the operating system does not report it.
     """
 
     is_stream = False
@@ -120,27 +88,20 @@ class UdpLink(SocketLink):
         super().__init__(spec)
         self.receive_buffer = 0
         self.lost_sends = 0
-        self.arrived_at: list[float] = []
-        self._has_arrival_times = False
         self._local_port = 0  # of the previous opening
         self._buffer_size = memoryview(bytearray(_LARGEST_DATAGRAM))
         self._no_route_since: float | None = None
-        # Addresses that have sent heartbeats, the latest sender last.
-        self._peers: dict[Address, _PeerState] = {}
-        # Addresses that have sent only other frames.
-        self._unproven: dict[Address, _PeerState] = {}
-        self._stranger_served_at = -math.inf
-        self._framer = Framer((message_id(Heartbeat),), stream=False)
+        # The senders of valid frames and the time of the last one, the latest sender last.
+        self._peers: dict[Address, float] = {}
+        self._framer = Framer((), stream=False)
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`. Returns at most `DATAGRAMS_PER_READ` datagrams; skips empty ones."""
         sock = self._open_socket()
         into, buffer_size = sock.recvfrom_into, self._buffer_size
         batch: list[tuple[Address, bytes]] = []
-        arrivals: list[float] = []
         while not batch:
             await self._readable(sock)
-            needs_time = self._has_arrival_times
             for _ in range(DATAGRAMS_PER_READ):
                 try:
                     size, address = into(buffer_size)
@@ -152,13 +113,6 @@ class UdpLink(SocketLink):
                     continue  # an ICMP error for an earlier datagram
                 if size:
                     batch.append((address, bytes(buffer_size[:size])))
-                    if needs_time:
-                        arrivals.append(_arrived_at(sock))
-                        needs_time = time.time() - arrivals[-1] > READ_DELAY_MAX
-        if arrivals:
-            ahead = seconds_ahead(time.time, anyio.current_time)
-            arrivals = [at - ahead for at in arrivals]
-        self.arrived_at = arrivals + arrivals[-1:] * (len(batch) - len(arrivals))
         self._learn(batch)
         return [*batch]
 
@@ -166,7 +120,7 @@ class UdpLink(SocketLink):
         """See `Link.send`. Does not wait for the network: drops and counts datagrams that cannot be sent."""
         await anyio.lowlevel.checkpoint()
         sock = self._open_socket()
-        for address in self._broadcast_addresses(data) if peer is None else self._destinations(peer):
+        for address in self._broadcast_addresses() if peer is None else self._destinations(peer):
             try:
                 self._transmit(sock, data, address)
             except OSError as error:
@@ -203,48 +157,23 @@ class UdpLink(SocketLink):
         """Remember the senders of valid frames, the latest last; forget the one silent for longest."""
         peers, now = self._peers, anyio.current_time()
         for address, data in batch:
-            known = peers.pop(address, None)
-            if known is not None:
-                peers[address] = known
-                if now < known.proven_at + FRAME_CHECK_INTERVAL:
-                    continue
-            self._prove(address, data, now)
+            proven_at = peers.pop(address, -math.inf)
+            if now >= proven_at + FRAME_CHECK_INTERVAL:
+                before = self._framer.frames
+                self._framer.receive(data)
+                proven_at = now if self._framer.frames > before else proven_at
+            if proven_at > now - PEER_TIMEOUT:
+                peers[address] = proven_at
+            if len(peers) > PEERS_MAX:
+                del peers[next(iter(peers))]
 
-    def _prove(self, address: Address, data: bytes, now: float) -> None:
-        """Check whether a datagram has a valid frame, and whether that is a heartbeat."""
-        before = self._framer.frames
-        beats = self._framer.receive(data)
-        if self._framer.frames == before:
-            return
-        known = self._unproven.pop(address, None) or self._peers.get(address) or _PeerState()
-        known.proven_at = now
-        if beats or address in self._peers:
-            self._peers[address] = known
-        else:
-            self._unproven[address] = known
-        if len(self._peers) + len(self._unproven) > PEERS_MAX:
-            least_useful = self._unproven or self._peers
-            del least_useful[next(iter(least_useful))]
-
-    def _forget_silent(self, now: float) -> None:
-        for known in (self._peers, self._unproven):
-            for address in [each for each, at in known.items() if now - at.proven_at >= PEER_TIMEOUT]:
-                del known[address]
-
-    def _broadcast_addresses(self, data: bytes) -> list[Address]:
-        """Return the addresses for a broadcast. Addresses without heartbeats get heartbeats in turn."""
-        now = anyio.current_time()
-        self._forget_silent(now)
-        unproven = list(self._unproven)
-        if unproven and self._framer.receive(data):
-            is_due = now >= self._stranger_served_at + UNKNOWN_PEER_INTERVAL
-            unproven = [min(unproven, key=lambda each: self._unproven[each].served_at)] if is_due else []
-            for address in unproven:
-                self._stranger_served_at = self._unproven[address].served_at = now
-        return [*self._peers, *unproven]
+    def _broadcast_addresses(self) -> list[Address]:
+        oldest = anyio.current_time() - PEER_TIMEOUT
+        self._peers = {address: at for address, at in self._peers.items() if at > oldest}
+        return [*self._peers]
 
     def _destinations(self, peer: Peer) -> list[Address]:
-        return [each for each in (peer,) if each in self._peers or each in self._unproven]
+        return [each for each in (peer,) if each in self._peers]
 
     def _transmit(self, sock: socket.socket, data: bytes, address: Address) -> None:
         sock.sendto(data, address)
@@ -258,48 +187,17 @@ class UdpLink(SocketLink):
             with suppress(OSError):  # beyond the limit, or not privileged
                 sock.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER)
         self.receive_buffer = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-        self._has_arrival_times = _note_arrivals(sock)
-        self._peers, self._unproven = {}, {}
+        self._peers = {}
         self._no_route_since = None
         return sock
-
-
-if sys.platform == "linux":
-    from fcntl import ioctl
-
-    def _note_arrivals(sock: socket.socket) -> bool:
-        """Make the kernel record arrival times; return whether it does."""
-        try:
-            _arrived_at(sock)
-        except OSError as error:
-            return error.errno == errno.ENOENT  # supported, but nothing was read yet
-        return True
-
-    def _arrived_at(sock: socket.socket) -> float:
-        """Return when the last datagram read arrived in the kernel's buffer, as a Unix time in seconds."""
-        stamp = ioctl(sock, _SIOCGSTAMP, bytes(_TIMEVAL.size))
-        seconds, microseconds = _TIMEVAL.unpack(stamp)
-        arrived_at: float = seconds + microseconds * 1e-6
-        return arrived_at
-
-else:
-
-    def _note_arrivals(sock: socket.socket) -> bool:
-        """Return false: the operating system does not report arrival times."""
-        return False
-
-    def _arrived_at(sock: socket.socket) -> float:
-        """Return 0; never called."""
-        return 0.0
 
 
 class UdpIn(UdpLink):
     """`udpin`: bound to a port; sends to all addresses from which MAVLink frames were received.
 
     Several vehicles may send from different addresses, or one after a restart from a new one. Broadcasts go
-    to the `PEERS_MAX` latest senders of valid frames in the last `PEER_TIMEOUT` seconds; those without
-    heartbeats share one heartbeat of ours per second, in turn. Messages to one peer go to its address,
-    independent of the number of senders.
+    to the `PEERS_MAX` latest senders of valid frames in the last `PEER_TIMEOUT` seconds. Messages to one peer
+    go to its address, independent of the number of senders.
     """
 
     async def _open(self, opening: int) -> None:
@@ -362,33 +260,23 @@ class UdpOut(UdpLink):
             with anyio.move_on_after(RESOLVE_INTERVAL):
                 await super()._readable(waitable)
                 return
-            failures: list[LinkError] = []
-            async with anyio.create_task_group() as tasks:  # a slow resolver must not delay received data
-                tasks.start_soon(self._check_address)
-                try:
-                    await super()._readable(waitable)
-                except LinkError as error:
-                    failures.append(error)
-                tasks.cancel_scope.cancel()
-            if failures:
-                raise failures[0]
-            return
+            await self._check_address()
 
     async def _check_address(self) -> None:
-        """While no data arrives: fail if the name's address is no longer the one in use."""
+        """Raise LinkError if the name's address is no longer the one in use."""
         opening = self._openings
-        while True:
-            with suppress(LinkError, TimeoutError), anyio.fail_after(OPEN_TIMEOUT):
-                found = [address for _, address in await self._resolve(socket.SOCK_DGRAM)]
-                if opening == self._openings and self._far not in found:
-                    self._fail(f"the address of {self._host} changed to {found[0][0]}")
-            await anyio.sleep(RESOLVE_INTERVAL)
+        found: list[Address] = []
+        with suppress(LinkError, TimeoutError), anyio.fail_after(OPEN_TIMEOUT):
+            found = [address for _, address in await self._resolve(socket.SOCK_DGRAM)]
+        self._check(opening)
+        if found and self._far not in found:
+            self._fail(f"the address of {self._host} changed to {found[0][0]}")
 
     def _learn(self, batch: list[tuple[Address, bytes]]) -> None:
         if self._group is not None:
             super()._learn(batch)
 
-    def _broadcast_addresses(self, data: bytes) -> list[Address]:
+    def _broadcast_addresses(self) -> list[Address]:
         return [each for each in (self._group or self._near,) if each is not None]
 
     def _destinations(self, peer: Peer) -> list[Address]:
@@ -434,5 +322,3 @@ _ANY_ADDRESS = ("0.0.0.0", "::")
 
 _LARGEST_DATAGRAM = 65535
 _SO_RCVBUFFORCE = 33  # Linux, asm-generic/socket.h; the socket module has no name for it
-_SIOCGSTAMP = 0x8906  # Linux, asm-generic/sockios.h
-_TIMEVAL = struct.Struct("@ll")

@@ -17,7 +17,6 @@ import anyio.to_thread
 
 from paramclient.client.component import Component
 from paramclient.client.files import Ftp
-from paramclient.client.local import LocalComponent, local
 from paramclient.errors import MetadataError, UsageError
 from paramclient.metadata.formats import PACKED_SIZE_MAX, json_of, read_content, unpacked
 from paramclient.metadata.info import Metadata
@@ -59,14 +58,13 @@ async def metadata_of(
         NoReply: no response in time.
         LinkError: the link failed, or the client was closed.
     """
-    vehicle = local(component)
     if isinstance(store, bool):
-        cache = vehicle.client.cache
+        cache = component.core.client.cache
         kept = MetadataStore.beside(cache.path) if store and cache is not None else None
     else:
         kept = store
     deadline = None if timeout is None else anyio.current_time() + timeout
-    files = _Files(vehicle, kept, deadline, progress)
+    files = _Files(component, kept, deadline, progress)
     before = component.identity
     announced = await announced_metadata(component, files.left())
     if announced is None:
@@ -95,7 +93,7 @@ class _Files:
         progress: called for each file.
     """
 
-    component: LocalComponent
+    component: Component
     kept: MetadataStore | None
     deadline: float | None
     progress: Callable[[int, int | None], None] | None
@@ -149,13 +147,13 @@ class _Files:
         number, path = found.groups()
         other: Component | None = self.component
         if number is not None and int(number) != self.component.component:
-            other = self.component.client.components.get((self.component.system, int(number)))
+            other = self.component.siblings.get((self.component.system, int(number)))
         if other is None:
             raise MetadataError(
                 f"{self.label} announces its metadata at {uri}, but component {number} has not been heard",
                 source=uri,
             )
-        return Ftp(other), path
+        return Ftp(other.core), path
 
 
 async def announced_metadata(component: Component, timeout: float | None) -> ComponentMetadata | None:
@@ -169,14 +167,14 @@ async def announced_metadata(component: Component, timeout: float | None) -> Com
         NoReply: no response in time.
         LinkError: the link failed, or the client was closed.
     """
-    link_component = local(component)
-    link_component.client.check_open()
+    core = component.core
+    core.client.check_open()
     what = f"COMPONENT_METADATA of {component.system}/{component.component}"
-    machine, now = link_component.machine, anyio.current_time()
+    machine, now = core.machine, anyio.current_time()
     machine.check_present(what, now)
     ask = machine.metadata_requests.ask(now)
     try:
-        return await link_component.wait(ask, timeout, lambda: (what, ask.attempts))
+        return await core.wait(ask, timeout, lambda: (what, ask.attempts))
     finally:
         machine.metadata_requests.release(ask)
 

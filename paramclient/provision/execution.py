@@ -12,8 +12,7 @@ from typing import Final
 import anyio
 
 from paramclient.client.arguments import check_author
-from paramclient.client.component import Component
-from paramclient.client.local import local
+from paramclient.client.component import Component, successor_of
 from paramclient.errors import (
     AnotherVehicle,
     CacheError,
@@ -160,7 +159,7 @@ class ApplyRun:
 
     async def prepare(self) -> None:
         """Inspect the vehicle, plan, and store its state. A failure is raised before the first write."""
-        if self._options.durable and local(self._component).client.cache is None:
+        if self._options.durable and self._component.core.client.cache is None:
             raise UsageError("durable needs a cache, and the client keeps none")
         check_component(self._wanted, self._component.component)
         plan({}, self._wanted, include=self._options.include, autopilot=self._component.autopilot)
@@ -191,7 +190,7 @@ class ApplyRun:
     @contextmanager
     def _without_checks(self) -> Iterator[None]:
         """Let no check of the table begin: the run reads the table itself, and each download takes time."""
-        sync = local(self._component).machine.sync
+        sync = self._component.core.machine.sync
         sync.hold()
         try:
             yield
@@ -202,7 +201,7 @@ class ApplyRun:
         """Write and verify until no stage is pending. `result` reports a failure after the first write."""
         with self._without_checks():  # a changed count starts no download besides those of the run
             if self._pending_stages():
-                local(self._component).machine.sync.drop_check(anyio.current_time())
+                self._component.core.machine.sync.drop_check(anyio.current_time())
             await self._write_and_verify()
         await self._record_end()
 
@@ -226,8 +225,8 @@ class ApplyRun:
                 else:
                     break
             if self._options.durable and self.sent:
-                vehicle = local(self._component)
-                await vehicle.client.cache_writer.write_durably(vehicle.machine)
+                core = self._component.core
+                await core.client.cache_writer.write_durably(core.machine)
         except ParamClientError as error:
             if not self.sent:
                 raise
@@ -441,8 +440,7 @@ class ApplyRun:
     async def _write_system_id(self, step: Step) -> None:
         """Set the system id, and continue with the vehicle under its new one."""
         system = int(step.value) if not isinstance(step.value, bytes) else 0
-        client = local(self._component).client
-        if any(self._is_other_vehicle_with(system, known) for known in client.components.values()):
+        if any(self._is_other_vehicle_with(system, known) for known in self._component.siblings.values()):
             reason = f"another vehicle on this link has system id {system}"
             self._record(step, ApplyStatus.SKIPPED, step.before, reason, WRONG)
             return
@@ -465,9 +463,7 @@ class ApplyRun:
         async with anyio.create_task_group() as sending:
             sending.start_soon(cancel_if_id_is_kept)
             try:
-                self._component = await client.successor(
-                    self._component, system, timeout=SYSTEM_CHANGE_TIMEOUT
-                )
+                self._component = await successor_of(self._component, system, timeout=SYSTEM_CHANGE_TIMEOUT)
             except ParamClientError as error:  # raised here, the task group would wrap it in a group
                 failure = error
             sending.cancel_scope.cancel()
@@ -502,7 +498,7 @@ class ApplyRun:
         with suppress(ParamClientError):
             await component.set(step.name, step.value, author=self._options.author)
             acknowledged_at = anyio.current_time()
-            while local(component).machine.presence.beat_at < acknowledged_at + SYSTEM_CHANGE_DELAY:  # noqa: ASYNC110 - no event
+            while component.core.machine.presence.beat_at < acknowledged_at + SYSTEM_CHANGE_DELAY:  # noqa: ASYNC110 - no event
                 await anyio.sleep(POLL_INTERVAL)
             return
         await anyio.sleep_forever()
@@ -552,8 +548,7 @@ class ApplyRun:
         with anyio.move_on_after(ARMED_STATE_TIMEOUT):
             while component.is_armed is None and component.state != "lost":  # noqa: ASYNC110 - no event
                 await anyio.sleep(POLL_INTERVAL)
-        heard = local(component).client.components.values()
-        own = [each for each in heard if each.system == component.system]
+        own = [each for each in component.siblings.values() if each.system == component.system]
         if any(each.is_armed for each in own):
             message = f"{self._address} is armed; nothing is set then"
         elif component.is_armed is None and component.state != "lost":
@@ -580,7 +575,7 @@ class ApplyRun:
 
     async def _store_state(self) -> None:
         """Store the vehicle's state: in the backup file, and in the cache if the plan has steps."""
-        client, component, inspection = local(self._component).client, self._component, self.inspection
+        client, component, inspection = self._component.core.client, self._component, self.inspection
         if (path := self._options.backup) is not None:
             from paramclient.files import write_file
 
@@ -603,7 +598,7 @@ class ApplyRun:
 
     async def _record_end(self) -> None:
         """Record in the cache that the run was not interrupted."""
-        client, number = local(self._component).client, self._snapshot
+        client, number = self._component.core.client, self._snapshot
         cache = client.cache
         if cache is not None and number is not None:
             with suppress(CacheError):  # the warning of the cache writer says so

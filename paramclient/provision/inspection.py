@@ -10,7 +10,6 @@ from typing import Final
 import anyio
 
 from paramclient.client.component import Component
-from paramclient.client.local import local, wait_until_identified
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -107,7 +106,7 @@ async def inspect(
         NoReply: the vehicle did not answer.
         LinkError: the link failed, or the client was closed.
     """
-    local(component).machine.sync.expire_hash()  # the hash may have changed since its announcement
+    component.core.machine.sync.expire_hash()  # the hash may have changed since its announcement
     before = copy_params(component.params)
     fetched = await component.fetch_all()
     await component.refreshed()
@@ -193,7 +192,7 @@ async def reread(component: Component, inspection: Inspection, names: Iterable[s
 
 async def wait_for_identity(component: Component) -> None:
     """Wait until the vehicle is identified, at most `SETUP_IDENTITY_TIMEOUT`, as the cache key requires."""
-    await wait_until_identified(local(component), SETUP_IDENTITY_TIMEOUT)
+    await component.core.wait_until_identified(SETUP_IDENTITY_TIMEOUT)
 
 
 async def prepare(
@@ -298,7 +297,7 @@ def _not_covered(component: Component, fetched: FetchResult) -> Collection[str]:
         return ()
     if fetched.hash is None:  # the cache policy did not verify it, or the download was resumed
         return component.params.keys()
-    return local(component).machine.table.unhashed()
+    return component.core.machine.table.unhashed()
 
 
 async def _read_names(

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import anyio
 
 from paramclient.client.component import Component
-from paramclient.client.local import local
 from paramclient.client.streams import Changes
 from paramclient.documents.component import ComponentDoc, ProgressDoc
 from paramclient.documents.param import ParamDoc
@@ -62,7 +61,7 @@ class FollowedComponent:
     """
 
     def __init__(self, component: Component, link: FollowedLink, feed: EventFeed) -> None:
-        self.component = local(component)
+        self.component = component
         self.link = link
         self.metadata: Metadata | None = None
         self._described_firmware: tuple[object, ...] | None = None
@@ -74,7 +73,7 @@ class FollowedComponent:
         self._is_fetching = False
         self._last_fetch: object = None
         self._forwarder = _ChangeForwarder(self)
-        self.component.listen(self._forwarder)
+        self.component.core.listen(self._forwarder)
         self.extended = FollowedExtended(self.component, self.publish)
 
     def __repr__(self) -> str:
@@ -88,13 +87,13 @@ class FollowedComponent:
     @property
     def key(self) -> str | None:
         """Return the key of its table in the cache; None before the vehicle is identified."""
-        identity = self.component.settled_identity
+        identity = self.component.core.settled_identity
         return None if identity is None else identity.key
 
     @property
     def document(self) -> ComponentDoc:
         """Return its current state."""
-        machine = self.component.machine
+        machine = self.component.core.machine
         fetch = machine.fetch
         return ComponentDoc.of(
             self.component,
@@ -196,7 +195,7 @@ class FollowedComponent:
     def publish_state_changes(self) -> None:
         """Publish changes of its state, and the progress of a fetch."""
         self._forget_other_firmware()
-        machine = self.component.machine
+        machine = self.component.core.machine
         fetch = machine.fetch
         if fetch is not None:
             self._is_fetching = True
@@ -219,7 +218,7 @@ class FollowedComponent:
 
     def close(self) -> None:
         """Stop following the component."""
-        self.component.ignore(self._forwarder)
+        self.component.core.changes.discard(self._forwarder)
         self.extended.close()
 
     def handle_change(self, change: Change) -> None:
@@ -243,7 +242,7 @@ class FollowedComponent:
     def _publish_value_changes(self) -> None:
         """Publish parameters whose trust, default or index differs from the published one."""
         params, published = as_params(self.component.params), self._published
-        last = self.component.machine.fetches.last
+        last = self.component.core.machine.fetches.last
         if last is not self._last_fetch:
             self._last_fetch = last
             self._record_all_received()
@@ -305,7 +304,7 @@ class FollowedComponent:
             component.state,
             component.sync_state,
             component.is_armed,
-            component.machine.fetches.last,
+            component.core.machine.fetches.last,
             self.link.state,
             (ext.is_spoken, ext.is_expected, ext.is_complete, ext.count),
         )

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import anyio
 
-from paramclient.client.local import LocalComponent
+from paramclient.client.component import Component
 from paramclient.client.streams import Changes
 from paramclient.documents.component import ProgressDoc
 from paramclient.documents.extended_param import ExtParamDoc
@@ -38,18 +38,19 @@ class FollowedExtended:
 
     def __init__(
         self,
-        component: LocalComponent,
+        component: Component,
         publish: Callable[[str, dict[str, Any] | Callable[[], str]], None],
     ) -> None:
         self.ext = component.ext
-        self._machine = component.machine.ext
+        self._machine = component.core.machine.ext
         self._publish = publish
         self._published = dict(component.ext.params)
         self._published_revision = self._machine.table.revision
         self._received_at: dict[str, tuple[float, float]] = {}
         self._is_fetching = False
         self._forwarder = _ExtChangeForwarder(self)
-        self.ext.listen(self._forwarder)
+        self._streams = component.core.ext_changes
+        self._streams.add(self._forwarder)
 
     def received_at(self, name: str) -> float | None:
         """Return when the component last sent or confirmed a value, in unix seconds, or None."""
@@ -111,7 +112,7 @@ class FollowedExtended:
 
     def close(self) -> None:
         """Stop following."""
-        self.ext.ignore(self._forwarder)
+        self._streams.discard(self._forwarder)
 
     def handle_change(self, change: Change) -> None:
         """Handle a change of a value."""

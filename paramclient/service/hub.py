@@ -18,7 +18,7 @@ import anyio.lowlevel
 
 from paramclient.client.arguments import address_in_words
 from paramclient.client.cache_writer import choose_cache
-from paramclient.client.client import ParamClient, local_client
+from paramclient.client.client import ParamClient
 from paramclient.client.worker_thread import Worker
 from paramclient.documents.component import ProgressDoc
 from paramclient.documents.extended_results import ExtFetchResultDoc
@@ -336,7 +336,7 @@ class Hub:
             while True:
                 self._check_open()
                 now = anyio.current_time()
-                clients = [(each, local_client(each.client)) for each in chosen if each.client is not None]
+                clients = [(each, each.client.core) for each in chosen if each.client is not None]
                 events = [each.changed for each in chosen] + [
                     client.link_task.activity for _, client in clients
                 ]
@@ -351,7 +351,7 @@ class Hub:
                 if machine is not None:
                     followed = machines[machine].followed.get((machine.system, machine.component))
                 if followed is not None:
-                    await followed.component.wait_for_cache()
+                    await followed.component.core.wait_for_cache()
                     return followed
                 with ExitStack() as looking:
                     for _, client in clients:
@@ -400,11 +400,11 @@ class Hub:
 
     async def _load_component(self, followed: FollowedComponent) -> None:
         """Load cached data of a component, then fetch its table."""
-        client = followed.component.client
+        client = followed.component.core.client
         with suppress(ParamClientError, ServiceError):
-            await followed.component.wait_for_cache()
+            await followed.component.core.wait_for_cache()
             await self._load_cached(followed)
-        machine = followed.component.machine
+        machine = followed.component.core.machine
         is_due = (
             machine.identification.has_parameters
             and machine.fetch is None
@@ -465,7 +465,7 @@ def _is_log(link: object) -> bool:
 
 def _silence_of(links: Iterable[ServiceLink]) -> str:
     """Return in sentences what was received on links instead of an awaited component."""
-    clients = [(each.name, local_client(each.client)) for each in links if each.client is not None]
+    clients = [(each.name, each.client.core) for each in links if each.client is not None]
     return " ".join(hint_of_link(client.station, name) for name, client in clients)
 
 

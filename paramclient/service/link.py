@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import anyio
 import anyio.lowlevel
 
-from paramclient.client.client import ParamClient, local_client
+from paramclient.client.client import ParamClient
 from paramclient.client.events import (
     Contested,
     Discovered,
@@ -179,7 +179,7 @@ class ServiceLink:
         self._ended = anyio.Event()
         self._ending = None
         self._forwarder = _EventForwarder(self)
-        local_client(client).subscribe(self._forwarder)
+        client.dispatch.events.add(self._forwarder)
         for component in client.components.values():
             self.handle_event(Discovered(component))
         self._set_state("open")
@@ -208,7 +208,7 @@ class ServiceLink:
         client = self.client
         if client is None:
             return
-        task = local_client(client).link_task
+        task = client.core.link_task
         if task.is_disconnected:
             error = self.error if task.broken is None else str(task.broken)
             self._set_state("reconnecting", error or f"{self.name} is disconnected and reconnects")

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from paramclient.client.client import local_client
 from paramclient.documents.document import Body, InParts
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.files import FileFormat, ParamFile, loads, loads_renames
@@ -367,7 +366,7 @@ async def flush_cache(hub: Hub) -> None:
         CacheError: the cache cannot be written, so that reads from it would be incomplete.
     """
     for _, client in hub.clients():
-        await local_client(client).cache_writer.write_all()
+        await client.core.cache_writer.write_all()
 
 
 async def load_cached_state(hub: Hub, key: str, component: int, when: float | int | None) -> ParamSet:

@@ -127,7 +127,11 @@ class Entry:
         self.bits = bits
         self._packed = None
         value = self.value
-        if self._encoding is Encoding.BYTEWISE or self.type == ParamType.REAL32 or isinstance(value, bytes | str):
+        if (
+            self._encoding is Encoding.BYTEWISE
+            or self.type == ParamType.REAL32
+            or isinstance(value, bytes | str)
+        ):
             self.raw = (bits & 0xFFFFFFFF).to_bytes(4, "little")
         else:
             self.raw = _cast(value)

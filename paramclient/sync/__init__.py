@@ -7,67 +7,50 @@ all other classes are those of `paramclient`::
         vehicle = client.component()
         print(vehicle.get("MC_ROLL_P"))
 
-- `blocking`: the classes, generated from the asynchronous ones by `tests/sync_interface.py` (`make sync`).
-- `client_thread`: the thread in which the asynchronous client runs, and calls to it.
-- `functions`: the functions that take a client or a component, such as `apply`.
-- `fetch_iterator`: a fetch as an iterator of its progress.
-- `wrappers`: base classes of those in `blocking`: opening and closing, streams, mappings.
+The functions have the arguments and the results of those in `paramclient.provision`, `paramclient.metadata`
+and `paramclient.diagnosis`.
+
+- `proxy`: the one class behind all of them.
+
+`tests/sync_stub.py` writes the types into `__init__.pyi` (`make sync`).
 """
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-from paramclient.sync.blocking import (
-    Changes,
-    Component,
+from paramclient import diagnosis, metadata, provision
+from paramclient.client.events import (
     Contested,
     Discovered,
     Event,
-    Events,
-    ExtChanges,
-    ExtParams,
     Found,
-    Ftp,
     Lost,
-    ParamClient,
     Rebooted,
     Resynced,
     Uncontested,
 )
-from paramclient.sync.fetch_iterator import FetchIterator
-
-if TYPE_CHECKING:
-    from paramclient.sync.functions import (
-        Wanted,
-        apply,
-        apply_all,
-        apply_extended,
-        check_vehicle,
-        load_extended_state,
-        metadata_of,
-        prepare,
-        restore,
-        restore_all,
-        restore_extended,
-        verify,
-        verify_all,
-        verify_extended,
-    )
+from paramclient.provision.fleet import Wanted
+from paramclient.sync.proxy import (
+    Changes,
+    Component,
+    Events,
+    ExtChanges,
+    ExtParams,
+    Ftp,
+    ParamClient,
+    blocking,
+)
 
 __all__ = [
     "Changes",
     "Component",
     "Contested",
+    "Discovered",
     "Event",
     "Events",
     "ExtChanges",
     "ExtParams",
-    "FetchIterator",
     "Found",
     "Ftp",
-    "Discovered",
     "Lost",
     "ParamClient",
     "Rebooted",
@@ -89,9 +72,16 @@ __all__ = [
     "verify_extended",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    """Import `functions` at the first use of one of its names: it loads three more packages."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module("paramclient.sync.functions"), name)
+prepare = blocking(provision.prepare)
+apply = blocking(provision.apply)
+verify = blocking(provision.verify)
+restore = blocking(provision.restore)
+apply_all = blocking(provision.apply_all)
+verify_all = blocking(provision.verify_all)
+restore_all = blocking(provision.restore_all)
+apply_extended = blocking(provision.apply_extended)
+verify_extended = blocking(provision.verify_extended)
+restore_extended = blocking(provision.restore_extended)
+load_extended_state = blocking(provision.load_extended_state)
+metadata_of = blocking(metadata.metadata_of)
+check_vehicle = blocking(diagnosis.check_vehicle)

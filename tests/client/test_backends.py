@@ -33,9 +33,8 @@ from paramclient import (
     Trust,
     WrittenParam,
 )
-from paramclient.client import link_client as client_module
+from paramclient.client import client as client_module
 from paramclient.client import reconnect_delays
-from paramclient.client.local import local
 from paramclient.errors import LinkError
 from paramclient.links import Link, create_link, serve_endpoint
 from paramclient.metadata import metadata_of
@@ -416,7 +415,7 @@ async def test_a_scope_around_a_client_has_the_file_closed_before_it_ends() -> N
                 await (await client.component()).fetch_all(progress=cancel_in_the_file)
         assert scope.cancelled_caught
         assert not vehicle.open_files
-        assert local(client.components[1, 1]).machine.files.is_idle, "the acknowledgement was awaited"
+        assert client.components[1, 1].core.machine.files.is_idle, "the acknowledgement was awaited"
         *_, last = tap.messages(wire.FileTransfer)
         assert Packet.unpack(last.payload).opcode == Opcode.TERMINATE_SESSION
         async with a_client(tap) as client:

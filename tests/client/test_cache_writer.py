@@ -31,11 +31,7 @@ from paramclient import (
 )
 from paramclient.cache import CachedComponent
 from paramclient.client import cache_writer
-from paramclient.client import link_component as component_module
-from paramclient.client.client import local_client
-from paramclient.client.link_client import LinkClient
-from paramclient.client.link_component import LinkComponent
-from paramclient.client.local import local
+from paramclient.client import component_core as component_module
 from paramclient.model.paramset import ParamSet
 from paramclient.protocol import wire
 from paramclient.provision import apply
@@ -112,13 +108,14 @@ async def test_an_unchanged_vehicle_is_not_downloaded_again(
     assert first.source == "stream"
     tap = Tap(vehicle)
     async with ParamClient(Air.symmetric([tap], delay=0.1), cache=path) as client:
+        await anext(client.events())
+        received_at = anyio.current_time()
         component = await client.component()
         assert bits(component.params) == bits(vehicle.params), "from the cache, before anything was requested"
         assert component.state == "cached"
         assert trusts(component, volatile) == {Trust.CACHED}
         result = await component.fetch_all()
-        assert isinstance(component, LinkComponent)
-        assert anyio.current_time() - component._received_at < 0.21, "one round trip after it was received"
+        assert anyio.current_time() - received_at < 0.21, "one round trip after it was received"
         assert (result.source, result.complete, result.hash) == ("cache", True, vehicle.announced_hash())
         assert bits(result.params) == bits(vehicle.params)
         assert trusts(component, component.params.keys() - volatile) == {Trust.VERIFIED}
@@ -395,7 +392,7 @@ async def test_the_end_of_a_table_is_no_message_of_the_vehicle_that_has_gone(pat
         second.reboot(anyio.current_time(), down=10.0)
         gone = await anext(component.changes())
         assert gone.new is None
-        await local_client(client).cache_writer.flush()  # which the clock may bring about at any moment
+        await client.core.cache_writer.flush()  # which the clock may bring about at any moment
     with ParamCache(path) as cache:
         table = cache.load(f"uid:{0xA:016x}", 1)
         assert table is not None
@@ -417,10 +414,8 @@ async def test_another_vehicle_takes_the_place_while_the_cache_is_read(path: Pat
             return super().load(key, component)
 
     def hear_of_another() -> None:
-        implementation = local_client(client)
-        assert isinstance(implementation, LinkClient)
-        implementation.station.receive(version, "sim", anyio.current_time())
-        implementation._dispatch()
+        client.core.station.receive(version, "sim", anyio.current_time())
+        client.core.dispatch()
 
     with Interrupted(path) as cache:
         async with ParamClient(tap, cache=cache) as client:
@@ -698,7 +693,7 @@ async def test_a_parameter_removed_from_the_table_is_removed_from_the_cache(path
     await session(small_px4(), path)
     async with ParamClient(small_px4(), cache=path) as client:
         component = await client.component()
-        local(component).machine.table.remove(lambda param: param.name == "PARAM_01")
+        component.core.machine.table.remove(lambda param: param.name == "PARAM_01")
     assert "PARAM_01" not in kept(path)
 
 

@@ -20,7 +20,6 @@ import anyio
 import pytest
 
 from paramclient import Component, ParamCache, ParamClient
-from paramclient.client.local import local
 from paramclient.protocol import wire
 from paramclient.sim import Air, PX4Vehicle
 from tests.caches import set_aside
@@ -138,7 +137,7 @@ def registered(client: ParamClient) -> list[object]:
     """What is registered in any component, except reads of the hash without a waiting caller."""
     found: list[object] = []
     for component in client.components.values():
-        hashes = ["1 reads"] if wire.HASH_CHECK in local(component).machine.reads else []
+        hashes = ["1 reads"] if wire.HASH_CHECK in component.core.machine.reads else []
         found += [each for each in residue(component) if each not in hashes]
     return found
 

@@ -26,7 +26,6 @@ from paramclient import (
     LinkError,
     NoReply,
     ParamClient,
-    ParamClientError,
     ParamErrorCode,
     ParamType,
     Progress,
@@ -37,8 +36,7 @@ from paramclient import (
     ValueNotApplied,
 )
 from paramclient.client import arguments, link_task, reconnect_delays
-from paramclient.client.client import local_client
-from paramclient.client.link_component import IDENTITY_TIMEOUT
+from paramclient.client.component_core import IDENTITY_TIMEOUT
 from paramclient.links import Peer, create_link, serve_endpoint
 from paramclient.protocol import wire
 from paramclient.protocol.station import Station
@@ -116,25 +114,6 @@ async def test_an_error_of_a_call_is_raised_unchanged() -> None:
 
     with pytest.raises(UnknownParameter):
         await session()
-
-
-@in_simulated_time
-async def test_the_traceback_of_a_mistake_is_short() -> None:
-    async with a_client(generic(param_error=True)) as client:
-        component = await client.component()
-        await component.fetch_all()
-        mistakes: dict[str, Callable[[], Coroutine[Any, Any, object]]] = {
-            "get": lambda: component.get("PARAM_0"),
-            "set": lambda: component.set("PARAM_0", 1),
-            "value": lambda: component.set("PARAM_01", "high"),  # type: ignore[arg-type]  # a mistake
-            "reset": lambda: component.reset("PARAM_0"),
-            "component": lambda: client.component(system=99, timeout=1.0),
-        }
-        for name, mistake in mistakes.items():
-            with pytest.raises(ParamClientError) as caught:
-                await mistake()
-            assert len(caught.traceback) <= 4, name
-            assert caught.value.__cause__ is None
 
 
 @in_simulated_time
@@ -1390,7 +1369,7 @@ class Chatter(Tap):
 async def known_component(client: ParamClient) -> Component:
     """The component, after it has said who it is."""
     component = await client.component()
-    await until(lambda: not local_client(client).station.is_waiting)
+    await until(lambda: not client.core.station.is_waiting)
     return component
 
 

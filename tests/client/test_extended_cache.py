@@ -11,7 +11,6 @@ import pytest
 from paramclient import ExtChange, ParamCache, ParamClient, Policy, Trust
 from paramclient.cache import CachedExtTable
 from paramclient.cache.sqlite import SqliteStore
-from paramclient.client.local import local
 from paramclient.errors import CacheError
 from paramclient.logs.telemetry import import_log
 from paramclient.sim import Air, Camera, PX4Vehicle
@@ -133,7 +132,7 @@ async def test_values_that_could_not_be_written_are_written_later(
         monkeypatch.setattr(SqliteStore, "run", fail)
         await ext.fetch_all()
         await ext.set("CAM_MODE", 2)
-        assert not await local(await client.component(1, 100)).client.cache_writer.flush()
+        assert not await (await client.component(1, 100)).core.client.cache_writer.flush()
         monkeypatch.setattr(SqliteStore, "run", run)
     assert kept(path).params["CAM_MODE"].value == 2
     assert [record.levelno for record in caplog.records if record.name.startswith("paramclient.cl")] == [

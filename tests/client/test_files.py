@@ -10,9 +10,8 @@ import anyio
 import pytest
 
 from paramclient import ClientClosed, NoReply, ParamClient, UsageError
+from paramclient.client.core import SESSION_CLOSE_TIMEOUT
 from paramclient.client.files import Ftp
-from paramclient.client.link_client import SESSION_CLOSE_TIMEOUT
-from paramclient.client.local import local
 from paramclient.errors import FileErrorCode, FileTransferError, LinkError
 from paramclient.links import SimLink
 from paramclient.model.px4_hash import crc32_px4
@@ -131,7 +130,7 @@ async def test_cancellation_closes_the_file() -> None:
             await files.write("/APM/new", LOG)
         await anyio.sleep(1.0)
         assert not vehicle.open_files
-        assert local(client.components[1, 1]).machine.files.is_idle
+        assert client.components[1, 1].core.machine.files.is_idle
 
 
 @pytest.mark.parametrize("how", ["timeout", "error", "cancelled", "scope"])
@@ -272,7 +271,7 @@ async def test_reads_are_done_in_order() -> None:
                 await asyncio.sleep(0)
             tasks.start_soon(client.components[1, 1].fetch_all)
         assert ended == ["/APM/LOGS/1.BIN", "/APM/a.txt", "/APM/empty"]
-        last = local(client.components[1, 1]).machine.fetches.last
+        last = client.components[1, 1].core.machine.fetches.last
         assert last is not None
         assert last.source == "ftp"
 
@@ -304,7 +303,7 @@ async def test_nothing_is_requested_from_a_lost_component() -> None:
         await anyio.sleep(3.0)
         assert await files.read("/APM/a.txt") == b"hello"
         await anyio.sleep(1.0)
-        assert local(component).machine.files.is_idle
+        assert component.core.machine.files.is_idle
 
 
 @in_simulated_time

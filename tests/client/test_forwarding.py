@@ -15,8 +15,6 @@ import pytest
 from paramclient import LinkError, ParamType
 from paramclient.cli import run
 from paramclient.client import forwarding, link_task
-from paramclient.client.client import local_client
-from paramclient.client.link_client import LinkClient
 from paramclient.links import Peer, create_link
 from paramclient.links.tlog import read_records
 from paramclient.model.values import Encoding, encode_value
@@ -172,9 +170,7 @@ async def test_a_program_that_reads_nothing_holds_nothing_up(monkeypatch: pytest
         assert bits((await component.fetch_all()).params) == bits(vehicle.params)
         assert (await component.set("PARAM_01", 8)).status == "accepted"
         assert anyio.current_time() - began < 3.0
-        implementation = local_client(client)
-        assert isinstance(implementation, LinkClient)
-        forwarder = implementation._link_taps.forwarder
+        forwarder = client.core._taps.forwarder
         assert forwarder is not None
         assert len(forwarder._waiting) == 10
         lost = forwarder.lost

@@ -17,8 +17,6 @@ from paramclient.cli import run as run_command
 from paramclient.cli import session as session_room
 from paramclient.client import cache_writer
 from paramclient.client import subscription as subscription_room
-from paramclient.client.client import local_client
-from paramclient.client.local import local
 from paramclient.client.subscription import Changes
 from paramclient.links import SimLink
 from paramclient.protocol import component as component_room
@@ -427,7 +425,7 @@ async def test_a_vehicle_that_changes_its_identity_each_time_fills_no_cache(
             liar.say(AutopilotVersion(16, uid=number + 1))
             liar.say(param_value(f"V{number}"))
             await anyio.sleep(LOST_AFTER + 2 * cache_writer.CACHE_FLUSH_INTERVAL)  # till then it may be two
-            assert len(local_client(client).cache_writer._loading) <= 1
+            assert len(client.core.cache_writer._loading) <= 1
     with ParamCache(path) as cache:
         systems = [each.identity.system for each in cache.vehicles()]
         assert systems.count(66) == kept
@@ -461,11 +459,11 @@ async def test_a_component_that_is_forgotten_ends_what_listens_to_it(monkeypatch
         other = await client.component(66, 1)
         changes = other.changes()
         await anyio.sleep(10)
-        local(other).machine.presence.is_lost = True
+        other.core.machine.presence.is_lost = True
         liar.say(Heartbeat(2, 12), 77)
         with pytest.raises(NoReply, match=r"66/1 \(lost\)"):
             await anext(changes)
-        assert [*client.components] == [*local_client(client).station.components] == [(1, 1), (77, 1)]
+        assert [*client.components] == [*client.core.station.components] == [(1, 1), (77, 1)]
         with pytest.raises(NoReply):
             await other.get("A")
 

@@ -21,7 +21,6 @@ from paramclient import (
     UsageError,
 )
 from paramclient.cli import run
-from paramclient.client.client import local_client
 from paramclient.model.values import Encoding, encode_value
 from paramclient.protocol import wire
 from paramclient.protocol.params.passive import LIST_PAUSE_MAX, PASSIVE_TIMEOUT
@@ -77,7 +76,7 @@ async def test_not_a_byte_is_sent() -> None:
         channel.is_mute = False
         await anyio.sleep(60.0)
         assert component.state == "new"
-        assert not local_client(client).station.is_waiting
+        assert not client.core.station.is_waiting
         assert residue(component) == []
         assert client.bytes_sent == 0
     assert channel.received == []

@@ -49,8 +49,8 @@ async def test_each_step_is_reported_in_one_line(caplog: pytest.LogCaptureFixtur
     ):
         assert sum(bool(re.fullmatch(step, each)) for each in steps) == 1, step
     assert len(steps) < 15, "values of a list are not reported one by one"
-    assert reported(caplog, "client.link_client")[0] == "sim:custom: open"
-    assert reported(caplog, "client.link_client")[-1] == "sim:custom: closing"
+    assert reported(caplog, "client")[0] == "sim:custom: open"
+    assert reported(caplog, "client")[-1] == "sim:custom: closing"
     assert any("nothing" in each for each in reported(caplog, "client.cache_writer"))
     caplog.clear()
     with caplog.at_level(logging.DEBUG, WATCHED):

@@ -35,7 +35,6 @@ from paramclient import (
     UnknownParameter,
     UsageError,
 )
-from paramclient.client.local import local
 from paramclient.links import Peer
 from tests.shell import TIMEOUT, bits, residue, until
 
@@ -360,7 +359,7 @@ async def test_extended_parameters_of_every_type_that_it_has(kind: ComponentType
             done = await ext.set("TEXT", text)
             assert (done.status, done.actual) == ("accepted", text)
             assert server.retrieve_param_custom("TEXT") == text.encode()
-        assert not local(component).machine.is_busy
+        assert not component.core.machine.is_busy
 
 
 @pytest.mark.asyncio
@@ -375,7 +374,7 @@ async def test_the_mavsdk_server_and_unusual_extended_writes() -> None:
             await ext.set("NO_SUCH", 1)
         with pytest.raises(UnknownParameter):
             await ext.get("NO_SUCH")
-        table = local(component).machine.ext.table
+        table = component.core.machine.ext.table
         known = table.params["INT_001"]
         table.params["INT_001"] = type(known).of("INT_001", b"text", ExtParamType.CUSTOM, known.index)
         with pytest.raises(SetFailed):

@@ -4,10 +4,8 @@ there."""
 from __future__ import annotations
 
 import asyncio
-import socket
-import sys
 from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import asynccontextmanager, closing
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import anyio
@@ -21,14 +19,14 @@ from paramclient.cache import HistoryEntry
 from paramclient.client import suspend_detection
 from paramclient.client.cache_writer import CacheWriter
 from paramclient.client.link_task import LinkTask
-from paramclient.links import Peer, create_link
+from paramclient.links import Peer
 from paramclient.links.clock_offset import seconds_ahead
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import NO_INDEX, AutopilotVersion, Heartbeat, Message, ParamValue
-from tests.shell import TIMEOUT, a_client, in_simulated_time, simulated_time_loop, small_px4, until
+from tests.shell import a_client, in_simulated_time, simulated_time_loop, small_px4, until
 from tests.simulation import param_value
 
 NOW = 1_795_000_000.0
@@ -387,38 +385,7 @@ def test_a_file_that_two_programs_write_to_agrees_with_a_model(tmp_path: Path) -
     interleaved(lambda: (ParamCache(path), ParamCache(path)), examples=100)
 
 
-# From the socket
-
-
-@pytest.mark.asyncio
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux reports when a datagram arrived")
-async def test_datagrams_read_late_have_their_arrival_times() -> None:
-    link = create_link("udpin:127.0.0.1:0")
-    await link.open()
-    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender:
-        sender.connect(link.address)  # type: ignore[attr-defined]  # of a link over sockets
-        has_times = False
-        with anyio.fail_after(TIMEOUT):
-            while not has_times:  # the kernel begins to note arrival times a moment after the request
-                sender.send(b"\xfd")
-                await anyio.sleep(0.02)
-                await link.receive()
-                has_times = link.arrived_at[0] < anyio.current_time() - 0.015  # type: ignore[attr-defined]
-        sent = [anyio.current_time()]
-        for _ in range(3):
-            sender.send(b"\xfd")
-            await anyio.sleep(0.05)
-            sent.append(anyio.current_time())
-        assert len(await link.receive()) == 3
-        arrived_at = link.arrived_at  # type: ignore[attr-defined]
-        assert len(arrived_at) == 3
-        for before, at, after in zip(sent, arrived_at, sent[1:], strict=False):
-            assert before - 0.001 <= at <= after + 0.001
-        sender.send(b"\xfd")
-        await link.receive()
-        [at] = link.arrived_at  # type: ignore[attr-defined]
-        assert sent[-1] - 0.001 <= at <= anyio.current_time() + 0.001
-    await link.close()
+# From the link
 
 
 class Scripted:
@@ -448,12 +415,6 @@ class Scripted:
     async def open(self) -> None: ...
 
     async def close(self) -> None: ...
-
-
-class Reporting(Scripted):
-    """A link with arrival times."""
-
-    arrived_at: Sequence[float] = ()
 
 
 class Asking(Station):
@@ -489,24 +450,6 @@ async def carried(link: Scripted) -> AsyncIterator[dict[bytes, float]]:
 
 
 @in_simulated_time
-async def test_the_arrival_time_of_the_system_is_used() -> None:
-    async with carried(link := Reporting()) as received:
-        link.arrive(b"0")
-        await anyio.sleep(1.0)
-        now = anyio.current_time()
-        link.arrived_at = [now - 0.5, now - 0.25]
-        link.arrive(b"1", b"2")
-        await anyio.sleep(0.01)
-        assert [received[b"1"], received[b"2"]] == pytest.approx([now - 0.5, now - 0.25], abs=0.001)
-        link.arrived_at = [now - 500.0]
-        link.arrive(b"3")
-        await anyio.sleep(0.01)
-        assert received[b"3"] == pytest.approx(now, abs=0.001), (
-            "the clock was set: it arrived after the last read"
-        )
-
-
-@in_simulated_time
 async def test_bytes_read_at_once_have_the_present_time() -> None:
     async with carried(link := Scripted()) as received:
         await anyio.sleep(5.0)
@@ -536,23 +479,6 @@ async def test_bytes_read_late_have_the_time_of_the_last_read() -> None:
         await anyio.sleep(0.01)
         assert received[b"4"] <= late
         assert received[b"5"] == pytest.approx(late + 0.2, abs=0.001)
-
-
-@in_simulated_time
-async def test_datagrams_from_before_a_suspend_are_as_old_as_the_suspend(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    asleep = 0.0
-    monkeypatch.setattr(suspend_detection, "time_asleep", lambda: asleep)
-    async with carried(link := Reporting()) as received:
-        link.arrive(b"0")
-        await anyio.sleep(0.05)
-        asleep = 3600.0
-        now = anyio.current_time()
-        link.arrived_at = [now - 3600.04]
-        link.arrive(b"1")
-        await anyio.sleep(0.01)
-        assert received[b"1"] == pytest.approx(now - 3600.04, abs=0.001)
 
 
 @in_simulated_time

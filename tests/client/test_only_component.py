@@ -6,7 +6,6 @@ import anyio
 import pytest
 
 from paramclient import AmbiguousVehicle, Component, LinkError, NoReply, UsageError
-from paramclient.client.client import local_client
 from paramclient.protocol import wire
 from paramclient.protocol.vehicle_selection import LOOK_TIME
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
@@ -154,7 +153,7 @@ async def test_after_an_absence_of_the_link_a_second_one_is_looked_for_again() -
     async with a_client(link) as client:
         await client.only_component()
         await link.drop()
-        await until(lambda: local_client(client).link_task.is_disconnected)
+        await until(lambda: client.core.link_task.is_disconnected)
         began = simulated_time_loop().now
         found = await client.only_component()
         assert simulated_time_loop().now - began >= LOOK_TIME

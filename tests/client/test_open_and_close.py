@@ -324,13 +324,3 @@ def run(*arguments: str, cache: Path, typed: str = "") -> str:
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr, done.stderr
     return done.stdout
-
-
-async def test_the_traceback_of_a_link_that_cannot_be_opened_is_short() -> None:
-    for open_it in (ParamClient.__aenter__, ParamClient.open):
-        client = ParamClient("serial:/dev/not-there", cache=False)
-        with pytest.raises(LinkError, match="/dev/not-there does not exist") as caught:
-            await open_it(client)
-        assert len(caught.traceback) <= 4
-        assert isinstance(caught.value.__cause__, FileNotFoundError)
-        assert caught.value.__cause__.__traceback__ is None

@@ -57,11 +57,9 @@ def test_only_the_keeping_of_things_knows_the_time_of_day() -> None:
     keeping = {
         *("client.recording", "cache.store", "cache.sqlite"),
         *("provision.inspection", "provision.restore_point", "provision.vehicle_params"),
-        "metadata.metadata_cache",
     }
     signing = {"client.signing"}  # whose timestamps are times of day by definition
-    waiting = {"links.udp"}  # for how long a datagram has: the kernel says its arrival as a time of day
-    assert library == {f"paramclient.{module}" for module in keeping | signing | waiting}
+    assert library == {f"paramclient.{module}" for module in keeping | signing}
 
 
 @pytest.mark.parametrize("step", [-HOUR, -DAY, HOUR, 400 * DAY])

@@ -573,23 +573,6 @@ async def got(sock: socket.socket) -> list[bytes]:
 
 
 @pytest.mark.asyncio
-async def test_peers_with_heartbeats_are_kept_before_others(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(udp, "PEERS_MAX", 3)
-    async with opened("udpin:127.0.0.1:0") as link:
-        with ExitStack() as stack:
-            vehicle = stack.enter_context(udp_socket(link.address))
-            vehicle.send(HEARTBEAT)
-            await collect(link, 1)
-            for _ in range(10):
-                stack.enter_context(udp_socket(link.address)).send(TELEMETRY)
-            await collect(link, 10)
-            await link.send(frame(1), None)
-            assert await got(vehicle) == [frame(1)]
-
-
-@pytest.mark.asyncio
 @pytest.mark.parametrize("junk", [b"\xfd\xfe and so on", HEARTBEAT[:-1] + b"\0", b"\xfd" * 300])
 async def test_udpin_ignores_senders_of_invalid_bytes(junk: bytes) -> None:
     async with opened("udpin:127.0.0.1:0") as link:

@@ -20,7 +20,6 @@ from paramclient import (
     Rebooted,
 )
 from paramclient.client.events import Events
-from paramclient.client.local import local
 from paramclient.errors import (
     ParamClientError,
     Refused,
@@ -572,11 +571,11 @@ async def reboot(session: Session) -> Measured:
     name = next(iter(session.choice.by_type.values()), None)
     if name is None:
         raise Skip("no harmless parameter")
-    async with session.client() as vehicle:
+    async with session.client_with_events() as (vehicle, listen):
         value = another_value(await vehicle.get(name))
         await session.journal.set(vehicle, name, value)
         await anyio.sleep(SAVING_TIME)
-        local(vehicle).client.subscribe(events := Events())
+        events = listen()
         began = time.monotonic()
         vehicle = await vehicle.reboot()
         seconds = time.monotonic() - began
@@ -591,10 +590,10 @@ async def reboot(session: Session) -> Measured:
 
 
 async def reboot_by_another(session: Session) -> Measured:
-    async with session.client() as watching, second_client(session) as other:
+    async with session.client_with_events() as (watching, listen), second_client(session) as other:
         await watching.fetch_all()
         await check_disarmed(watching)
-        local(watching).client.subscribe(events := Events())
+        events = listen()
         await anyio.sleep(BASELINE_TIME)
         began = time.monotonic()
         await other.reboot()

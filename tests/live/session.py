@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from paramclient import Component, FetchResult, ParamClient
+from paramclient import Component, Events, FetchResult, ParamClient
 from paramclient.model.values import Param
 from tests.live.choice import Choice
 from tests.live.journal import Journal
@@ -96,11 +96,19 @@ class Session:
         self, *, cache: Path | None = None, link: str = "", component: int = 190
     ) -> AsyncIterator[Component]:
         """Open a client behind the relay, without a cache unless one is given, and find the vehicle."""
+        async with self.client_with_events(cache=cache, link=link, component=component) as (vehicle, _):
+            yield vehicle
+
+    @asynccontextmanager
+    async def client_with_events(
+        self, *, cache: Path | None = None, link: str = "", component: int = 190
+    ) -> AsyncIterator[tuple[Component, Callable[[], Events]]]:
+        """Open a client as `client` does; yield the vehicle, and the call that returns a stream of events."""
         opened = ParamClient(
             link or self.relay.link, cache=False if cache is None else cache, component=component
         )
         async with opened as client:
-            yield await client.component(self.system, timeout=DISCOVERY_TIMEOUT)
+            yield await client.component(self.system, timeout=DISCOVERY_TIMEOUT), client.events
 
     @asynccontextmanager
     async def under(self, conditions: Conditions) -> AsyncIterator[None]:

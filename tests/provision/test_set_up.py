@@ -15,7 +15,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from paramclient import ParamCache, ParamClient
-from paramclient.client.client import local_client
 from paramclient.errors import (
     AnotherVehicle,
     CacheError,
@@ -750,7 +749,7 @@ async def run_interrupted(
         else:
             scope.cancel()
         if how == "kill":  # nothing more is written to the disk
-            local_client(client).cache_writer._cache = None
+            client.core.cache_writer._cache = None
 
     tap = EndpointWithEvent(Air.symmetric([story.vehicle], **faults), frames, end)
     with scope:

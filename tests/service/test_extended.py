@@ -9,7 +9,6 @@ from typing import Any
 import httpx
 import pytest
 
-from paramclient.client.local import local
 from paramclient.documents.extended_param import ExtParamDoc
 from paramclient.model.ext_params import ExtParam
 from paramclient.service import AccessSettings, Hub, Settings, Tokens, create_app
@@ -180,7 +179,7 @@ async def test_a_timeout_leaves_the_rest_open() -> None:
         done = (await browser.patch(f"{E}/params", json=body)).json()
         assert [each["status"] for each in done["results"].values()] == ["unknown", "accepted"]
         assert done["problem"]["error"] == "NoReply"
-        assert not local(hub.followed[0].component).machine.is_busy
+        assert not hub.followed[0].component.core.machine.is_busy
 
 
 @in_simulated_time
@@ -202,7 +201,7 @@ async def test_a_fetch_is_a_job_that_readers_may_cancel() -> None:
             assert (await guarded.delete(started.headers["location"])).status_code == 204
             await asyncio.sleep(0.1)
             assert (await guarded.get(started.headers["location"])).json()["state"] == "cancelled"
-            assert not local(hub.followed[0].component).machine.ext.is_busy
+            assert not hub.followed[0].component.core.machine.ext.is_busy
             assert (await guarded.get(f"{E}/params")).status_code == 200
             assert (await guarded.post(f"{E}/read", json={"name": "P000"})).status_code == 200
             for refused in (
@@ -218,7 +217,7 @@ async def test_a_write_has_the_name_of_its_author() -> None:
     async with service(Camera()) as (hub, browser):
         await met(browser, system=1, component=100)
         await browser.post(f"{E}/fetch", json={})
-        changes = local(hub.followed[0].component).ext.changes()
+        changes = hub.followed[0].component.ext.changes()
         await put(browser, "CAM_ISO", 400)
         change = await anext(changes)
         assert (change.new and change.new.value, change.by) == (400, "us for local")
@@ -367,7 +366,7 @@ async def test_a_published_table_is_not_compared_again_for_each_request() -> Non
         answers = await asyncio.gather(*[browser.get(f"{E}/params") for _ in range(10)])
         assert {answer.status_code for answer in answers} == {200}
         assert counted.looks == 0
-        local(hub.followed[0].component).machine.ext.table.doubt()
+        hub.followed[0].component.core.machine.ext.table.doubt()
         await asyncio.gather(*[browser.get(f"{E}/params") for _ in range(10)])
         assert counted.looks == 40
         await reported(received)

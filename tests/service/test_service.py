@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from paramclient import ParamCache, UsageError
-from paramclient.client.local import local
 from paramclient.documents.component import ComponentDoc
 from paramclient.documents.job import JobDoc
 from paramclient.documents.param import ParamDoc
@@ -466,7 +465,7 @@ async def test_a_call_whose_client_leaves_is_given_up() -> None:
         vehicle.is_deaf = True
         call = asyncio.create_task(browser.post(f"{C}/params/PARAM_01/read", json={}))
         await asyncio.sleep(0.05)
-        machine = local(hub.followed[0].component).machine
+        machine = hub.followed[0].component.core.machine
         assert len(machine.reads) == 1
         call.cancel()
         await settled()

@@ -6,7 +6,6 @@ import asyncio
 import base64
 import contextlib
 import json
-import math
 import threading
 import tracemalloc
 import weakref
@@ -22,7 +21,6 @@ import pytest
 from fastapi import FastAPI
 from fastapi.dependencies import utils as dependency_utils
 
-from paramclient.client.fetch_all import ENDED_FETCHES_MAX, STARTED_FETCHES_MAX, FleetFetch
 from paramclient.documents.component import ComponentsDoc
 from paramclient.documents.diff import DiffDoc, DifferenceDoc
 from paramclient.documents.document import Document
@@ -858,70 +856,6 @@ async def test_events_are_written_out_few_at_a_time() -> None:
                 if line.endswith("-1000"):
                     break
         assert turns.most == BATCH_EVENTS_MAX
-
-
-@in_simulated_time
-async def test_fetches_of_many_are_begun_and_ended_few_at_a_time() -> None:
-    class Station:
-        def begin_fetches(self, machines: list[Any], now: float, *, refresh: bool) -> list[Any]:
-            turns.note()
-            return [SimpleNamespace(done=False) for _ in machines]
-
-    def end_fetch(fetch: Any, now: float) -> None:
-        ends.note()
-        ended.append(next(address for address, each in together._fetches.items() if each is fetch))
-
-    def component(system: int) -> Any:
-        machine = SimpleNamespace(
-            identification=SimpleNamespace(has_parameters=True),
-            presence=SimpleNamespace(is_lost=False),
-            peers=SimpleNamespace(contest=None),
-            fetch=None,
-            end_fetch=end_fetch,
-            system=system,
-            vehicle=(system, None),
-            address=(system, 1),
-        )
-        return SimpleNamespace(machine=machine, is_cache_due=lambda now: True)
-
-    components = {(system, 1): component(system) for system in range(1, 251)}
-    station: Any = Station()
-    station.components = {address: each.machine for address, each in components.items()}
-    together = FleetFetch(station, components, system=None, refresh=False)
-    turns, ends = Turns(), Turns()
-    ended: list[tuple[int, int]] = []
-    checks = 0
-
-    def check() -> None:
-        nonlocal checks
-        checks += 1
-        if len(together._fetches) == 250:
-            raise EOFError
-
-    async def closed(machine: Any) -> None:
-        pass
-
-    bounds = {"until": 9e9, "hear_until": 0.0, "listen_until": 0.0}
-    with pytest.raises(EOFError):
-        await together.run(check, lambda: None, closed, **bounds, progress=None)
-    assert turns.most == STARTED_FETCHES_MAX
-    assert ends.most == ENDED_FETCHES_MAX
-    assert ended == list(reversed(components)), "none that waits for its turn gets it now"
-    assert checks == 1 + math.ceil(250 / STARTED_FETCHES_MAX)
-
-
-@in_simulated_time
-async def test_a_component_that_the_link_has_forgotten_does_not_break_the_end_of_a_fetch() -> None:
-    ended: list[int] = []
-    machines = {
-        (system, 1): SimpleNamespace(end_fetch=lambda fetch, now, system=system: ended.append(system))
-        for system in (1, 3)
-    }
-    station: Any = SimpleNamespace(components=machines)
-    together = FleetFetch(station, {}, system=None, refresh=False)
-    together._fetches.update({(system, 1): SimpleNamespace() for system in (1, 2, 3)})  # type: ignore[misc]
-    await together._end(lambda: None)
-    assert ended == [3, 1]
 
 
 @in_simulated_time

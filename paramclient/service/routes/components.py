@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Request, Response
 from pydantic import Field
 
 from paramclient.client.arguments import COMPONENT_TIMEOUT
-from paramclient.client.component import Component
+from paramclient.client.component import Component, successor_of
 from paramclient.documents.component import ComponentDoc, ComponentsDoc
 from paramclient.documents.document import Body
 from paramclient.service.followed_component import FollowedComponent
@@ -107,8 +107,7 @@ async def successor(request: Request, target: Target, body: SuccessorRequest) ->
     """Wait for the same component of the same vehicle with another system id."""
 
     async def work() -> Component:
-        client = target.component.client
-        return await client.successor(target.component, body.system, timeout=body.timeout_s)
+        return await successor_of(target.component, body.system, timeout=body.timeout_s)
 
     return _document(target, await run_until_disconnect(request, work, target))
 

@@ -21,8 +21,7 @@ from paramclient import (
     ParamClient,
     Rebooted,
 )
-from paramclient.client.link_component import REBOOT_TIMEOUT
-from paramclient.client.local import local
+from paramclient.client.component import REBOOT_TIMEOUT
 from paramclient.protocol import wire
 from paramclient.protocol.requests.retry import REBOOT_COMMANDS_MAX
 from paramclient.protocol.system_id_change import OLD_ID_SILENCE_MIN
@@ -140,7 +139,7 @@ async def test_reboot_returns_when_the_vehicle_is_back(
         assert await component.reboot() is component
         assert len(starts) == 1
         assert starts[0] <= anyio.current_time() < starts[0] + 3.5
-        assert local(component).machine.identification.known_at >= starts[0]  # it has said who it is since
+        assert component.core.machine.identification.known_at >= starts[0]  # it has said who it is since
         assert (await component.get(next(iter(vehicle.params)))).value is not None
         assert residue(component) == []
         await asyncio.sleep(10.0)
@@ -409,8 +408,8 @@ async def test_cancelling_leaves_nothing(make: Make, after: float) -> None:
         await asyncio.wait([call])
         assert call.cancelled() or call.done()
         assert residue(component) == []
-        assert len(local(component).machine.commands) == 0
-        assert local(component).machine.reboots.current is None
+        assert len(component.core.machine.commands) == 0
+        assert component.core.machine.reboots.current is None
         assert tasks_beside() == tasks
         await asyncio.sleep(5.0)
         assert await component.reboot() is component

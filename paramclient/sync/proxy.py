@@ -1,0 +1,411 @@
+"""Proxies: the objects of an asynchronous client, which runs in its own thread, with calls that block."""
+
+from __future__ import annotations
+
+import atexit
+import inspect
+import os
+import threading
+import weakref
+from collections import deque
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+from concurrent import futures
+from contextlib import AbstractContextManager, suppress
+from dataclasses import replace
+from functools import partial, wraps
+from queue import Empty, SimpleQueue
+from types import MappingProxyType, TracebackType
+from typing import Any, Final, Self
+
+import anyio
+from anyio.from_thread import BlockingPortal, start_blocking_portal
+
+import paramclient.client.client as asynchronous
+from paramclient.client import component, events, extended_params, files, subscription
+from paramclient.errors import ClientClosed, UsageError
+from paramclient.model.params import ParamMap
+
+__all__ = ["Changes", "Component", "Events", "ExtChanges", "ExtParams", "Ftp", "ParamClient", "blocking"]
+
+THREAD_NAME: Final = "paramclient blocking client"
+"""Name of the thread of a client, in debuggers."""
+WAIT_INTERVAL: Final = 0.1
+"""Seconds after which a waiting thread wakes up: Windows delivers Ctrl-C only then."""
+CANCEL_TIMEOUT: Final = 0.5
+"""Seconds for which an interrupted call waits until the client has cancelled it. Most calls take 1 ms. A file
+transfer also closes its session on board, which continues in the background."""
+EXIT_TIMEOUT: Final = 3.0
+"""Seconds for which the end of the program waits until open clients are closed: longer than a file session
+takes to be closed on board."""
+
+
+class _Session:
+    """An asynchronous client in an event loop of its own thread.
+
+    The thread ends when the client is closed, when the last proxy of the session is dropped, or with the
+    program.
+
+    Args:
+        make: makes the client.
+    """
+
+    def __init__(self, make: Callable[[], asynchronous.ParamClient]) -> None:
+        context = start_blocking_portal(name=THREAD_NAME)
+        self._portal = context.__enter__()
+        try:
+            self.client = self._portal.call(make)
+        except BaseException:
+            context.__exit__(None, None, None)
+            raise
+        self.proxies: weakref.WeakValueDictionary[object, Proxy] = weakref.WeakValueDictionary()
+        self._process = os.getpid()
+        self._end = weakref.finalize(self, _end_in_background, context, self._portal, self.client)
+        self._end.atexit = False  # `_close_all` waits for the end
+        _sessions.add(self)
+
+    def close(self) -> None:
+        """Close the client, and end the thread. Without effect after the first call."""
+        try:
+            with suppress(ClientClosed):
+                self.run(self.client.aclose)
+        finally:
+            if (found := self._end.detach()) is not None:
+                context: AbstractContextManager[BlockingPortal] = found[2][0]
+                context.__exit__(None, None, None)
+
+    def run(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """Call a function in the event loop, and await what it returns. Return the result as a proxy.
+
+        Callbacks among the arguments are called in this thread. KeyboardInterrupt, or another exception of
+        a signal handler or a callback, cancels the call.
+
+        Raises:
+            ClientClosed: the client was closed.
+            UsageError: the caller is in the event loop itself, or in a forked process.
+        """
+        calls: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
+        ended = threading.Event()
+        convert = partial(self._argument, calls, _components_of(args))
+        values = [convert("", value) for value in args]
+        options = {name: convert(name, value) for name, value in kwargs.items()}
+
+        async def work() -> Any:
+            try:
+                result = function(*values, **options)
+                return await result if inspect.isawaitable(result) else result
+            finally:
+                ended.set()
+                calls.put(None)
+
+        future = self.start(work)
+        try:
+            while (call := _next(calls)) is not None:
+                call()
+            return self.shown(future.result())
+        except futures.CancelledError:
+            raise ClientClosed("the client was closed", link=self.client.link.name) from None
+        except BaseException:
+            if not future.done():
+                future.cancel()
+                ended.wait(CANCEL_TIMEOUT)
+            raise
+
+    def start(self, work: Callable[[], Coroutine[Any, Any, Any]]) -> futures.Future[Any]:
+        """Start a task in the event loop.
+
+        Raises:
+            ClientClosed, UsageError: as from `run`.
+        """
+        if os.getpid() != self._process:
+            raise UsageError("a client cannot be used in a forked process; create a new one there")
+        try:
+            return self._portal.start_task_soon(work)
+        except RuntimeError as error:
+            if "event loop thread" in str(error):
+                raise UsageError("a blocking call cannot be made in the event loop of its client") from None
+            raise ClientClosed("the client was closed", link=self.client.link.name) from None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the event loop runs."""
+        return self._end.alive
+
+    def read(self, function: Callable[[], Any]) -> Any:
+        """Call a function that does not wait: in the event loop, or after its end in this thread."""
+        return self.run(function) if self.is_open else self.shown(function())
+
+    def shown(self, value: Any) -> Any:
+        """Return a value of the client as the caller is to see it."""
+        kind = _PROXIES.get(type(value))
+        if kind is not None:
+            found = self.proxies.get(value)
+            if found is None:
+                found = self.proxies[value] = kind.__new__(kind)
+                found._session, found._target = self, value
+            return found
+        if isinstance(value, list):
+            return [self.shown(each) for each in value]
+        if isinstance(value, ParamMap):
+            return ParamMap(_LiveMapping(self, value))
+        if isinstance(value, MappingProxyType):
+            return _LiveMapping(self, value)
+        if isinstance(value, events.Event):
+            return replace(value, component=self.shown(value.component))
+        return value
+
+    def _argument(
+        self,
+        calls: SimpleQueue[Callable[[], object] | None],
+        vehicles: Sequence[Component],
+        name: str,
+        value: Any,
+    ) -> Any:
+        """Return an argument of a call as the client is to see it."""
+        if isinstance(value, Proxy):
+            return value._target
+        if name == "progress" and value is not None:
+            return lambda *items: calls.put(partial(value, *map(self.shown, items)))
+        if name == "before_writing" and value is not None:
+            return partial(self._ask, calls, value)
+        if callable(value) and vehicles:  # one result for each vehicle
+            results = {each._target: value(each) for each in vehicles}
+            return results.__getitem__
+        if isinstance(value, list | tuple):
+            return type(value)(each._target if isinstance(each, Proxy) else each for each in value)
+        return value if isinstance(value, Mapping | str) or not isinstance(value, Iterator) else list(value)
+
+    async def _ask(
+        self,
+        calls: SimpleQueue[Callable[[], object] | None],
+        question: Callable[..., object],
+        *items: object,
+    ) -> None:
+        """Call a function in the thread of the caller, and wait for its end."""
+        answered = anyio.Event()
+
+        def answer() -> None:
+            question(*map(self.shown, items))
+            self._portal.start_task_soon(answered.set)
+
+        calls.put(answer)
+        await answered.wait()
+
+
+_sessions: weakref.WeakSet[_Session] = weakref.WeakSet()
+
+
+class Proxy:
+    """An object of the client. Its methods block, and its attributes are those of the object."""
+
+    _session: _Session
+    _target: Any
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        target, session = self._target, self._session
+        method = getattr(type(target), name, None)
+        if inspect.iscoroutinefunction(method):
+            return wraps(method)(partial(session.run, getattr(target, name)))
+        if inspect.isfunction(method):
+            return wraps(method)(lambda *args: session.read(partial(method, target, *map(_target_of, args))))
+        if name in vars(target):
+            return session.shown(vars(target)[name])
+        return session.read(partial(getattr, target, name))
+
+    def __dir__(self) -> list[str]:
+        return sorted(name for name in dir(self._target) if not name.startswith("_"))
+
+    def __repr__(self) -> str:
+        shown: str = self._session.read(partial(repr, self._target))
+        return shown
+
+
+class ParamClient(Proxy):
+    """See `paramclient.ParamClient`: the same arguments and calls, without `await`."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self._session = _Session(partial(asynchronous.ParamClient, *args, **kwargs))
+        self._target = self._session.client
+        self._session.proxies[self._target] = self
+
+    def open(self) -> Self:
+        """Open the client without a `with`, until `close`. Return the client."""
+        try:
+            self._session.run(self._target.open)
+        except BaseException:
+            if self._target.core.state == "closed":
+                self.close()
+            raise
+        return self
+
+    def close(self) -> None:
+        """Close the client, as on exit from a `with`. Calls that wait in other threads raise ClientClosed."""
+        self._session.close()
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class Component(Proxy):
+    """See `paramclient.Component`."""
+
+
+class ExtParams(Proxy):
+    """See `paramclient.ExtParams`."""
+
+
+class Ftp(Proxy):
+    """See `paramclient.Ftp`."""
+
+
+class Stream(Proxy):
+    """Items as they arrive: a `for` loop waits for each. Ctrl-C loses none."""
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Any:
+        return self.next()
+
+    def next(self, timeout: float | None = None) -> Any:
+        """Return the next item.
+
+        Args:
+            timeout: seconds; None waits without limit.
+
+        Raises:
+            TimeoutError: no item arrived in time. None is lost: it remains for the next call.
+            StopIteration: the stream has ended, as at the end of a log.
+            ParamClientError: the stream has ended with this error.
+        """
+        taken: deque[Any] = self.__dict__.setdefault("_taken", deque())  # an interrupted call leaves its item
+        if not taken:
+            try:
+                self._session.read(partial(self._take, taken, timeout))
+            except StopAsyncIteration:
+                raise StopIteration from None
+        return self._session.shown(taken.popleft())
+
+    def _take(self, taken: deque[Any], timeout: float | None) -> Any:
+        """Move one item into `taken`; a closed client has no event loop, and its streams do not wait."""
+
+        async def take() -> None:
+            taken.append(await anext(self._target))
+
+        async def take_in_time() -> None:
+            with anyio.fail_after(timeout):
+                await take()
+
+        if self._session.is_open:
+            return take_in_time()
+        with suppress(StopIteration):
+            take().send(None)
+        return None
+
+
+class Changes(Stream):
+    """See `paramclient.Changes`."""
+
+
+class ExtChanges(Stream):
+    """See `paramclient.ExtChanges`."""
+
+
+class Events(Stream):
+    """See `paramclient.Events`."""
+
+
+_PROXIES: dict[type, type[Proxy]] = {
+    asynchronous.ParamClient: ParamClient,
+    component.Component: Component,
+    extended_params.ExtParams: ExtParams,
+    files.Ftp: Ftp,
+    subscription.Changes: Changes,
+    subscription.ExtChanges: ExtChanges,
+    events.Events: Events,
+}
+
+
+class _LiveMapping(Mapping[Any, Any]):
+    """A view of a mapping that the event loop may change at any moment: an iteration is one over a copy."""
+
+    def __init__(self, session: _Session, mapping: Mapping[Any, Any]) -> None:
+        self._session = session
+        self._mapping = mapping
+
+    def __getitem__(self, key: Any) -> Any:
+        return self._session.shown(self._mapping[key])
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self._session.read(partial(list, self._mapping)))
+
+    def __len__(self) -> int:
+        return len(self._mapping)
+
+    def __repr__(self) -> str:
+        return repr(dict(self))
+
+
+def blocking(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that takes a client or components with calls that block."""
+
+    @wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        if isinstance(args[0], Proxy):
+            return args[0]._session.run(function, *args, **kwargs)
+        vehicles, *rest = [list(args[0]), *args[1:]]
+        sessions = {each._session for each in vehicles}
+        if len(sessions) > 1:
+            raise UsageError(
+                f"the vehicles belong to {len(sessions)} clients; make one call for those of each client"
+            )
+        if not sessions:
+            return anyio.run(partial(function, vehicles, *rest, **kwargs))
+        return sessions.pop().run(function, vehicles, *rest, **kwargs)
+
+    return call
+
+
+def _target_of(value: Any) -> Any:
+    return value._target if isinstance(value, Proxy) else value
+
+
+def _components_of(args: Sequence[Any]) -> Sequence[Component]:
+    """Return the vehicles of a call for several: its first argument."""
+    is_fleet = bool(args) and isinstance(args[0], list) and all(isinstance(each, Proxy) for each in args[0])
+    return args[0] if is_fleet else ()
+
+
+def _next(calls: SimpleQueue[Callable[[], object] | None]) -> Callable[[], object] | None:
+    while True:
+        with suppress(Empty):
+            return calls.get(timeout=WAIT_INTERVAL)
+
+
+def _end_in_background(
+    context: AbstractContextManager[BlockingPortal], portal: BlockingPortal, client: asynchronous.ParamClient
+) -> None:
+    """Close a client whose last reference was dropped. The garbage collector may call this in any thread."""
+
+    def end() -> None:
+        with suppress(Exception):
+            portal.call(client.aclose)
+        context.__exit__(None, None, None)
+
+    threading.Thread(target=end, name=THREAD_NAME, daemon=True).start()
+
+
+@atexit.register
+def _close_all() -> None:
+    """Close the clients that are open at the end of the program."""
+    closing = []
+    for session in list(_sessions):
+        with suppress(ClientClosed, UsageError):
+            closing.append(session.start(session.client.aclose))
+    futures.wait(closing, EXIT_TIMEOUT)

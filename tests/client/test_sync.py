@@ -1,0 +1,616 @@
+"""Staying in step, losing and finding vehicles, policies and events, as users of the client see them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+
+from paramclient import (
+    Added,
+    CacheError,
+    Changed,
+    ClientClosed,
+    Component,
+    ComponentState,
+    Discovered,
+    Event,
+    Events,
+    Found,
+    Lost,
+    NoReply,
+    ParamCache,
+    ParamClient,
+    Policy,
+    Rebooted,
+    Removed,
+    Resynced,
+    SyncState,
+    Trust,
+    UsageError,
+)
+from paramclient.client.events import EVENTS_MAX
+from paramclient.client.subscription import Changes
+from paramclient.protocol import wire
+from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSetMessage
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle
+from tests.shell import (
+    VALUES,
+    FlakyLink,
+    Tap,
+    a_client,
+    bits,
+    generic,
+    in_simulated_time,
+    outcome,
+    residue,
+    settled,
+    small_px4,
+    until,
+)
+
+VOLATILE = {"CAL_ACC0_XOFF", "PARAM_03"}
+MISSES = (ParamRequestRead, ParamRequestList, ParamSetMessage)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "parameters.sqlite3"
+
+
+async def drained(events: Events) -> list[Event]:
+    """Take the events that wait for a listener."""
+    taken: list[Event] = []
+    while True:
+        with anyio.move_on_after(0.001) as waiting:
+            taken.append(await anext(events))
+        if waiting.cancelled_caught:
+            return taken
+
+
+async def kinds(events: Events) -> list[type]:
+    return [type(event) for event in await drained(events)]
+
+
+def state(component: Component) -> SyncState:
+    return component.sync_state
+
+
+def trusts(component: Component) -> set[Trust]:
+    return {param.trust for param in component.params.values()}
+
+
+def requested(tap: Tap) -> int:
+    """All requests to the vehicle that concern parameters."""
+    return sum(len(tap.messages(kind)) for kind in MISSES)
+
+
+def hashes(tap: Tap) -> int:
+    return sum(each.param_id == HASH_CHECK for each in tap.messages(ParamRequestRead))
+
+
+async def change_silently(tap: Tap, vehicle: PX4Vehicle | ArduPilotVehicle, **values: float) -> None:
+    """Values change on board, and the messages that report it are lost."""
+    tap.is_mute = True
+    for name, value in values.items():
+        vehicle.set_param(name, value)
+    await asyncio.sleep(1.2)  # it does nothing before its next heartbeat
+    tap.is_mute = False
+
+
+async def away(tap: Tap, seconds: float) -> None:
+    tap.is_mute = tap.is_deaf = True
+    await asyncio.sleep(seconds)
+    tap.is_mute = tap.is_deaf = False
+
+
+# the watch
+
+
+@in_simulated_time
+async def test_an_update_that_was_lost_is_reported_within_one_interval() -> None:
+    vehicle = small_px4()
+    tap = Tap(vehicle)
+    async with a_client(tap, watch_interval=10.0) as client:
+        component = await client.component()
+        await component.fetch_all()
+        await asyncio.sleep(1.0)
+        events, changes = client.events(), component.changes()
+        await change_silently(tap, vehicle, PARAM_01=1001, PARAM_02=1002)
+        began = anyio.current_time()
+        assert component.params["PARAM_01"].value == 1
+        with anyio.fail_after(11.0):
+            change = await anext(changes)
+            assert change.name == "PARAM_01"
+            assert [param and param.value for param in (change.old, change.new)] == [1, 1001]
+            assert (await anext(changes)).name == "PARAM_02"
+            event = await anext(events)
+        assert event == Resynced(component, ("PARAM_01", "PARAM_02"), vehicle.announced_hash())
+        assert anyio.current_time() - began <= 10.5
+        assert state(component) is SyncState.SYNCED
+        assert component.state == "synced"
+        assert component.state is ComponentState.SYNCED
+        assert bits(component.params) == bits(vehicle.params)
+        assert not residue(component)
+
+
+@in_simulated_time
+async def test_by_default_a_hash_is_watched_and_a_list_is_not() -> None:
+    px4, ardupilot = Tap(small_px4()), Tap(ArduPilotVehicle(table=VALUES, system=2))
+    async with a_client(Air([px4, ardupilot])) as client:
+        await client.component(2)
+        await client.fetch_all()
+        await asyncio.sleep(1.0)
+        px4.received.clear()
+        await asyncio.sleep(100.0)
+        reads = [each.param_id for each in px4.messages(ParamRequestRead)]
+        assert reads.count(HASH_CHECK) == 3
+        assert len(reads) == 3 * (1 + 2), "and the two that the hash leaves out"
+        assert not px4.messages(ParamRequestList), "nor one for the other vehicle"
+
+
+@in_simulated_time
+async def test_an_interval_that_is_given_goes_for_lists_too() -> None:
+    vehicle = ArduPilotVehicle(ftp=False, table=VALUES)
+    tap = Tap(vehicle)
+    async with a_client(tap, watch_interval=20) as client:
+        component = await client.component()
+        await component.fetch_all()
+        changes, events = component.changes(), client.events()
+        await change_silently(tap, vehicle, PARAM_01=1001)
+        with anyio.fail_after(21.0):
+            assert (await anext(changes)).name == "PARAM_01"
+            assert await anext(events) == Resynced(component, ("PARAM_01",), None)
+
+
+@in_simulated_time
+@pytest.mark.parametrize("source", ["file", "list"])
+async def test_parameters_that_appear_are_added_and_can_be_set(path: Path, source: str) -> None:
+    group = {f"GRIP_{number}": number for number in range(5)}
+    table = {**VALUES, "GRIP_ENABLE": 0}
+    options: dict[str, Any] = {"groups": {"GRIP_ENABLE": group}, "ftp": source == "file", "live": ()}
+    vehicle = ArduPilotVehicle(table=table, **options)
+    async with a_client(vehicle, cache=path) as client:
+        component = await client.component()
+        await component.fetch_all()
+        changes = component.changes()
+        await component.set("GRIP_ENABLE", 1)
+        assert (await component.set("GRIP_2", 20)).status == "accepted"
+        with anyio.fail_after(3.0):
+            reported = [await anext(changes)]
+            while len(reported) < 6:
+                each = await anext(changes)
+                reported += [] if each.name in {every.name for every in reported} else [each]
+        assert (type(reported[0]), reported[0].name) == (Changed, "GRIP_ENABLE")
+        assert (type(reported[1]), reported[1].name) == (Added, "GRIP_2")
+        assert {each.name for each in reported if isinstance(each, Added)} == group.keys()
+        await until(lambda: component.sync_state is SyncState.SYNCED)
+        assert bits(component.params) == bits(vehicle.params)
+        await asyncio.sleep(1.0)
+        await component.set("GRIP_ENABLE", 0)
+        with anyio.fail_after(3.0):
+            while not isinstance(gone := await anext(changes), Removed):
+                pass
+        assert gone.new is None
+        await until(lambda: component.sync_state is SyncState.SYNCED)
+        assert component.params.keys() == vehicle.params.keys()
+        key = component.identity.key
+    with ParamCache(path) as cache:
+        kept = cache.load(key, 1)
+    assert kept is not None
+    assert (kept.count, kept.params.keys()) == (len(table), vehicle.params.keys())
+    assert kept.complete
+    assert {name: param.index for name, param in kept.params.items()} == {
+        name: param.index for name, param in vehicle.params.items()
+    }
+    assert vehicle.requests["PARAM_REQUEST_LIST"] == {"file": 0, "list": 3}[source]
+
+
+@in_simulated_time
+async def test_an_interval_of_zero_ends_the_watch() -> None:
+    tap = Tap(small_px4())
+    async with a_client(tap, watch_interval=0) as client:
+        component = await client.component()
+        await component.fetch_all()
+        tap.received.clear()
+        await asyncio.sleep(200.0)
+        assert requested(tap) == 0
+        assert state(component) is SyncState.SYNCED
+
+
+@pytest.mark.parametrize("wrong", [-1, 0.5, float("nan")])
+def test_an_interval_that_cannot_be(wrong: float) -> None:
+    with pytest.raises(UsageError, match="watch_interval"):
+        ParamClient("sim:px4", watch_interval=wrong)
+
+
+# lost and found
+
+
+@in_simulated_time
+async def test_lost_and_found() -> None:
+    vehicle = small_px4()
+    tap = Tap(vehicle)
+    async with a_client(tap) as client:
+        component = await client.component()
+        await component.fetch_all()
+        events = client.events()
+        tap.is_mute = tap.is_deaf = True
+        with anyio.fail_after(7.0):
+            lost = await anext(events)
+        assert isinstance(lost, Lost)
+        assert lost.component is component
+        assert lost.silence == pytest.approx(5.0, abs=0.01)
+        assert component.silence == pytest.approx(5.0, abs=0.01)
+        assert state(component) is SyncState.LOST
+        assert component.state == "lost"
+        assert "lost 25 params" in repr(component)
+        assert component.params["PARAM_01"].value == 1
+        assert trusts(component) == {Trust.CACHED}
+        tap.is_mute = tap.is_deaf = False
+        with anyio.fail_after(2.0):
+            found = await anext(events)
+            assert isinstance(found, Found)
+            assert found.component is component
+            assert found.silence > 5.0
+            assert await anext(events) == Resynced(component, (), vehicle.announced_hash())
+        await component.refreshed()
+        assert state(component) is SyncState.SYNCED
+        for name, param in component.params.items():
+            assert param.trust is (Trust.LIVE if name in VOLATILE else Trust.VERIFIED)
+
+
+@in_simulated_time
+async def test_calls_end_at_once_when_it_is_lost() -> None:
+    tap = Tap(small_px4())
+    async with a_client(tap) as client:
+        component = await client.component()
+        await component.fetch_all()
+        tap.is_mute = True
+        await asyncio.sleep(3.0)
+        calls: list[Callable[[], Awaitable[object]]] = [
+            lambda: component.get("PARAM_01"),
+            lambda: component.get(3),
+            lambda: component.set("PARAM_02", 5),
+        ]
+        began = anyio.current_time()
+        pending = await asyncio.gather(*(outcome(call()) for call in calls))
+        assert anyio.current_time() - began < 3.0
+        for error in pending:
+            assert isinstance(error, NoReply)
+            assert "1/1" in error.awaited
+            assert "lost" in error.awaited
+            assert error.attempts > 0
+            assert 0.0 < error.waited < 3.0
+        began = anyio.current_time()
+        calls += [component.fetch_all, lambda: component.fetch_all(refresh=True)]
+        tap.received.clear()
+        for call in calls:
+            error = await outcome(call())
+            assert isinstance(error, NoReply), error
+            assert error.attempts == 0
+        assert anyio.current_time() - began < 0.01
+        await asyncio.sleep(20.0)
+        assert requested(tap) == 0
+        assert not residue(component)
+
+
+@in_simulated_time
+async def test_a_fetch_survives_a_vehicle_that_starts_again() -> None:
+    vehicle = small_px4(burst=1, period=0.2)
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        events = client.events()
+        async with asyncio.TaskGroup() as tasks:
+            fetching = tasks.create_task(component.fetch_all())
+            await asyncio.sleep(2.0)
+            vehicle.reboot(anyio.current_time(), down=8.0)
+            await asyncio.sleep(6.0)
+            assert component.state == "lost"
+            vehicle.set_param("PARAM_01", 1001)
+        result = fetching.result()
+        assert result.complete
+        assert result.params["PARAM_01"].value == 1001
+        assert bits(result.params) == bits(vehicle.params)
+        assert await kinds(events) == [Lost, Found, Rebooted]
+        assert state(component) is SyncState.SYNCED
+
+
+@in_simulated_time
+async def test_a_reboot_is_reported() -> None:
+    vehicle = small_px4()
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        await component.fetch_all()
+        events = client.events()
+        await asyncio.sleep(5.0)
+        vehicle.reboot(anyio.current_time(), down=1.5)
+        await asyncio.sleep(5.0)
+        assert await drained(events) == [
+            Rebooted(component),
+            Resynced(component, (), vehicle.announced_hash()),
+        ]
+
+
+@in_simulated_time
+async def test_a_write_waits_until_it_is_known_who_it_is() -> None:
+    vehicle = small_px4()
+    tap = Tap(vehicle)
+    async with a_client(Air.symmetric([tap], delay=0.3)) as client:
+        component = await client.component()
+        await component.fetch_all()
+        await away(tap, 8.0)
+        await until(lambda: component.state != "lost")
+        tap.received.clear()
+        assert (await component.set("PARAM_02", 22)).actual == 22
+        order = [type(message) for _, _, message in tap.received]
+        assert order.index(wire.CommandLong) < order.index(ParamSetMessage)
+        times = {type(message): when for when, _, message in reversed(tap.received)}
+        assert times[ParamSetMessage] - times[wire.CommandLong] > 0.5, "a round trip"
+
+
+@in_simulated_time
+async def test_a_link_that_was_disconnected_is_checked_like_a_loss() -> None:
+    vehicle = small_px4()
+    link = FlakyLink(Air.symmetric([vehicle], delay=0.05))
+    async with a_client(link) as client:
+        component = await client.component()
+        await component.fetch_all()
+        events = client.events()
+        await link.drop(stays_offline=True)
+        vehicle.set_param("PARAM_01", 1001)
+        await asyncio.sleep(8.0)
+        link.is_offline = False
+        await until(lambda: component.state == "cached")
+        assert state(component) is SyncState.CHECKING
+        assert component.params["PARAM_05"].trust is Trust.CACHED
+        await asyncio.sleep(5.0)
+        assert await drained(events) == [Resynced(component, ("PARAM_01",), vehicle.announced_hash())]
+        assert bits(component.params) == bits(vehicle.params)
+
+
+# another vehicle in its place, and the cache
+
+
+class Berth(Tap):
+    """An address that one vehicle takes after the other."""
+
+    def moor(self, vehicle: Endpoint) -> None:
+        self._endpoint = vehicle
+
+
+def kept(path: Path) -> dict[tuple[str, int], dict[str, object]]:
+    """Values in the cache by vehicle and component."""
+    with ParamCache(path) as cache:
+        tables = {(e.key, e.component): cache.load(e.key, e.component) for e in cache.components()}
+        return {
+            address: {name: param.value for name, param in table.params.items()}
+            for address, table in tables.items()
+            if table is not None
+        }
+
+
+@pytest.mark.parametrize("answers", [True, False], ids=["says who it is late", "never says who it is"])
+@in_simulated_time
+async def test_a_strangers_values_never_reach_the_other_ones_cache(path: Path, answers: bool) -> None:
+    berth, camera = Berth(small_px4(uid=1)), Berth(generic(component=100))
+    async with a_client(Air([berth, camera]), cache=path) as client:
+        component = await client.component()
+        await client.fetch_all()
+        await asyncio.sleep(1.0)
+        await asyncio.gather(away(berth, 9.0), away(camera, 9.0))
+        stranger = small_px4(uid=2)
+        stranger.set_param("PARAM_01", 1001)
+        late = LateVersion(stranger)
+        berth.moor(late)
+        camera.moor(generic(component=100, table={"PARAM_01": 1001}))
+        await until(lambda: component.state != "lost")
+        eye = client.components[1, 100]
+        assert (await component.get("PARAM_01")).value == 1001
+        assert (await eye.get("PARAM_01")).value == 1001
+        await asyncio.sleep(1.0)
+        assert {values["PARAM_01"] for values in kept(path).values()} == {1}, "it is open whose they are"
+        if answers:
+            late.is_late = False
+        await asyncio.sleep(10.0)
+        if answers:
+            assert component.identity.uid == "0000000000000002"
+            assert component.params.keys() <= {"PARAM_01"}
+            assert eye.params.keys() <= {"PARAM_01"}
+            await client.fetch_all()
+            await asyncio.sleep(1.0)
+    found = {address: values["PARAM_01"] for address, values in kept(path).items()}
+    first, second = "uid:0000000000000001", "uid:0000000000000002"
+    of_the_second = {(second, 1): 1001, (second, 100): 1001} if answers else {}
+    assert found == {(first, 1): 1, (first, 100): 1} | of_the_second
+
+
+class LateVersion(Tap):
+    """A vehicle that keeps to itself who it is."""
+
+    is_late = True
+
+    def data_to_send(self) -> list[bytes]:
+        frames = [(wire.Framer(stream=False).receive(data)[0], data) for data in super().data_to_send()]
+        return [data for frame, data in frames if not self.is_late or frame.message_id not in (148, 77)]
+
+
+# policies
+
+
+async def learn(vehicle: PX4Vehicle, path: Path) -> None:
+    async with ParamClient(vehicle, cache=path) as client:
+        await (await client.component()).fetch_all()
+
+
+@in_simulated_time
+async def test_cache_only_sends_nothing(path: Path) -> None:
+    vehicle = small_px4()
+    await learn(vehicle, path)
+    tap = Tap(vehicle)
+    async with a_client(tap, cache=path, policy="cache-only") as client:
+        component = await client.component()
+        result = await component.fetch_all()
+        assert (result.source, result.hash, result.complete) == ("cache", None, True)
+        assert "cache-only" in result.notes[0]
+        assert bits(result.params) == bits(vehicle.params)
+        assert state(component) is SyncState.UNSYNCED
+        assert component.state == "cached"
+        assert trusts(component) == {Trust.CACHED}
+        everything = await client.fetch_all()
+        assert everything.results[1, 1].source == "cache"
+        await component.refreshed()
+        await asyncio.sleep(100.0)
+        assert requested(tap) == 0
+        assert (await component.get("PARAM_01")).trust is Trust.LIVE, "a name that is requested is read"
+
+
+@in_simulated_time
+async def test_cache_only_where_nothing_is_cached(path: Path) -> None:
+    tap = Tap(Air([small_px4(), generic(component=100)]))
+    async with a_client(tap, cache=path, policy=Policy.CACHE_ONLY) as client:
+        component = await client.component()
+        with pytest.raises(CacheError, match="1/1"):
+            await component.fetch_all()
+        with pytest.raises(CacheError):
+            await client.fetch_all()
+        assert requested(tap) == 0
+        assert not residue(component)
+
+
+@in_simulated_time
+async def test_a_component_without_a_cached_table_does_not_delay_the_others(path: Path) -> None:
+    vehicle = small_px4()
+    await learn(vehicle, path)
+    async with a_client(Air([vehicle, generic(component=100)]), cache=path, policy="cache-only") as client:
+        await client.component()
+        everything = await client.fetch_all()
+        assert everything.results.keys() == {(1, 1)}
+        assert isinstance(everything.silent[1, 100], CacheError)
+
+
+@in_simulated_time
+async def test_hash_only_requests_the_hash_alone(path: Path) -> None:
+    vehicle = small_px4()
+    await learn(vehicle, path)
+    tap = Tap(vehicle)
+    async with a_client(tap, cache=path, policy="hash-only") as client:
+        component = await client.component()
+        result = await component.fetch_all()
+        assert (result.source, result.hash) == ("cache", vehicle.announced_hash())
+        assert state(component) is SyncState.SYNCED
+        await component.refreshed()
+        for name, param in component.params.items():
+            assert param.trust is (Trust.CACHED if name in VOLATILE else Trust.VERIFIED)
+        await asyncio.sleep(100.0)
+        assert requested(tap) == hashes(tap) == 1
+        await change_silently(tap, vehicle, PARAM_02=1002)
+        result = await component.fetch_all()
+        assert (result.hash, result.source) == (None, "cache")
+        assert "hash-only" in result.notes[0]
+        assert state(component) is SyncState.UNSYNCED
+        assert requested(tap) == hashes(tap) == 2
+
+
+@pytest.mark.parametrize("policy", [Policy.CACHE_ONLY, Policy.HASH_ONLY])
+@in_simulated_time
+async def test_refresh_is_refused_with_a_policy_that_forbids_downloads(policy: Policy) -> None:
+    tap = Tap(small_px4())
+    async with a_client(tap, policy=policy) as client:
+        component = await client.component()
+        for call in (component.fetch_all(refresh=True), client.fetch_all(refresh=True)):
+            with pytest.raises(UsageError, match=f"policy is {policy}"):
+                await call
+        assert requested(tap) == 0
+
+
+def test_a_policy_that_does_not_exist() -> None:
+    with pytest.raises(UsageError, match="auto, hash-only, cache-only"):
+        ParamClient("sim:px4", policy="never")
+
+
+# events
+
+
+@in_simulated_time
+async def test_several_listeners_hear_the_same() -> None:
+    vehicle = small_px4()
+    client = a_client(vehicle)
+    early = client.events()
+    async with client:
+        component = await client.component()
+        late = client.events()
+        await component.fetch_all()
+        await asyncio.sleep(3.0)
+        vehicle.reboot(anyio.current_time(), down=1.5)
+        await asyncio.sleep(5.0)
+        assert await kinds(early) == [Discovered, Rebooted, Resynced]
+        assert await kinds(late) == [Rebooted, Resynced]
+
+
+@in_simulated_time
+async def test_events_end_with_the_client() -> None:
+    async with a_client(small_px4()) as client:
+        component = await client.component()
+        events, others = client.events(), client.events()
+        waiting = asyncio.ensure_future(outcome(anext(others)))
+        await settled()
+        events.push(Lost(component, 5.0))
+    assert isinstance(await waiting, ClientClosed)
+    assert await anext(events) == Lost(component, 5.0), "earlier events precede it"
+    for each in (events, client.events()):
+        with pytest.raises(ClientClosed):
+            await anext(each)
+
+
+@in_simulated_time
+async def test_cancelled_a_listener_loses_nothing() -> None:
+    async with a_client(small_px4()) as client:
+        component = await client.component()
+        events = client.events()
+        with anyio.move_on_after(0.01):
+            await anext(events)
+        events.push(Lost(component, 5.0))
+        assert await anext(events) == Lost(component, 5.0)
+
+
+@in_simulated_time
+async def test_a_slow_listener_misses_the_oldest_and_holds_no_more() -> None:
+    async with a_client(small_px4()) as client:
+        component = await client.component()
+        events = client.events()
+        for number in range(EVENTS_MAX + 10):
+            events.push(Lost(component, float(number)))
+        waiting = await drained(events)
+        assert len(waiting) == EVENTS_MAX
+        assert waiting[0] == Lost(component, 10.0)
+
+
+@in_simulated_time
+async def test_a_listener_may_stop_in_the_middle() -> None:
+    vehicle = small_px4()
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        await component.fetch_all()
+        received: list[Event] = []
+
+        async def listen() -> None:
+            async for event in client.events():
+                received.append(event)
+                if isinstance(event, Rebooted):
+                    return
+
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(listen())
+            await asyncio.sleep(3.0)
+            vehicle.reboot(anyio.current_time(), down=1.5)
+        assert received == [Rebooted(component)]
+
+
+def test_feeds_are_no_iterators_of_the_other_kind() -> None:
+    assert isinstance(Changes().__aiter__(), Changes)
+    assert isinstance(Events().__aiter__(), Events)
