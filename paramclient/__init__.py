@@ -35,20 +35,17 @@ if TYPE_CHECKING:
     from paramclient.client.client import ParamClient
     from paramclient.client.component import Component, ComponentState
     from paramclient.client.events import (
-        Contested,
         Discovered,
         Event,
         Found,
         Lost,
         Rebooted,
         Resynced,
-        Uncontested,
     )
     from paramclient.client.files import Ftp
     from paramclient.client.fleet_fetch import FetchedAll
     from paramclient.client.reset import ResetResult
     from paramclient.client.signing import Signing, key_from_environment, read_key
-    from paramclient.client.stats import ClientStats
     from paramclient.client.streams import Changes, Events
     from paramclient.client.traffic import ComponentTraffic, MessageTraffic, RadioStatus, TrafficReport
     from paramclient.errors import (
@@ -59,7 +56,6 @@ if TYPE_CHECKING:
         ClientClosed,
         CommandRefused,
         CommandResult,
-        ContestedAddress,
         ExtAckResult,
         ExtSetRefused,
         FileError,
@@ -108,13 +104,11 @@ if TYPE_CHECKING:
     from paramclient.protocol.fetch import FetchResult, FetchSource, Policy, Progress
     from paramclient.protocol.ftp import DirectoryEntry
     from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
-    from paramclient.protocol.vehicle.address_contest import Contest
     from paramclient.protocol.watch import SyncState
     from paramclient.wire.messages import AutopilotVersion, Heartbeat
     from paramclient.wire.signing import Refusal, SigningKey, SigningPolicy, SigningReport, SigningStream
 
 __all__ = [
-    "Added",
     "Address",
     "AlreadyRestored",
     "AmbiguousVehicle",
@@ -126,19 +120,14 @@ __all__ = [
     "CachedSummary",
     "CachedVehicle",
     "Change",
-    "Changed",
     "Changes",
     "ClientClosed",
-    "ClientStats",
     "CommandRefused",
     "CommandResult",
     "Comparison",
     "Component",
     "ComponentState",
     "ComponentTraffic",
-    "Contest",
-    "Contested",
-    "ContestedAddress",
     "Difference",
     "DirectoryEntry",
     "Encoding",
@@ -167,7 +156,6 @@ __all__ = [
     "FileErrorCode",
     "FileFormat",
     "FileTransferError",
-    "FirstValue",
     "Found",
     "Ftp",
     "Discovered",
@@ -200,7 +188,6 @@ __all__ = [
     "RadioStatus",
     "Refusal",
     "Refused",
-    "Removed",
     "Rename",
     "Renames",
     "ResetResult",
@@ -223,7 +210,6 @@ __all__ = [
     "TrafficReport",
     "Trust",
     "TypeMismatch",
-    "Uncontested",
     "UnknownParameter",
     "UnknownVehicle",
     "UsageError",
@@ -261,7 +247,6 @@ _HOMES: Final = {
     "paramclient.client.client": ("ParamClient",),
     "paramclient.client.component": ("Component",),
     "paramclient.client.events": (
-        "Contested",
         "Event",
         "Events",
         "Found",
@@ -269,7 +254,6 @@ _HOMES: Final = {
         "Lost",
         "Rebooted",
         "Resynced",
-        "Uncontested",
     ),
     "paramclient.client.extended_params": ("Component",),
     "paramclient.client.fetch_all": ("FetchedAll",),
@@ -290,7 +274,6 @@ _HOMES: Final = {
         "ClientClosed",
         "CommandRefused",
         "CommandResult",
-        "ContestedAddress",
         "ExtAckResult",
         "ExtSetRefused",
         "FileError",
@@ -369,11 +352,7 @@ _HOMES: Final = {
     "paramclient.protocol.ext.writes": ("SetResult",),
     "paramclient.protocol.ftp": ("DirectoryEntry",),
     "paramclient.protocol.params.change": (
-        "Added",
         "Change",
-        "Changed",
-        "FirstValue",
-        "Removed",
     ),
     "paramclient.protocol.params.fetch_result": (
         "FetchResult",

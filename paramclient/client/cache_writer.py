@@ -68,12 +68,13 @@ class CacheWriter:
         owned: whether `close` closes the cache.
 
     Attributes:
+        cache: as given.
         failure: why the cache cannot be written; None while it can.
     """
 
     def __init__(self, cache: ParamCache | None, *, owned: bool) -> None:
         self.failure: CacheError | UsageError | None = None
-        self._cache = cache
+        self.cache = cache
         self._owned = owned
         self._thread = anyio.CapacityLimiter(1)
         self._identities: dict[Node, Identity] = {}  # under which the tables of a component are written
@@ -85,13 +86,13 @@ class CacheWriter:
 
     async def open(self) -> None:
         """Load the list of cached components."""
-        if self._cache is not None:
-            summaries = await self._try(self._cache.components) or ()
+        if self.cache is not None:
+            summaries = await self._try(self.cache.components) or ()
             self._known = {(each.system, each.component) for each in summaries}
 
     async def close(self) -> None:
         """Write all new values, warn of lost ones, and close the cache if it is owned."""
-        if self._cache is None:
+        if self.cache is None:
             return
         is_written = False
         with anyio.move_on_after(CLOSE_WAIT_MAX, shield=True):
@@ -100,7 +101,7 @@ class CacheWriter:
             logger.warning("the last values could not be written to the cache: %s", self.failure or "timeout")
         if self._owned:
             with anyio.move_on_after(CLOSE_WAIT_MAX, shield=True):
-                await self.run_in_thread(self._cache.close)
+                await self.run_in_thread(self.cache.close)
 
     def may_have(self, node: Node) -> bool:
         """Return whether the cache had a table for these ids when the client was opened."""
@@ -110,10 +111,10 @@ class CacheWriter:
         """Load the cached tables of an identified component, and write its values from now on."""
         identity = node.identification.identity
         kept = self._identities.get(node)
-        if self._cache is None or (kept is not None and kept.key == identity.key):
+        if self.cache is None or (kept is not None and kept.key == identity.key):
             self._identities[node] = identity
             return
-        cache = self._cache
+        cache = self.cache
         plain = await self._try(lambda: cache.load(identity.key, node.component))
         extended = await self._try(lambda: cache.load_ext(identity.key, node.component))
         if plain is not None:
@@ -153,7 +154,7 @@ class CacheWriter:
 
     def changed(self, session: Session, change: Change) -> None:
         """Take a change of a parameter."""
-        if self._cache is None:
+        if self.cache is None:
             return
         pending = self._pending.setdefault(session, _Pending())
         at = self._unix(session.table.moments.get(change.name, math.inf))
@@ -190,7 +191,7 @@ class CacheWriter:
         Args:
             durable: whether to wait until they are safe from power loss.
         """
-        cache = self._cache
+        cache = self.cache
         if cache is None:
             return not durable
         async with self._flushing:

@@ -477,7 +477,7 @@ class ParamClient:
         watch = Watch(session, node.presence, emit, interval=self._interval, policy=self._policy)
         session.table.recounted = watch.doubt
         component = self._by_session[session] = Component(
-            self.core, node, session, watch, partial(self.successor, timeout=None)
+            self.core, node, session, watch, self._components, self.successor
         )
         component.policy = self._policy
         if not self.listens_only:

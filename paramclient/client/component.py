@@ -100,19 +100,21 @@ class Component:
         node: Node,
         session: Session,
         watch: Watch,
-        successor: Callable[[Component, int], Awaitable[Component]],
+        siblings: Mapping[Address, Component],
+        successor: Callable[..., Awaitable[Component]],
     ) -> None:
         self.core = core
         self.node = node
         self.session = session
         self.watch = watch
+        self.siblings = siblings  # all components of the client, this one included
         self.system = node.system
         self.component = node.component
         self.params = ParamMap(session.table.params)
         self.subscribers: Subscribers[Change] = Subscribers()
         self.policy = Policy.AUTO
         self.cache_is_read = anyio.Event()
-        self.successor: Callable[[Component, int], Awaitable[Component]] = successor
+        self.successor = successor
         self._ext: Component | None = None
         self._last: FetchResult | None = None
 
@@ -520,7 +522,7 @@ class Component:
             await commands.reboot(self.node, returns=not moves)
             if system is None or not moves:
                 return self
-            return await self.successor(self, system)
+            return await self.successor(self, system, timeout=None)
         raise AssertionError("the timeout has raised")
 
     def changes(self) -> Changes:
@@ -536,6 +538,11 @@ class Component:
         """
         self.subscribers.add(changes := Changes())
         return changes
+
+    async def wait_until_identified(self, timeout: float) -> None:
+        """Wait at most `timeout` seconds until the vehicle is identified, as its cache key requires."""
+        with anyio.move_on_after(timeout):
+            await self.node.identification.settled()
 
     async def wait_for_cache(self) -> None:
         """Wait until the cached table, if there is one, is in the table; 1.5 s at most."""

@@ -35,6 +35,7 @@ class ClientCore:
 
     Attributes:
         link_task, station, cache_writer, taps: the parts.
+        cache: the cache of the tables, or None.
         is_over: whether a log has ended.
     """
 
@@ -49,6 +50,7 @@ class ClientCore:
     ) -> None:
         self.link = link
         self.cache_writer = cache_writer
+        self.cache = cache_writer.cache
         self.is_over = False
         self.link_task = LinkTask(link, taps=taps.taps, ended=self._log_ended)
         self.station = self.link_task.station = new_station(send=self.link_task.queue, spawn=self.spawn)

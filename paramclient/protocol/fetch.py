@@ -49,10 +49,21 @@ class Progress:
     Attributes:
         received: parameters received.
         total: parameters of the component, or None while unknown.
+        rate: parameters per second since the fetch began.
+        seconds_left: at that rate, or None while unknown.
     """
 
     received: int
     total: int | None
+    rate: float = 0.0
+    seconds_left: float | None = None
+
+    @classmethod
+    def after(cls, received: int, total: int | None, elapsed: float) -> Progress:
+        """Return the progress `elapsed` seconds after the begin."""
+        rate = received / elapsed if elapsed > 0 else 0.0
+        left = (total - received) / rate if rate and total is not None else None
+        return cls(received, total, rate, left)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,9 +143,11 @@ async def fetch_all(
     async def work() -> FetchResult:
         return await _Fetch(session, policy).run(refresh=refresh)
 
+    began = anyio.current_time()
+
     def observe(received: int, total: int | None) -> None:
         if progress is not None:
-            progress(Progress(received, total))
+            progress(Progress.after(received, total, anyio.current_time() - began))
 
     session.observers.add(observe)
     try:

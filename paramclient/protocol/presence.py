@@ -34,7 +34,7 @@ class Presence:
     """When a component was heard, and whether it has rebooted.
 
     Attributes:
-        received_at: when the last message arrived; minus infinity before the first.
+        received_at, beat_at: when the last message, and the last heartbeat arrived; minus infinity before.
         is_lost: whether no message arrived for the timeout.
         base_mode: of the last heartbeat; None before the first.
         is_booting: whether the last heartbeat has MAV_STATE_BOOT.
@@ -47,7 +47,7 @@ class Presence:
         self.base_mode: int | None = None
         self.is_booting = False
         self.clock_at = -math.inf
-        self._beat_at = -math.inf
+        self.beat_at = -math.inf
         self._interval = math.inf  # the shortest between two heartbeats
         self._is_high_latency = False
         self._clocks: dict[int, tuple[int, float]] = {}  # by message id, the last value and when
@@ -58,7 +58,7 @@ class Presence:
         """Seconds of silence after which the component is lost; infinity before the first heartbeat."""
         if self._is_high_latency:
             return LOST_AFTER_HIGH_LATENCY
-        if self._beat_at == -math.inf:
+        if self.beat_at == -math.inf:
             return math.inf
         if self._interval == math.inf:
             return LOST_AFTER
@@ -67,15 +67,15 @@ class Presence:
     @property
     def has_beaten(self) -> bool:
         """Whether a heartbeat ever arrived."""
-        return self._beat_at > -math.inf
+        return self.beat_at > -math.inf
 
     def heartbeat(self, message: Heartbeat, now: float) -> bool:
         """Take a heartbeat, and return whether it shows a reboot: the first with MAV_STATE_BOOT does."""
-        interval = now - self._beat_at
+        interval = now - self.beat_at
         if interval > DUPLICATE_TIME:
             self._interval = min(self._interval, interval)
         has_beaten, was_booting = self.has_beaten, self.is_booting
-        self._beat_at = now
+        self.beat_at = now
         self._is_high_latency = False
         self.base_mode = message.base_mode
         self.is_booting = message.system_status == MAV_STATE_BOOT

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from enum import StrEnum
 from typing import Final
 
@@ -75,6 +76,7 @@ class Watch:
         self._is_doubted = False
         self._download_time = math.inf
         self._signal = anyio.Event()
+        self._holds = 0
 
     @property
     def state(self) -> SyncState:
@@ -92,6 +94,15 @@ class Watch:
         if elapsed is not None:
             self._download_time = elapsed
         self._signal.set()
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Begin no check during the block: its owner reads the table itself."""
+        self._holds += 1
+        try:
+            yield
+        finally:
+            self._holds -= 1
 
     def doubt(self) -> None:
         """Check the table soon: there is a sign of change."""
@@ -127,7 +138,7 @@ class Watch:
         is_allowed = self._policy is Policy.AUTO and self._is_fetched and not self._presence.is_lost
         is_armed = bool((self._presence.base_mode or 0) & MAV_MODE_FLAG_SAFETY_ARMED)
         is_busy = self._session.fetching.is_running or bool(self._session.writing)
-        return is_allowed and not is_busy and (self._is_doubted or not is_armed)
+        return is_allowed and not is_busy and not self._holds and (self._is_doubted or not is_armed)
 
     async def _check(self) -> None:
         """Ask for the digest, and fetch what it does not confirm."""

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from paramclient.errors import NoReply, NotInCache, UsageError, VehicleError
+from paramclient.errors import NotInCache, UsageError, VehicleError
 from paramclient.model.comparison import defaults_of, non_defaults
 from paramclient.model.defaults import add_defaults
 from paramclient.model.ext_params import ExtParam
@@ -125,8 +123,6 @@ async def collect_set(
     Raises:
         LinkError: the link failed.
     """
-    with suppress(NoReply):  # values that were not read again are reported as missing below
-        await component.refreshed(timeout=min(REFRESH_TIMEOUT, math.inf if timeout is None else timeout))
     table = copy_params(component.params)
     to_set = set_maker(component, source)
 

@@ -21,11 +21,11 @@ import anyio
 from anyio.from_thread import BlockingPortal, start_blocking_portal
 
 import paramclient.client.client as asynchronous
-from paramclient.client import component, events, extended_params, files, subscription
+from paramclient.client import component, events, files, streams
 from paramclient.errors import ClientClosed, UsageError
 from paramclient.model.params import ParamMap
 
-__all__ = ["Changes", "Component", "Events", "ExtChanges", "ExtParams", "Ftp", "ParamClient", "blocking"]
+__all__ = ["Changes", "Component", "Events", "Ftp", "ParamClient", "blocking"]
 
 THREAD_NAME: Final = "paramclient blocking client"
 """Name of the thread of a client, in debuggers."""
@@ -256,10 +256,6 @@ class Component(Proxy):
     """See `paramclient.Component`."""
 
 
-class ExtParams(Proxy):
-    """See `paramclient.ExtParams`."""
-
-
 class Ftp(Proxy):
     """See `paramclient.Ftp`."""
 
@@ -313,10 +309,6 @@ class Changes(Stream):
     """See `paramclient.Changes`."""
 
 
-class ExtChanges(Stream):
-    """See `paramclient.ExtChanges`."""
-
-
 class Events(Stream):
     """See `paramclient.Events`."""
 
@@ -324,11 +316,9 @@ class Events(Stream):
 _PROXIES: dict[type, type[Proxy]] = {
     asynchronous.ParamClient: ParamClient,
     component.Component: Component,
-    extended_params.ExtParams: ExtParams,
     files.Ftp: Ftp,
-    subscription.Changes: Changes,
-    subscription.ExtChanges: ExtChanges,
-    events.Events: Events,
+    streams.Changes: Changes,
+    streams.Events: Events,
 }
 
 
