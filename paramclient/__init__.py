@@ -351,9 +351,7 @@ _HOMES: Final = {
     ),
     "paramclient.protocol.ext.writes": ("SetResult",),
     "paramclient.protocol.ftp": ("DirectoryEntry",),
-    "paramclient.protocol.params.change": (
-        "Change",
-    ),
+    "paramclient.protocol.params.change": ("Change",),
     "paramclient.protocol.params.fetch_result": (
         "FetchResult",
         "FetchSource",

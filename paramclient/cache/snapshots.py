@@ -10,7 +10,6 @@ from typing import Any, Final, TypeAlias
 
 from paramclient.cache.history import values_at
 from paramclient.cache.records import (
-    ExtSnapshot,
     Snapshot,
     SnapshotSummary,
     StoredParam,
@@ -21,7 +20,6 @@ from paramclient.cache.records import (
 from paramclient.cache.schema import IDENTITY, Transaction
 from paramclient.cache.tables import identity_cells, load_rows, read_identity, time_cell
 from paramclient.errors import NotInCache, UsageError
-from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import bits_of, from_bits
@@ -29,13 +27,10 @@ from paramclient.model.values import bits_of, from_bits
 __all__ = [
     "SNAPSHOTS",
     "end_operation",
-    "ext_set_rows",
-    "extended_state",
-    "load_ext_snapshot",
     "load_snapshot",
     "load_summaries",
     "param_set_rows",
-    "plain_state",
+    "state_at",
     "store_snapshot",
     "stored_rows",
 ]
@@ -109,7 +104,7 @@ def load_summaries(
 
 
 def load_snapshot(tx: Transaction, owner: int, number: int) -> Snapshot:
-    """Return a snapshot of a table of plain parameters.
+    """Return a snapshot of a table.
 
     Raises:
         NotInCache: the table has no such snapshot.
@@ -119,15 +114,6 @@ def load_snapshot(tx: Transaction, owner: int, number: int) -> Snapshot:
     source = f"snapshot {number} of {known['key']}"
     content = ParamSet(written, known["component"], identity.system, identity, known["at"], source)
     return Snapshot(**known, params=content)
-
-
-def load_ext_snapshot(tx: Transaction, owner: int, number: int) -> ExtSnapshot:
-    """Return a snapshot of a table of extended parameters. Errors as of `load_snapshot`."""
-    known, identity, rows = _load(tx, owner, number)
-    params = {name: value.ext_param(name) for name, value, _ in rows}
-    source = f"snapshot {number} of {known['key']}"
-    content = ExtParamSet(params, identity.system, known["component"], known["at"], source, identity)
-    return ExtSnapshot(**known, params=content)
 
 
 def _table_at(
@@ -161,18 +147,11 @@ def _table_at(
     return values_at(tx, owner, load_rows(tx, owner), when), identity, component, when
 
 
-def plain_state(tx: Transaction, owner: int, when: float) -> ParamSet:
-    """Return a table of plain parameters as it was at a time. Errors as of `_table_at`."""
+def state_at(tx: Transaction, owner: int, when: float) -> ParamSet:
+    """Return a table as it was at a time. Errors as of `_table_at`."""
     values, identity, component, at = _table_at(tx, owner, when)
     written = {name: _written(name, value, None) for name, value in values.items()}
     return ParamSet(written, component, identity.system, identity, at, f"history of {identity.key}")
-
-
-def extended_state(tx: Transaction, owner: int, when: float) -> ExtParamSet:
-    """Return a table of extended parameters as it was at a time. Errors as of `_table_at`."""
-    values, identity, component, at = _table_at(tx, owner, when)
-    params = {name: value.ext_param(name) for name, value in values.items()}
-    return ExtParamSet(params, identity.system, component, at, f"history of {identity.key}", identity)
 
 
 def stored_rows(rows: Mapping[str, StoredParam]) -> list[SnapshotRow]:
@@ -196,11 +175,6 @@ def param_set_rows(params: ParamSet) -> list[SnapshotRow]:
             default = written_value(each.type_number, bits_of(each.default, each.type_number), is_raw=False)
         rows.append((name, value, None if default is None else default.value))
     return rows
-
-
-def ext_set_rows(params: ExtParamSet) -> list[SnapshotRow]:
-    """Return the parameters of a set of extended ones as those of a snapshot."""
-    return [(name, StoredValue(int(each.type), each.raw, 0), None) for name, each in params.params.items()]
 
 
 def _load(tx: Transaction, owner: int, number: int) -> tuple[dict[str, Any], Identity, list[SnapshotRow]]:

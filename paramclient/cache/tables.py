@@ -16,26 +16,24 @@ from paramclient.cache.history import Line, add_lines, last_removal
 from paramclient.cache.records import (
     BY_VEHICLE,
     CachedComponent,
-    CachedExtTable,
     CachedSummary,
     CachedVehicle,
     StoredParam,
     StoredValue,
     TableState,
     TableUpdate,
-    plain_params,
+    stored_params,
 )
 from paramclient.cache.schema import IDENTITY, Transaction
 from paramclient.errors import UsageError
 from paramclient.model.identity import Identity
-from paramclient.model.params import ParamMap, unpack_fields
+from paramclient.model.params import ParamMap
 from paramclient.model.px4_hash import hash_bits
 
 __all__ = [
     "find_owner",
     "identity_cells",
     "load_component",
-    "load_extended",
     "load_extended_sizes",
     "load_rows",
     "load_summaries",
@@ -119,17 +117,17 @@ def load_vehicles(tx: Transaction) -> list[CachedVehicle]:
 
 
 def load_summaries(
-    tx: Transaction, key: str | None = None, component: int | None = None
+    tx: Transaction, key: str | None = None, component: int | None = None, *, extended: bool = False
 ) -> list[CachedSummary]:
-    """Return tables of plain parameters without their parameters, optionally of one vehicle or component."""
+    """Return tables without their parameters, optionally of one vehicle or component."""
     conditions, values = _conditions({"c.vehicle": key, "c.component": component})
     found = []
     for last_seen, *cells in tx.all(
         f"SELECT v.last_seen, c.vehicle, c.component, c.autopilot, {_STATE},"
         " (SELECT count(*) FROM parameter p WHERE p.owner = c.id),"
         f" {', '.join('v.' + column for column in IDENTITY.split(', '))}"
-        f" FROM component c JOIN vehicle v ON v.key = c.vehicle WHERE c.extended = 0{conditions}",
-        values,
+        f" FROM component c JOIN vehicle v ON v.key = c.vehicle WHERE c.extended = ?{conditions}",
+        [int(extended), *values],
     ):
         vehicle, number, autopilot, *state = cells[:11]
         size, *described = cells[11:]
@@ -193,25 +191,23 @@ def load_rows(tx: Transaction, owner: int, names: Collection[str] | None = None)
     return {row.name: row for row in rows}
 
 
-def load_component(tx: Transaction, key: str, component: int) -> CachedComponent | None:
-    """Return a table of plain parameters; None if there is none.
+def load_component(
+    tx: Transaction, key: str, component: int, *, extended: bool = False
+) -> CachedComponent | None:
+    """Return a table; None if there is none.
 
     A hash that the stored values do not have is left out: it cannot confirm them.
     """
-    owner = find_owner(tx, key, component)
+    owner = find_owner(tx, key, component, extended=extended)
     if owner is None:
         return None
-    [summary] = load_summaries(tx, key, component)
+    [summary] = load_summaries(tx, key, component, extended=extended)
     rows = load_rows(tx, owner)
-    params = plain_params(rows)
+    params = stored_params(rows)
     volatile = frozenset(name for name, row in rows.items() if row.volatile)
     confirmed = summary.hash
     if confirmed is not None and summary.volatile_known:
-        listed = {
-            name: unpack_fields(params.compact[name])[0]
-            for name, row in rows.items()
-            if row.param_index is not None
-        }
+        listed = {name: param.bits for name, param in params.items() if param.index is not None}
         if hash_bits(listed, leave_out=volatile) != confirmed:
             confirmed = None
     described = {name: getattr(summary, name) for name in CachedSummary.__slots__}
@@ -221,18 +217,6 @@ def load_component(tx: Transaction, key: str, component: int) -> CachedComponent
         volatile=volatile,
         heard_at={name: row.heard_at for name, row in rows.items()},
     )
-
-
-def load_extended(tx: Transaction, key: str, component: int) -> CachedExtTable | None:
-    """Return a table of extended parameters; None if there is none."""
-    owner = find_owner(tx, key, component, extended=True)
-    if owner is None:
-        return None
-    [(count, complete)] = tx.all("SELECT param_count, complete FROM component WHERE id = ?", (owner,))
-    rows = load_rows(tx, owner)
-    params = {name: row.stored.ext_param(name, row.param_index) for name, row in rows.items()}
-    heard_at = {name: row.heard_at for name, row in rows.items()}
-    return CachedExtTable(key, component, params, heard_at, count, bool(complete))
 
 
 # writes

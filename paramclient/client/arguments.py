@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Final
 
 from paramclient.errors import UsageError
-from paramclient.model.ext_params import check_ext_value
+from paramclient.model.ext_values import check_ext_value
 from paramclient.model.values import Settable, WireValue, check_name, check_value, is_portable_name
 from paramclient.wire.messages import HASH_CHECK, PARAMETERS_MAX
 

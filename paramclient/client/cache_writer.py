@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final, TypeVar
 
 import anyio
@@ -115,34 +116,20 @@ class CacheWriter:
             self._identities[node] = identity
             return
         cache = self.cache
-        plain = await self._try(lambda: cache.load(identity.key, node.component))
-        extended = await self._try(lambda: cache.load_ext(identity.key, node.component))
-        if plain is not None:
-            node.plain.table.load(
-                plain.params.values(),
-                count=plain.count if plain.complete else None,
-                hash=plain.hash,
-                volatile=plain.volatile,
-                volatile_is_known=plain.volatile_known,
+        for session in node.sessions:
+            is_extended = session is node.extended
+            cached = await self._try(partial(cache.load, identity.key, node.component, extended=is_extended))
+            if cached is None:
+                continue
+            session.table.load(
+                cached.params.values(),
+                count=cached.count if cached.complete else None,
+                hash=cached.hash,
+                volatile=cached.volatile,
+                volatile_is_known=cached.volatile_known,
             )
-            is_same = (plain.identity.firmware, plain.identity.git_hash) == (
-                identity.firmware,
-                identity.git_hash,
-            )
-            if is_same and node.plain.serves_file is None:
-                node.plain.serves_file = plain.file_works
-        if extended is not None:
-            dialect, encoding = node.extended.dialect, node.extended.table.encoding
-            node.extended.table.load(
-                [
-                    dialect.param(each.name, each.raw, each.type, each.index, encoding)
-                    for each in extended.params.values()
-                ],
-                count=extended.count if extended.complete else None,
-                hash=None,
-                volatile=(),
-                volatile_is_known=False,
-            )
+            if _firmware(cached.identity) == _firmware(identity) and session.serves_file is None:
+                session.serves_file = cached.file_works
         self._identities[node] = identity
         self._wake()
 
@@ -331,3 +318,7 @@ def choose_cache(
     if cache is False or is_log:
         return None
     return ParamCache(None if cache is None or cache is True else cache)
+
+
+def _firmware(identity: Identity) -> tuple[int, str]:
+    return identity.firmware, identity.git_hash

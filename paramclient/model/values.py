@@ -197,7 +197,7 @@ class Param:
         """The value as `set` takes it to write it to another vehicle: the four wire bytes where `is_raw`."""
         if not self.is_raw:
             return self.value
-        return self.bits.to_bytes(max(WIRE_SIZE, -(-self.bits.bit_length() // 8)), "little")
+        return self.bits.to_bytes(max(WIRE_SIZE, byte_length(self.bits)), "little")
 
     @property
     def is_changed(self) -> bool | None:
@@ -263,7 +263,7 @@ _TYPES: tuple[ParamType | int, ...] = (0, *TYPES_BY_NAME.values())
 
 def type_name(number: ParamType | int) -> str:
     """Return the name of a type, `INT32`, `REAL32`, …, or `TYPE_77` for an unknown type."""
-    return ParamType(number).name if 1 <= number <= ParamType.REAL64 else f"TYPE_{number}"
+    return ParamType(number).name if 1 <= number <= ParamType.CUSTOM else f"TYPE_{number}"
 
 
 def type_of_name(name: str) -> ParamType | int:
@@ -427,9 +427,11 @@ def from_bits(bits: int, number: int, *, is_raw: bool = False) -> WireValue:
     """
     if number == _REAL32:
         return _shortest_of_bits(bits)
+    if number == _CUSTOM:
+        return _text_or_bytes(bits)
     layout = None if is_raw else _LAYOUTS.get(number)
     if layout is None:
-        return bits.to_bytes(4, "little")
+        return bits.to_bytes(max(WIRE_SIZE, byte_length(bits)), "little")
     value: int | float = layout.unpack(bits.to_bytes(layout.size, "little"))[0]
     return value
 
@@ -440,15 +442,34 @@ def _shortest_of_bits(bits: int) -> float:
     return shortest_float(number)
 
 
+def byte_length(bits: int) -> int:
+    """Return the number of bytes of a number without leading zeros."""
+    return -(-bits.bit_length() // 8)
+
+
+def _text_or_bytes(bits: int) -> str | bytes:
+    """Return a CUSTOM value: text where its bytes are UTF-8 without control characters, else the bytes."""
+    raw = bits.to_bytes(byte_length(bits), "little")
+    try:
+        text = raw.decode()
+    except UnicodeDecodeError:
+        return raw
+    return text if all(each.isprintable() or each in "\t\r\n" for each in text) else raw
+
+
 def bits_of(value: WireValue, number: int) -> int:
     """Return the value's own bytes in its type, as a little-endian unsigned number.
 
     Raises:
         UsageError: the value does not fit the type.
     """
+    if number == ParamType.CUSTOM:
+        if not isinstance(value, str | bytes):
+            raise UsageError(f"{value!r} is a number, and the parameter is CUSTOM")
+        return int.from_bytes(value.encode() if isinstance(value, str) else value, "little")
     value = check_value(value)
     if isinstance(value, str):
-        return int.from_bytes(value.encode(), "little")
+        raise UsageError(f"{value!r} is text, and the parameter is a number")
     if number in (ParamType.UINT64, ParamType.INT64) and not isinstance(value, bytes):
         kind = ParamType(number)
         low, high = kind.bounds
@@ -480,7 +501,9 @@ def same_bits(number: int, a: int, b: int) -> bool:
 def format_value(value: WireValue, number: int = ParamType.REAL32) -> str:
     """Return the shortest text that parses to the same value: floats as float32, raw bytes as hexadecimal."""
     if isinstance(value, bytes):
-        return f"0x{int.from_bytes(value, 'little'):08x}"
+        return (
+            f"0x{value.hex()}" if number == ParamType.CUSTOM else f"0x{int.from_bytes(value, 'little'):08x}"
+        )
     if isinstance(value, int | str):
         return str(value)
     return repr(shortest_float(value) if number == ParamType.REAL32 else value)

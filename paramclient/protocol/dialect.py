@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
-from paramclient.model.ext_params import decode_ext_value, encode_ext_value, own_bytes
+from paramclient.model.ext_values import encode_ext_value, own_bytes
 from paramclient.model.values import (
     Encoding,
     Param,
-    ParamType,
-    Trust,
     WireValue,
     bits_of_wire,
     encode_value,
@@ -135,11 +133,8 @@ class _Extended(Dialect):
         return encode_ext_value(value, number)
 
     def param(self, name: str, raw: bytes, number: int, index: int | None, encoding: Encoding) -> Param:
-        own = own_bytes(raw, number)
-        bits = int.from_bytes(own, "little")
-        is_real32 = number == ParamType.REAL32
-        value: Any = from_bits(bits, number) if is_real32 else decode_ext_value(own, number)
-        return Param(name, value, known_type(number), index, bits, Trust.LIVE)
+        bits = int.from_bytes(own_bytes(raw, number), "little")
+        return Param(name, from_bits(bits, number), known_type(number), index, bits)
 
 
 PLAIN = _Plain()
