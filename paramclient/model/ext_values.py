@@ -7,9 +7,18 @@ import struct
 from typing import Final, SupportsFloat, SupportsIndex
 
 from paramclient.errors import UsageError
-from paramclient.model.values import ParamType, Settable, WireValue, type_name
+from paramclient.model.values import (
+    Param,
+    ParamType,
+    Settable,
+    Trust,
+    WireValue,
+    byte_length,
+    from_bits,
+    type_name,
+)
 
-__all__ = ["EXT_VALUE_SIZE", "check_ext_value", "encode_ext_value", "own_bytes"]
+__all__ = ["EXT_VALUE_SIZE", "check_ext_value", "encode_ext_value", "ext_bytes", "ext_param", "own_bytes"]
 
 EXT_VALUE_SIZE: Final = 128
 """Bytes of `param_value` in PARAM_EXT_VALUE, PARAM_EXT_SET and PARAM_EXT_ACK (MAVLink common message set)."""
@@ -26,6 +35,21 @@ def own_bytes(data: bytes, number: int) -> bytes:
     if layout is None:
         return data[:EXT_VALUE_SIZE].rstrip(b"\0")
     return data[: layout.size].ljust(layout.size, b"\0")
+
+
+def ext_param(
+    name: str, data: bytes, number: int, index: int | None = None, trust: Trust = Trust.LIVE
+) -> Param:
+    """Return the extended parameter whose value has these bytes, those of a message or of `ext_bytes`."""
+    bits = int.from_bytes(own_bytes(data, number), "little")
+    return Param(name, from_bits(bits, number), number, index, bits, trust)
+
+
+def ext_bytes(param: Param) -> bytes:
+    """Return the bytes of the value of an extended parameter, without zeros at the end of text and bytes."""
+    layout = _LAYOUTS.get(param.type_number)
+    size = byte_length(param.bits) if layout is None else layout.size
+    return param.bits.to_bytes(size, "little")
 
 
 def check_ext_value(value: Settable) -> WireValue:

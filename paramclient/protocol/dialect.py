@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from paramclient.model.ext_values import encode_ext_value, own_bytes
+from paramclient.model.ext_values import encode_ext_value, ext_param
 from paramclient.model.values import (
     Encoding,
     Param,
@@ -133,8 +133,7 @@ class _Extended(Dialect):
         return encode_ext_value(value, number)
 
     def param(self, name: str, raw: bytes, number: int, index: int | None, encoding: Encoding) -> Param:
-        bits = int.from_bytes(own_bytes(raw, number), "little")
-        return Param(name, from_bits(bits, number), known_type(number), index, bits)
+        return ext_param(name, raw, number, index)
 
 
 PLAIN = _Plain()
