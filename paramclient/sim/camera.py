@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, TypeAlias, Unpack
 
 from paramclient.errors import ExtAckResult, UsageError
@@ -169,7 +169,7 @@ class Camera(BytewiseVehicle):
             UsageError: the camera has no extended parameter with that name.
         """
         del self._ext[self.ext_param(name).name]
-        self._ext = {each.name: each.with_index(index) for index, each in enumerate(self._ext.values())}
+        self._ext = {each.name: replace(each, index=index) for index, each in enumerate(self._ext.values())}
 
     def _on_request(self, message: messages.Message, sender: frames.Frame) -> None:
         if isinstance(message, messages.ParamExtRequestRead):
