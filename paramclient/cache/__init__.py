@@ -4,7 +4,7 @@
 - `records`: records that the cache stores and returns.
 - `schema`: the tables, and the interface of a place that stores them.
 - `sqlite`, `postgres`: a file, and a database.
-- `tables`: updates and reads of tables.
+- `tables`, `updates`: reads and updates of tables.
 - `history`: lines of changes, earlier states, insertion by time.
 - `snapshots`: snapshots, and tables at an earlier time.
 - `lookup`: vehicles by system id, address, kind, hardware id or key.
@@ -21,9 +21,7 @@ from paramclient.cache.records import (
     CachedSummary,
     CachedVehicle,
     ExtHistoryEntry,
-    ExtSnapshot,
     HistoryEntry,
-    Snapshot,
     SnapshotSummary,
     StoredParam,
     TableState,
@@ -45,10 +43,8 @@ __all__ = [
     "CachedSummary",
     "CachedVehicle",
     "ExtHistoryEntry",
-    "ExtSnapshot",
     "HistoryEntry",
     "ParamCache",
-    "Snapshot",
     "SnapshotSummary",
     "StoredParam",
     "TableState",

@@ -8,10 +8,8 @@ from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
 from paramclient.model.ext_params import ExtParam
-from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.params import CACHED, COMPACT_NO_INDEX, CompactParam, ParamMap, Params
-from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, ParamType, Trust, WireValue, bits_of, from_bits, same_bits
 
 __all__ = [
@@ -22,9 +20,7 @@ __all__ = [
     "CachedSummary",
     "CachedVehicle",
     "ExtHistoryEntry",
-    "ExtSnapshot",
     "HistoryEntry",
-    "Snapshot",
     "SnapshotSummary",
     "StoredParam",
     "StoredValue",
@@ -265,28 +261,6 @@ class SnapshotSummary:
     def __repr__(self) -> str:
         what = f"{self.id} of {self.key}/{self.component}: {self.size} params, {_minute(self.at)}"
         return f"<{type(self).__name__} {what}, {self.reason!r}>"
-
-
-@dataclass(frozen=True, slots=True, repr=False, kw_only=True)
-class Snapshot(SnapshotSummary):
-    """A snapshot of a table.
-
-    Attributes:
-        params: its parameters, with known types and defaults, and the identity of the vehicle at that time.
-    """
-
-    params: ParamSet = field(hash=False)
-
-
-@dataclass(frozen=True, slots=True, repr=False, kw_only=True)
-class ExtSnapshot(SnapshotSummary):
-    """A snapshot of a table of extended parameters. Its `hash` is None.
-
-    Attributes:
-        params: its parameters, and the identity of the vehicle at that time.
-    """
-
-    params: ExtParamSet = field(hash=False)
 
 
 @dataclass(frozen=True, slots=True)
