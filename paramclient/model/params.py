@@ -28,7 +28,6 @@ __all__ = [
     "copy_params",
     "compact_param",
     "is_listed",
-    "iter_unpack_fields",
     "as_params",
     "number_of",
     "param_of",
@@ -58,8 +57,6 @@ pack_fields = _LAYOUT.pack
 """Pack bits, the number of the type, whether the value is raw bytes, the number of the trust, the index."""
 unpack_fields = _LAYOUT.unpack
 """Unpack the fields that `pack_fields` takes."""
-iter_unpack_fields = _LAYOUT.iter_unpack
-"""Iterate over the fields of several compact parameters that are joined into one `bytes`."""
 _TRUST_AT: Final = 10
 """Offset of the trust in the compact form, in bytes."""
 _INDEX_AT: Final = 11

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 from codecs import BOM_UTF8
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from datetime import datetime
 from typing import TYPE_CHECKING, Annotated, Final, Literal, Self, TypeVar
 
@@ -22,7 +22,6 @@ from paramclient.model.patterns import is_pattern
 from paramclient.model.values import Trust, check_name
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.restore_point import load_restore_point, load_state_before_apply
-from paramclient.provision.runner import Runner
 from paramclient.provision.vehicle_params import (
     FetchedSet,
     fetch_set,
@@ -308,7 +307,7 @@ async def resolve_source(hub: Hub, target: FollowedComponent, source: WantedPara
     if source.component is not None:
         where = source.component
         other = hub.find_component(where.system, where.component, where.link)
-        found = await fetch_set(other.component, source=f"link {other.link.name}", run=hub.run_in_file_thread)
+        found = await fetch_set(other.component, source=f"link {other.link.name}")
         return found.set
     if source.vehicle is not None:
         kept = source.vehicle
@@ -425,7 +424,9 @@ async def read_cache(hub: Hub, look: Callable[[], Result]) -> Result:
         raise ServiceError(404, "unknown-state", str(error), error=type(error).__name__) from error
 
 
-async def current_set(target: FollowedComponent, run: Runner) -> FetchedSet:
+async def current_set(
+    target: FollowedComponent, run: Callable[[Callable[[], FetchedSet]], Awaitable[FetchedSet]]
+) -> FetchedSet:
     """Return the current table of a component without requests, if it was received or verified in this
     session.
 

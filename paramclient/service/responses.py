@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Sequence
 from typing import Any, Final
 
 import anyio.lowlevel
@@ -12,7 +12,6 @@ from fastapi import Response
 from fastapi.responses import StreamingResponse
 
 from paramclient.documents.document import Document
-from paramclient.provision.runner import Runner
 from paramclient.service.event_feed import COMPACT_SEPARATORS
 
 __all__ = [
@@ -37,7 +36,12 @@ STREAMED_CHUNK_LENGTH: Final = 32_768
 """Number of characters from which the entries encoded so far are sent."""
 
 
-async def document_response(run: Runner, make: Callable[[], Document], *, status: int = 200) -> Response:
+async def document_response(
+    run: Callable[[Callable[[], bytes]], Awaitable[bytes]],
+    make: Callable[[], Document],
+    *,
+    status: int = 200,
+) -> Response:
     """Return a response with a document.
 
     Args:

@@ -265,7 +265,7 @@ async def _present(hub: Hub, target: FollowedComponent, body: DiffRequest) -> Pa
     source = f"link {target.link.name}"
 
     async def work() -> FetchedSet:
-        return await fetch_set(target.component, source=source, run=hub.run_in_file_thread)
+        return await fetch_set(target.component, source=source)
 
     return (await _within(target, body.timeout_s, work)).set
 
@@ -333,7 +333,6 @@ async def _plan(hub: Hub, target: FollowedComponent, body: PlanRequest) -> Plan:
             info=target.metadata,
             force=body.force,
             renames=renames,
-            run=hub.run_in_file_thread,
         )
 
     return await _within(target, body.timeout_s, work)
@@ -351,7 +350,6 @@ async def _plan_back(hub: Hub, target: FollowedComponent, body: RestorePlanReque
             include=include,
             info=info,
             force=body.force,
-            run=hub.run_in_file_thread,
         )
 
     return await _within(target, body.timeout_s, work)

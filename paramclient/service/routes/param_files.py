@@ -81,9 +81,7 @@ async def file(
         if source == "known":
             found = await current_set(target, hub.run_in_thread)
         else:
-            found = await fetch_set(
-                target.component, source=f"link {target.link.name}", run=hub.run_in_thread
-            )
+            found = await fetch_set(target.component, source=f"link {target.link.name}")
         chosen = found.set
         if changed:
             metadata = target.metadata
