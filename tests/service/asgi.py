@@ -20,24 +20,11 @@ class ASGITransport(httpx.AsyncBaseTransport):
     """Calls an application in a task of its own for each request.
 
     The application receives `http.disconnect` when the response is closed or the request is cancelled. What
-    it raises is raised by the request, if it has not begun to respond.
-
-    Args:
-        app: the application.
-        client: who asks, as the application sees it.
-        state: what a middleware would have put into the scope.
+    it raises is raised by the request, unless it has responded with the status 500.
     """
 
-    def __init__(
-        self,
-        app: ASGIApp,
-        *,
-        client: tuple[str, int] = ("127.0.0.1", 50_000),
-        state: dict[str, Any] | None = None,
-    ) -> None:
+    def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        self._client = client
-        self._state = state or {}
 
     async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
         url = request.url
@@ -53,8 +40,7 @@ class ASGITransport(httpx.AsyncBaseTransport):
             "root_path": "",
             "headers": [(name.lower(), value) for name, value in request.headers.raw],
             "server": (url.host, url.port or 80),
-            "client": self._client,
-            "state": dict(self._state),
+            "client": ("127.0.0.1", 50_000),
         }
         exchange = _Exchange(await request.aread())
         exchange.begin(self._app, scope)
@@ -95,7 +81,7 @@ class _Exchange(httpx.AsyncByteStream):
             if self._waiting <= HIGH_WATER:
                 self._has_room.set()
             yield chunk
-        if self.error is not None:
+        if self.error is not None and self.status != 500:
             raise self.error
 
     async def aclose(self) -> None:
@@ -142,6 +128,6 @@ class _Exchange(httpx.AsyncByteStream):
 
 
 def a_browser(app: ASGIApp, **options: Any) -> httpx.AsyncClient:
-    """A client of an application; the options are those of `ASGITransport`."""
-    transport = ASGITransport(app, **options)
-    return httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1:8765", timeout=None)
+    """A client of an application; the options are those of `httpx.AsyncClient`."""
+    defaults = {"base_url": "http://127.0.0.1:8765", "timeout": None}
+    return httpx.AsyncClient(transport=ASGITransport(app), **(defaults | options))
