@@ -3,13 +3,12 @@
 #   make demo         the main job on a simulated vehicle
 #   make test         the tests                      make lint       style and types
 #   make test-slow    tests in real time, of many processes, and of every program and command in the documentation
-#   make test-all     test, test-slow, lint-platforms, and soak, kills, attack and fuzz for some minutes each
+#   make test-all     test, test-slow, lint-platforms, and soak, kills and fuzz for some minutes each
 #   make coverage     the tests with their coverage  make docs       the documentation, into docs/_build/html
 #   make bench        parser and start-up time       make dist       wheel and sdist, into dist
 #   make cost         CPU and memory                 make peers      downloads, compared with other clients
 #   make fuzz         each target of fuzz/ for SECONDS
 #   make soak         random sessions                make kills      programs killed while they write
-#   make attack       hostile clients and services   make fuzz-http  random requests to the service
 #   make sync         generates the types of the blocking client
 #   make clean        removes .venv and all other files that these commands create
 #   make pictures     the comparison with other clients as pictures, into docs/images
@@ -43,7 +42,7 @@ WORKERS ?= $(shell $(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 2)
 # the tests start several hundred processes; without bytecode, each of them would compile paramclient again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow test-all coverage soak kills live fuzz fuzz-http attack lint lint-platforms docs screenshots pictures sync bench cost peers dist clean
+.PHONY: demo test test-slow test-all coverage soak kills live fuzz lint lint-platforms docs screenshots pictures sync bench cost peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -61,7 +60,6 @@ test-all:
 	$(MAKE) lint-platforms
 	$(MAKE) soak SESSIONS=1000
 	$(MAKE) kills KILLS=100
-	$(MAKE) attack
 	$(MAKE) fuzz SECONDS=30
 
 coverage: $(VENV)/with-test
@@ -125,13 +123,6 @@ cost: $(VENV)/with-cli
 peers: $(VENV)/with-peers
 	$(BIN)/python bench/peers.py
 
-attack: $(VENV)/with-cli
-	$(BIN)/python bench/attack.py
-
-# make fuzz-http SECONDS=1200
-fuzz-http: $(VENV)/with-cli $(VENV)/with-fuzz-http
-	$(BIN)/python -m fuzz.over_http --seconds $(SECONDS)
-
 dist: $(VENV)/with-test
 	rm -rf dist
 	$(BIN)/hatchling build
@@ -158,7 +149,7 @@ $(VENV)/with-cli: pyproject.toml $(VENV)/made
 	@touch $@
 
 # dependency groups need pip 25.1; the pip of a new environment may be older
-$(VENV)/with-test $(VENV)/with-lint $(VENV)/with-docs $(VENV)/with-peers $(VENV)/with-fuzz $(VENV)/with-fuzz-http: $(VENV)/with-%: pyproject.toml $(VENV)/with-cli
+$(VENV)/with-test $(VENV)/with-lint $(VENV)/with-docs $(VENV)/with-peers $(VENV)/with-fuzz: $(VENV)/with-%: pyproject.toml $(VENV)/with-cli
 	@echo "Installing what $* needs into $(VENV)"
 	@$(PIP) 'pip>=25.1'
 	@$(PIP) --group $*

@@ -35,6 +35,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Final
 from urllib.parse import urlsplit
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
@@ -57,6 +58,10 @@ FRESH_EVERY = 25
 """Rounds after which a new cache is used, because the history has a maximum length."""
 TIMEOUT = 60.0
 """Seconds to wait for the start of a process, and for its responses."""
+
+
+VEHICLE: Final = "/api/vehicles/1/1"
+"""Path of the vehicle of the service."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +215,7 @@ class Rounds:
                 where = urlsplit(line.decode().strip())
                 connection = http.client.HTTPConnection(where.hostname or "", where.port, timeout=TIMEOUT)
                 with suppress(OSError, http.client.HTTPException):
-                    ask(connection, "POST", "/api/v1/find", {})
+                    wait_for_table(connection)
                     if not is_early:
                         signal.setitimer(signal.ITIMER_REAL, max(life, 0.01))
                     for value in range(first, last):
@@ -218,7 +223,7 @@ class Rounds:
                             break
                         name, durable = self._dice.choice(NAMES), self._dice.random() < self._durable
                         body = {"value": value, "durable": durable}
-                        ask(connection, "PUT", f"/api/v1/components/1/1/params/{name}", body)
+                        ask(connection, "PUT", f"{VEHICLE}/params/{name}", body)
                         acknowledged.append(Acknowledged(name, value, durable, time.monotonic()))
                 connection.close()
             reported.read()
@@ -314,6 +319,19 @@ def serve(place: str, reported: int) -> None:
 
 def report(reported: int, text: str) -> None:
     os.write(reported, text.encode())
+
+
+def wait_for_table(connection: http.client.HTTPConnection) -> None:
+    """Wait until the service has fetched the table of the vehicle.
+
+    Raises:
+        OSError, HTTPException: the service has ended.
+    """
+    state = ""
+    while state != "synced":
+        time.sleep(0.02)
+        connection.request("GET", VEHICLE)
+        state = json.loads(connection.getresponse().read()).get("state", "")
 
 
 def ask(connection: http.client.HTTPConnection, method: str, path: str, body: object) -> None:

@@ -19,7 +19,7 @@ HERE: Final = Path(__file__).parent
 TARGETS: Final = sorted(
     path.stem
     for path in HERE.glob("*.py")
-    if path.stem not in ("__init__", "__main__", "draw", "keep", "over_http")
+    if path.stem not in ("__init__", "__main__", "draw", "keep")
 )
 
 

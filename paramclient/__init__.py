@@ -25,23 +25,14 @@ if TYPE_CHECKING:
         CachedExtTable,
         CachedVehicle,
         ExtHistoryEntry,
-        ExtSnapshot,
         HistoryEntry,
         ParamCache,
-        Snapshot,
         SnapshotSummary,
     )
     from paramclient.cache.records import CachedSummary
     from paramclient.client.client import ParamClient
     from paramclient.client.component import Component, ComponentState
-    from paramclient.client.events import (
-        Discovered,
-        Event,
-        Found,
-        Lost,
-        Rebooted,
-        Resynced,
-    )
+    from paramclient.client.events import Discovered, Event, Found, Lost, Rebooted, Resynced
     from paramclient.client.files import Ftp
     from paramclient.client.fleet_fetch import FetchedAll
     from paramclient.client.reset import ResetResult
@@ -147,7 +138,6 @@ __all__ = [
     "ExtSetRefused",
     "SetResult",
     "ExtSettable",
-    "ExtSnapshot",
     "ExtValue",
     "FetchResult",
     "FetchSource",
@@ -203,7 +193,6 @@ __all__ = [
     "SigningPolicy",
     "SigningReport",
     "SigningStream",
-    "Snapshot",
     "SnapshotSummary",
     "DifferenceStatus",
     "SyncState",
@@ -237,10 +226,8 @@ _HOMES: Final = {
         "CachedExtTable",
         "CachedVehicle",
         "ExtHistoryEntry",
-        "ExtSnapshot",
         "HistoryEntry",
         "ParamCache",
-        "Snapshot",
         "SnapshotSummary",
     ),
     "paramclient.cache.records": ("CachedSummary",),

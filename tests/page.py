@@ -1,4 +1,4 @@
-"""What the tests of the page have in common: a service over simulated vehicles, and the browser."""
+"""A service over simulated vehicles in a thread, and the browser that looks at its page."""
 
 from __future__ import annotations
 
@@ -15,15 +15,13 @@ import anyio
 import anyio.abc
 import anyio.from_thread
 
-from paramclient import ParamCache, ParamClient
 from paramclient.links import SimLink
 from paramclient.model.values import ParamType, WireValue
-from paramclient.service import Hub, Listening, Settings, serve
+from paramclient.service import Hub, Listening, Tokens, serve
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.sim.param_table import Entry
-from paramclient.testing import SimVehicle
 
-__all__ = ["BROWSER", "BROWSER_OPTIONS", "Bench", "at_work"]
+__all__ = ["BROWSER", "BROWSER_OPTIONS", "HIGHEST", "HOSTILE", "Bench", "at_work"]
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 """Where a browser is, or None."""
@@ -58,17 +56,17 @@ class Bench:
 
     Attributes:
         url: where it is.
-        px4, ardupilot, odd: the vehicles; what is done to them goes through `do`.
+        vehicles: the vehicles by the name of their link; what is done to them goes through `do`.
         token: what other programs show to the service, where it wants one.
     """
 
-    def __init__(self, portal: anyio.from_thread.BlockingPortal, url: str, **links: SimVehicle[Any]) -> None:
+    def __init__(
+        self, portal: anyio.from_thread.BlockingPortal, url: str, vehicles: Mapping[str, Vehicle]
+    ) -> None:
         self._portal = portal
         self.url = url
         self.token = ""
-        self.px4: Vehicle = links["px4"].vehicle
-        self.ardupilot: Vehicle = links["ardupilot"].vehicle
-        self.odd: Vehicle = links["odd"].vehicle
+        self.vehicles = vehicles
 
     def do(self, call: Callable[..., Result], *arguments: Any) -> Result:
         """Call something where the vehicles are."""
@@ -77,43 +75,36 @@ class Bench:
     def ask(self, method: str, address: str, body: object = None) -> Any:
         """What another program asks of the service, and is answered."""
         request = urllib.request.Request(
-            f"{self.url}/api/v1{address}",
+            f"{self.url}/api{address}",
             method=method,
             data=None if body is None else json.dumps(body).encode(),
             headers={"Content-Type": "application/json", "Authorization": f"Bearer {self.token}"},
         )
         with urllib.request.urlopen(request, timeout=20) as answer:
-            return json.loads(answer.read() or b"null")
+            return json.loads(answer.read())
 
     def set(self, name: str, value: float) -> None:
-        """Another program sets a value of the PX4.
+        """Another program sets a value of the PX4."""
+        self.ask("PATCH", "/vehicles/1/1/params?link=px4", {"values": {name: value}})
 
-        A value that is set on board is reported once, and not at all if it was saved first: then it takes the
-        client's next look, half a minute later.
-        """
-        self.ask("PATCH", "/components/1/1/params?link=px4", {"values": {name: value}})
-
-    def is_synced(self, system: int) -> bool:
-        """Whether the table of this vehicle is here, whole."""
-        components = self.ask("GET", "/components")["components"]
-        return any(each["system"] == system and each["state"] == "synced" for each in components)
+    def is_ready(self) -> bool:
+        """Whether the tables of all vehicles are here, and the metadata of the PX4."""
+        found = self.ask("GET", "/vehicles")["vehicles"]
+        px4 = next((each for each in found if each["link"] == "px4" and each["state"] == "synced"), None)
+        if px4 is not None and not px4["has_metadata"]:
+            self.ask("POST", "/vehicles/1/1/metadata?link=px4", {})
+        is_described = px4 is not None and px4["has_metadata"]
+        return is_described and sum(each["state"] == "synced" for each in found) == len(self.vehicles)
 
 
 @contextmanager
-def at_work(
-    folder: Path,
-    settings: Settings | None = None,
-    *,
-    port: int = 0,
-    more: Mapping[str, SimVehicle[Any]] | None = None,
-) -> Iterator[Bench]:
+def at_work(folder: Path, *, tokens: Tokens | None = None, port: int = 0) -> Iterator[Bench]:
     """A service over both autopilots and one with names that no vehicle should have, its cache in this
     folder."""
-    links: dict[str, SimVehicle[Any]] = {
-        "px4": SimVehicle(PX4Vehicle(metadata=True, param_error=True)),
-        "ardupilot": SimVehicle(Limited()),
-        "odd": SimVehicle(PX4Vehicle(system=3, table=HOSTILE, metadata=True)),
-        **(more or {}),
+    vehicles: dict[str, Vehicle] = {
+        "px4": PX4Vehicle(metadata=True, param_error=True),
+        "ardupilot": Limited(),
+        "odd": PX4Vehicle(system=3, uid=3, table=HOSTILE, metadata=True),
     }
     url = ""
     listens = threading.Event()
@@ -128,18 +119,15 @@ def at_work(
         async def run(*, task_status: anyio.abc.TaskStatus[anyio.Event]) -> None:
             stop = anyio.Event()
             task_status.started(stop)
-            with ParamCache(folder / "cache.sqlite3") as cache:
-                hub = Hub([(name, _maker(name, links[name], cache)) for name in links], cache=cache)
-                await serve(hub, settings, listening=Listening(port=port), stop=stop, listens=reported)
+            links = [SimLink(vehicle, name) for name, vehicle in vehicles.items()]
+            hub = Hub(links, cache=folder / "cache.sqlite3")
+            listening = Listening(port=port)
+            await serve(hub, listening=listening, tokens=tokens, stop=stop, listens=reported)
 
         running, stop = portal.start_task(run)
         try:
             assert listens.wait(20)
-            yield Bench(portal, url, **links)
+            yield Bench(portal, url, vehicles)
         finally:
             portal.call(stop.set)
             running.result(20)
-
-
-def _maker(name: str, vehicle: SimVehicle[Any], cache: ParamCache) -> Callable[[], ParamClient]:
-    return lambda: ParamClient(SimLink(vehicle, name), cache=cache)

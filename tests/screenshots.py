@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
+import re
 import sys
 import tempfile
 import time
-import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +16,6 @@ from tests.page import BROWSER, BROWSER_OPTIONS, Bench, at_work
 IMAGES = Path(__file__).parent.parent / "docs/images"
 DESKTOP: Any = {"viewport": {"width": 1180, "height": 640}}
 PHONE: Any = {"viewport": {"width": 390, "height": 760}, "has_touch": True, "is_mobile": True}
-DESCRIBED = {
-    "MC_ROLL_P": ("Gain from the roll angle's error to the roll rate", "1/s", 6.5, 0, 12),
-    "MC_PITCH_P": ("Gain from the pitch angle's error to the pitch rate", "1/s", 6.5, 0, 12),
-    "MC_YAW_P": ("Gain from the heading's error to the yaw rate", "1/s", 2.8, 0, 5),
-    "MC_ROLLRATE_P": ("Gain from the roll rate's error to torque", "", 0.15, 0.01, 0.5),
-    "MC_ROLLRATE_I": ("Integral gain of the roll rate", "", 0.2, 0, 3),
-    "MC_ROLLRATE_D": ("Differential gain of the roll rate", "", 0.003, 0, 0.01),
-    "MC_ROLLRATE_MAX": ("Fastest roll that is requested", "deg/s", 220.0, 0, 1800),
-    "MC_PITCHRATE_P": ("Gain from the pitch rate's error to torque", "", 0.15, 0.01, 0.6),
-    "MC_PITCHRATE_I": ("Integral gain of the pitch rate", "", 0.2, 0, 3),
-    "MC_PITCHRATE_D": ("Differential gain of the pitch rate", "", 0.003, 0, 0.01),
-    "MC_PITCHRATE_MAX": ("Fastest pitch that is requested", "deg/s", 220.0, 0, 1800),
-    "MC_YAWRATE_P": ("Gain from the yaw rate's error to torque", "", 0.2, 0, 0.6),
-    "MC_YAWRATE_I": ("Integral gain of the yaw rate", "", 0.1, 0, 1),
-    "MC_YAWRATE_MAX": ("Fastest turn that is requested", "deg/s", 200.0, 0, 1800),
-    "MC_AIRMODE": ("Torque at low thrust", "", 0, None, None),
-}
 
 
 def main() -> None:
@@ -46,39 +28,14 @@ def main() -> None:
         at_work(Path(folder)) as bench,
         sync_playwright() as playwright,
     ):
-        while not all(map(bench.is_synced, (1, 2, 3))):
+        while not bench.is_ready():
             time.sleep(0.1)
-        _describe(bench)
-        bench.ask("PATCH", "/components/1/1/params?link=px4", {"values": {"MC_ROLL_P": 7.2, "MC_YAW_P": 2.4}})
+        bench.set("MC_ROLL_P", 7.2)
+        bench.set("MC_YAW_P", 2.4)
         browser = playwright.chromium.launch(executable_path=BROWSER, args=BROWSER_OPTIONS)
         _table(browser, bench)
         _review(browser, bench)
         _phone(browser, bench)
-
-
-def _describe(bench: Bench) -> None:
-    """Say of some parameters what they mean, in our words."""
-    parameters = [
-        {
-            "name": name,
-            "type": "Int32" if isinstance(default, int) else "Float",
-            "group": "Multicopter",
-            "shortDesc": text,
-            "default": default,
-            **({"units": units} if units else {}),
-            **({} if low is None else {"min": low, "max": high}),
-            **({"values": [{"value": 0, "description": "Off"}]} if name == "MC_AIRMODE" else {}),
-        }
-        for name, (text, units, default, low, high) in DESCRIBED.items()
-    ]
-    request = urllib.request.Request(
-        f"{bench.url}/api/v1/components/1/1/metadata?link=px4",
-        method="PUT",
-        data=json.dumps({"version": 1, "parameters": parameters}).encode(),
-        headers={"Content-Type": "application/octet-stream"},
-    )
-    with urllib.request.urlopen(request, timeout=20):
-        pass
 
 
 def _open(browser: Browser, bench: Bench, scheme: Any, kind: Any) -> Page:
@@ -105,7 +62,7 @@ def _table(browser: Browser, bench: Bench) -> None:
     page.keyboard.press("Space")
     expect(page.locator(".past")).to_contain_text("→")
     page.get_by_role("searchbox").fill("")
-    page.get_by_role("button", name="Multicopter").click()
+    page.get_by_role("button", name=re.compile("^MC ")).click()
     page.locator("#rail").evaluate("rail => rail.scrollTo(0, 0)")
     page.mouse.move(0, 0)
     _save(page, "page-table.png")
@@ -129,7 +86,7 @@ def _phone(browser: Browser, bench: Bench) -> None:
     page = _open(browser, bench, "light", PHONE)
     page.get_by_role("searchbox").fill("")
     page.get_by_role("searchbox").blur()
-    page.get_by_label("Group", exact=True).select_option("Multicopter")
+    page.get_by_label("Group", exact=True).select_option("MC")
     _save(page, "page-phone.png")
     page.locator("#rows .row", has_text="MC_PITCH_P").tap()
     expect(page.locator(".past li").first).to_be_visible()

@@ -7,7 +7,6 @@ import functools
 import math
 import selectors
 import time
-from collections import deque
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
 from types import SimpleNamespace
 from typing import Any, ParamSpec, TypeVar
@@ -23,7 +22,6 @@ from paramclient.errors import LinkError
 from paramclient.links import Peer, SimLink
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
-from paramclient.service.event_feed import EventFeed
 from paramclient.sim import Endpoint, GenericVehicle, PX4Vehicle, SimParam
 
 P = ParamSpec("P")
@@ -418,9 +416,3 @@ def a_client(link: Any, **options: Any) -> ParamClient:
 
 def _nothing() -> None:
     return
-
-
-def shorten_feed(feed: EventFeed, kept: int) -> None:
-    """Keep fewer events from now on."""
-    feed._labels = deque(feed._labels, kept)
-    feed._texts = deque(feed._texts, kept)

@@ -25,8 +25,7 @@ SOURCES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient").
 PLUGIN = "pytest_paramclient.py"
 SERVED = {
     path.relative_to(ROOT).as_posix()
-    for folder in ("page", "reference")
-    for path in (ROOT / "paramclient/service" / folder).glob("*.*")
+    for path in (ROOT / "paramclient/service/page").glob("*.*")
 }
 TABLES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient/sim/tables").glob("*.csv")}
 

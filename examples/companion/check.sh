@@ -10,7 +10,7 @@ set -eu
 service=${1:-http://127.0.0.1:8765}
 name=${2:-BAT1_N_CELLS}
 wanted=${3:-6}
-parameter="$service/api/v1/components/1/1/params/$name"
+parameter="$service/api/vehicles/1/1/params/$name"
 
 ask() {
     if [ -n "${PARAMCLIENT_TOKEN:-}" ]; then
@@ -24,10 +24,10 @@ value_of() {
 }
 
 # the service listens before it has heard the vehicle
-until ask "$service/api/v1/components/1/1" > /dev/null 2>&1; do
+until ask "$service/api/vehicles/1/1" > /dev/null 2>&1; do
     sleep 0.2
 done
-now=$(ask --data '{}' "$parameter/read" | value_of)
+now=$(ask "$parameter?live=true" | value_of)
 echo "$name = $now"
 if [ "$now" != "$wanted" ]; then
     ask --request PUT --data "{\"value\":$wanted}" "$parameter" > /dev/null

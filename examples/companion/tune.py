@@ -13,7 +13,7 @@ import urllib.error
 import urllib.request
 from typing import Any
 
-VEHICLE = "/api/v1/components/1/1"
+VEHICLE = "/api/vehicles/1/1"
 
 
 def ask(address: str, body: dict[str, Any] | None = None, method: str | None = None) -> Any:

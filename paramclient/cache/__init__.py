@@ -4,7 +4,7 @@
 - `records`: records that the cache stores and returns.
 - `schema`: the tables, and the interface of a place that stores them.
 - `sqlite`, `postgres`: a file, and a database.
-- `tables`: updates and reads of tables.
+- `tables`, `updates`: reads and updates of tables.
 - `history`: lines of changes, earlier states, insertion by time.
 - `snapshots`: snapshots, and tables at an earlier time.
 - `lookup`: vehicles by system id, address, kind, hardware id or key.
@@ -17,10 +17,11 @@ from paramclient.cache.records import (
     BY_US,
     BY_VEHICLE,
     CachedComponent,
+    CachedExtTable,
     CachedSummary,
     CachedVehicle,
+    ExtHistoryEntry,
     HistoryEntry,
-    Snapshot,
     SnapshotSummary,
     StoredParam,
     TableState,
@@ -38,11 +39,12 @@ __all__ = [
     "SNAPSHOTS",
     "YEAR_10000",
     "CachedComponent",
+    "CachedExtTable",
     "CachedSummary",
     "CachedVehicle",
+    "ExtHistoryEntry",
     "HistoryEntry",
     "ParamCache",
-    "Snapshot",
     "SnapshotSummary",
     "StoredParam",
     "TableState",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final, TypeVar
 from urllib.parse import quote
@@ -109,7 +109,7 @@ class PostgresStore:
                 connection.execute("SELECT pg_advisory_xact_lock(%s)", (_WRITE_LOCK,))
             else:
                 connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
-            return work(_PostgresTransaction(connection))
+            return work(Transaction(connection, "%s"))
 
     def _connect(self) -> psycopg.Connection:
         if self._failure is not None and time.monotonic() < self._failure[0]:
@@ -154,28 +154,6 @@ class PostgresStore:
         if connection is not None:
             with suppress(psycopg.Error):
                 connection.close()
-
-
-class _PostgresTransaction:
-    """See `Transaction`."""
-
-    def __init__(self, connection: psycopg.Connection) -> None:
-        self._connection = connection
-
-    def all(self, sql: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
-        return self._connection.execute(_marked(sql), values).fetchall()
-
-    def do(self, sql: str, values: Sequence[object] = ()) -> int:
-        return self._connection.execute(_marked(sql), values).rowcount
-
-    def many(self, sql: str, rows: Iterable[Sequence[object]]) -> None:
-        with self._connection.cursor() as cursor:
-            cursor.executemany(_marked(sql), rows)
-
-
-def _marked(sql: str) -> bytes:
-    """Return a statement with psycopg's placeholders."""
-    return sql.replace("?", "%s").encode()
 
 
 def _place(options: dict[str, Any]) -> str:

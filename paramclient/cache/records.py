@@ -7,28 +7,20 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
+from paramclient.model.ext_params import ExtParam
 from paramclient.model.identity import Identity, autopilot_name
-from paramclient.model.params import ParamMap
-from paramclient.model.paramset import ParamSet
-from paramclient.model.values import (
-    Param,
-    ParamType,
-    Trust,
-    WireValue,
-    bits_of,
-    byte_length,
-    from_bits,
-    same_bits,
-)
+from paramclient.model.params import CACHED, COMPACT_NO_INDEX, CompactParam, ParamMap, Params
+from paramclient.model.values import Param, ParamType, Trust, WireValue, bits_of, from_bits, same_bits
 
 __all__ = [
     "BY_US",
     "BY_VEHICLE",
     "CachedComponent",
+    "CachedExtTable",
     "CachedSummary",
     "CachedVehicle",
+    "ExtHistoryEntry",
     "HistoryEntry",
-    "Snapshot",
     "SnapshotSummary",
     "StoredParam",
     "StoredValue",
@@ -55,7 +47,7 @@ class StoredValue(NamedTuple):
 
     Attributes:
         type: number of the type.
-        value: `Param.bits`, little-endian, in 8 bytes; in more for text and bytes.
+        value: `Param.bits` in 8 bytes, little-endian; or `ExtParam.raw`.
         is_raw: 1 if a plain value is only known as the four bytes of the message.
     """
 
@@ -78,6 +70,10 @@ class StoredValue(NamedTuple):
         bits = int.from_bytes(self.value, "little")
         value = from_bits(bits, self.type, is_raw=bool(self.is_raw))
         return Param(name, value, self.type, index, bits, Trust.CACHED, default_value(default, self.type))
+
+    def ext_param(self, name: str, index: int | None = None) -> ExtParam:
+        """Return it as an extended parameter, with trust CACHED."""
+        return ExtParam.of(name, self.value, self.type, index, Trust.CACHED)
 
 
 class StoredParam(NamedTuple):
@@ -116,6 +112,34 @@ class StoredParam(NamedTuple):
             None if param.default is None else _bits_cell(bits_of(param.default, number)),
             by,
         )
+
+    @classmethod
+    def of_compact(
+        cls,
+        name: str,
+        compact: CompactParam,
+        default: WireValue | None,
+        volatile: int | None,
+        heard_at: float,
+        by: str,
+    ) -> StoredParam:
+        """Return an observation of a live table's parameter, without creating a `Param`."""
+        number, is_raw, index = compact[8], compact[9], int.from_bytes(compact[11:], "little", signed=True)
+        return cls(
+            name,
+            StoredValue(number, compact[:BITS_SIZE], is_raw),
+            None if index == COMPACT_NO_INDEX else index,
+            volatile,
+            heard_at,
+            None if default is None else _bits_cell(bits_of(default, number)),
+            by,
+        )
+
+    @classmethod
+    def of_ext(cls, param: ExtParam, heard_at: float, by: str = BY_VEHICLE) -> StoredParam:
+        """Return an observation of an extended parameter."""
+        value = StoredValue(int(param.type), param.raw, 0)
+        return cls(param.name, value, param.index, None, heard_at, None, by)
 
     @property
     def hashed(self) -> StoredValue | None:
@@ -195,6 +219,18 @@ class HistoryEntry:
     by: str
 
 
+@dataclass(frozen=True, slots=True)
+class ExtHistoryEntry:
+    """One change of an extended value, with the attributes of `HistoryEntry`."""
+
+    at: float
+    component: int
+    name: str
+    old: ExtParam
+    new: ExtParam | None
+    by: str
+
+
 @dataclass(frozen=True, slots=True, repr=False)
 class SnapshotSummary:
     """A snapshot of a table, without its parameters.
@@ -225,17 +261,6 @@ class SnapshotSummary:
     def __repr__(self) -> str:
         what = f"{self.id} of {self.key}/{self.component}: {self.size} params, {_minute(self.at)}"
         return f"<{type(self).__name__} {what}, {self.reason!r}>"
-
-
-@dataclass(frozen=True, slots=True, repr=False, kw_only=True)
-class Snapshot(SnapshotSummary):
-    """A snapshot of a table.
-
-    Attributes:
-        params: its parameters, with known types and defaults, and the identity of the vehicle at that time.
-    """
-
-    params: ParamSet = field(hash=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,9 +343,40 @@ class CachedComponent(CachedSummary):
     heard_at: Mapping[str, float] = field(hash=False)
 
 
-def stored_params(rows: Mapping[str, StoredParam]) -> dict[str, Param]:
-    """Return stored parameters with trust CACHED."""
-    return {name: row.stored.param(name, row.param_index, row.default) for name, row in rows.items()}
+@dataclass(frozen=True, slots=True)
+class CachedExtTable:
+    """The cached extended parameters of one component.
+
+    Attributes:
+        key: key of the vehicle in the cache.
+        component: component id.
+        params: the parameters by name, with trust CACHED, in the order of their indices.
+        heard_at: time of the last observation of each value, by name.
+        count: param_count of the component, or None.
+        complete: whether the table has every index below the count.
+    """
+
+    key: str
+    component: int
+    params: Mapping[str, ExtParam]
+    heard_at: Mapping[str, float]
+    count: int | None
+    complete: bool
+
+
+def plain_params(rows: Mapping[str, StoredParam]) -> Params:
+    """Return stored parameters as plain ones, with trust CACHED."""
+    params = Params()
+    for name, row in rows.items():
+        index = COMPACT_NO_INDEX if row.param_index is None else row.param_index
+        number, value, is_raw = row.stored
+        params.compact[name] = (
+            value + bytes((number, is_raw, CACHED)) + index.to_bytes(4, "little", signed=True)
+        )
+        default = default_value(row.default, number)
+        if default is not None:
+            params.defaults[name] = default
+    return params
 
 
 def default_value(default: bytes | None, number: int) -> WireValue | None:
@@ -334,7 +390,7 @@ def written_value(number: ParamType | int, bits: int, *, is_raw: bool) -> Stored
 
 
 def _bits_cell(bits: int) -> bytes:
-    return bits.to_bytes(max(BITS_SIZE, byte_length(bits)), "little")
+    return bits.to_bytes(BITS_SIZE, "little")
 
 
 def _minute(at: float) -> str:

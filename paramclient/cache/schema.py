@@ -6,7 +6,7 @@ database keeps each version in a schema of its own. Values are marked by `?`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, Protocol, TypeVar
 
 __all__ = ["IDENTITY", "TABLES", "SCHEMA_VERSION", "Store", "Transaction"]
@@ -112,20 +112,34 @@ rows in the order of the primary key."""
 T = TypeVar("T")
 
 
-class Transaction(Protocol):
-    """Runs the statements of one transaction. A write transaction excludes all others."""
+class Transaction:
+    """Runs the statements of one transaction. A write transaction excludes all others.
+
+    Args:
+        connection: a connection of `sqlite3` or psycopg.
+        mark: the placeholder of a value in its statements.
+    """
+
+    def __init__(self, connection: Any, mark: str = "?") -> None:
+        self._connection = connection
+        self._mark = mark
 
     def all(self, sql: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
         """Run a statement and return its rows."""
-        ...
+        rows: list[tuple[Any, ...]] = self._connection.execute(self._marked(sql), values).fetchall()
+        return rows
 
     def do(self, sql: str, values: Sequence[object] = ()) -> int:
         """Run a statement and return the number of rows that it changed."""
-        ...
+        return int(self._connection.execute(self._marked(sql), values).rowcount)
 
-    def many(self, sql: str, rows: Iterable[Sequence[object]]) -> None:
+    def many(self, sql: str, rows: Sequence[Sequence[object]]) -> None:
         """Run a statement once for each row of values."""
-        ...
+        if rows:
+            self._connection.cursor().executemany(self._marked(sql), rows)
+
+    def _marked(self, sql: str) -> str:
+        return sql.replace("?", self._mark)
 
 
 class Store(Protocol):

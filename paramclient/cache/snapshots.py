@@ -4,35 +4,38 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from paramclient.cache.history import values_at
-from paramclient.cache.records import (
-    Snapshot,
-    SnapshotSummary,
-    StoredParam,
-    StoredValue,
-    default_value,
-    written_value,
+from paramclient.cache.records import SnapshotSummary, StoredParam, StoredValue, default_value, written_value
+from paramclient.cache.schema import Transaction
+from paramclient.cache.tables import (
+    StoredTable,
+    identity_cells,
+    load_rows,
+    load_vehicles,
+    read_identity,
+    time_cell,
 )
-from paramclient.cache.schema import IDENTITY, Transaction
-from paramclient.cache.tables import identity_cells, load_rows, read_identity, time_cell
 from paramclient.errors import NotInCache, UsageError
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import bits_of, from_bits
 
 __all__ = [
     "SNAPSHOTS",
+    "EarlierState",
+    "SnapshotRow",
     "end_operation",
-    "load_snapshot",
-    "load_summaries",
-    "param_set_rows",
-    "state_at",
+    "load_snapshots",
+    "load_state",
+    "rows_of_ext_set",
+    "rows_of_set",
+    "rows_of_table",
     "store_snapshot",
-    "stored_rows",
 ]
 
 SNAPSHOTS: Final = 50
@@ -40,34 +43,61 @@ SNAPSHOTS: Final = 50
 cover weeks of work on one vehicle."""
 
 SnapshotRow: TypeAlias = tuple[str, StoredValue, bytes | None]
-"""Name, value and default of a parameter of a snapshot."""
+"""Name, value and default of a parameter."""
 
-_SUMMARY: Final = (
-    "s.id, c.vehicle, c.component, s.at, s.reason,"
-    " (SELECT count(*) FROM snapshot_parameter p WHERE p.snapshot = s.id), s.hash, s.complete, s.ended"
-)
-_FROM: Final = "FROM snapshot s JOIN component c ON c.id = s.owner"
+
+class EarlierState(NamedTuple):
+    """An earlier state of a table.
+
+    Attributes:
+        rows: its parameters.
+        component: component id.
+        identity: the vehicle. Only a snapshot has its firmware of that time.
+        at: the time.
+        source: the source, for messages.
+    """
+
+    rows: Sequence[SnapshotRow]
+    component: int
+    identity: Identity
+    at: float
+    source: str
+
+    @property
+    def plain(self) -> ParamSet:
+        """The state of a table of plain parameters."""
+        params = {}
+        for name, (number, bits, is_raw), default in self.rows:
+            value = from_bits(int.from_bytes(bits, "little"), number, is_raw=bool(is_raw))
+            params[name] = WrittenParam(name, value, number, default_value(default, number))
+        return ParamSet(params, self.component, self.identity.system, self.identity, self.at, self.source)
+
+    @property
+    def extended(self) -> ExtParamSet:
+        """The state of a table of extended parameters."""
+        params = {name: value.ext_param(name) for name, value, _ in self.rows}
+        return ExtParamSet(params, self.identity.system, self.component, self.at, self.source, self.identity)
 
 
 def store_snapshot(
     tx: Transaction,
-    owner: int,
+    table: StoredTable,
     identity: Identity,
-    rows: list[SnapshotRow],
+    rows: Sequence[SnapshotRow],
     *,
     at: float,
     reason: str,
-    hash: int | None = None,  # noqa: A002  # the word of the record
+    hash: int | None,  # noqa: A002  # the word of the record
     complete: bool,
-    is_of_operation: bool = False,
-) -> int:
-    """Store a snapshot of a table, delete the oldest ones beyond `SNAPSHOTS`, and return its number."""
+    is_of_operation: bool,
+) -> SnapshotSummary:
+    """Store a snapshot of a table, delete the oldest ones beyond `SNAPSHOTS`, and return it."""
     text = reason.encode("utf-8", "backslashreplace").decode()  # a file name in it may not be UTF-8
     [(number,)] = tx.all(
         "INSERT INTO snapshot (owner, at, reason, identity, hash, complete, ended)"
         " VALUES (?, ?, ?, ?, ?, ?, ?) RETURNING id",
         (
-            owner,
+            table.owner,
             round(time_cell(at), 3),
             text.replace("\0", "\\x00"),  # PostgreSQL's text type does not allow NUL
             json.dumps(identity_cells(identity)),
@@ -84,9 +114,9 @@ def store_snapshot(
     tx.do(
         "DELETE FROM snapshot WHERE owner = ? AND id NOT IN"
         f" (SELECT id FROM snapshot WHERE owner = ? ORDER BY id DESC LIMIT {SNAPSHOTS})",
-        (owner, owner),
+        (table.owner, table.owner),
     )
-    return int(number)
+    return load_snapshots(tx, table)[-1]
 
 
 def end_operation(tx: Transaction, number: int) -> None:
@@ -94,72 +124,68 @@ def end_operation(tx: Transaction, number: int) -> None:
     tx.do("UPDATE snapshot SET ended = 1 WHERE id = ?", (number,))
 
 
-def load_summaries(
-    tx: Transaction, key: str, component: int | None, *, extended: bool
-) -> list[SnapshotSummary]:
-    """Return the snapshots of a vehicle's tables, newest last."""
-    where = "c.vehicle = ? AND c.extended = ?" + ("" if component is None else " AND c.component = ?")
-    values = (key, int(extended), *(() if component is None else (component,)))
-    return [_summary(row) for row in tx.all(f"SELECT {_SUMMARY} {_FROM} WHERE {where} ORDER BY s.id", values)]
-
-
-def load_snapshot(tx: Transaction, owner: int, number: int) -> Snapshot:
-    """Return a snapshot of a table.
-
-    Raises:
-        NotInCache: the table has no such snapshot.
-    """
-    known, identity, rows = _load(tx, owner, number)
-    written = {name: _written(name, value, default) for name, value, default in rows}
-    source = f"snapshot {number} of {known['key']}"
-    content = ParamSet(written, known["component"], identity.system, identity, known["at"], source)
-    return Snapshot(**known, params=content)
-
-
-def _table_at(
-    tx: Transaction, owner: int, when: float
-) -> tuple[dict[str, StoredValue], Identity, int, float]:
-    """Return the values that a table had at a time, the vehicle, the component id, and the time.
-
-    The identity is the last known one, without the firmware: only a snapshot has that of its time.
-
-    Raises:
-        NotInCache: the history of the table begins later, or the table was never complete.
-    """
-    when = time_cell(when)
-    [(key, component, since)] = tx.all(
-        "SELECT vehicle, component, known_since FROM component WHERE id = ?", (owner,)
+def load_snapshots(tx: Transaction, table: StoredTable) -> list[SnapshotSummary]:
+    """Return the snapshots of a table, newest last."""
+    found = tx.all(
+        "SELECT id, at, reason,"
+        " (SELECT count(*) FROM snapshot_parameter WHERE snapshot = snapshot.id), hash, complete, ended"
+        " FROM snapshot WHERE owner = ? ORDER BY id",
+        (table.owner,),
     )
-    if since is None or when < since:
-        near = tx.all(
-            "SELECT id, at FROM snapshot WHERE owner = ? ORDER BY abs(at - ?), id LIMIT 2", (owner, when)
+    return [
+        SnapshotSummary(
+            *(number, table.key, table.component, at, reason, size, hash_, bool(complete)),
+            None if ended is None else bool(ended),
         )
-        listed = " and ".join(f"snapshot {number} of {_second(at)}" for number, at in sorted(near))
+        for number, at, reason, size, hash_, complete, ended in found
+    ]
+
+
+def load_state(tx: Transaction, table: StoredTable, when: float) -> EarlierState:
+    """Return an earlier state of a table.
+
+    Args:
+        tx: the transaction.
+        table: the table.
+        when: a float is a time, in unix seconds; an int is the id of a snapshot.
+
+    Raises:
+        NotInCache: there is no such snapshot; or the history begins later, or the table was never complete.
+        UsageError: the time is not in unix seconds.
+    """
+    if isinstance(when, int):
+        return _of_snapshot(tx, table, when)
+    when = time_cell(when)
+    snapshots = load_snapshots(tx, table)
+    for each in snapshots:
+        if each.at == when:
+            return _of_snapshot(tx, table, each.id)
+    since = table.known_since
+    if since is None or when < since:
+        near = sorted(snapshots, key=lambda each: abs(each.at - when))[:2]
+        listed = [f"snapshot {each.id} of {_second(each.at)}" for each in sorted(near, key=lambda n: n.id)]
         reach = (
             "is not known: its table was never complete"
             if since is None
-            else f"at {_second(when)} is not known: what is kept of its history begins at {_second(since)}"
+            else f"at {_second(when)} is not known: the history begins at {_second(since)}"
         )
-        kept = f"there is {listed}" if listed else "there is no snapshot"
-        raise NotInCache(f"the state of {key}, component {component}, {reach}; {kept}")
-    [cells] = tx.all(f"SELECT {IDENTITY} FROM vehicle WHERE key = ?", (key,))
-    identity = replace(read_identity(cells), firmware=0, git_hash="", capabilities=0)
-    return values_at(tx, owner, load_rows(tx, owner), when), identity, component, when
+        raise NotInCache(
+            f"the state of {table.key}, component {table.component}, {reach}; there is"
+            f" {' and '.join(listed) or 'no snapshot'}"
+        )
+    [vehicle] = load_vehicles(tx, table.key)
+    identity = replace(vehicle.identity, firmware=0, git_hash="", capabilities=0)
+    values = values_at(tx, table.owner, load_rows(tx, table.owner), when)
+    rows: list[SnapshotRow] = [(name, value, None) for name, value in values.items()]
+    return EarlierState(rows, table.component, identity, when, f"history of {table.key}")
 
 
-def state_at(tx: Transaction, owner: int, when: float) -> ParamSet:
-    """Return a table as it was at a time. Errors as of `_table_at`."""
-    values, identity, component, at = _table_at(tx, owner, when)
-    written = {name: _written(name, value, None) for name, value in values.items()}
-    return ParamSet(written, component, identity.system, identity, at, f"history of {identity.key}")
-
-
-def stored_rows(rows: Mapping[str, StoredParam]) -> list[SnapshotRow]:
+def rows_of_table(rows: Mapping[str, StoredParam]) -> list[SnapshotRow]:
     """Return the parameters of a stored table as those of a snapshot."""
     return [(name, row.stored, row.default) for name, row in rows.items()]
 
 
-def param_set_rows(params: ParamSet) -> list[SnapshotRow]:
+def rows_of_set(params: ParamSet) -> list[SnapshotRow]:
     """Return the parameters of a set as those of a snapshot.
 
     Raises:
@@ -167,48 +193,45 @@ def param_set_rows(params: ParamSet) -> list[SnapshotRow]:
     """
     rows: list[SnapshotRow] = []
     for name, each in params.items():
-        if each.type_number is None:
+        number = each.type_number
+        if number is None:
             raise UsageError(f"a snapshot has the type of each parameter; that of {name} is not known")
-        value = written_value(each.type_number, each.bits_as(each.type_number), is_raw=each.is_raw)
+        value = written_value(number, each.bits_as(number), is_raw=each.is_raw)
         default = None
         if each.default is not None:
-            default = written_value(each.type_number, bits_of(each.default, each.type_number), is_raw=False)
-        rows.append((name, value, None if default is None else default.value))
+            default = written_value(number, bits_of(each.default, number), is_raw=False).value
+        rows.append((name, value, default))
     return rows
 
 
-def _load(tx: Transaction, owner: int, number: int) -> tuple[dict[str, Any], Identity, list[SnapshotRow]]:
-    """Return the attributes of a snapshot's summary, the identity of the vehicle, and the parameters."""
-    where = f"{_FROM} WHERE s.owner = ? AND s.id = ?"
-    found = tx.all(f"SELECT s.identity, {_SUMMARY} {where}", (owner, number))
-    if not found:
-        kept = tx.all("SELECT id FROM snapshot WHERE owner = ? ORDER BY id", (owner,))
-        listed = f"those kept are {', '.join(str(each) for (each,) in kept)}" if kept else "none is kept"
-        raise NotInCache(f"there is no snapshot {number} of this table: {listed}")
-    [(described, *row)] = found
-    summary = _summary(row)
+def rows_of_ext_set(params: ExtParamSet) -> list[SnapshotRow]:
+    """Return the parameters of a set of extended ones as those of a snapshot."""
+    return [(name, StoredValue(int(each.type), each.raw, 0), None) for name, each in params.params.items()]
+
+
+def _of_snapshot(tx: Transaction, table: StoredTable, number: int) -> EarlierState:
+    kept: dict[int, Any] = {
+        each: (at, described)
+        for each, at, described in tx.all(
+            "SELECT id, at, identity FROM snapshot WHERE owner = ? ORDER BY id", (table.owner,)
+        )
+    }
+    if number not in kept:
+        listed = f"those kept are {', '.join(map(str, kept))}" if kept else "none is kept"
+        raise NotInCache(
+            f"there is no snapshot {number} of {table.key}, component {table.component}: {listed}"
+        )
+    at, described = kept[number]
     rows: list[SnapshotRow] = [
-        (name, StoredValue(number_, value, is_raw), default)
-        for name, number_, value, is_raw, default in tx.all(
+        (name, StoredValue(kind, value, is_raw), default)
+        for name, kind, value, is_raw, default in tx.all(
             "SELECT name, type, value, is_raw, default_value FROM snapshot_parameter"
             " WHERE snapshot = ? ORDER BY position",
             (number,),
         )
     ]
-    known = {each.name: getattr(summary, each.name) for each in fields(SnapshotSummary)}
-    return known, read_identity(json.loads(described)), rows
-
-
-def _summary(row: Sequence[Any]) -> SnapshotSummary:
-    number, key, component, at, reason, size, hash_, complete, ended = row
-    is_ended = None if ended is None else bool(ended)
-    return SnapshotSummary(number, key, component, at, reason, size, hash_, bool(complete), is_ended)
-
-
-def _written(name: str, value: StoredValue, default: bytes | None) -> WrittenParam:
-    number, bits, is_raw = value
-    settable = from_bits(int.from_bytes(bits, "little"), number, is_raw=bool(is_raw))
-    return WrittenParam(name, settable, number, default_value(default, number))
+    identity = read_identity(json.loads(described))
+    return EarlierState(rows, table.component, identity, at, f"snapshot {number} of {table.key}")
 
 
 def _second(at: float) -> str:

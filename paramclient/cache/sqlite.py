@@ -13,10 +13,10 @@ import os
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 from paramclient.cache.schema import SCHEMA_VERSION, TABLES, Transaction
 from paramclient.errors import CacheError, ParamClientError
@@ -143,7 +143,7 @@ class SqliteStore:
             return _read_nothing(work)
         if is_empty:
             _create(connection)
-        result = work(_SqliteTransaction(connection))
+        result = work(Transaction(connection))
         if durable:  # a transaction without a write would not sync; this writes the unchanged version
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         connection.execute("COMMIT")
@@ -221,22 +221,6 @@ _KINDS: Final = {
 }
 
 
-class _SqliteTransaction:
-    """See `Transaction`."""
-
-    def __init__(self, connection: sqlite3.Connection) -> None:
-        self._connection = connection
-
-    def all(self, sql: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
-        return self._connection.execute(sql, values).fetchall()
-
-    def do(self, sql: str, values: Sequence[object] = ()) -> int:
-        return self._connection.execute(sql, values).rowcount
-
-    def many(self, sql: str, rows: Iterable[Sequence[object]]) -> None:
-        self._connection.executemany(sql, rows)
-
-
 def _connect(uri: str) -> sqlite3.Connection:
     return sqlite3.connect(
         uri, uri=True, timeout=LOCK_WAIT_MAX, isolation_level=None, check_same_thread=False
@@ -285,6 +269,6 @@ def _read_nothing(work: Callable[[Transaction], T]) -> T:
     connection = _connect("file::memory:")
     try:
         _create(connection)
-        return work(_SqliteTransaction(connection))
+        return work(Transaction(connection))
     finally:
         connection.close()

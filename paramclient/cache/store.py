@@ -17,17 +17,21 @@ from paramclient.cache.history import Line
 from paramclient.cache.lookup import find_vehicle
 from paramclient.cache.records import (
     CachedComponent,
+    CachedExtTable,
     CachedSummary,
     CachedVehicle,
+    ExtHistoryEntry,
     HistoryEntry,
-    Snapshot,
     SnapshotSummary,
     StoredParam,
     TableUpdate,
 )
 from paramclient.cache.schema import Store, Transaction
+from paramclient.cache.snapshots import SnapshotRow
 from paramclient.cache.sqlite import SqliteStore
+from paramclient.cache.updates import ensure_table, save_table
 from paramclient.errors import NotInCache, UsageError
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 
@@ -133,7 +137,7 @@ class ParamCache:
 
         def work(tx: Transaction) -> None:
             for each in updates:
-                tables.save_table(tx, each, time.time())
+                save_table(tx, each, time.time())
 
         if updates or durable:
             self._store.run(work, writing=True, durable=durable)
@@ -162,15 +166,14 @@ class ParamCache:
             for each in updates:
                 place = (each.identity.key, each.component, each.extended)
                 if place not in stored:
-                    at = tables.load_updated_at(tx, *place)
+                    before = tables.find_table(tx, each.identity.key, each.component, extended=each.extended)
+                    at = None if before is None else before.updated_at
                     stored[place] = None if at == known.get(place[:2]) else at
                 last = stored[place]
                 is_apart = last is not None and each.at <= last
                 if each.replace and not is_apart:
                     stored[place] = last = None
-                found = tables.save_table(tx, each, math.inf, keeps_state=last is not None, is_apart=is_apart)
-                owner = tables.find_owner(tx, each.identity.key, each.component, extended=each.extended)
-                assert owner is not None
+                owner, found = save_table(tx, each, math.inf, keeps_state=last is not None, is_apart=is_apart)
                 earlier.setdefault(owner, []).extend(found)
             for owner, items in earlier.items():
                 history.insert_observations(tx, owner, tables.load_rows(tx, owner), items)
@@ -178,14 +181,23 @@ class ParamCache:
         if updates:
             self._store.run(work, writing=True)
 
-    def load(self, key: str, component: int, *, extended: bool = False) -> CachedComponent | None:
+    def load(self, key: str, component: int) -> CachedComponent | None:
         """Return the table of a vehicle's component; None if there is none.
 
         Args:
             key: `Identity.key`.
             component: component id.
         """
-        return self._read(lambda tx: tables.load_component(tx, key, component, extended=extended))
+        return self._read(lambda tx: tables.load_component(tx, key, component))
+
+    def load_ext(self, key: str, component: int) -> CachedExtTable | None:
+        """Return the extended parameters of a vehicle's component; None if there are none.
+
+        Args:
+            key: `Identity.key`.
+            component: component id.
+        """
+        return self._read(lambda tx: tables.load_extended(tx, key, component))
 
     def vehicles(self) -> list[CachedVehicle]:
         """Return all vehicles, the last seen first."""
@@ -208,39 +220,37 @@ class ParamCache:
         )
 
     def component(
-        self,
-        vehicle: str | None = None,
-        *,
-        system: int | None = None,
-        component: int = 1,
-        extended: bool = False,
+        self, vehicle: str | None = None, *, system: int | None = None, component: int = 1
     ) -> CachedComponent:
         """Return the only table that matches.
 
         Args:
             vehicle: as for `components`.
             system: its system id.
-            component: component id; the autopilot's is 1, that of a camera 100.
-            extended: the extended parameters of the component, instead of the plain ones.
+            component: component id; the autopilot's is 1.
 
         Raises:
             UnknownVehicle: no table matches. `vehicles` and the message list the existing ones.
             AmbiguousVehicle: tables of several vehicles match. `vehicles` and the message list them.
-            NotInCache: the component has no extended parameters in the cache.
         """
 
         def work(tx: Transaction) -> CachedComponent:
             key = self._choose(tx, vehicle, system=system, component=component)
-            found = tables.load_component(tx, key, component, extended=extended)
-            if found is None:  # only of extended parameters: a component has a plain table
-                raise NotInCache(f"{key}, component {component}, has no extended parameters in the cache")
+            found = tables.load_component(tx, key, component)
+            assert found is not None, "what was chosen exists for the whole transaction"
             return found
 
         return self._read(work)
 
     def ext_sizes(self) -> dict[tuple[str, int], int]:
         """Return the number of extended parameters of each component that has some, by key and component."""
-        return self._read(tables.load_extended_sizes)
+        return self._read(
+            lambda tx: {
+                (each.key, each.component): each.size
+                for each in tables.load_tables(tx, extended=True)
+                if each.size
+            }
+        )
 
     def remove(self, vehicle: str, component: int | None = None) -> int:
         """Remove a vehicle's tables with history and snapshots, and return the number of tables.
@@ -265,8 +275,6 @@ class ParamCache:
         name: str | None = None,
         limit: int | None = None,
         since: float | None = None,
-        *,
-        extended: bool = False,
     ) -> list[HistoryEntry]:
         """Return the changes of a vehicle's values, newest last.
 
@@ -278,16 +286,29 @@ class ParamCache:
             name: only changes of this parameter.
             limit: maximum number of changes, the newest.
             since: only changes from this time on, in unix seconds.
-            extended: those of extended parameters, instead of the plain ones.
 
         Raises:
             UnknownVehicle: no vehicle in the cache has this name.
             AmbiguousVehicle: several vehicles have this name.
         """
-        lines = self._lines(vehicle, component, name, limit, since, extended=extended)
-        return [history.entry_of(number, line) for number, line in lines]
+        lines = self._lines(vehicle, component, name, limit, since, extended=False)
+        return [history.plain_entry(number, line) for number, line in lines]
 
-    def snapshot(self, vehicle: str, component: int, *, reason: str, at: float | None = None) -> Snapshot:
+    def ext_history(
+        self,
+        vehicle: str,
+        component: int | None = None,
+        name: str | None = None,
+        limit: int | None = None,
+        since: float | None = None,
+    ) -> list[ExtHistoryEntry]:
+        """Return the changes of a vehicle's extended parameters; as `history`."""
+        lines = self._lines(vehicle, component, name, limit, since, extended=True)
+        return [history.extended_entry(number, line) for number, line in lines]
+
+    def snapshot(
+        self, vehicle: str, component: int, *, reason: str, at: float | None = None
+    ) -> SnapshotSummary:
         """Store a snapshot of a cached table as a restore point, and return it.
 
         The cache keeps the newest `SNAPSHOTS` (50) of each table.
@@ -303,22 +324,7 @@ class ParamCache:
             AmbiguousVehicle: several vehicles have this name.
         """
 
-        def work(tx: Transaction) -> Snapshot:
-            key, owner = self._table(tx, vehicle, component)
-            [kept] = tables.load_summaries(tx, key, component)
-            number = snapshots.store_snapshot(
-                tx,
-                owner,
-                kept.identity,
-                snapshots.stored_rows(tables.load_rows(tx, owner)),
-                at=time.time() if at is None else at,
-                reason=reason,
-                hash=kept.hash,
-                complete=kept.complete,
-            )
-            return snapshots.load_snapshot(tx, owner, number)
-
-        return self._store.run(work, writing=True)
+        return self._keep(vehicle, component, None, reason=reason, at=at)
 
     def store_snapshot(
         self,
@@ -331,8 +337,7 @@ class ParamCache:
         hash: int | None = None,  # noqa: A002  # the word of the record
         complete: bool = True,
         is_of_operation: bool = False,
-        extended: bool = False,
-    ) -> Snapshot:
+    ) -> SnapshotSummary:
         """Store a snapshot of given parameters, and return it.
 
         The cached table does not change. The cache keeps the newest `SNAPSHOTS` (50) of each table.
@@ -348,32 +353,36 @@ class ParamCache:
             complete: whether these are all parameters of the vehicle.
             is_of_operation: whether an `apply` or `restore` is about to write; it calls `end_operation` at
                 its end.
-            extended: whether these are extended parameters.
 
         Raises:
             UsageError: the type of a parameter is unknown.
             UnknownVehicle: a name was given, and there is no such table.
             AmbiguousVehicle: several vehicles have this name.
         """
-        rows = snapshots.param_set_rows(params)
-        moment = time.time() if at is None else at
+        return self._keep(
+            vehicle,
+            component,
+            snapshots.rows_of_set(params),
+            reason=reason,
+            at=at,
+            hash=hash,
+            complete=complete,
+            is_of_operation=is_of_operation,
+        )
 
-        def work(tx: Transaction) -> Snapshot:
-            owner, identity = self._snapshot_owner(tx, vehicle, component, moment, extended=extended)
-            number = snapshots.store_snapshot(
-                tx,
-                owner,
-                identity,
-                rows,
-                at=moment,
-                reason=reason,
-                hash=hash,
-                complete=complete,
-                is_of_operation=is_of_operation,
-            )
-            return snapshots.load_snapshot(tx, owner, number)
-
-        return self._store.run(work, writing=True)
+    def store_ext_snapshot(
+        self,
+        vehicle: Identity | str,
+        component: int,
+        params: ExtParamSet,
+        *,
+        reason: str,
+        at: float | None = None,
+        complete: bool = True,
+    ) -> SnapshotSummary:
+        """Store a snapshot of given extended parameters, and return it; as `store_snapshot`."""
+        rows = snapshots.rows_of_ext_set(params)
+        return self._keep(vehicle, component, rows, reason=reason, at=at, complete=complete, extended=True)
 
     def end_operation(self, snapshot: int) -> None:
         """Record that the `apply` or `restore` that has stored a snapshot has ended.
@@ -383,25 +392,24 @@ class ParamCache:
         """
         self._store.run(lambda tx: snapshots.end_operation(tx, snapshot), writing=True)
 
-    def snapshots(
-        self, vehicle: str, component: int | None = None, *, extended: bool = False
-    ) -> list[SnapshotSummary]:
+    def snapshots(self, vehicle: str, component: int | None = None) -> list[SnapshotSummary]:
         """Return the snapshots of a vehicle's tables, without parameters, newest last.
 
         Args:
             vehicle: as for `components`.
             component: only snapshots of this component.
-            extended: those of extended parameters, instead of the plain ones.
 
         Raises:
             UnknownVehicle: no vehicle in the cache has this name.
             AmbiguousVehicle: several vehicles have this name.
         """
-        return self._read(
-            lambda tx: snapshots.load_summaries(tx, self._choose(tx, vehicle), component, extended=extended)
-        )
+        return self._snapshots(vehicle, component, extended=False)
 
-    def state_at(self, vehicle: str, component: int, when: float, *, extended: bool = False) -> ParamSet:
+    def ext_snapshots(self, vehicle: str, component: int | None = None) -> list[SnapshotSummary]:
+        """Return the snapshots of a vehicle's extended parameters; as `snapshots`."""
+        return self._snapshots(vehicle, component, extended=True)
+
+    def state_at(self, vehicle: str, component: int, when: float) -> ParamSet:
         """Return a table as it was at a given time.
 
         It is computed backwards from the current table with the history lines, and has the last values
@@ -413,7 +421,6 @@ class ParamCache:
             vehicle: as for `components`.
             component: component id.
             when: a float is a time, in unix seconds; an int is the id of a snapshot.
-            extended: those of extended parameters, instead of the plain ones.
 
         Raises:
             UsageError: the time is not in unix seconds.
@@ -423,13 +430,18 @@ class ParamCache:
                 its beginning, and the nearest snapshots).
         """
 
-        def work(tx: Transaction) -> ParamSet:
-            _, owner = self._table(tx, vehicle, component, extended=extended)
-            if isinstance(when, int):
-                return snapshots.load_snapshot(tx, owner, when).params
-            return snapshots.state_at(tx, owner, when)
+        return self._read(
+            lambda tx: snapshots.load_state(tx, self._table(tx, vehicle, component), when).plain
+        )
 
-        return self._read(work)
+    def ext_state_at(self, vehicle: str, component: int, when: float) -> ExtParamSet:
+        """Return the extended parameters of a component as they were at a given time; as `state_at`."""
+
+        return self._read(
+            lambda tx: (
+                snapshots.load_state(tx, self._table(tx, vehicle, component, extended=True), when).extended
+            )
+        )
 
     def _read(self, work: Callable[[Transaction], T]) -> T:
         return self._store.run(work, writing=False)
@@ -450,31 +462,62 @@ class ParamCache:
             )
         )
 
-    def _snapshot_owner(
-        self, tx: Transaction, vehicle: Identity | str, component: int, at: float, *, extended: bool
-    ) -> tuple[int, Identity]:
-        """Return the id of the table of a snapshot, which may be new, and the identity of the vehicle."""
-        if isinstance(vehicle, str):
-            key, owner = self._table(tx, vehicle, component, extended=extended)
-            return owner, tables.load_summaries(tx, key, component)[0].identity
-        owner_or_none = tables.find_owner(tx, vehicle.key, component, extended=extended)
-        if owner_or_none is None:
-            autopilot = vehicle.autopilot if component == 1 else 0
-            new = TableUpdate(
-                identity=vehicle, component=component, autopilot=autopilot, at=at, extended=extended
+    def _snapshots(self, vehicle: str, component: int | None, *, extended: bool) -> list[SnapshotSummary]:
+        def work(tx: Transaction) -> list[SnapshotSummary]:
+            found = tables.load_tables(tx, self._choose(tx, vehicle), component, extended=extended)
+            kept = [each for table in found for each in snapshots.load_snapshots(tx, table)]
+            return sorted(kept, key=lambda each: each.id)
+
+        return self._read(work)
+
+    def _keep(
+        self,
+        vehicle: Identity | str,
+        component: int,
+        rows: Sequence[SnapshotRow] | None,
+        *,
+        reason: str,
+        at: float | None,
+        hash: int | None = None,  # noqa: A002  # the word of the record
+        complete: bool = True,
+        is_of_operation: bool = False,
+        extended: bool = False,
+    ) -> SnapshotSummary:
+        """Store a snapshot of these rows; without any, of the stored table."""
+        moment = time.time() if at is None else at
+
+        def work(tx: Transaction) -> SnapshotSummary:
+            if isinstance(vehicle, str):
+                table = self._table(tx, vehicle, component, extended=extended)
+                [known] = tables.load_vehicles(tx, table.key)
+                identity = known.identity
+            else:
+                identity = vehicle
+                table = ensure_table(tx, identity, component, moment, extended=extended)
+            kept = snapshots.rows_of_table(tables.load_rows(tx, table.owner)) if rows is None else rows
+            return snapshots.store_snapshot(
+                tx,
+                table,
+                identity,
+                kept,
+                at=moment,
+                reason=reason,
+                hash=table.state.hash if rows is None else hash,
+                complete=table.state.complete if rows is None else complete,
+                is_of_operation=is_of_operation,
             )
-            owner_or_none = tables.upsert_owner(tx, new)
-        return owner_or_none, vehicle
+
+        return self._store.run(work, writing=True)
 
     def _table(
         self, tx: Transaction, vehicle: str, component: int, *, extended: bool = False
-    ) -> tuple[str, int]:
-        """Return the key of the only vehicle with this name, and the id of its table."""
+    ) -> tables.StoredTable:
+        """Return the table of the only vehicle with this name."""
         key = self._choose(tx, vehicle, component=component)
-        owner = tables.find_owner(tx, key, component, extended=extended)
-        if owner is None:  # only of extended parameters: a component has a plain table
+        table = tables.find_table(tx, key, component, extended=extended)
+        if table is None:  # only of extended parameters: a component has a plain table
             raise NotInCache(f"{key}, component {component}, has no extended parameters in the cache")
-        return key, owner
+        return table
 
     def _choose(
         self,

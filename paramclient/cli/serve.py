@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import gc
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Final
@@ -20,13 +17,8 @@ from paramclient.errors import UsageError
 
 __all__ = ["serve"]
 
-SERVICE_LIBRARIES: Final = ("fastapi", "prometheus_client", "uvicorn", "websockets")
+SERVICE_LIBRARIES: Final = ("fastapi", "prometheus_client", "uvicorn")
 """Libraries that the extra `service` installs."""
-SWITCH_INTERVAL: Final = 0.001
-"""Seconds for which a worker thread may keep the interpreter while the event loop waits for it.
-
-The loop waits that long after each system call, as system calls release the interpreter. With Python's 5 ms,
-six comparisons of 10,000 parameters at once delay it by more than 100 ms."""
 _UNSIGNED: Final = SigningOptions()
 
 
@@ -37,11 +29,9 @@ async def serve(
     no_cache: bool = False,
     fetch: Annotated[bool, Parameter(negative="--no-fetch")] = True,
     listen_only: bool = False,
-    token_file: Path | None = None,
-    read_only: bool = False,
+    tokens: Path | None = None,
     host: tuple[str, ...] = (),
     allow_origin: tuple[str, ...] = (),
-    trusted_proxy: tuple[str, ...] = (),
     tls_cert: Path | None = None,
     tls_key: Path | None = None,
     verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False,
@@ -60,16 +50,12 @@ async def serve(
         fetch: Fetch the parameters of all vehicles that are heard.
         listen_only: Send nothing to vehicles; receive the parameters that other stations on the links
             request.
-        token_file: A file with access tokens, see `paramclient token`. Without it, and without
-            PARAMCLIENT_SERVICE_TOKEN_FILE or PARAMCLIENT_SERVICE_TOKEN in the environment, only this computer
-            can connect.
-        read_only: Refuse all changes of vehicles.
-        host: A host name of this service for browsers and programs, such as companion.local; may be given
-            several times.
-        allow_origin: Origin of a web page that may use the service from a browser, such as
-            https://station.example; may be given several times. Without tokens, such a page can only read.
-        trusted_proxy: Address or network, such as 10.0.0.0/8, of a reverse proxy whose header X-Forwarded-For
-            or Forwarded names the client; may be given several times.
+        tokens: A file with access tokens, made by `paramclient token`. Without it, only this computer can
+            connect.
+        host: A name of this service for browsers and programs, such as companion.local; may be given several
+            times.
+        allow_origin: Origin of a web page of another site that may use the service with a token, such as
+            https://station.example; may be given several times.
         tls_cert: A certificate file (PEM), to serve over TLS.
         tls_key: The key file of the certificate (PEM).
         verbose: Log each step on stderr.
@@ -77,7 +63,6 @@ async def serve(
     if missing := [name for name in SERVICE_LIBRARIES if find_spec(name) is None]:
         raise UsageError(f"serving needs {' and '.join(missing)}: pip install 'paramclient[service]'")
     from paramclient import service  # only here: needs the extra
-    from paramclient.service.garbage_collection import GarbageCollection
 
     if no_cache and cache is not None:
         raise UsageError("--cache and --no-cache exclude each other")
@@ -89,30 +74,17 @@ async def serve(
         fetches=fetch,
         listen_only=listen_only,
         signing=options.signing,
-        traffic=True,
         **options.source,
     )
-    listening = service.Listening.at(listen, tls_cert=tls_cert, tls_key=tls_key)
-    access = service.AccessSettings(
-        listen=listening.host,
-        tokens=service.tokens_from(token_file),
-        hosts=host,
-        origins=allow_origin,
-        proxies=trusted_proxy,
-        read_only=read_only,
-    )
-    settings = service.Settings(access=access)
-
-    def listens(url: str) -> None:
-        gc.freeze()  # as at the start of the command: a full collection takes as long as ten requests
-        print_line(f"serving on {url}")
-
-    sys.setswitchinterval(SWITCH_INTERVAL)
     stop = anyio.Event()
     with on_end_signal(lambda _: stop.set()):
-        collecting = asyncio.create_task(GarbageCollection().run(lambda: hub.followed, lambda: hub.is_busy))
-        try:
-            await service.serve(hub, settings, listening=listening, stop=stop, listens=listens)
-        finally:
-            collecting.cancel()
+        await service.serve(
+            hub,
+            listening=service.Listening.at(listen, tls_cert=tls_cert, tls_key=tls_key),
+            tokens=None if tokens is None else service.Tokens.read(tokens),
+            hosts=host,
+            origins=allow_origin,
+            stop=stop,
+            listens=lambda url: print_line(f"serving on {url}"),
+        )
     return ExitCode.DONE

@@ -19,12 +19,12 @@ def token(name: str, /, *, file: Path, read: bool = False) -> None:
 
     Args:
         name: The user or computer, such as anna or bench-laptop.
-        file: The token file of serve --token-file.
+        file: The token file of serve --tokens.
         read: Allow only reading.
     """
     if find_spec("fastapi") is None:
         raise UsageError("the service needs fastapi: pip install 'paramclient[service]'")
-    from paramclient.service.tokens import add_token  # only here: needs the extra
+    from paramclient.service import add_token  # only here: needs the extra
 
     made = add_token(file, name, "read" if read else "write")
     say(f"token for {name} ({'read' if read else 'read and write'}), which is shown only once:")

@@ -18,7 +18,7 @@ from typing import Final
 
 from paramclient.model.values import Param
 
-__all__ = ["crc32_px4", "find_volatile", "hash_bits", "hash_params", "usual_volatile"]
+__all__ = ["crc32_px4", "find_volatile", "hash_bits", "hash_params"]
 
 HASHED_PARAMETERS_MAX: Final = 1_000_000
 """Parameters hashed while single names are tried, about 0.1 s: each attempt hashes the whole table."""
@@ -92,11 +92,6 @@ def find_volatile(
         if _hash(hashed, candidate) == announced:
             return candidate, True
     return guess or frozenset(), False
-
-
-def usual_volatile(names: Iterable[str]) -> frozenset[str]:
-    """Return those of the names that PX4 usually excludes from its hash."""
-    return frozenset(name for name in names if _group_of(name) is not None)
 
 
 def _hashed_bytes(bits: Iterable[tuple[str, int]]) -> list[tuple[str, bytes]]:

@@ -10,7 +10,7 @@
 - `restore_point`: reads the snapshot that the last `apply` stored, and what has changed since.
 - `apply_rules`: parameters that `apply` leaves out, writes first or last, or reboots for; the list is
   `apply_rules.toml`.
-- `runner`: long computations and `before_writing`.
+- `callbacks`: calls `before_writing`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,6 @@ from paramclient.provision.results import (
     FleetApplied,
     FleetVerified,
 )
-from paramclient.provision.runner import Runner
 
 __all__ = [
     "ApplyProgress",
@@ -66,7 +65,6 @@ __all__ = [
     "PlanRow",
     "PlanStatus",
     "RowComparison",
-    "Runner",
     "Stage",
     "Step",
     "WRONG",

@@ -32,6 +32,7 @@ from paramclient.model.values import WireValue
 from paramclient.protocol.requests.write_window import WRITES_IN_FLIGHT_MAX
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
+from paramclient.provision.callbacks import call_and_wait
 from paramclient.provision.inspection import (
     POLL_INTERVAL,
     Inspection,
@@ -55,7 +56,6 @@ from paramclient.provision.planning import (
     plan,
 )
 from paramclient.provision.results import ApplyProgress, ApplyResult, ApplyRow, ApplyStatus
-from paramclient.provision.runner import call_and_wait
 
 __all__ = ["ApplyOptions", "ApplyRun"]
 

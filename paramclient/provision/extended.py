@@ -15,8 +15,8 @@ from paramclient.model.ext_params import ExtParam
 from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.protocol.set_results import SetOutcome
 from paramclient.provision.apply_restore import BEFORE_RESTORE
+from paramclient.provision.callbacks import call_and_wait
 from paramclient.provision.restore_point import choose_restore_point
-from paramclient.provision.runner import call_and_wait
 from paramclient.provision.vehicle_params import BEFORE_APPLY, extended_set
 
 __all__ = [

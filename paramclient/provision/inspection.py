@@ -11,13 +11,11 @@ import anyio
 
 from paramclient.client.component import Component
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
-from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Renames
 from paramclient.model.values import Param, ParamType, Trust
 from paramclient.protocol.fetch import FetchResult
 from paramclient.provision.planning import ParamInfo, Plan, check_component, plan
-from paramclient.provision.runner import Runner, run_here
 from paramclient.provision.vehicle_params import set_maker
 
 __all__ = [
@@ -84,7 +82,6 @@ async def inspect(
     *,
     renames: Renames | None = None,
     whole: bool = False,
-    run: Runner = run_here,
 ) -> Inspection:
     """Update the table, and read by name the wanted parameters that it does not have.
 
@@ -100,47 +97,36 @@ async def inspect(
         absent: names that the vehicle is known not to have, unless they are listed by now.
         renames: other names of the wanted parameters, which are read if the table lacks the wanted name.
         whole: read all unconfirmed parameters, not only the wanted ones.
-        run: runs the computations that take long for a large table.
 
     Raises:
         NoReply: the vehicle did not answer.
         LinkError: the link failed, or the client was closed.
     """
-    before = copy_params(component.params)
+    component.core.machine.sync.expire_hash()  # the hash may have changed since its announcement
+    before = {name for name, param in component.params.items() if param.trust is Trust.LIVE}
     fetched = await component.fetch_all()
-    after = copy_params(component.params)
-    not_covered = frozenset(_not_covered(component, fetched))
-    autopilot = component.autopilot
-
-    def select() -> tuple[dict[str, Param], bool, set[str], set[str], list[str]]:
-        listed = {name: param for name, param in after.items() if param.index is not None}
-        table = {name: param for name, param in listed.items() if param.trust is not Trust.CACHED}
-        is_whole = fetched.complete and len(table) == len(listed)
-        hidden: set[str] = set()
-        names = with_other_names(wanted, table, renames)
-        if is_whole and autopilot == "ardupilot":
-            hidden = set(_in_no_hidden_group(table, names).difference(after))
-        missing = frozenset(fetched.missing)
-        given_up = {name for name, param in table.items() if param.index in missing}
-        live = {name for name, param in before.items() if param.trust is Trust.LIVE}
-        unconfirmed = given_up | live.intersection(table, not_covered)
-        known = absent | hidden
-        to_read = [name for name in names if name in unconfirmed or (name not in table and name not in known)]
-        if whole:
-            to_read += unconfirmed.difference(to_read)
-        return table, is_whole, hidden, given_up, to_read
-
-    table, is_whole, absent_names, given_up, to_read = await run(select)
+    await component.refreshed()
+    params = dict(component.params)
+    listed = [name for name, param in params.items() if param.index is not None]
+    table = {name: params[name] for name in listed if params[name].trust is not Trust.CACHED}
+    complete = fetched.complete and len(table) == len(listed)
+    names = with_other_names(wanted, table, renames)
+    hidden: frozenset[str] = frozenset()
+    if complete and component.autopilot == "ardupilot":
+        hidden = _in_no_hidden_group(table, names).difference(params)
+    missing = frozenset(fetched.missing)
+    given_up = {name for name, param in table.items() if param.index in missing}
+    unconfirmed = given_up | before.intersection(table, _not_covered(component, fetched))
+    known = absent | hidden
+    to_read = [name for name in names if name in unconfirmed or (name not in table and name not in known)]
+    if whole:
+        to_read += unconfirmed.difference(to_read)
     found, unreported = await _read_names(component, to_read, given_up)
-    unknown = absent_names.difference(table) | unreported
+    unknown = hidden.difference(table) | unreported
     to_set = set_maker(component, f"vehicle {component.system}/{component.component}")
-
-    def make_set() -> ParamSet:
-        return to_set(param for name, param in (table | found).items() if name not in unknown)
-
     return Inspection(
-        await run(make_set),
-        is_whole,
+        to_set(param for name, param in (table | found).items() if name not in unknown),
+        complete,
         fetched.hash,
         (absent | unknown).difference(table),
         0.0 if fetched.source == "cache" else fetched.elapsed,
@@ -190,7 +176,7 @@ async def reread(component: Component, inspection: Inspection, names: Iterable[s
 
 async def wait_for_identity(component: Component) -> None:
     """Wait until the vehicle is identified, at most `SETUP_IDENTITY_TIMEOUT`, as the cache key requires."""
-    await component.wait_until_identified(SETUP_IDENTITY_TIMEOUT)
+    await component.core.wait_until_identified(SETUP_IDENTITY_TIMEOUT)
 
 
 async def prepare(
@@ -201,14 +187,12 @@ async def prepare(
     info: Mapping[str, ParamInfo] | None = None,
     force: bool = False,
     renames: Renames | None = None,
-    run: Runner = run_here,
 ) -> Plan:
     """Return the plan of what `apply` would send to a vehicle, and in which order. Only reads.
 
     Args:
         component: the vehicle.
         wanted, include, info, force, renames: as in `plan`.
-        run: runs long computations: a plan of thousands of parameters takes a second.
 
     Raises:
         UsageError: as from `plan`.
@@ -217,14 +201,10 @@ async def prepare(
     """
     check_component(wanted, component.component)
     given = (include,) if isinstance(include, str) else tuple(include)
-    autopilot = component.autopilot
-    # errors in `wanted` are raised before the vehicle is read
-    await run(lambda: plan({}, wanted, include=given, autopilot=autopilot))
+    plan({}, wanted, include=given, autopilot=component.autopilot)  # raises errors before the vehicle is read
     await wait_for_identity(component)
-    inspection = await inspect(component, wanted, renames=renames, run=run)
-    return await run(
-        lambda: plan_for(component, inspection.table, wanted, given, info, force=force, renames=renames)
-    )
+    inspection = await inspect(component, wanted, renames=renames)
+    return plan_for(component, inspection.table, wanted, given, info, force=force, renames=renames)
 
 
 async def verify(
@@ -291,11 +271,11 @@ def _current_values(
 
 def _not_covered(component: Component, fetched: FetchResult) -> Collection[str]:
     """Return the names whose values a fetch neither received nor confirmed, except missing ones."""
-    if fetched.source != "cache":
+    if fetched.source != "cache" and not fetched.resumed:
         return ()
-    if fetched.hash is None:  # the cache policy did not verify it
+    if fetched.hash is None:  # the cache policy did not verify it, or the download was resumed
         return component.params.keys()
-    return [name for name, param in component.params.items() if param.trust is Trust.CACHED]
+    return component.core.machine.table.unhashed()
 
 
 async def _read_names(

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from paramclient.errors import NotInCache, UsageError, VehicleError
+from paramclient.errors import NoReply, NotInCache, UsageError, VehicleError
 from paramclient.model.comparison import defaults_of, non_defaults
 from paramclient.model.defaults import add_defaults
 from paramclient.model.ext_params import ExtParam
 from paramclient.model.ext_paramset import ExtParamSet
-from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, Trust
 from paramclient.model.wording import first_of
-from paramclient.provision.runner import Runner, run_here
 
 if TYPE_CHECKING:
     from paramclient.cache import CachedComponent, ParamCache
@@ -105,7 +105,6 @@ async def collect_set(
     *,
     source: str,
     timeout: float | None = None,
-    run: Runner = run_here,
 ) -> FetchedSet:
     """Return the parameters of a fetched table as a set.
 
@@ -118,26 +117,19 @@ async def collect_set(
         source: the origin of the set, in words.
         timeout: seconds to wait for the values that no hash covers, at most `REFRESH_TIMEOUT`; values that
             were not received by then are missing.
-        run: runs the computations that take long for a large table.
 
     Raises:
         LinkError: the link failed.
     """
-    table = copy_params(component.params)
-    to_set = set_maker(component, source)
-
-    def make_set() -> FetchedSet:
-        params = list(table.values())
-        known = [param for param in params if param.trust is not Trust.CACHED]
-        stale = {
-            param.index: param.name
-            for param in params
-            if param.trust is Trust.CACHED and param.index is not None
-        }
-        missing = [stale.get(index, f"index {index}") for index in sorted({*result.missing, *stale})]
-        return FetchedSet(to_set(known), known, missing)
-
-    return await run(make_set)
+    with suppress(NoReply):  # values that were not read again are reported as missing below
+        await component.refreshed(timeout=min(REFRESH_TIMEOUT, math.inf if timeout is None else timeout))
+    params = list(component.params.values())
+    known = [param for param in params if param.trust is not Trust.CACHED]
+    stale = {
+        param.index: param.name for param in params if param.trust is Trust.CACHED and param.index is not None
+    }
+    missing = [stale.get(index, f"index {index}") for index in sorted({*result.missing, *stale})]
+    return FetchedSet(set_maker(component, source)(known), known, missing)
 
 
 async def fetch_set(
@@ -146,12 +138,11 @@ async def fetch_set(
     source: str,
     timeout: float | None = None,
     progress: Callable[[Progress], None] | None = None,
-    run: Runner = run_here,
 ) -> FetchedSet:
     """Fetch all parameters of a component and return them as a set.
 
     Args:
-        component, source, run: as in `collect_set`.
+        component, source: as in `collect_set`.
         timeout, progress: as in `Component.fetch_all`.
 
     Raises:
@@ -159,7 +150,7 @@ async def fetch_set(
         ParamClientError: as from `Component.fetch_all`.
     """
     result = await component.fetch_all(timeout=timeout, progress=progress)
-    found = await collect_set(component, result, source=source, run=run)
+    found = await collect_set(component, result, source=source)
     if found.missing:
         raise incomplete_error(component, found.missing)
     return found

@@ -1,27 +1,26 @@
-"""The cache service: one process holds the links, and everyone on the network uses them over HTTP.
+"""The service: links and cache of this computer over HTTP, with a web page. Needs the extra `service`.
 
-Needs the extra `service`.
-
-- `app`, `server`, `routes`: the application, the server, the routes.
-- `hub`, `link`, `followed_component`, `followed_extended`: links and cache, one link, one component, its
-  extended parameters.
-- `event_feed`, `jobs`: numbered events, jobs. The members of events are built by `followed_component`,
-  `followed_extended`, `link` and `jobs`.
-- `access`, `request`, `tokens`, `client_address`, `tls`: access checks of every request.
-- `acceptor`, `connection_slots`, `connections`: connections before TLS, their number, their limits.
-- `quota`, `body_limits`, `body_memory`, `log_limit`: limits of requests in progress, request bodies and log
-  lines.
-- `garbage_collection`: when full garbage collections of a serving process run, and what they skip.
-- `request_body`, `param_sources`, `route_context`, `responses`, `problems`, `metrics`: request bodies,
-  parameter sets named in requests, shared parts of routes, responses, errors, Prometheus.
+- `access`: checks of each request: token and role, origin, headers of responses.
+- `app`: the FastAPI application: middleware, routes, the page.
+- `documents`: JSON of vehicles, parameters and results.
+- `event_feed`: events for any number of listeners, with resume.
+- `extended`: extended parameters behind the routes of plain ones.
+- `hub`: opens the links, follows their components, and reads the cache.
+- `metrics`: metrics for Prometheus.
+- `problems`: errors as problem documents (RFC 9457).
+- `request_bodies`: models of request bodies.
+- `routes`: vehicles, parameters, fetches, events, health; `setup_routes`: files, plan, apply, restore,
+  snapshots, history.
+- `server`: uvicorn with its limits and TLS, start and shutdown.
+- `targets`: the links, and the components on them.
+- `tokens`: the token file.
 """
 
 from __future__ import annotations
 
-from paramclient.service.access import AccessSettings
-from paramclient.service.app import Settings, create_app
+from paramclient.service.app import create_app
 from paramclient.service.hub import Hub
 from paramclient.service.server import Listening, serve
-from paramclient.service.tokens import Tokens, tokens_from
+from paramclient.service.tokens import Tokens, add_token
 
-__all__ = ["AccessSettings", "Hub", "Listening", "Settings", "Tokens", "create_app", "serve", "tokens_from"]
+__all__ = ["Hub", "Listening", "Tokens", "add_token", "create_app", "serve"]

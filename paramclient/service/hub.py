@@ -1,61 +1,45 @@
-"""The hub: links and cache of the service, and the components on them."""
+"""The hub: the links of the service, the components on them, and the cache."""
 
 from __future__ import annotations
 
 import logging
-import math
 import os
 import time
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from functools import partial
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
 import anyio
 import anyio.abc
-import anyio.lowlevel
+import anyio.to_thread
 
-from paramclient.client.arguments import address_in_words
-from paramclient.client.cache_writer import choose_cache
+from paramclient.cache import ParamCache
 from paramclient.client.client import ParamClient
-from paramclient.client.worker_thread import Worker
-from paramclient.documents.component import ProgressDoc
-from paramclient.documents.extended_results import ExtFetchResultDoc
-from paramclient.documents.results import FetchResultDoc
-from paramclient.errors import NoReply, ParamClientError, UsageError
+from paramclient.client.events import Discovered, Event, Found, Rebooted, Resynced, Uncontested
+from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.links import Link, create_link
-from paramclient.metadata.metadata_cache import MetadataStore
-from paramclient.protocol.selection import LOOK_TIME, hint_of_link, only_vehicle
+from paramclient.metadata import Metadata, MetadataStore, metadata_of
+from paramclient.protocol.events import Change
+from paramclient.protocol.fetch import FetchResult, Progress
+from paramclient.service import documents
 from paramclient.service.event_feed import EventFeed
-from paramclient.service.followed_component import FollowedComponent
-from paramclient.service.jobs import Job, Jobs
-from paramclient.service.link import ServiceLink
 from paramclient.service.problems import ServiceError
-from paramclient.service.quota import (
-    LONG_REQUESTS_MAX,
-    LONG_REQUESTS_OF_HOLDER_MAX,
-    WAITING_REQUESTS_MAX,
-    WAITING_REQUESTS_OF_HOLDER_MAX,
-    Quota,
-)
+from paramclient.service.targets import ServiceLink, Target
 
 if TYPE_CHECKING:
-    from paramclient.cache import ParamCache
     from paramclient.sim import Endpoint
 
 __all__ = ["Hub"]
 
-SERVICE_AUTHOR: Final = "service"
-"""Author of fetches that the service starts itself."""
-FILE_WORK_TIMEOUT: Final = 1.0
-"""Timeout in seconds for running work of the threads for files and responses at shutdown. Queued work is
-dropped."""
-CLOSING_LOCK_WAIT: Final = 1.5
-"""Timeout in seconds for locks of other processes on the cache at shutdown, in all: with `FILE_WORK_TIMEOUT`,
-the service ends within 3 s."""
+CHECK_INTERVAL: Final = 0.2
+"""Seconds between two checks for changes of states, and between two progress events."""
+REOPEN_DELAYS: Final = (0.25, 0.5, 1.0, 2.0, 5.0)
+"""Seconds before each attempt to reopen a failed link; the last one repeats."""
 
 Result = TypeVar("Result")
+LinkChoice: TypeAlias = "str | Link | Endpoint"
 
 logger = logging.getLogger(__name__)
 
@@ -64,26 +48,19 @@ class Hub:
     """All links with one cache, as an async context manager.
 
     A link does not have to exist at the start: it is opened as soon as possible, and again after a failure.
-    At the end, waiting calls get ClientClosed, and the cache is written.
 
     Args:
-        links: links by name, object or simulated vehicle, as for `ParamClient`; or pairs of a name and a
-            function that creates a client.
+        links: links by name, object or simulated vehicle, as for `ParamClient`.
         cache: as for `ParamClient`; shared by all links.
-        fetches: whether the table of every new component is fetched automatically, and its descriptions where
-            the link is quick.
-        options: options of each `ParamClient`: `system`, `component`, `signing`, `listen_only`, …
+        fetches: whether the table of every component is fetched when it is heard.
+        options: options of each `ParamClient`.
 
     Attributes:
         cache: the cache, or None.
         feed: the event feed.
-        jobs: fetches and set-ups.
         links: the links, by name.
-        metadata_store: the metadata files beside the cache, used in the thread for files; None without a
-            cache.
-        long_requests: quota of long requests.
-        waiting_requests: quotas of requests that wait for a vehicle, the cache or a comparison, by whether
-            the client may write: no number of readers can keep a writer out.
+        metadata_store: the metadata files beside the cache; None without a cache.
+        started: `time.monotonic()` of the start.
 
     Raises:
         UsageError: a link or option is invalid, or two links have one name.
@@ -91,387 +68,245 @@ class Hub:
 
     def __init__(
         self,
-        links: Iterable[str | Link | Endpoint | tuple[str, Callable[[], ParamClient]]],
+        links: Iterable[LinkChoice],
         *,
         cache: ParamCache | str | os.PathLike[str] | bool | None = None,
         fetches: bool = True,
         **options: Any,
     ) -> None:
-        self.cache = choose_cache(cache, is_log=False)
-        self.feed = EventFeed()
-        self.jobs = Jobs(self.feed)
-        self.links: dict[str, ServiceLink] = {}
+        self.cache = _open_cache(cache)
         self._owns_cache = self.cache is not cache
         self._fetches = fetches
-        self._began = time.monotonic()
-        self._options = options
-        self._worker = Worker("paramclient service")
-        self._reader = Worker("paramclient files")
-        self._encoder = Worker("paramclient responses")
-        self.long_requests = Quota(
-            "long requests", total_max=LONG_REQUESTS_MAX, holder_max=LONG_REQUESTS_OF_HOLDER_MAX
-        )
-        self.waiting_requests = {
-            may_write: Quota(
-                "waiting requests",
-                total_max=WAITING_REQUESTS_MAX,
-                holder_max=WAITING_REQUESTS_OF_HOLDER_MAX,
-                is_fair=True,
-            )
-            for may_write in (False, True)
-        }
-        self._closing = anyio.Event()
+        self.feed = EventFeed()
         self.metadata_store = None if self.cache is None else MetadataStore.beside(self.cache.path)
+        self.started = time.monotonic()
+        self.links: dict[str, ServiceLink] = {}
         self._tasks: anyio.abc.TaskGroup | None = None
-        self._link_tasks: anyio.abc.TaskGroup | None = None
+        self._cache_thread = anyio.CapacityLimiter(1)
         for link in links:
-            self._add(link)
-
-    def __repr__(self) -> str:
-        return f"<Hub {', '.join(map(repr, self.links.values())) or 'without links'}>"
-
-    @property
-    def followed(self) -> list[FollowedComponent]:
-        """Return all components, link by link."""
-        return [followed for each in self.links.values() for followed in each.followed.values()]
-
-    @property
-    def is_busy(self) -> bool:
-        """Return whether a request waits or is worked on for long, or a job runs."""
-        quotas = (self.long_requests, *self.waiting_requests.values())
-        return any(map(len, quotas)) or any(job.state == "running" for job in self.jobs.all)
-
-    @property
-    def uptime(self) -> float:
-        """Return the seconds since its creation."""
-        return time.monotonic() - self._began
-
-    @property
-    def is_closing(self) -> bool:
-        """Return whether the service ends."""
-        return self._closing.is_set()
+            name = create_link(link).name
+            if name in self.links:
+                raise UsageError(f"the link {name} is given twice")
+            is_log = isinstance(link, str) and link.startswith("replay:")
+            make = partial(ParamClient, link, cache=False if is_log else self.cache or False, **options)
+            make()  # an invalid option raises here
+            self.links[name] = ServiceLink(name, make)
 
     async def __aenter__(self) -> Hub:
-        tasks = self._tasks = anyio.create_task_group()
-        await tasks.__aenter__()
-        self.jobs.open(tasks)
-        tasks.start_soon(self.feed.wake_listeners, name="paramclient feed")
-        link_tasks = self._link_tasks = anyio.create_task_group()
-        await link_tasks.__aenter__()
-        for each in self.links.values():
-            link_tasks.start_soon(each.run, name=f"paramclient link {each.name}")
+        self._tasks = await anyio.create_task_group().__aenter__()
+        for link in self.links.values():
+            self._tasks.start_soon(self._run_link, link)
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        tasks, link_tasks = self._tasks, self._link_tasks
-        assert tasks is not None
-        assert link_tasks is not None
+        tasks = self._tasks
+        assert tasks is not None, "the hub is open"
+        self._tasks = None
         self.feed.end()
-        self._closing.set()
-        self._reader.drop(_closing)
-        self._encoder.drop(_closing)
-        try:
-            link_tasks.cancel_scope.cancel()
-            await link_tasks.__aexit__(None, None, None)
-            await anyio.lowlevel.checkpoint()  # calls that wait for a client now raise ClientClosed
-        finally:
-            tasks.cancel_scope.cancel()
-            await tasks.__aexit__(None, None, None)
-            close = self.cache.close if self._owns_cache and self.cache is not None else _nothing
+        tasks.cancel_scope.cancel()
+        await tasks.__aexit__(None, None, None)
+        if self.cache is not None and self._owns_cache:
             with anyio.CancelScope(shield=True):
-                await self._worker.close(close)
-                await self._reader.abandon(_closing, FILE_WORK_TIMEOUT)
-                await self._encoder.abandon(_closing, FILE_WORK_TIMEOUT)
+                await anyio.to_thread.run_sync(self.cache.close)
 
-    async def run_in_thread(self, work: Callable[[], Result]) -> Result:
-        """Run blocking work in a thread, such as an access to the cache. It is not interrupted by
-        cancellation.
+    @property
+    def targets(self) -> list[Target]:
+        """All components, the lowest ids first."""
+        found = [target for link in self.links.values() for target in link.targets.values()]
+        return sorted(found, key=lambda each: (each.component.system, each.component.component))
 
-        Raises:
-            ServiceError: the service ends.
-        """
-        self._check_open()
-        return await self._worker.run(work)
-
-    async def run_in_file_thread(self, work: Callable[[], Result]) -> Result:
-        """Run work on received data in a thread of its own: parsing or comparing can take seconds, and must
-        not delay accesses to the cache. `long_requests` limits the waiting work.
-
-        Raises:
-            ServiceError: the service ends.
-        """
-        self._check_open()
-        return await self._reader.run(work)
-
-    async def encode_in_thread(self, work: Callable[[], Result]) -> Result:
-        """Encode a response in a thread of its own, which neither a locked cache nor a comparison delays.
-
-        Raises:
-            ServiceError: the service ends.
-        """
-        self._check_open()
-        return await self._encoder.run(work)
-
-    def find_component(self, system: int, component: int, link: str | None = None) -> FollowedComponent:
+    def target(self, system: int, component: int, link: str | None = None) -> Target:
         """Return the component with this address.
 
         Raises:
             ServiceError: the component is unknown, or on several links and none is given.
         """
         found = [
-            followed
+            target
             for each in self.links.values()
-            if link in (None, each.name) and (followed := each.followed.get((system, component))) is not None
+            if link in (None, each.name) and (target := each.targets.get((system, component))) is not None
         ]
         if not found:
             on = "any link" if link is None else link
-            raise ServiceError(
-                404, "unknown-component", f"No heartbeat of {system}/{component} was received on {on}."
-            )
+            detail = f"No message of {system}/{component} was received on {on}."
+            raise ServiceError(404, "unknown-vehicle", detail)
         if len(found) > 1:
-            names = [followed.link.name for followed in found]
-            what = f"{system}/{component} is on {' and '.join(names)}. Choose one with ?link=NAME."
-            raise ServiceError(409, "ambiguous", what, links=names)
+            names = [each.link.name for each in found]
+            detail = f"{system}/{component} is on {' and '.join(names)}. Choose one with ?link=NAME."
+            raise ServiceError(409, "ambiguous", detail, links=names)
         return found[0]
 
-    def clients(self, link: str | None = None) -> list[tuple[ServiceLink, ParamClient]]:
-        """Return the open links with their clients.
+    async def fetch(
+        self, target: Target, *, refresh: bool = False, timeout: float | None = None
+    ) -> FetchResult:
+        """Fetch the table of a component; see `Component.fetch_all`. The progress is published."""
 
-        Args:
-            link: name of the only link, or None for all.
+        def note(progress: Progress) -> None:
+            target.progress = progress
 
-        Raises:
-            ServiceError: the link does not exist.
-        """
-        self._check_link(link)
-        chosen = [each for each in self.links.values() if link in (None, each.name)]
-        return [(each, each.client) for each in chosen if each.client is not None]
+        try:
+            result = await target.component.fetch_all(refresh=refresh, timeout=timeout, progress=note)
+        finally:
+            target.progress = None
+            target.fetches += 1
+            self._check(target)
+        await self._load_known_metadata(target)
+        return result
 
-    def start_fetch(
-        self, followed: FollowedComponent, requested_by: str, holder: str = "", **options: Any
-    ) -> Job:
-        """Start a job that fetches a component's table; the options are those of `Component.fetch_all`.
-
-        Simultaneous jobs share one download. Cancelling one does not affect the others.
-
-        Raises:
-            ServiceError: too many jobs are running, of this holder or in total.
-        """
-        return self.jobs.start("fetch", followed, partial(_fetch, options), requested_by, holder)
-
-    def start_extended_fetch(
-        self,
-        followed: FollowedComponent,
-        requested_by: str,
-        holder: str = "",
-        *,
-        timeout: float | None = None,
-    ) -> Job:
-        """Start a job that downloads a component's extended parameters; see `ExtParams.fetch_all`.
-
-        Simultaneous jobs share one download. Cancelling one does not affect the others.
+    async def load_metadata(self, target: Target, *, timeout: float | None = None) -> Metadata:
+        """Load the metadata of a component from the vehicle; see `metadata_of`.
 
         Raises:
-            ServiceError: too many jobs are running, of this holder or in total.
+            ServiceError: 404, the vehicle provides none.
         """
-        work = partial(_fetch_extended, timeout)
-        return self.jobs.start("extended-fetch", followed, work, requested_by, holder)
+        identity = target.component.identity
+        found = await metadata_of(target.component, store=self.metadata_store or False, timeout=timeout)
+        if found is None:
+            detail = "The vehicle provides no metadata. Add a file of its firmware: paramclient metadata add."
+            raise ServiceError(404, "no-metadata", detail)
+        target.metadata, target.described = found, identity
+        self._check(target)
+        return found
 
-    async def wait_for_component(
-        self, system: int | None, component: int | None, link: str | None, timeout: float | None
-    ) -> FollowedComponent:
-        """Wait for the component with this address on any link; see `ParamClient.component`.
-
-        Includes links that are not open yet.
+    async def read_cache(self, work: Callable[[ParamCache], Result]) -> Result:
+        """Run a function of the cache in a thread.
 
         Raises:
-            ServiceError: the link does not exist, or the service ends.
-            NoReply: the component was not heard before the timeout.
+            ServiceError: the service has no cache, or ends.
+            ParamClientError: the cache cannot be read, or does not have what is requested.
         """
-        self._check_link(link)
-        chosen = [each for each in self.links.values() if link in (None, each.name)]
-        found: list[FollowedComponent] = []
-        is_ending = False
-        began = anyio.current_time()
-        with anyio.move_on_after(timeout):
-            async with anyio.create_task_group() as tasks:
+        cache = self.cache
+        if cache is None:
+            detail = "The service runs without a cache and has no earlier states."
+            raise ServiceError(409, "no-cache", detail)
+        if self._tasks is None:
+            raise ServiceError(503, "closing", "The service is shutting down.")
+        return await anyio.to_thread.run_sync(partial(work, cache), limiter=self._cache_thread)
 
-                async def look(each: ServiceLink) -> None:
-                    found.append(await each.wait_for(system, component))
-                    tasks.cancel_scope.cancel()
+    async def _run_link(self, link: ServiceLink) -> None:
+        """Keep a link open until cancelled."""
+        attempts = 0
+        while True:
+            try:
+                async with link.make() as client, anyio.create_task_group() as tasks:
+                    link.client, attempts = client, 0
+                    self._set_state(link, "open")
+                    tasks.start_soon(self._check_regularly, link)
+                    await self._follow(link, client, tasks)
+            except* (LinkError, UsageError) as group:  # UsageError: a missing library
+                self._set_state(link, "failed", str(_first(group)))
+            finally:
+                link.client = None
+                for target in list(link.targets.values()):
+                    self._forget(target)
+            await anyio.sleep(REOPEN_DELAYS[min(attempts, len(REOPEN_DELAYS) - 1)])
+            attempts += 1
 
-                for each in chosen:
-                    tasks.start_soon(look, each)
-                await self._closing.wait()
-                is_ending = True
-                tasks.cancel_scope.cancel()
-        if is_ending:
-            self._check_open()
-        if not found:
-            reasons = [f"; {each.error}" for each in chosen if each.state == "failed" and each.error]
-            awaited = address_in_words(system, component) + "".join(reasons)
-            hint = "" if reasons else _silence_of(chosen)
-            raise NoReply(awaited, attempts=0, waited=anyio.current_time() - began, hint=hint)
-        return found[0]
+    async def _follow(self, link: ServiceLink, client: ParamClient, tasks: anyio.abc.TaskGroup) -> None:
+        """Follow the components of a link until it fails. At the end of a log, its components stay."""
+        events = client.events()
+        for component in client.components.values():
+            self._take(link, Discovered(component), tasks)
+        async for event in events:
+            self._take(link, event, tasks)
+        self._set_state(link, "ended")
+        await anyio.sleep_forever()
 
-    async def wait_for_only_component(
-        self, system: int | None, component: int | None, link: str | None, timeout: float | None
-    ) -> FollowedComponent:
-        """Wait for the component with this address if no other vehicle on the links matches.
+    def _take(self, link: ServiceLink, event: Event, tasks: anyio.abc.TaskGroup) -> None:
+        """Handle an event of a client."""
+        component = event.component
+        target = link.targets.get((component.system, component.component))
+        if target is None or target.component is not component:
+            target = link.targets[component.system, component.component] = Target(link, component)
+            tasks.start_soon(self._publish_changes, target)
+            tasks.start_soon(self._publish_extended_changes, target)
+        if isinstance(event, Resynced):
+            target.fetches += 1
+        self._check(target)
+        listens_only = link.client is not None and link.client.listens_only
+        if isinstance(event, Discovered | Found | Rebooted | Uncontested) and not listens_only:
+            tasks.start_soon(self._load, target)
 
-        See `ParamClient.only_component`. Links that are not open are ignored.
-
-        Raises:
-            ServiceError: the link does not exist, or the service ends.
-            AmbiguousVehicle: several vehicles match.
-            NoReply: the component was not heard before the timeout.
-        """
-        self._check_link(link)
-        chosen = [each for each in self.links.values() if link in (None, each.name)]
-        choice = only_vehicle(system, component, spans_links=len(chosen) > 1)
-        began = anyio.current_time()
-        with anyio.move_on_after(timeout):
-            while True:
-                self._check_open()
-                now = anyio.current_time()
-                clients = [(each, each.client.core) for each in chosen if each.client is not None]
-                events = [each.changed for each in chosen] + [
-                    client.link_task.activity for _, client in clients
-                ]
-                machines = {
-                    machine: each
-                    for each, client in clients
-                    for machine in client.station.components.values()
-                }
-                since = max((client.station.listening_since for _, client in clients), default=math.inf)
-                machine = choice.look(machines, now, listening_since=since)
-                followed = None
-                if machine is not None:
-                    followed = machines[machine].followed.get((machine.system, machine.component))
-                if followed is not None:
-                    await followed.component.core.wait_for_cache()
-                    return followed
-                with ExitStack() as looking:
-                    for _, client in clients:
-                        looking.enter_context(client.station.looking_for_others())
-                    with anyio.move_on_after(None if choice.due == math.inf else choice.due - now):
-                        await _wait_for_any([*events, self._closing])
-                for _, client in clients:
-                    await client.link_task.wait_for_reader(choice.due)
-        awaited, hint = address_in_words(system, component), _silence_of(chosen)
-        if choice.due < math.inf:
-            awaited, hint = f"{awaited}, then {LOOK_TIME} s without another vehicle", ""
-        raise NoReply(awaited, attempts=0, waited=anyio.current_time() - began, hint=hint)
-
-    def _check_open(self) -> None:
-        if self._closing.is_set():
-            raise _closing()
-
-    def _add(self, link: str | Link | Endpoint | tuple[str, Callable[[], ParamClient]]) -> None:
-        if isinstance(link, tuple):
-            name, make = link
-        else:
-            name = create_link(link).name
-            make = partial(self._client, link)
-            make()  # invalid options raise an error here
-        if name in self.links:
-            raise UsageError(f"the link {name} is given twice")
-        self.links[name] = ServiceLink(name, make, self.feed, self._on_found)
-
-    def _check_link(self, link: str | None) -> None:
-        if link is not None and link not in self.links:
-            raise ServiceError(
-                404,
-                "unknown-link",
-                f"The service has no link {link!r}. Its links: {', '.join(self.links)}.",
-                links=list(self.links),
-            )
-
-    def _client(self, link: str | Link | Endpoint) -> ParamClient:
-        cache = False if self.cache is None or _is_log(link) else self.cache
-        return ParamClient(link, cache=cache, **self._options)
-
-    def _on_found(self, followed: FollowedComponent) -> None:
-        """Handle a component that is new, found again, or restarted."""
-        assert self._tasks is not None, "the hub is open"
-        self._tasks.start_soon(self._load_component, followed)
-
-    async def _load_component(self, followed: FollowedComponent) -> None:
-        """Load cached data of a component, then fetch its table."""
-        client = followed.component.core.client
-        with suppress(ParamClientError, ServiceError):
-            await followed.component.core.wait_for_cache()
-            await self._load_cached(followed)
-        machine = followed.component.core.machine
-        is_due = (
-            machine.identification.has_parameters
-            and machine.fetch is None
-            and machine.sync_state == "unsynced"
-        )
-        if self._fetches and is_due and not client.station.listens_only:
-            with suppress(ServiceError):  # the maximum number of jobs is running
-                self.start_fetch(followed, SERVICE_AUTHOR)
-
-    async def _load_cached(self, followed: FollowedComponent) -> None:
-        """Load the times of cached values and the descriptions of the parameters."""
-        cache, key = self.cache, followed.key
-        if cache is None or key is None:
+    async def _load(self, target: Target) -> None:
+        """Fetch the table of a component that was heard."""
+        if not self._fetches:
             return
-        component = followed.component
-        cached = await self.run_in_thread(lambda: cache.load(key, component.component))
-        if cached is not None:
-            followed.add_cached_times(cached.heard_at.items())
-        store, identity = self.metadata_store, component.identity
-        if store is None:
+        with suppress(ParamClientError):
+            await self.fetch(target)
+            await target.component.refreshed()
+            target.fetches += 1
+
+    async def _load_known_metadata(self, target: Target) -> None:
+        """Load the metadata of the firmware of a component that this computer has, if any."""
+        identity, store = target.component.identity, self.metadata_store
+        if store is None or target.described == identity:
             return
-        known = await self.run_in_file_thread(partial(store.known, identity, component.component))
-        if known is not None and followed.metadata is None:
-            followed.describe(known, identity)
+        component = target.component.component
+        target.metadata = await anyio.to_thread.run_sync(store.known, identity, component)
+        target.described = identity
+
+    async def _publish_changes(self, target: Target) -> None:
+        """Publish the changes of a table, until the client has removed the component or is closed.
+
+        First values are not published: a fetch has thousands, and its end is published.
+        """
+        with suppress(ParamClientError):
+            async for change in target.component.changes():
+                if isinstance(change, Added) or not isinstance(change, FirstValue):
+                    members = documents.change(change, target.metadata)
+                    self.feed.publish("change", **target.address, **members)
+            return  # the end of a log
+        self._forget(target)
+
+    async def _publish_extended_changes(self, target: Target) -> None:
+        """Publish the changes of extended parameters."""
+        with suppress(ParamClientError):
+            async for change in target.component.ext.changes():
+                if change.old is not None or change.is_added:
+                    members = documents.ext_change(change)
+                    self.feed.publish("extended_change", **target.address, **members)
+
+    async def _check_regularly(self, link: ServiceLink) -> None:
+        while True:
+            await anyio.sleep(CHECK_INTERVAL)
+            for target in list(link.targets.values()):
+                self._check(target)
+
+    def _check(self, target: Target) -> None:
+        """Publish the state of a component if it has changed, or the progress of its fetch."""
+        if target.progress is not None:
+            self.feed.publish("progress", **target.address, **documents.progress(target.progress))
+        state = documents.vehicle_state(target)
+        if state != target.published:
+            target.published = state
+            self.feed.publish("vehicle", **target.address, vehicle=documents.vehicle(target))
+
+    def _forget(self, target: Target) -> None:
+        component, targets = target.component, target.link.targets
+        if targets.get((component.system, component.component)) is target:
+            del targets[component.system, component.component]
+            self.feed.publish("vehicle", **target.address, vehicle=None)
+
+    def _set_state(self, link: ServiceLink, state: str, error: str | None = None) -> None:
+        if (state, error) == (link.state, link.error):
+            return
+        level = logging.WARNING if state == "failed" and link.state != "failed" else logging.INFO
+        logger.log(level, "%s: %s%s", link.name, state, "" if error is None else f": {error}")
+        link.state, link.error = state, error
+        self.feed.publish("link", link=link.name, state=state, error=error)
 
 
-async def _wait_for_any(events: Iterable[anyio.Event]) -> None:
-    """Wait until one of the events is set."""
-    async with anyio.create_task_group() as tasks:
-
-        async def wait(event: anyio.Event) -> None:
-            await event.wait()
-            tasks.cancel_scope.cancel()
-
-        for event in events:
-            tasks.start_soon(wait, event)
+def _open_cache(cache: ParamCache | str | os.PathLike[str] | bool | None) -> ParamCache | None:
+    if isinstance(cache, ParamCache):
+        return cache
+    if cache is False:
+        return None
+    return ParamCache(None if cache is None or cache is True else cache)
 
 
-async def _fetch(options: dict[str, Any], job: Job) -> FetchResultDoc:
-    def note(progress: Any) -> None:
-        job.progress = ProgressDoc.of(progress)
-
-    result = await job.followed.component.fetch_all(progress=note, **options)
-    return FetchResultDoc.of(result, link=job.followed.link.name)
-
-
-async def _fetch_extended(timeout: float | None, job: Job) -> ExtFetchResultDoc:
-    def note(progress: Any) -> None:
-        job.progress = ProgressDoc.of(progress)
-
-    result = await job.followed.extended.ext.fetch_all(timeout=timeout, progress=note)
-    return ExtFetchResultDoc.of(result, link=job.followed.link.name)
-
-
-def _is_log(link: object) -> bool:
-    return isinstance(link, str) and link.lower().startswith("replay:")
-
-
-def _silence_of(links: Iterable[ServiceLink]) -> str:
-    """Return in sentences what was received on links instead of an awaited component."""
-    clients = [(each.name, each.client.core) for each in links if each.client is not None]
-    return " ".join(hint_of_link(client.station, name) for name, client in clients)
-
-
-def _closing() -> ServiceError:
-    return ServiceError(503, "closing", "The service is shutting down.")
-
-
-def _nothing() -> None:
-    return
+def _first(group: BaseExceptionGroup[BaseException]) -> BaseException:
+    """Return the first error of a group."""
+    error = group.exceptions[0]
+    return _first(error) if isinstance(error, BaseExceptionGroup) else error

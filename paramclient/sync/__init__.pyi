@@ -40,7 +40,6 @@ from paramclient.protocol.wire import SigningKey, SigningReport
 from paramclient.provision.extended import ExtApplyResult, ExtPlan
 from paramclient.provision.planning import ParamInfo, Plan
 from paramclient.provision.results import ApplyProgress, ApplyResult, FleetApplied, FleetVerified
-from paramclient.provision.runner import Runner, run_here
 from paramclient.sim import Endpoint
 
 __all__ = [
@@ -413,7 +412,6 @@ def prepare(
     info: Mapping[str, ParamInfo] | None = None,
     force: bool = False,
     renames: Renames | None = None,
-    run: Runner = run_here,
 ) -> Plan:
     """Return the plan of what `apply` would send to a vehicle, and in which order. Only reads."""
 

@@ -10,7 +10,8 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from concurrent import futures
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
+from contextvars import Context
 from dataclasses import replace
 from functools import partial, wraps
 from queue import Empty, SimpleQueue
@@ -18,7 +19,7 @@ from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
 
 import anyio
-from anyio.from_thread import BlockingPortal, start_blocking_portal
+from anyio.from_thread import BlockingPortal
 
 import paramclient.client.client as asynchronous
 from paramclient.client import component, events, files, streams
@@ -50,16 +51,15 @@ class _Session:
     """
 
     def __init__(self, make: Callable[[], asynchronous.ParamClient]) -> None:
-        context = start_blocking_portal(name=THREAD_NAME)
-        self._portal = context.__enter__()
+        self._portal, self._thread = _start_event_loop()
         try:
             self.client = self._portal.call(make)
         except BaseException:
-            context.__exit__(None, None, None)
+            self._portal.call(self._portal.stop)
             raise
         self.proxies: weakref.WeakValueDictionary[object, Proxy] = weakref.WeakValueDictionary()
         self._process = os.getpid()
-        self._end = weakref.finalize(self, _end_in_background, context, self._portal, self.client)
+        self._end = weakref.finalize(self, _end_in_background, self._portal, self.client)
         self._end.atexit = False  # `_close_all` waits for the end
         _sessions.add(self)
 
@@ -69,9 +69,9 @@ class _Session:
             with suppress(ClientClosed):
                 self.run(self.client.aclose)
         finally:
-            if (found := self._end.detach()) is not None:
-                context: AbstractContextManager[BlockingPortal] = found[2][0]
-                context.__exit__(None, None, None)
+            if self._end.detach() is not None:
+                self._portal.call(self._portal.stop)
+                self._thread.join()
 
     def run(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """Call a function in the event loop, and await what it returns. Return the result as a proxy.
@@ -192,6 +192,8 @@ class _Session:
 
 
 _sessions: weakref.WeakSet[_Session] = weakref.WeakSet()
+_ending: set[threading.Thread] = set()
+"""The threads that close clients whose last reference was dropped."""
 
 
 class Proxy:
@@ -378,17 +380,40 @@ def _next(calls: SimpleQueue[Callable[[], object] | None]) -> Callable[[], objec
             return calls.get(timeout=WAIT_INTERVAL)
 
 
-def _end_in_background(
-    context: AbstractContextManager[BlockingPortal], portal: BlockingPortal, client: asynchronous.ParamClient
-) -> None:
+def _start_event_loop() -> tuple[BlockingPortal, threading.Thread]:
+    """Start an event loop in a thread of its own."""
+    started: futures.Future[BlockingPortal] = futures.Future()
+
+    async def serve() -> None:
+        async with BlockingPortal() as portal:
+            started.set_result(portal)
+            await portal.sleep_until_stopped()
+
+    def run() -> None:
+        try:
+            anyio.run(serve)
+        except BaseException as error:
+            if not started.done():
+                started.set_exception(error)
+
+    # without the context of the caller, which may run in another event loop
+    thread = threading.Thread(target=Context().run, args=(run,), name=THREAD_NAME, daemon=True)
+    thread.start()
+    return started.result(), thread
+
+
+def _end_in_background(portal: BlockingPortal, client: asynchronous.ParamClient) -> None:
     """Close a client whose last reference was dropped. The garbage collector may call this in any thread."""
 
     def end() -> None:
         with suppress(Exception):
             portal.call(client.aclose)
-        context.__exit__(None, None, None)
+        portal.call(portal.stop)
+        _ending.discard(thread)
 
-    threading.Thread(target=end, name=THREAD_NAME, daemon=True).start()
+    thread = threading.Thread(target=end, name=THREAD_NAME, daemon=True)
+    _ending.add(thread)
+    thread.start()
 
 
 @atexit.register
@@ -399,3 +424,5 @@ def _close_all() -> None:
         with suppress(ClientClosed, UsageError):
             closing.append(session.start(session.client.aclose))
     futures.wait(closing, EXIT_TIMEOUT)
+    for thread in list(_ending):
+        thread.join(EXIT_TIMEOUT)

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from paramclient.cache import ParamCache
+from paramclient.cache.schema import SCHEMA_VERSION
 from tests.postgres import GIVEN, PROGRAMS, WHY_NONE, database_on, server
 
 Open = Callable[[], ParamCache]
@@ -17,14 +18,12 @@ Open = Callable[[], ParamCache]
 
 @pytest.fixture(scope="session")
 def postgres_url() -> Iterator[str]:
-    """The URL of a PostgreSQL server."""
-    if GIVEN is not None:
-        yield GIVEN
-    elif PROGRAMS is None:
+    """The URL of an empty PostgreSQL database."""
+    if GIVEN is None and PROGRAMS is None:
         pytest.skip(WHY_NONE)
-    else:
-        with server() as running:
-            yield running.url
+    with ExitStack() as stack:
+        url = stack.enter_context(server()).url if GIVEN is None else GIVEN
+        yield stack.enter_context(database_on(url))
 
 
 @pytest.fixture(params=["sqlite", "postgres"])
@@ -33,8 +32,12 @@ def place(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
     if request.param == "sqlite":
         yield str(tmp_path / "cache" / "parameters.sqlite3")
         return
-    with database_on(request.getfixturevalue("postgres_url")) as url:
-        yield url
+    url = request.getfixturevalue("postgres_url")
+    yield url
+    import psycopg
+
+    with psycopg.connect(url, autocommit=True) as connection:
+        connection.execute(f"DROP SCHEMA IF EXISTS paramclient_{SCHEMA_VERSION} CASCADE".encode())
 
 
 @pytest.fixture

@@ -115,7 +115,7 @@ def test_extended_parameters_are_apart(cache: ParamCache) -> None:
     assert found is not None
     assert dict(found.params) == {"P_0": text, "P_1": number}
     assert (found.count, found.complete) == (2, True)
-    assert cache.extended("1").params["P_0"].value == "café"
+    assert found.params["P_0"].value == "café"
     assert cache.ext_sizes() == {(PX4.key, 100): 2}
     assert [(each.component, each.size) for each in cache.components()] == [(100, 0)]
     other = ExtParam.of("P_0", b"tea", ExtParamType.CUSTOM, 0)

@@ -134,7 +134,7 @@ def test_messages_of_the_cache_have_local_times(
     assert command("fetch", put(PX4Vehicle(table={"A": 1}))).code == 0
     failed = command("restore", put(PX4Vehicle(table={"A": 1})), "2026-01-02 03:00", "--dry-run")
     assert failed.code == 5
-    assert "at 2026-01-02T03:00:00+05:30 is not known: what is kept of its history begins at" in failed.err
+    assert "at 2026-01-02T03:00:00+05:30 is not known: the history begins at" in failed.err
     assert re.search(r"begins at [0-9-]{10}T[0-9:]{8}\+05:30", failed.err)
 
 

@@ -1,4 +1,4 @@
-"""Two vehicles under one address of a link: the client, the cache, the service and the command."""
+"""Two vehicles under one address of a link: the client, the cache and the command."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ from paramclient.protocol import wire
 from paramclient.protocol.vehicle.presence import LOST_AFTER
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
 from tests.commands import Command, behind, in_process, leaping
-from tests.service_hub import C, met, problem, service
 from tests.shell import Late, PeersLink, in_simulated_time, outcome, until
 from tests.simulation import param_value
 
@@ -157,20 +156,6 @@ async def test_closing_in_a_contest_writes_nothing(tmp_path: Path) -> None:
             vehicle = await client.component()
             await until(lambda: vehicle.contest is not None)  # noqa: B023 - awaited at once
     assert lines(path) == []
-
-
-@in_simulated_time
-async def test_the_service_reports_the_contest_and_answers_409() -> None:
-    async with service(two()) as (_, browser):
-        await met(browser)
-        await anyio.sleep(3.0)
-        document = (await browser.get(C)).json()
-        assert document["state"] == "contested"
-        assert len(document["contest"]["claimants"]) == 2
-        assert "autopilot" in document["contest"]["difference"]
-        answer = await browser.put(f"{C}/params/SHARED_A", json={"value": 5})
-        reported = problem(answer, 409, "contested-address")
-        assert reported["claimants"] == document["contest"]["claimants"]
 
 
 def test_the_command_says_so_on_stderr(

@@ -178,6 +178,7 @@ def test_a_link_has_so_many_components_and_no_more(monkeypatch: pytest.MonkeyPat
     assert [(event.machine.system, event.machine.component) for event in forgotten] == [(3, 1)]
 
 
+@pytest.mark.slow
 def test_ten_thousand_components_cost_what_a_thousand_do() -> None:
     session = Simulation()
     beat(session)
@@ -190,6 +191,7 @@ def test_ten_thousand_components_cost_what_a_thousand_do() -> None:
     assert held < station_room.COMPONENTS_MAX * 30_000
 
 
+@pytest.mark.slow
 def test_a_flood_of_random_systems_from_random_peers_stays_within_the_page_of_the_bounds() -> None:
     session = Simulation()
     tracemalloc.start()
@@ -360,6 +362,7 @@ GROWTH_MAX = 300_000
 """Bytes by which the memory may differ between two moments of one session, without anything that stays."""
 
 
+@pytest.mark.slow
 def test_memory_is_bounded_under_all_kinds_of_lies_at_once() -> None:
     """When all that has a bound has reached it, nothing grows any more."""
     names, components = 100, 10
@@ -470,8 +473,8 @@ async def test_a_component_that_is_forgotten_ends_what_listens_to_it(monkeypatch
 
 @pytest.mark.parametrize(
     "words",
-    [("fetch",), ("watch", "--duration", "2"), ("link", "--duration", "2"), ("get",)],
-    ids=lambda each: each[0],
+    [pytest.param(("fetch",), marks=pytest.mark.slow), ("link", "--duration", "1"), ("get",)],
+    ids=str,
 )
 def test_no_escape_code_reaches_the_terminal(
     words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

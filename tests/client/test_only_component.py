@@ -1,4 +1,4 @@
-"""The call that refuses when several vehicles are there: with a link of one's own, and over a service."""
+"""The call that refuses when several vehicles are there."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from paramclient import AmbiguousVehicle, Component, LinkError, NoReply, UsageEr
 from paramclient.protocol import wire
 from paramclient.protocol.vehicle_selection import LOOK_TIME
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
-from tests.service_hub import met, problem, service
 from tests.shell import (
     FlakyLink,
     Late,
@@ -167,38 +166,3 @@ async def test_a_client_that_is_closed_says_so() -> None:
         pass
     with pytest.raises(LinkError):
         await client.only_component()
-
-
-# several links of a service
-
-
-@in_simulated_time
-async def test_the_vehicles_on_all_links_of_a_service_count() -> None:
-    other = FlakyLink(Air([copter()]))
-    async with service(px4(), other) as (hub, browser):
-        found = await met(browser)
-        assert found["system"] in (1, 2)
-        reported = problem(await browser.post("/api/v1/find", json={"only": True}), 409, "ambiguous-vehicle")
-        assert reported["vehicles"] == [
-            "1/1 PX4 quadrotor on sim:custom",
-            "2/1 ArduPilot quadrotor on tcp:flaky:5760",
-        ]
-        assert reported["choose_by"] == "system"
-        assert (await met(browser, only=True, system=2))["link"] == "tcp:flaky:5760"
-        answer = await browser.post("/api/v1/find?link=sim:custom", json={"only": True})
-        assert (answer.json()["system"], answer.json()["component"]) == (1, 1)
-        answer = await browser.post("/api/v1/find?link=nowhere", json={"only": True})
-        problem(answer, 404, "unknown-link")
-        assert len(hub.links) == 2
-
-
-@in_simulated_time
-async def test_a_link_that_cannot_be_opened_has_no_vehicle() -> None:
-    offline = FlakyLink(Air([copter()]))
-    offline.is_offline = True
-    async with service(px4(), offline) as (_, browser):
-        assert (await met(browser, only=True))["system"] == 1
-        offline.is_offline = False
-        await until(lambda: offline.openings > 1, pause=0.1)
-        await anyio.sleep(2.0)
-        problem(await browser.post("/api/v1/find", json={"only": True}), 409, "ambiguous-vehicle")

@@ -30,11 +30,10 @@ from paramclient.errors import (
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, type_name
 from paramclient.protocol.vehicle.reboot_command import SAVING_TIME
-from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, message_name
 from paramclient.provision import ApplyStatus, apply, restore
 from tests.live.choice import another_value
 from tests.live.journal import check_disarmed
-from tests.live.relay import FILE_TRANSFER_ID, LIST_REQUEST_ID, Conditions
+from tests.live.relay import Conditions
 from tests.live.session import Check, CheckFailed, Measured, Session, Skip
 
 __all__ = ["checks"]
@@ -66,8 +65,6 @@ LOSSY_FETCH: Final[Mapping[tuple[str, float], float]] = {
 LOSSY_LIST: Final[Mapping[float, float]] = {0.05: 3.5, 0.20: 6.0}
 """The same by list, of ArduPilot."""
 
-BASELINE_TIME: Final = 2.5
-"""Seconds until the clock of a vehicle that does not send it was requested; a restart may not show before."""
 NOTICING_TIME: Final = 6.0
 """Seconds after a restart in which it shows, and in which it could show a second time."""
 
@@ -81,14 +78,12 @@ def checks(*, reboots: bool) -> Iterator[Check]:
         reboots: whether the vehicle is restarted too.
     """
     yield Check("fetch, nothing known", fetch_cold, "every value right", CLEAN_FETCH)
-    yield Check("fetch again at once", fetch_again, "as quick as the first", CLEAN_FETCH)
     yield Check(
         "fetch in a new session, cached",
         fetch_warm,
         "PX4: confirmed by its hash, nothing downloaded",
         {"px4": 0.3, "ardupilot": 0.6},
     )
-    yield Check("fetch, refreshed", fetch_refreshed, "downloaded whatever is cached", CLEAN_FETCH)
     yield Check("get by name", partial(get_some, by_name=True), "the value in the table")
     yield Check("get by index", partial(get_some, by_name=False), "the value in the table")
     yield Check("get of an unknown name", get_unknown, "UnknownParameter")
@@ -107,7 +102,6 @@ def checks(*, reboots: bool) -> Iterator[Check]:
         kinds=("ardupilot", "px4"),
     )
     yield Check("set, refused", set_refused, "Refused with the reason", writes=True, kinds=("ardupilot",))
-    yield Check("set of an unknown name", set_unknown, "UnknownParameter")
     yield Check(
         "30 sets at once",
         set_many,
@@ -161,12 +155,6 @@ def checks(*, reboots: bool) -> Iterator[Check]:
             "the same vehicle is back, with the value that was set; noticed once",
             writes=True,
         )
-        yield Check(
-            "reboot by another session",
-            reboot_by_another,
-            "noticed once, and the table is right afterwards",
-            writes=True,
-        )
 
 
 def lossy_checks() -> Iterator[Check]:
@@ -188,19 +176,6 @@ def lossy_checks() -> Iterator[Check]:
             {"ardupilot": LOSSY_LIST[loss]},
             kinds=("ardupilot",),
         )
-    for number, kinds in (
-        (AUTOPILOT_VERSION_ID, None),
-        (FILE_TRANSFER_ID, ("ardupilot",)),
-        (LIST_REQUEST_ID, ("px4",)),
-    ):
-        conditions = Conditions(round_trip=0.1, loses_first=frozenset({number}))
-        yield Check(
-            f"fetch, first {message_name(number)} lost, 100 ms",
-            partial(fetch_under, conditions=conditions),
-            "one round trip more, and the same way",
-            {"ardupilot": 1.3, "px4": 1.5},
-            kinds=kinds,
-        )
     radio = Conditions(rate=RADIO_RATE, drops_telemetry=True)
     yield Check("fetch, 57600 baud", partial(fetch_under, conditions=radio), "every value right")
     worst = Conditions(loss=0.20, round_trip=0.1, seed=2)
@@ -220,28 +195,12 @@ async def fetch_cold(session: Session) -> Measured:
         return await fetch(session, vehicle)
 
 
-async def fetch_again(session: Session) -> Measured:
-    async with session.client() as vehicle:
-        await fetch(session, vehicle)
-        return await fetch(session, vehicle)
-
-
 async def fetch_warm(session: Session) -> Measured:
     cache = session.folder / "warm.sqlite3"
     async with session.client(cache=cache) as vehicle:
         await fetch(session, vehicle)
     async with session.client(cache=cache) as vehicle:
         return await fetch(session, vehicle)
-
-
-async def fetch_refreshed(session: Session) -> Measured:
-    cache = session.folder / "refreshed.sqlite3"
-    async with session.client(cache=cache) as vehicle:
-        await fetch(session, vehicle)
-        measured = await fetch(session, vehicle, refresh=True)
-    if "cache" in measured.text:
-        raise CheckFailed("nothing was downloaded")
-    return measured
 
 
 async def fetch(session: Session, vehicle: Component, *, refresh: bool = False) -> Measured:
@@ -394,12 +353,6 @@ async def set_refused(session: Session) -> Measured:
         finally:
             await put_back(session, vehicle)
     raise Skip(f"this firmware lets {name} be changed")
-
-
-async def set_unknown(session: Session) -> Measured:
-    async with session.client() as vehicle:
-        await vehicle.get(0)
-        return await expect(UnknownParameter, lambda: vehicle.set(NO_SUCH_NAME, 1))
 
 
 # Many writes
@@ -587,22 +540,6 @@ async def reboot(session: Session) -> Measured:
     if noticed != 1:
         raise CheckFailed(f"one restart was noticed {noticed} times")
     return Measured(f"back after {seconds:.1f} s, {name} is {value}")
-
-
-async def reboot_by_another(session: Session) -> Measured:
-    async with session.client_with_events() as (watching, listen), second_client(session) as other:
-        await watching.fetch_all()
-        await check_disarmed(watching)
-        events = listen()
-        await anyio.sleep(BASELINE_TIME)
-        began = time.monotonic()
-        await other.reboot()
-        back = time.monotonic() - began
-        noticed = await count_reboots(events)
-        result = await fetch(session, watching)
-    if noticed != 1:
-        raise CheckFailed(f"one restart was noticed {noticed} times")
-    return Measured(f"noticed; back after {back:.1f} s; {result.text}")
 
 
 async def count_reboots(events: Events) -> int:

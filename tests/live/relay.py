@@ -82,7 +82,6 @@ class Conditions:
             a server that has no such file, so that the table has to be downloaded by list.
         drops_telemetry: whether messages that have nothing to do with parameters are left out on the way
             down, as a vehicle sends less telemetry when it knows that its link is slow.
-        loses_first: message ids; of each, the first message in either direction is lost.
     """
 
     loss: float = 0.0
@@ -91,14 +90,12 @@ class Conditions:
     seed: int = 0
     refuses_files: bool = False
     drops_telemetry: bool = False
-    loses_first: frozenset[int] = frozenset()
 
     def __str__(self) -> str:
         parts = [
             f"{self.loss:.0%} loss" if self.loss else "",
             f"{self.round_trip * 1000:.0f} ms" if self.round_trip else "",
             f"{self.rate * 10:.0f} baud" if self.rate else "",
-            *(f"first {wire.message_name(each)} lost" for each in sorted(self.loses_first)),
         ]
         return ", ".join(filter(None, parts)) or "clean"
 
@@ -140,7 +137,6 @@ class RealVehicle:
         self.outgoing: list[bytes] = []
         self.first_request_at: float | None = None
         self._conditions = CLEAN
-        self._to_lose: set[int] = set()
         self._cutter = FrameCutter(stream=True) if is_stream else None
         self._framer = wire.Framer({FILE_TRANSFER_ID}, stream=False)
         self._incoming: list[tuple[float, bytes]] = []
@@ -150,7 +146,6 @@ class RealVehicle:
     def change(self, conditions: Conditions) -> None:
         """Put other conditions into force."""
         self._conditions = conditions
-        self._to_lose = set(conditions.loses_first)
         self.first_request_at = None
 
     def take_request(self, data: bytes, now: float) -> None:
@@ -163,13 +158,11 @@ class RealVehicle:
         for datagram in (data,) if self._cutter is None else self._cutter.cut(data, peer):
             number = _message_id(datagram)
             is_telemetry = number not in PARAMETER_TRAFFIC
-            if not (is_telemetry and self._conditions.drops_telemetry) and not self._loses(number):
+            if not (is_telemetry and self._conditions.drops_telemetry):
                 self._incoming.append((now, datagram))
 
     def receive(self, data: bytes, now: float) -> None:
         """See `Endpoint.receive`."""
-        if self._loses(_message_id(data)):
-            return
         if self._conditions.refuses_files:
             for frame in self._framer.receive(data):
                 message = wire.decode(frame)
@@ -191,13 +184,6 @@ class RealVehicle:
         due = [data for at, data in self._incoming if at <= self._now]
         del self._incoming[: len(due)]
         return due
-
-    def _loses(self, number: int | None) -> bool:
-        """Whether a message is the first of a kind whose first one is lost."""
-        if number not in self._to_lose:
-            return False
-        self._to_lose.discard(number)
-        return True
 
     def _refusal(self, message: wire.FileTransfer, frame: wire.Frame) -> bytes:
         """Encode the NAK with which a server answers that it has no such file."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable
-from dataclasses import replace
 
 import pytest
 
@@ -26,16 +25,12 @@ from paramclient.protocol.events import (
     EventMaker,
     Fetched,
     ParamChanged,
-    TableChanged,
 )
 from paramclient.protocol.params import table as table_room
 from paramclient.protocol.params.change import Change
-from paramclient.protocol.params.change_origin import DOUBT_TIME, FOREIGN_SET_MEMORY, FOREIGN_SETS_MAX
-from paramclient.protocol.params.sync import SyncSettings
+from paramclient.protocol.params.change_origin import DOUBT_TIME, FOREIGN_SET_MEMORY
 from paramclient.protocol.params.value_check import AMBIGUITY_WINDOW
-from paramclient.protocol.station import Station
 from paramclient.protocol.wire import (
-    CAPABILITY_PARAM_ENCODE_BYTEWISE,
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_PX4,
@@ -51,7 +46,7 @@ from paramclient.protocol.wire import (
     ParamValue,
     StatusText,
 )
-from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
+from paramclient.sim import GenericVehicle, PX4Vehicle, Vehicle
 from tests.simulation import Simulation, is_so, known, listed, param_value
 
 OWN = (255, 190)
@@ -165,21 +160,6 @@ def test_a_value_goes_into_the_table_and_is_reported() -> None:
     assert len(desk.changes) == 1
 
 
-def test_without_reports_each_change_several_changes_make_one_event() -> None:
-    desk = Desk()
-    desk.events.clear()
-    desk.machine.reports_each_change = False
-    desk.send_list("A", "B")
-    desk.cached(known("C", 1, index=2))
-    assert desk.events == [TableChanged(desk.machine)]
-    desk.machine.has_changed = False
-    desk.hear("A", 7.0)
-    assert desk.events == [TableChanged(desk.machine)] * 2
-    desk.machine.reports_each_change = True
-    desk.hear("A", 8.0)
-    assert [change.new.value for change in desk.changes if change.new] == [8.0]
-
-
 def test_a_value_without_a_name_is_none() -> None:
     desk = Desk()
     desk.hear("")
@@ -270,21 +250,6 @@ def test_a_type_of_the_cache_gives_way() -> None:
     assert write.done
 
 
-@pytest.mark.parametrize("value", [3.5, 128.0, -129.0, math.nan, math.inf])
-def test_a_value_that_the_known_type_cannot_have_brings_its_own(value: float) -> None:
-    desk = Desk(ARDUPILOT)
-    desk.hear("A", 3, ParamType.INT8, index=0)
-    desk.hear("A", value)
-    assert types_of(desk) == {"A": ParamType.REAL32}
-
-
-def test_a_list_says_what_type_it_is() -> None:
-    desk = Desk(ARDUPILOT)
-    desk.hear("A", 3, ParamType.INT8, index=0)
-    desk.hear("A", 3.0, index=0)
-    assert types_of(desk) == {"A": ParamType.REAL32}
-
-
 def test_other_autopilots_mean_the_type_that_they_say() -> None:
     desk = Desk(SOMETHING)
     desk.hear("A", 3, ParamType.INT8, index=0)
@@ -330,35 +295,6 @@ def test_a_value_that_changes_twice_quickly_is_read_again() -> None:
     assert len(desk.machine.reads) == 0
 
 
-def test_a_value_that_changes_slowly_is_not_read_again() -> None:
-    desk = Desk()
-    for number in range(5):
-        desk.now += DOUBT_TIME + 0.1
-        desk.hear("A", float(number))
-    desk.pass_time(3 * DOUBT_TIME)
-    assert desk.reads() == []
-
-
-def test_own_quick_changes_are_not_read_again() -> None:
-    desk = Desk(SOMETHING)
-    desk.hear("A", 0.0)
-    for value in (1.0, 2.0, 3.0):
-        desk.machine.write("A", value, desk.now)
-        desk.hear("A", value)
-    desk.pass_time(3 * DOUBT_TIME)
-    assert desk.reads() == []
-
-
-def test_memory_of_changes_is_short() -> None:
-    desk = Desk()
-    for number in range(1000):
-        desk.now += 0.1
-        desk.hear(f"N{number}")
-        if number % 10 == 0:
-            desk.receive(PX4)
-    assert len(desk.machine._authors._changed_at) <= (DOUBT_TIME + 1.0) / 0.1 + 2
-
-
 # who did it
 
 
@@ -380,43 +316,6 @@ def test_a_change_by_another_station() -> None:
     desk.now += FOREIGN_SET_MEMORY + 0.1
     desk.hear("A", 3.0)
     assert desk.changes[-1].by == "vehicle"
-
-
-@pytest.mark.parametrize(
-    ("received", "by"),
-    [
-        pytest.param(3.0, "station 254/190", id="its value"),
-        pytest.param(2.0, "us", id="our value"),
-        pytest.param(2.5, "us", id="an adjustment"),
-    ],
-)
-def test_a_change_while_our_write_and_another_stations_are_under_way(received: float, by: str) -> None:
-    desk = Desk()
-    desk.hear("A", 1.0)
-    desk.machine.write("A", 2.0, desk.now)
-    desk.machine.foreign_set("A", struct.pack("<f", 3.0), "station 254/190", desk.now)
-    desk.hear("A", received)
-    assert [change.by for change in desk.changes] == ["vehicle", by]
-
-
-def test_an_old_set_of_another_station_is_not_the_author_of_our_write() -> None:
-    desk = Desk()
-    desk.hear("A", 1.0)
-    desk.machine.foreign_set("A", struct.pack("<f", 3.0), "station 254/190", desk.now)
-    desk.now += FOREIGN_SET_MEMORY + 0.1
-    desk.machine.write("A", 2.0, desk.now)
-    desk.hear("A", 3.0)
-    assert desk.changes[-1].by == "us"
-
-
-def test_the_memory_of_other_stations_is_bounded() -> None:
-    desk = Desk()
-    for number in range(3 * FOREIGN_SETS_MAX):
-        desk.machine.foreign_set(f"N{number}", bytes(4), "station 2/2", desk.now)
-    assert len(desk.machine._authors.foreign_sets) == FOREIGN_SETS_MAX
-    desk.hear("N0")
-    desk.hear(f"N{3 * FOREIGN_SETS_MAX - 1}")
-    assert [change.by for change in desk.changes] == ["vehicle", "station 2/2"]
 
 
 # refusals
@@ -465,12 +364,6 @@ def test_ardupilots_text(text: str, is_refusal: bool) -> None:
     write = desk.machine.write("A", 2.0, desk.now)
     desk.receive(StatusText(4, text))
     assert write.done is is_refusal
-
-
-def test_a_silent_index_beyond_the_count_is_unknown() -> None:
-    world = Simulation(PX4Vehicle(table={"A": 1, "B": 2}))
-    world.fetch()
-    assert isinstance(world.error_of(lambda: world.get(5)), UnknownParameter)
 
 
 # writes and what they need
@@ -552,28 +445,6 @@ def test_the_right_hash_with_another_count_confirms_nothing() -> None:
     assert not desk.machine.sync.synced
 
 
-def test_the_right_hash_with_another_count_is_no_hit() -> None:
-    desk = Desk()
-    fetched(desk)
-    desk.now += 10.0
-    fetch = desk.machine.begin_fetch(desk.now)
-    assert desk.reads() == [HASH_CHECK]
-    expected = desk.machine.table.hash
-    assert expected is not None
-    desk.hash(expected, count=4)
-    assert not fetch.done
-    assert ParamRequestList(1, 1) in desk.take()
-
-
-def test_during_further_writes_a_hash_means_nothing() -> None:
-    desk = Desk()
-    fetched(desk)
-    desk.machine.sync.ask(desk.now)
-    desk.machine.write("A", 7.0, desk.now)
-    desk.hash(0x12345678)
-    assert desk.machine.sync.synced
-
-
 def test_no_hash_is_requested_from_a_vehicle_without_one() -> None:
     for heartbeat in (ARDUPILOT, SOMETHING):
         desk = Desk(heartbeat)
@@ -582,34 +453,6 @@ def test_no_hash_is_requested_from_a_vehicle_without_one() -> None:
         desk.hear("A", 2.0)
         desk.pass_time(1.0)
         assert HASH_CHECK not in desk.reads()
-
-
-def test_a_hash_that_the_vehicle_does_not_have_is_not_requested_again() -> None:
-    desk = Desk()
-    desk.hear("A", 1.0)
-    desk.machine.sync.ask(desk.now)
-    desk.receive(ParamError(*OWN, HASH_CHECK, -1, 1))
-    desk.machine.write("A", 2.0, desk.now)
-    desk.hear("A", 2.0)
-    desk.take()
-    desk.pass_time(1.0)
-    assert desk.reads() == []
-    desk.hash(5)  # it has one after all
-    desk.machine.write("A", 3.0, desk.now)
-    desk.hear("A", 3.0)
-    desk.pass_time(1.0)
-    assert HASH_CHECK in desk.reads()
-
-
-@pytest.mark.parametrize("how", ["silence", "link"])
-def test_a_hash_that_was_not_received_may_still_be_there(how: str) -> None:
-    desk = Desk()
-    desk.machine.sync.ask(desk.now)
-    if how == "silence":
-        desk.pass_time()
-    else:
-        desk.machine.fail_all(LinkError("gone", link="x"), desk.now)
-    assert desk.machine.sync.expects_hash
 
 
 def test_a_change_makes_an_announced_hash_old() -> None:
@@ -623,27 +466,6 @@ def test_a_change_makes_an_announced_hash_old() -> None:
 
 
 # the cache
-
-
-def test_a_hash_received_before_the_cache_was_read_confirms_it() -> None:
-    desk = Desk()
-    params = [known("A", 1, index=0), known("B", 2, index=1)]
-    desk.hash(hash_params(params), count=2)
-    desk.cached(*params, confirmed=hash_params(params), volatile_known=True)
-    assert {param.trust for param in desk.machine.table.params.values()} == {Trust.VERIFIED}
-    assert [change.name for change in desk.changes] == ["A", "B"]
-    assert desk.machine.state == "cached"
-    assert desk.machine.can_hit
-
-
-@pytest.mark.parametrize("announced", [None, 1])
-def test_without_such_a_hash_it_stays_cached(announced: int | None) -> None:
-    desk = Desk()
-    params = [known("A", 1, index=0), known("B", 2, index=1)]
-    if announced is not None:
-        desk.hash(announced, count=2)
-    desk.cached(*params, confirmed=hash_params(params), volatile_known=True)
-    assert {param.trust for param in desk.machine.table.params.values()} == {Trust.CACHED}
 
 
 def test_values_received_before_the_cache_was_read_are_kept() -> None:
@@ -667,23 +489,6 @@ def test_a_hash_that_cannot_be_computed_is_dropped_after_a_change() -> None:
     assert other.machine.table.hash == 77
 
 
-def test_a_table_of_another_count_is_only_a_start() -> None:
-    desk = Desk()
-    desk.hear("A", 9, ParamType.INT32, index=0, count=5)
-    desk.cached(known("B", 2, index=1), confirmed=77)
-    assert "B" in desk.machine.table.params
-    assert not desk.machine.table.complete
-    assert desk.machine.table.hash is None
-    assert desk.machine.state == "partial"
-
-
-def test_a_complete_table_needs_no_cache() -> None:
-    desk = Desk()
-    fetched(desk)
-    desk.cached(known("OLD", 2, index=1))
-    assert "OLD" not in desk.machine.table.params
-
-
 # its state
 
 
@@ -704,31 +509,7 @@ def test_the_states_of_a_table() -> None:
     assert repr(Desk(None).machine) == "<ComponentMachine 1/1 unknown new>"
 
 
-def test_a_table_whose_count_never_rests_is_not_in_step() -> None:
-    desk = Desk(SOMETHING)
-    fetch = desk.machine.begin_fetch(desk.now)
-    for number in range(30):
-        desk.hear("A", 1.0, index=0, count=2 + number % 2)
-    desk.hear("B", 1.0, index=1, count=2)
-    assert fetch.result is not None
-    assert fetch.result.complete
-    assert "kept changing" in fetch.result.notes[0]
-    assert not desk.machine.sync.synced
-    assert not desk.machine.table.complete
-
-
 # identity
-
-
-def test_the_observer_is_called_when_the_identity_is_settled() -> None:
-    desk = Desk(None)
-    desk.receive(PX4)
-    assert desk.events == []
-    desk.receive(AutopilotVersion(CAPABILITY_PARAM_ENCODE_BYTEWISE, uid=7))
-    assert desk.events == [ComponentIdentified(desk.machine)]
-    desk.receive(PX4)
-    assert len(desk.events) == 1
-    assert desk.machine.identity.uid == "0000000000000007"
 
 
 def test_a_late_hardware_id_is_announced_as_a_new_identity() -> None:
@@ -781,20 +562,6 @@ def test_another_vehicle_during_a_fetch_begins_it_anew() -> None:
     assert list(fetch.result.params) == ["X", "Y", "Z"]
 
 
-def test_two_vehicles_one_after_the_other() -> None:
-    first, second = PX4Vehicle(uid=1, table={"A": 1, "B": 2}), PX4Vehicle(uid=2, table={"A": 3, "C": 4})
-    second.reboot(0.0, down=math.inf)
-    world = Simulation(first, second)
-    world.fetch()
-    first.reboot(world.now, down=math.inf)
-    world.run(10.0)
-    second.reboot(world.now, down=0.0)
-    world.until(lambda: world.machine.identity.uid == f"{2:016x}")
-    assert world.machine.table.params == {}
-    result = world.fetch()
-    assert {name: param.value for name, param in result.params.items()} == {"A": 3, "C": 4}
-
-
 @pytest.mark.parametrize("make", [PX4Vehicle, GenericVehicle])
 def test_a_vehicle_that_takes_the_place_of_another_at_once_is_distinguished_by_its_table(
     make: Callable[..., Vehicle],
@@ -836,33 +603,6 @@ def test_when_the_link_is_gone_everything_ends_and_nothing_is_left() -> None:
     assert desk.machine.next_deadline() == desk.machine.presence.lost_at(), "that is all there is left to see"
 
 
-def test_a_refresh_of_volatile_values_fails_with_the_link() -> None:
-    world = Simulation(air=Air.symmetric([PX4Vehicle()], delay=0.2))
-    world.fetch()
-    memory = world.memory()
-    world.next_session()
-    world.meet().use_cached(now=world.now, **memory)
-    world.fetch()
-    refresh = world.machine.refresh
-    assert refresh is not None
-    error = LinkError("gone", link="x")
-    world.station.fail_all(error, world.now)
-    assert refresh.error is error
-    assert world.machine.refresh is None
-
-
-def test_a_pause_does_not_count_as_the_vehicles_silence() -> None:
-    desk = Desk()
-    desk.hear("A", 1.0)
-    read = desk.machine.read("A", desk.now)
-    desk.pass_time(4.0)
-    assert not read.done
-    desk.now += 100.0
-    desk.machine.resume(desk.now)
-    desk.pass_time(4.0)  # several time-outs
-    assert not read.done
-
-
 def test_a_dead_vehicle_is_given_up_by_all_that_waits() -> None:
     desk = Desk()
     desk.hear("A", 1.0)
@@ -872,46 +612,4 @@ def test_a_dead_vehicle_is_given_up_by_all_that_waits() -> None:
     assert isinstance(write.error, NoReply)
 
 
-def test_messages_that_mean_nothing_here() -> None:
-    desk = Desk()
-    desk.receive(ParamRequestList(1, 1))
-    assert desk.take() == []
-
-
 # with ArduPilot: answers that were made before a change
-
-
-def test_an_answer_made_before_a_write_does_not_stay_in_the_table() -> None:
-    vehicle = ArduPilotVehicle(table={"A": 1.0, "B": 2.0}, live=())
-    world = Simulation(air=Air.symmetric([vehicle], delay=0.01))
-    world.fetch()
-    world.run(3.0)
-    machine = world.machine
-    for moment in range(12):
-        machine.read("A", world.now)
-        world.run(0.01 * moment)
-        world.outcome(machine.write("A", 10.0 + moment, world.now))
-        world.run(5.0)
-        assert machine.table.params["A"].value == 10.0 + moment
-
-
-def test_hit_results_do_not_change_afterwards() -> None:
-    world = Simulation(PX4Vehicle(table={"A": 1}))
-    result = world.fetch()
-    world.set("A", 5)
-    assert result.params["A"].value == 1
-    assert replace(result, elapsed=0.0).params is result.params
-
-
-def test_sync_continues_when_a_vehicle_is_found_whose_count_has_changed() -> None:
-    vehicle = ArduPilotVehicle(table={"A": 1, "B_ENABLE": 0}, groups={"B_ENABLE": {"B_X": 5}}, live=())
-    station = Station(link="sim:test", is_stream=False, sync_settings=SyncSettings(30.0, without_hash=True))
-    world = Simulation(vehicle, station=station)
-    world.fetch()
-    world.run(10.0)  # so that its clock shows that it has started again
-    world.machine.table.change_count(1)
-    vehicle._entry("B_ENABLE").store(1)
-    vehicle.reboot(world.now, down=8.0)
-    world.run(60.0)
-    assert world.machine.sync.synced
-    assert world.machine.table.params["B_X"].value == 5

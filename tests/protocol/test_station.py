@@ -7,14 +7,11 @@ import math
 import pytest
 
 from paramclient.errors import LinkError
-from paramclient.model.values import Encoding, ParamType, Trust
+from paramclient.model.values import Encoding, ParamType
 from paramclient.protocol import station as room
 from paramclient.protocol import wire
-from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import ComponentDiscovered, ComponentIdentified
+from paramclient.protocol.events import ComponentDiscovered
 from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.requests.retry import HEARTBEAT_REQUESTS
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_INVALID,
@@ -31,7 +28,7 @@ from paramclient.protocol.wire import (
     StatusText,
 )
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
-from tests.simulation import Simulation, is_so, known, param_value
+from tests.simulation import Simulation, param_value
 
 PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4)
 GCS = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID)
@@ -86,14 +83,6 @@ def test_the_content_of_our_heartbeat() -> None:
     assert message == Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, system_status=4)
     assert (version, peer) == (2, None)
     assert station.own_address == (250, 7)
-
-
-def test_a_late_tick_sends_one_heartbeat() -> None:
-    station = a_station()
-    station.tick(0.0)
-    station.tick(100.0)
-    assert len(sent(station)) == 2
-    assert station.next_deadline() == 101.0
 
 
 def test_frames_are_numbered_and_counted() -> None:
@@ -161,64 +150,6 @@ def test_the_heartbeat_of_a_vehicle_that_sends_telemetry_is_requested(is_stream:
     assert heartbeat_requests(station) == []
 
 
-def test_a_heartbeat_ends_that_also_of_a_component_that_is_known_by_a_value() -> None:
-    station = a_station()
-    hear(station, param_value("A"), 4)
-    hear(station, PX4, 4)
-    sent(station)
-    station.receive(telemetry(4), "there", 1.0)
-    assert heartbeat_requests(station) == []
-
-
-def test_requests_to_a_vehicle_without_heartbeats_end() -> None:
-    station = a_station()
-    for step in range(1000):
-        station.receive(telemetry(4), "there", 0.1 * step)
-    assert len(heartbeat_requests(station)) == HEARTBEAT_REQUESTS.count
-
-
-@pytest.mark.parametrize("is_stream", [False, True])
-def test_during_a_search_the_heartbeat_of_every_sender_is_requested(is_stream: bool) -> None:
-    station = a_station(is_stream=is_stream)
-    hear(station, PX4, 4)
-    sent(station)
-    with station.looking_for_others(), station.looking_for_others():
-        station.receive(telemetry(4), "there", 1.0)
-        assert heartbeat_requests(station) == [], "it was received"
-        for step in range(100):
-            station.receive(telemetry(5), "there", 1.0 + 0.1 * step)
-            station.receive(telemetry(4), "here", 1.0 + 0.1 * step)
-        assert heartbeat_requests(station) == [(5, 1, "there")] * 34
-        hear(station, PX4, 5, now=11.0)
-        sent(station)
-        station.receive(telemetry(5), "there", 12.0)
-        assert heartbeat_requests(station) == []
-    station.receive(telemetry(6), "there", 13.0)
-    assert heartbeat_requests(station) == []
-
-
-def test_a_ground_station_does_not_stand_in_the_way_of_that() -> None:
-    station = a_station()
-    hear(station, GCS, 254, 190)
-    hear(station, CAMERA, 1, 100)
-    sent(station)
-    station.receive(telemetry(), "there", 0.1)
-    assert heartbeat_requests(station) == [(1, 1, "there")]
-
-
-@pytest.mark.parametrize(("system", "component"), [(1, 100), (0, 1), (255, 190)])
-def test_only_the_heartbeat_of_an_autopilot_is_requested(system: int, component: int) -> None:
-    station = a_station()
-    assert not station.receive(telemetry(system, component), "there", 0.0)
-    assert heartbeat_requests(station) == []
-
-
-def test_a_listen_only_station_requests_no_heartbeat() -> None:
-    station = Station(link="x", is_stream=False, sync_settings=SyncSettings(listens_only=True))
-    station.receive(telemetry(), "there", 0.0)
-    assert sent(station) == []
-
-
 @pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
 def test_a_vehicle_in_mid_second_is_found_at_once(make: type[PX4Vehicle] | type[ArduPilotVehicle]) -> None:
     """Both autopilots answer the request within some milliseconds (measured)."""
@@ -243,41 +174,6 @@ def test_bytes_that_mean_nothing() -> None:
     station.receive(wire.build_frame(30, bytes(28), system=1, component=1, sequence=0), "peer", 0.0)
     assert station.components == {}
     assert station.bytes_received > 9
-
-
-def test_receive_says_whether_a_datagram_had_a_message_of_interest() -> None:
-    for is_stream in (False, True):
-        station = a_station(is_stream=is_stream)
-        telemetry = wire.build_frame(30, bytes(28), system=1, component=1, sequence=0)
-        assert station.receive(frame(PX4), "peer", 0.0)
-        assert not station.receive(telemetry + b"noise" + telemetry, "peer", 0.0)
-        assert station.receive(telemetry + frame(param_value("A")), "peer", 0.0)
-        assert not station.receive(frame(PX4)[:-1], "peer", 0.0)
-        assert station.receive(frame(PX4)[-1:], "peer", 0.0) is is_stream
-
-
-def test_is_waiting_while_a_response_is_expected() -> None:
-    station = a_station()
-    assert not station.is_waiting
-    hear(station, PX4)
-    assert is_so(station.is_waiting), "for who it is"
-    hear(station, AutopilotVersion(0, uid=1))
-    assert not is_so(station.is_waiting)
-    machine = station.components[1, 1]
-    read = machine.read("A", 0.0)
-    assert is_so(station.is_waiting)
-    machine.reads.release(read)
-    assert not is_so(station.is_waiting)
-    write = machine.write("A", 1.0, 0.0)
-    assert is_so(station.is_waiting)
-    machine.writes.cancel(write, 0.0)
-    assert not is_so(station.is_waiting)
-    hear(station, PX4, 2, 1)
-    hear(station, AutopilotVersion(0, uid=2), 2, 1)
-    fetch = station.components[2, 1].begin_fetch(0.0)
-    assert is_so(station.is_waiting)
-    station.components[2, 1].end_fetch(fetch, 0.0)
-    assert not station.is_waiting
 
 
 def test_nothing_is_requested_from_a_ground_station() -> None:
@@ -337,32 +233,6 @@ def test_the_end_of_a_stream_forgets_its_rest_and_its_peer() -> None:
     assert requests == ["b"], "nothing is requested from another peer"
 
 
-def test_the_end_of_a_stream_gives_out_what_is_whole() -> None:
-    station = a_station(is_stream=True)
-    # a start of a longer frame, and in it a whole one
-    station.receive(b"\xfd\xff\x00\x00\x00\x01\x01\x00\x00\x00" + frame(PX4), "a", 0.0)
-    assert station.components == {}
-    station.receive(b"", "a", 0.0)
-    assert list(station.components) == [(1, 1)]
-
-
-def test_an_empty_datagram_removes_no_component() -> None:
-    station = a_station()
-    station.receive(frame(PX4), "a", 0.0)
-    station.data_to_send()
-    station.receive(b"", "a", 0.0)
-    station.components[1, 1].read("A", 0.0)
-    assert [peer for _, _, peer in sent(station)] == ["a"]
-
-
-def test_unfinished_streams_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room, "STREAM_PEERS_MAX", 3)
-    station = a_station(is_stream=True)
-    for peer in range(100):
-        station.receive(b"\xfd", peer, 0.0)
-    assert len(station._framers) == 3
-
-
 def test_requests_go_to_the_first_peer_until_it_is_silent() -> None:
     station = a_station()
     station.receive(frame(PX4), "here", 0.0)
@@ -406,32 +276,6 @@ def test_a_whole_session_in_mavlink_1(make: type[PX4Vehicle] | type[ArduPilotVeh
 
 
 # other stations
-
-
-def test_a_param_set_of_another_station_is_attributed_to_its_targets() -> None:
-    station = a_station()
-    for component in (1, 2):
-        hear(station, PX4, 1, component)
-    hear(station, PX4, 2, 1)
-    for system, component in ((1, 1), (1, 0), (0, 0), (2, 2)):
-        hear(station, ParamSetMessage(system, component, f"P{system}{component}", bytes(4), 9), 254, 190)
-    reported = {}
-    for address, machine in station.components.items():
-        for name in ("P11", "P10", "P00", "P22"):
-            hear(station, param_value(name), *address)
-        reported[address] = [machine._authors.of(name, 0.0) for name in ("P11", "P10", "P00", "P22")]
-    other = "station 254/190"
-    assert reported[1, 1] == [other, other, other, "vehicle"]
-    assert reported[1, 2] == ["vehicle", other, other, "vehicle"]
-    assert reported[2, 1] == ["vehicle", "vehicle", other, "vehicle"]
-    assert (254, 190) not in station.components
-
-
-def test_our_own_echoed_sets_are_not_those_of_another_station() -> None:
-    station = a_station()
-    hear(station, PX4)
-    hear(station, ParamSetMessage(1, 1, "A", bytes(4), 9), 255, 190)
-    assert station.components[1, 1]._authors.of("A", 0.0) == "vehicle"
 
 
 # pause and resume
@@ -519,15 +363,6 @@ def test_a_write_that_met_a_short_doubt_is_begun_all_the_same() -> None:
     ]
 
 
-def test_a_component_alone_speaks_for_itself() -> None:
-    station = a_station()
-    hear(station, CAMERA, 1, 100)
-    hear(station, AutopilotVersion(0, uid=8), 1, 100)
-    identity = station.identity_of(station.components[1, 100])
-    assert identity is not None
-    assert identity.uid == "0000000000000008"
-
-
 # several at once
 
 
@@ -566,44 +401,6 @@ def test_one_list_request_reaches_all_components_of_a_system() -> None:
     assert lists(world) == [(1, 0)]
 
 
-def test_a_component_that_loses_the_common_list_gets_its_own_request() -> None:
-    deaf = GenericVehicle(rows("B", 20), component=100, boot_time=0.0)
-    on_list = deaf._on_list
-    received: list[int] = []
-
-    def first_one_is_lost() -> None:
-        received.append(1)
-        if len(received) > 1:
-            on_list()
-
-    deaf._on_list = first_one_is_lost  # type: ignore[method-assign]  # a loss for one of two
-    world = Simulation(GenericVehicle(rows("A", 30)), deaf)
-    settle(world, 2)
-    assert all(result.complete for result in fetch_of(world, (1, 1), (1, 100)))
-    assert lists(world) == [(1, 0), (1, 100)]
-
-
-def test_some_of_the_components_get_a_request_each() -> None:
-    vehicles = [GenericVehicle(rows("A", 5), component=component) for component in (1, 2, 3)]
-    world = Simulation(*vehicles)
-    settle(world, 3)
-    fetch_of(world, (1, 1), (1, 2))
-    assert lists(world) == [(1, 1), (1, 2)]
-    world.sent.clear()
-    fetch_of(world, (1, 3))
-    assert lists(world) == [(1, 3)]
-
-
-def test_a_list_under_way_is_not_started_again_for_others() -> None:
-    vehicles = [GenericVehicle(rows("A", 200), component=component) for component in (1, 2)]
-    world = Simulation(*vehicles)
-    settle(world, 2)
-    world.station.components[1, 1].begin_fetch(world.now)
-    world.run(0.05)
-    assert all(result.complete for result in fetch_of(world, (1, 1), (1, 2)))
-    assert lists(world) == [(1, 1), (1, 2)]
-
-
 def test_components_with_a_hash_get_a_request_each() -> None:
     vehicles = [PX4Vehicle(table=rows("A", 5)), GenericVehicle(rows("B", 5), component=2)]
     world = Simulation(*vehicles)
@@ -615,14 +412,6 @@ def test_components_with_a_hash_get_a_request_each() -> None:
     assert lists(world) == [(1, 2)]
     world.sent.clear()
     fetch_of(world, (1, 1), (1, 2), refresh=True)
-    assert lists(world) == [(1, 0)]
-
-
-def test_a_ground_station_in_the_system_is_not_counted() -> None:
-    world = Simulation(GenericVehicle(rows("A", 5)), GenericVehicle(rows("B", 5), component=2))
-    settle(world, 2)
-    world.station.receive(frame(GCS, 1, 190), "x", world.now)
-    fetch_of(world, (1, 1), (1, 2))
     assert lists(world) == [(1, 0)]
 
 
@@ -671,30 +460,3 @@ def test_a_write_reaches_the_one_it_is_for() -> None:
     write = world.station.components[1, 2].write("SAME", 7, world.now)
     assert world.outcome(write).status == "accepted"
     assert [vehicle.param("SAME").value for vehicle in vehicles] == [1, 7]
-
-
-def test_identities_are_reported_for_each() -> None:
-    world = Simulation(PX4Vehicle(), ArduPilotVehicle(system=9))
-    settle(world, 2)
-    identified = [event.machine for event in world.events if isinstance(event, ComponentIdentified)]
-    assert {(machine.system, machine.component) for machine in identified} == {(1, 1), (9, 1)}
-    assert all(isinstance(machine, ComponentMachine) for machine in identified)
-
-
-def test_a_cached_table_of_one_component_needs_no_common_list() -> None:
-    world = Simulation(PX4Vehicle(table=rows("A", 5)), GenericVehicle(rows("B", 5), component=2))
-    settle(world, 2)
-    machine = world.station.components[1, 1]
-    machine.use_cached(
-        {"A000": known("A000", 0)},
-        world.now,
-        count=1,
-        confirmed=5,
-        complete=True,
-        volatile=frozenset(),
-        volatile_known=False,
-    )
-    assert machine.table.params["A000"].trust is Trust.CACHED
-    assert all(result.complete for result in fetch_of(world, (1, 1), (1, 2)))
-    assert next(each.param_id for each in world.sent_of(ParamRequestRead)) == "_HASH_CHECK"
-    assert sorted(lists(world)) == [(1, 1), (1, 2)]

@@ -1,14 +1,14 @@
-"""The command that serves, as a process with real sockets: how it begins, what it survives, how it ends."""
+"""The command that serves, as a process with real sockets: start, TLS, a signal, a second start."""
 
 from __future__ import annotations
 
 import asyncio
-import json
 import re
 import signal
-import socket
+import ssl
 import subprocess
 import sys
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -16,22 +16,20 @@ from pathlib import Path
 import anyio
 import httpx
 import pytest
-from websockets.asyncio.client import connect
 
-from paramclient import ParamCache
-from paramclient.cli import serve as command
-from paramclient.errors import UsageError
-from paramclient.links import create_link, serve_endpoint
-from paramclient.protocol import wire
-from paramclient.service import Listening
+from paramclient.service import add_token
 from tests.commands import in_process
-from tests.shell import TIMEOUT, VALUES, Tap, small_px4, until
+from tests.service.hub import V, synced
+from tests.shell import TIMEOUT
 
-C = "/api/v1/components/1/1"
+END_TIME = 30.0
+"""Seconds within which the service ends on a busy computer, else within 3; a request in it would take 60."""
 
 
 @asynccontextmanager
-async def served(*words: str) -> AsyncIterator[tuple[asyncio.subprocess.Process, httpx.AsyncClient]]:
+async def served(
+    *words: str, verify: ssl.SSLContext | bool = True
+) -> AsyncIterator[tuple[asyncio.subprocess.Process, httpx.AsyncClient]]:
     """The command in a process of its own, and a client of it."""
     process = await asyncio.create_subprocess_exec(
         sys.executable,
@@ -43,9 +41,9 @@ async def served(*words: str) -> AsyncIterator[tuple[asyncio.subprocess.Process,
         assert process.stdout is not None
         with anyio.fail_after(TIMEOUT):
             line = (await process.stdout.readline()).decode()
-        found = re.fullmatch(r"serving on (http://127\.0\.0\.1:[1-9]\d*)\n", line)
+        found = re.fullmatch(r"serving on (https?://127\.0\.0\.1:[1-9]\d*)\n", line)
         assert found, line
-        async with httpx.AsyncClient(base_url=found[1], timeout=TIMEOUT) as browser:
+        async with httpx.AsyncClient(base_url=found[1], timeout=TIMEOUT, verify=verify) as browser:
             yield process, browser
     finally:
         if process.returncode is None:
@@ -53,130 +51,79 @@ async def served(*words: str) -> AsyncIterator[tuple[asyncio.subprocess.Process,
         await process.wait()
 
 
-async def ended(process: asyncio.subprocess.Process) -> tuple[int, str]:
-    """How a process ends, and what it has said on stderr."""
-    with anyio.fail_after(TIMEOUT):
-        _, err = await process.communicate()
-    assert process.returncode is not None
-    return process.returncode, err.decode()
-
-
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.asyncio
-async def test_serve_waits_for_a_vehicle_and_ends_cleanly(tmp_path: Path) -> None:
-    """The link is not there yet when it begins. At the end listeners are let go, and callers answered."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    vehicle = Tap(small_px4())
-    async with (
-        served(f"tcp:127.0.0.1:{port}", "--cache", str(tmp_path / "cache")) as (process, browser),
-        anyio.create_task_group() as tasks,
-    ):
+async def test_a_signal_ends_it_cleanly_with_streams_and_requests_open(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    words = ("sim:px4", "--cache", str(tmp_path / "cache.sqlite3"))
+    async with served(*words) as (process, browser), anyio.create_task_group() as tasks:
+        await synced(browser)
+        await browser.put(f"{V}/params/MC_ROLL_P", json={"value": 7.5})
+        answers = []
 
-        async def state() -> str:
-            return str((await browser.get("/health")).json()["links"][0]["state"])
+        async def wait() -> None:
+            body = {"value": 8.5, "settle_s": 60}
+            answers.append((await browser.put(f"{V}/params/MC_ROLL_P", json=body)).status_code)
 
-        with anyio.fail_after(TIMEOUT):
-            while await state() != "failed":  # noqa: ASYNC110 - requested over HTTP
-                await asyncio.sleep(0.05)
-        await tasks.start(serve_endpoint, vehicle, create_link(f"tcpin:127.0.0.1:{port}"))
-        await browser.post("/api/v1/find", json={})
-        fetched = (await browser.post(f"{C}/fetch", json={})).json()
-        assert fetched["received"] == len(VALUES) + 1
-        with ParamCache(tmp_path / "cache") as cache:
-            await until(cache.components)  # a change of what was never kept is none
-        done = await browser.put(f"{C}/params/PARAM_01", json={"value": 77})
-        assert done.status_code == 200, done.text
-
-        address = str(browser.base_url).replace("http", "ws")
-        async with (
-            browser.stream("GET", "/api/v1/events") as stream,
-            connect(f"{address}/api/v1/ws") as frames,
-        ):
+        async with browser.stream("GET", "/api/events") as stream:
             lines = stream.aiter_lines()
             assert (await anext(lines)).startswith("id: ")
-            assert json.loads(await frames.recv())["type"] == "hello"
-            vehicle.is_deaf = True
-            pending = asyncio.create_task(browser.put(f"{C}/params/PARAM_02", json={"value": 5}))
-            await until(
-                lambda: any(each.param_id == "PARAM_02" for each in vehicle.messages(wire.ParamSetMessage))
-            )
-            process.send_signal(signal.SIGTERM)
-            answer = await pending
-            assert (answer.status_code, answer.json()["type"]) == (503, "urn:paramclient:closing")
-            async for _ in lines:
+            tasks.start_soon(wait)
+            async for line in lines:
+                if '"type":"change"' in line:
+                    break
+            began = time.monotonic()
+            process.send_signal(number)
+            async for _ in lines:  # ends
                 pass
-            async for _ in frames:
-                pass
-            assert frames.close_code == 1001
-        code, err = await ended(process)
-        assert code == 0, err
-        assert "Traceback" not in err
-        tasks.cancel_scope.cancel()
-    with ParamCache(tmp_path / "cache") as cache:
-        kept = cache.component(system=1)
-        assert kept.params["PARAM_01"].value == 77
-        assert [each.by for each in cache.history(kept.key, name="PARAM_01")] == ["us for local"]
+        out, err = await process.communicate()
+        assert time.monotonic() - began < END_TIME
+        assert (process.returncode, out, err) == (0, b"", b"")
+    assert answers == [503]
+    async with served(*words) as (_, browser):  # the values are in the cache
+        found = (await browser.get("/api/vehicles")).json()["cached"]
+        assert [each["complete"] for each in found] == [True]
+
+
+@pytest.fixture
+def certificate(tmp_path: Path) -> tuple[Path, Path]:
+    """A certificate of this computer, and its key."""
+    cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    request = "openssl req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=localhost"
+    words = [*request.split(), "-addext", "subjectAltName=IP:127.0.0.1"]
+    subprocess.run([*words, "-keyout", str(key), "-out", str(cert)], check=True, capture_output=True)
+    return cert, key
 
 
 @pytest.mark.asyncio
-async def test_ctrl_c_ends_it_too_and_a_page_of_the_api_is_there() -> None:
-    async with served("sim:px4", "--no-cache", "--no-fetch") as (process, browser):
-        assert (await browser.get("/docs")).status_code == 200
-        found = (await browser.post("/api/v1/find", json={})).json()
-        assert (found["link"], found["params"]) == ("sim:px4", 0)
-        process.send_signal(signal.SIGINT)
-        code, err = await ended(process)
-        assert (code, err) == (0, "")
-
-
-def test_invalid_arguments_of_serve_are_reported_in_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
-    call = in_process(capsys)
-    for words, what in (
-        ((), "no link is given"),
-        (("nonsense:",), "link name"),
-        (("sim:px4", "--listen", "8765"), "HOST:PORT"),
-        (("sim:px4", "--listen", "[::1"), "HOST:PORT"),
-        (("sim:px4", "--cache", "a", "--no-cache"), "exclude"),
-        (("sim:px4", "--tls-cert", "a.pem", "--no-cache"), "key"),
-    ):
-        outcome = call("serve", *words)
-        assert outcome.code == 2, outcome
-        assert what in outcome.err
-
-
-def test_without_its_libraries_it_says_how_to_install_them(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(command, "find_spec", lambda name: None if name == "uvicorn" else object())
-    outcome = in_process(capsys)("serve", "sim:px4")
-    assert outcome.code == 2
-    assert "serving needs uvicorn: pip install 'paramclient[service]'" in outcome.err
-
-
-def test_an_address_that_is_taken_is_a_link_that_fails(capsys: pytest.CaptureFixture[str]) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        outcome = in_process(capsys)("serve", "sim:px4", "--no-cache", "--listen", f"127.0.0.1:{port}")
-    assert outcome.code == 4
-    assert f"cannot listen on 127.0.0.1:{port}" in outcome.err
+async def test_tls_and_tokens(tmp_path: Path, certificate: tuple[Path, Path]) -> None:
+    (cert, key), tokens = certificate, tmp_path / "tokens"
+    token = add_token(tokens, "anna", "write")
+    words = ("sim:px4", "--no-cache", "--tokens", str(tokens), "--tls-cert", str(cert), "--tls-key", str(key))
+    trusted = ssl.create_default_context(cafile=str(cert))
+    async with served(*words, verify=trusted) as (_, browser):
+        assert browser.base_url.scheme == "https"
+        assert (await browser.get("/api/vehicles")).status_code == 401
+        browser.headers["Authorization"] = f"Bearer {token}"
+        await synced(browser)
 
 
 @pytest.mark.parametrize(
-    ("text", "url"),
+    ("words", "said"),
     [
-        ("127.0.0.1:8765", "http://127.0.0.1:8765"),
-        ("localhost:0", "http://localhost:0"),
-        ("[::1]:80", "http://[::1]:80"),
+        (["sim:px4", "--listen", "0.0.0.0:0"], "--tokens"),
+        (["sim:px4", "--tokens", "no-such-file"], "no-such-file"),
+        (["sim:px4", "--tls-cert", "no-such-cert", "--tls-key", "no-such-key"], "certificate"),
+        (["sim:px4", "--cache", "a", "--no-cache"], "exclude"),
+        (["sim:px4", "sim:px4"], "twice"),
+        ([], "link"),
     ],
 )
-def test_valid_listening_addresses(text: str, url: str) -> None:
-    assert Listening.at(text).url == url
-
-
-@pytest.mark.parametrize("text", ["", "8765", ":8765", "a:", "a:x", "a:65536", "::1:80", "a:-1", "a:٣"])
-def test_invalid_listening_addresses_are_refused(text: str) -> None:
-    with pytest.raises(UsageError):
-        Listening.at(text)
+def test_what_cannot_be_served_is_refused_at_the_start(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = [] if {"--cache", "--no-cache"} & set(words) else ["--no-cache"]
+    ended = in_process(capsys)("serve", *words, *options)
+    assert (ended.code, ended.out) == (2, "")
+    assert said in ended.err

@@ -16,7 +16,6 @@ from paramclient.protocol import wire
 from paramclient.sim import (
     Air,
     ArduPilotVehicle,
-    FaultyLink,
     GenericVehicle,
     OtherStation,
     PX4Vehicle,
@@ -24,7 +23,6 @@ from paramclient.sim import (
     Vehicle,
 )
 from tests.ground_station import LIST, PERIODIC_MESSAGES, SMALL, Station, cast, indices, names, read, write
-from tests.simulation import Simulation
 
 NO_INDEX = wire.NO_INDEX
 TEN = {f"P{number}": number for number in range(10)}
@@ -83,21 +81,6 @@ class TestDead:
         assert vehicle.values["P7"] == 70
 
 
-def test_an_index_stays_dead_when_the_list_changes() -> None:
-    vehicle = PX4Vehicle(table=TEN, dead=[3], not_in_use=["P0"])
-    station = Station(vehicle)
-    assert "P4" not in names(station.ask(LIST))
-    vehicle.use("P0")
-    values = station.ask(LIST)
-    assert "P3" not in names(values)
-    assert "P4" in names(values)
-
-
-def test_dead_reads_use_no_place_in_a_slot() -> None:
-    station = Station(ArduPilotVehicle(table=TEN, dead=[0, 1]))
-    assert indices(station.ask(*(read(index=index) for index in range(7)), seconds=0.15)) == [2, 3, 4, 5, 6]
-
-
 @EVERY_KIND
 class TestListStops:
     def test_a_list_stops_once(self, kind: Callable[..., Vehicle]) -> None:
@@ -106,43 +89,10 @@ class TestListStops:
         assert indices(station.ask(read(index=8))) == [8]
         assert listed(station) == list(range(10))
 
-    def test_a_list_stops_several_times(self, kind: Callable[..., Vehicle]) -> None:
-        station = Station(kind(table=TEN, list_stops_at=4, list_stops=2))
-        assert [len(listed(station)) for _ in range(4)] == [4, 4, 10, 10]
-
-    def test_every_list_stops_also_after_a_reboot(self, kind: Callable[..., Vehicle]) -> None:
-        vehicle = kind(table=TEN, list_stops_at=4, list_stops=math.inf)
-        station = Station(vehicle)
-        for _ in range(5):
-            assert len(listed(station)) == 4
-            vehicle.reboot(station.now)
-
     def test_a_list_stops_at_its_start(self, kind: Callable[..., Vehicle]) -> None:
         station = Station(kind(table=TEN, list_stops_at=0))
         assert listed(station) == []
         assert len(listed(station)) == 10
-
-    def test_the_count_starts_with_each_list(self, kind: Callable[..., Vehicle]) -> None:
-        """A request during the list restarts it, and its count."""
-        vehicle = kind(table=TEN, list_stops_at=4, burst=1, period=0.01)
-        station = Station(vehicle).send(LIST)
-        while len(station.times()) < 3:
-            station.wait(0.005)
-        assert listed(station, 1.0)[-4:] == [0, 1, 2, 3]
-
-
-def test_px4_sends_its_hash_before_a_list_that_stops() -> None:
-    station = Station(PX4Vehicle(table=TEN, list_stops_at=2))
-    assert names(station.ask(LIST)) == ["_HASH_CHECK", "P0", "P1"]
-    assert names(station.ask(LIST))[:2] == ["_HASH_CHECK", "P0"]
-
-
-def test_a_complete_list_does_not_count_as_stopped() -> None:
-    vehicle = PX4Vehicle(table=TEN, not_in_use=["P9"], list_stops_at=9)
-    station = Station(vehicle)
-    assert len(listed(station)) == 9
-    vehicle.use("P9")
-    assert [len(listed(station)) for _ in range(2)] == [9, 10]
 
 
 class TestWhenListed:
@@ -189,17 +139,6 @@ class TestWhenListed:
         assert [value.param_count for value in values] == [9] * 4 + [10] * 6
         assert names(values) == ["P1", "P2", "P3", "P4", "P4", "P5", "P6", "P7", "P8", "P9"]
 
-    @EVERY_KIND
-    @pytest.mark.parametrize("down", [0.0, 2.0, math.inf])
-    def test_a_reboot_during_a_list(self, kind: Callable[..., Vehicle], down: float) -> None:
-        vehicle = kind(table=TEN, burst=1)
-        vehicle.when_listed(6, lambda: vehicle.reboot(down=down))
-        station = Station(vehicle).wait(1.5).send(LIST).wait(0.5)
-        assert max(value.param_index for value in station.values() if value.param_index < 10) == 4
-        beats = station.wait(4.0).receive(wire.Heartbeat)
-        assert len(beats) == {0.0: 4, 2.0: 3, math.inf: 0}[down]
-        assert (len(listed(station)) == 10) == (down < math.inf)
-
 
 @EVERY_KIND
 class TestSwitchingOn:
@@ -219,10 +158,6 @@ class TestSwitchingOn:
         assert [beat.system_status for beat in beats] == [1, 1, 1, ready, ready]
         vehicle.reboot(station.now)
         assert station.wait(0.5).receive(wire.Heartbeat)[0].system_status == 1
-
-    def test_without_a_boot_time_the_vehicle_is_ready_immediately(self, kind: Callable[..., Vehicle]) -> None:
-        beats = Station(kind(table=TEN)).receive(wire.Heartbeat)
-        assert beats[0].system_status != wire.MAV_STATE_BOOT
 
 
 class TestClock:
@@ -251,12 +186,6 @@ class TestClock:
         falls = [at for at in range(1, len(clock)) if clock[at] < clock[at - 1]]
         assert len(falls) == 1
         assert clock[falls[0]] == pytest.approx(100, abs=1)
-
-    def test_the_time_since_boot_has_32_bits(self) -> None:
-        station = Station(GenericVehicle(table=TEN, telemetry=1.0))
-        station.now = 2.0**32 / 1000 + 5.0
-        (time,) = station.wait(0.0).receive(wire.SystemTime)[1:]
-        assert time.time_boot_ms == 5000
 
     @pytest.mark.parametrize(("kind", "requested"), [("copter", [True]), ("plane", []), ("rover", [])])
     def test_ardupilot_sends_system_time_when_its_main_loop_runs(
@@ -307,74 +236,6 @@ class TestClock:
         assert states == sorted(states, key=[first, then].index)
 
 
-def test_a_reboot_during_a_list_resets_px4s_count() -> None:
-    vehicle = PX4Vehicle(table=TEN, not_in_use=["P5"], burst=1)
-    station = Station(vehicle)
-    vehicle.use("P5")
-    before = vehicle.announced_hash()
-    vehicle.when_listed(5, lambda: vehicle.reboot(down=1.0))
-    assert {value.param_count for value in station.ask(LIST, seconds=2.0)} == {10}
-    assert {value.param_count for value in station.ask(LIST, seconds=2.0)} == {9}
-    assert vehicle.announced_hash() != before
-
-
-class TestRepeatedNames:
-    TABLE = (
-        SimParam("CAMERA_EXPOSURE_", ParamType.INT32, 1),
-        SimParam("GAIN", ParamType.INT32, 5),
-        SimParam("CAMERA_EXPOSURE_", ParamType.REAL32, 2.0),
-    )
-
-    @EVERY_KIND
-    def test_repeated_names_must_be_allowed(self, kind: Callable[..., Vehicle]) -> None:
-        with pytest.raises(UsageError):
-            kind(table=self.TABLE)
-
-    @EVERY_KIND
-    def test_a_read_of_a_repeated_name_gets_the_first(self, kind: Callable[..., Vehicle]) -> None:
-        vehicle = kind(table=self.TABLE, repeated_names=True)
-        first, last = (0, 1) if kind is PX4Vehicle else (0, 2)
-        station = Station(vehicle)
-        values = [value for value in station.ask(LIST, seconds=0.5) if value.param_index != NO_INDEX]
-        assert names(values) == [param.name for param in vehicle.listed]
-        assert [value.param_index for value in values if value.param_id != "GAIN"] == [first, last]
-        by_index = station.ask(read(index=first), read(index=last), seconds=0.5)
-        assert [value.param_type for value in by_index] == [ParamType.INT32, ParamType.REAL32]
-        (by_name,) = station.ask(read("CAMERA_EXPOSURE_"))
-        assert by_name.param_type == ParamType.INT32
-        assert vehicle.params["CAMERA_EXPOSURE_"] == vehicle.param("CAMERA_EXPOSURE_") == vehicle.listed[0]
-        assert vehicle.values == {"CAMERA_EXPOSURE_": 1, "GAIN": 5}
-
-    def test_a_set_of_a_repeated_name_sets_the_first(self) -> None:
-        vehicle = GenericVehicle(self.TABLE, repeated_names=True)
-        Station(vehicle).ask(write("CAMERA_EXPOSURE_", 9, ParamType.INT32))
-        assert [param.value for param in vehicle.listed] == [9, 5, 2.0]
-
-
-def test_two_components_with_the_same_names_do_not_mix() -> None:
-    autopilot = GenericVehicle(TEN, autopilot=wire.MAV_AUTOPILOT_PX4)
-    camera = GenericVehicle({name: value + 100 for name, value in TEN.items()}, component=100)
-    station = Station(Air([autopilot, camera])).send(wire.ParamRequestList(1, 0)).wait(1.0)
-    found: dict[int, list[int]] = {1: [], 100: []}
-    for _, frame, message in station.log:
-        if isinstance(message, wire.ParamValue):
-            found[frame.component].append(int.from_bytes(message.raw, "little"))
-    assert found == {1: list(TEN.values()), 100: [value + 100 for value in TEN.values()]}
-    assert station.send(write("P1", 7, ParamType.INT32, component=100)).wait(0.1)
-    assert (autopilot.values["P1"], camera.values["P1"]) == (1, 7)
-
-    world = Simulation(autopilot, camera)
-    world.until(lambda: {(1, 1), (1, 100)} <= world.station.components.keys())
-    world.run(3.0)
-    fetches = [machine.begin_fetch(world.now) for machine in world.station.components.values()]
-    for fetch in fetches:
-        world.outcome(fetch)
-    for vehicle in (autopilot, camera):
-        table = world.station.components[1, vehicle.component].table
-        assert {name: param.value for name, param in table.params.items()} == vehicle.values
-        assert table.complete
-
-
 class TestHighLatency:
     @EVERY_KIND
     def test_one_message_every_5_s(self, kind: Callable[..., Vehicle]) -> None:
@@ -397,24 +258,6 @@ class TestHighLatency:
         station.wait(1.2)
         beats = [time for time, _, message in station.log if isinstance(message, wire.Heartbeat)]
         assert beats == [10.5, 11.5]
-
-    def test_suppressed_telemetry_is_not_sent_later(self) -> None:
-        vehicle = GenericVehicle(TEN, telemetry=50.0)
-        vehicle.tick(0.0)
-        vehicle.high_latency = True
-        vehicle.tick(60.0)
-        vehicle.data_to_send()
-        vehicle.high_latency = False
-        vehicle.tick(60.1)
-        ids = [frame.message_id for data in vehicle.data_to_send() for frame in wire.Framer().receive(data)]
-        assert ids == [0, 2, *[30] * 6]
-
-    @EVERY_KIND
-    def test_high_latency_continues_after_a_reboot(self, kind: Callable[..., Vehicle]) -> None:
-        vehicle = kind(table=TEN, high_latency=True)
-        station = Station(vehicle).wait(1.0)
-        vehicle.reboot(1.0, down=1.0)
-        assert {type(message) for _, _, message in station.wait(9.0).log} == {wire.HighLatency2}
 
     @EVERY_KIND
     def test_reads_are_answered_and_the_list_waits(self, kind: Callable[..., Vehicle]) -> None:
@@ -475,39 +318,3 @@ class TestOtherStation:
         assert wire.ParamSetMessage(2, 1, "B_INT", b"\x08\0\0\0", ParamType.INT32) in [
             each[2] for each in received
         ]
-
-    def test_another_station_uses_the_vehicles_encoding(self) -> None:
-        vehicle = ArduPilotVehicle()
-        row = SimParam("RTL_ALT", ParamType.INT32, 2000)
-        Station(Air([vehicle], others=[OtherStation(sets=[(0.5, row)], encoding=Encoding.C_CAST)])).wait(1.0)
-        assert vehicle.values["RTL_ALT"] == 2000
-
-    def test_another_station_shares_the_links(self) -> None:
-        other = OtherStation(list_every=0.001)
-        uplink = FaultyLink(rate=1000.0, queue=100)
-        vehicle = GenericVehicle(SMALL)
-        Station(Air([vehicle], uplink=uplink, others=[other])).wait(0.9).send(read("B_INT")).wait(1.0)
-        assert uplink.lost
-        assert vehicle.requests.keys() == {"HEARTBEAT", "PARAM_REQUEST_LIST"}
-        lossy = Air.symmetric([GenericVehicle(SMALL)], loss=1.0, others=[OtherStation(list_every=0.1)])
-        assert Station(lossy).wait(5.0).log == []
-
-    def test_a_late_call_skips_repeated_work(self) -> None:
-        other = OtherStation(list_every=0.5)
-        assert other.next_deadline() is None
-        other.tick(0.0)
-        assert other.next_deadline() == 0.5
-        other.tick(1000.0)
-        assert len(other.data_to_send()) == 1 + 2
-        assert other.data_to_send() == []
-        assert other.next_deadline() == 1000.5
-
-    def test_another_station_is_not_a_vehicle(self) -> None:
-        vehicle = PX4Vehicle(table=TEN)
-        other = OtherStation(list_every=0.7, sets=[(2.0, SimParam("P1", ParamType.INT32, 50))])
-        world = Simulation(air=Air.symmetric([vehicle], delay=0.05, others=[other]))
-        result = world.fetch()
-        assert not result.missing
-        world.run(5.0)
-        assert {name: param.value for name, param in world.machine.table.params.items()} == vehicle.values
-        assert vehicle.values["P1"] == 50

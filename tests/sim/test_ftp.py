@@ -13,7 +13,7 @@ from paramclient.protocol import wire
 from paramclient.protocol.ftp import param_pck
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.ftp.param_pck import PackedParam
-from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 
 PARAMS = b"@PARAM/param.pck"
 
@@ -132,12 +132,6 @@ def test_param_pck_with_start_and_count() -> None:
     assert len(content_of(pilot, b"?count=9999").entries) == 1382
 
 
-@pytest.mark.parametrize("query", [b"?start=1382", b"?withdefaults=2", b"?count=x", b"?start=70000"])
-def test_invalid_queries_are_refused(query: bytes) -> None:
-    pilot = Pilot(ArduPilotVehicle())
-    assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, PARAMS + query)) == (FileErrorCode.FAIL_ERRNO, 22)
-
-
 def test_param_pck_has_the_current_values() -> None:
     pilot = Pilot(ArduPilotVehicle(live_period=0.0))
     before = {each.name: each for each in content_of(pilot, b"?withdefaults=1").entries}
@@ -148,18 +142,6 @@ def test_param_pck_has_the_current_values() -> None:
     assert after["RTL_ALT"].default == before["RTL_ALT"].bits
     assert before["COMPASS_DEC"].default == 0
     assert after["COMPASS_DEC"].default is None
-
-
-def test_a_value_close_to_its_default_has_no_separate_default() -> None:
-    rows = [
-        SimParam("A", ParamType.REAL32, 1e-7, default=0.0),
-        SimParam("B", ParamType.REAL32, 2e-7, default=0.0),
-        SimParam("C", ParamType.REAL32, 1500.1, default=1500.1),
-        SimParam("D", ParamType.INT32, 16777217, default=16777216.0),
-        SimParam("E", ParamType.INT8, 3),
-    ]
-    entries = content_of(Pilot(ArduPilotVehicle(table=rows)), b"?withdefaults=1").entries
-    assert [each.default for each in entries] == [None, 0, None, None, None]
 
 
 def test_a_table_with_other_types_has_no_param_pck() -> None:
@@ -204,25 +186,6 @@ def test_directories_and_checksums() -> None:
     checksum = pilot.ask(Opcode.CALC_FILE_CRC32, b"logs/1.bin")
     assert int.from_bytes(checksum.data, "little") == crc32_px4(b"abc")
     assert refusal(pilot.ask(Opcode.CALC_FILE_CRC32, b"nothing")) == (FileErrorCode.FILE_NOT_FOUND,)
-
-
-def test_unsupported_operations_are_refused() -> None:
-    pilot = Pilot(ArduPilotVehicle())
-    pilot.send(Packet(1, 3, 12))
-    (answer,) = pilot.listen(1.0)
-    assert refusal(answer) == (FileErrorCode.UNKNOWN_COMMAND,)
-    assert answer.requested == 12
-
-
-def test_a_long_directory_is_listed_in_parts() -> None:
-    pilot = Pilot(ArduPilotVehicle())
-    names = [f"file{number:03d}" for number in range(60)]
-    pilot.vehicle.files.update(dict.fromkeys((f"d/{name}" for name in names), b""))
-    received: list[bytes] = []
-    while (answer := pilot.ask(Opcode.LIST_DIRECTORY, b"d", offset=len(received))).opcode == Opcode.ACK:
-        assert len(answer.data) <= DATA_SIZE_MAX
-        received += answer.data.split(b"\0")[:-1]
-    assert received == [f"F{name}\t0".encode() for name in names]
 
 
 class TestSessions:
@@ -282,14 +245,6 @@ class TestSessions:
             answer = pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4)
             assert refusal(answer) == (FileErrorCode.INVALID_SESSION,)
 
-    def test_a_written_file_is_kept_when_the_session_times_out(self) -> None:
-        pilot = Pilot(ArduPilotVehicle())
-        pilot.ask(Opcode.CREATE_FILE, b"a", session=3)
-        pilot.ask(Opcode.WRITE_FILE, b"abc", session=3)
-        pilot.listen(3.0)
-        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
-        assert pilot.vehicle.files["a"] == b"abc"
-
     @pytest.mark.parametrize(("path", "texts"), [(b"a", 0), (PARAMS, 3), (PARAMS + b"?withdefaults=1", 3)])
     def test_ardupilot_sends_its_banner_with_the_parameters(self, path: bytes, texts: int) -> None:
         vehicle = ArduPilotVehicle()
@@ -323,16 +278,6 @@ class TestSessions:
         pilot.ask(Opcode.OPEN_FILE_RO, b"a")
         assert pilot.ask(Opcode.RESET_SESSIONS, session=9).opcode == Opcode.ACK
         assert pilot.ask(Opcode.OPEN_FILE_RO, b"a").opcode == Opcode.ACK
-
-    def test_a_reboot_closes_all_sessions(self) -> None:
-        pilot = Pilot(ArduPilotVehicle())
-        pilot.vehicle.files["a"] = bytes(5000)
-        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
-        pilot.send(Packet(90, 3, Opcode.BURST_READ_FILE, size=239))
-        assert pilot.listen(0.05)
-        pilot.vehicle.reboot(pilot.now)
-        assert pilot.listen(1.0) == []
-        assert refusal(pilot.ask(Opcode.READ_FILE, size=1)) == (FileErrorCode.FILE_NOT_FOUND,)
 
 
 class TestPace:
@@ -467,12 +412,6 @@ class TestSwitches:
     def test_invalid_rates_are_rejected(self, rate: float) -> None:
         with pytest.raises(UsageError, match="rate of MAVFTP"):
             ArduPilotVehicle(ftp_rate=rate)
-
-    def test_responses_are_not_answered(self) -> None:
-        pilot = Pilot(ArduPilotVehicle())
-        pilot.send(Packet(1, 0, Opcode.ACK))
-        pilot.send(Packet(1, 0, Opcode.NAK))
-        assert pilot.listen(1.0) == []
 
 
 def test_files_wait_in_high_latency_mode() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import struct
 from collections import Counter
 from collections.abc import Container, Sequence
 from functools import partial
@@ -63,13 +62,6 @@ def test_received_messages_wait_while_a_list_runs() -> None:
     assert pauses(station) == []
 
 
-def test_nothing_waits_after_the_list() -> None:
-    station = listing(0.9).send(SET).wait(0.1)
-    assert acknowledged(station) == near([0.924])
-    assert station.values()[-2].param_index == 1381
-    assert acknowledged(station.send(SET).wait(0.1)) == near([1.006])
-
-
 def test_a_second_request_restarts_and_pauses_the_list() -> None:
     station = listing(0.25).send(LIST).wait(2.0)
     (pause,) = pauses(station)
@@ -80,12 +72,6 @@ def test_a_second_request_restarts_and_pauses_the_list() -> None:
     assert values == [*range(again), *range(1382)]
     assert times[again] == near(0.36)
     assert times[-1] == pytest.approx(1.2, abs=0.02)
-
-
-def test_a_request_just_before_a_slot_pauses_the_list() -> None:
-    station = Station(quiet()).wait(0.095).send(LIST).wait(2.0)
-    (pause,) = pauses(station)
-    assert pause == near((0.11, 0.2))
 
 
 def test_the_first_10_reads_do_not_pause_the_list() -> None:
@@ -137,15 +123,6 @@ def test_a_list_pauses_a_file_burst() -> None:
     assert [time for time, _ in at_once] == near([0.23, 0.36, 0.49])
     assert not [time for time in times if 0.1 < time < 0.229]
     assert pauses(station) == []
-
-
-def test_a_reboot_drops_waiting_requests() -> None:
-    vehicle = quiet()
-    station = listing(0.15, vehicle).send(SET)
-    vehicle.reboot(station.now)
-    station.wait(1.0)
-    assert vehicle.param("RTL_ALT").value == 1500
-    assert struct.unpack("<f", cast("RTL_ALT", 1234.0).raw) == (1234.0,)
 
 
 def test_high_latency_processes_waiting_requests_and_pauses_the_list() -> None:

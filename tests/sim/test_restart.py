@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import pytest
 
 from paramclient import CommandResult, UsageError
-from paramclient.cli.simulate import VehicleFaults
 from paramclient.model.values import Encoding, ParamType, encode_value
 from paramclient.protocol import wire
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, Vehicle
@@ -115,24 +113,6 @@ def test_reboot_without_acknowledgement(make: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "answers"),
-    [
-        (PX4Vehicle, {0: CommandResult.ACCEPTED, 2: CommandResult.DENIED, 3: CommandResult.DENIED}),
-        (ArduPilotVehicle, {0: CommandResult.UNSUPPORTED, 2: CommandResult.UNSUPPORTED}),
-        (generic, {0: CommandResult.UNSUPPORTED}),
-    ],
-)
-def test_other_reboot_commands(make: Any, answers: Mapping[int, int]) -> None:
-    desk = Desk(make())
-    for mode, answer in answers.items():
-        assert desk.command(mode) == [answer]
-    desk.received.clear()
-    desk.run(5.0)
-    beats = [when for when, _, each in desk.received if isinstance(each, wire.Heartbeat)]
-    assert beats == [1.0, 2.0, 3.0, 4.0, 5.0]
-
-
-@pytest.mark.parametrize(
     ("make", "answer"),
     [
         (PX4Vehicle, CommandResult.DENIED),
@@ -167,30 +147,6 @@ def test_px4s_system_id_takes_effect_after_a_reboot() -> None:
     assert not desk.received
     desk.send(wire.ParamRequestRead(9, 1, "MAV_SYS_ID"))
     assert desk.messages(wire.ParamValue)
-
-
-@pytest.mark.parametrize("value", [0, -1, 256])
-def test_an_invalid_system_id_is_ignored(value: int) -> None:
-    desk = Desk(PX4Vehicle())
-    desk.set("MAV_SYS_ID", value, ParamType.INT32, Encoding.BYTEWISE)
-    desk.command()
-    desk.run(5.0)
-    assert desk.vehicle.system == 1
-
-
-@pytest.mark.parametrize(("make", "name"), [(PX4Vehicle, "MAV_SYS_ID"), (ArduPilotVehicle, "SYSID_THISMAV")])
-def test_recorded_tables_have_the_system_id(make: Any, name: str) -> None:
-    vehicle = make(system=7)
-    assert vehicle.param(name).value == 7
-    vehicle.tick(0.0)
-    vehicle.reboot(1.0)
-    vehicle.tick(10.0)
-    assert vehicle.system == 7
-
-
-def test_custom_tables_have_the_system_id() -> None:
-    assert ArduPilotVehicle(system=7, table={"SYSID_THISMAV": 1}).param("SYSID_THISMAV").value == 7
-    assert PX4Vehicle(system=7, table={"A": 1}).values == {"A": 1}
 
 
 def test_sys_autoconfig_resets_all_but_kept_parameters() -> None:
@@ -273,19 +229,6 @@ def test_a_reboot_group_appears_after_a_reboot() -> None:
     assert list(vehicle.params) == ["A_ENABLE", "A_X", "B_ENABLE", "C_ENABLE", "C_X"]
 
 
-def test_a_late_call_does_not_change_the_end_of_a_reboot() -> None:
-    vehicle = generic(reboot_down=2.0)
-    desk = Desk(vehicle)
-    desk.command()
-    vehicle.data_to_send()
-    vehicle.tick(9.3)
-    assert vehicle._on_at == pytest.approx(2.3)
-    desk.now = 9.3
-    desk.received.clear()
-    desk.run(9.3)
-    assert [each.time_boot_ms for each in desk.messages(wire.SystemTime)] == [7000]
-
-
 def test_invalid_reboot_arguments_are_rejected() -> None:
     with pytest.raises(UsageError, match="copter, plane, rover"):
         ArduPilotVehicle(kind="blimp")  # type: ignore[arg-type]
@@ -293,9 +236,3 @@ def test_invalid_reboot_arguments_are_rejected() -> None:
         generic(reboot_down=-1.0)
     with pytest.raises(UsageError, match="A_ENABLE"):
         ArduPilotVehicle(table={"A_ENABLE": 0}, reboot_groups=["A_ENABLE"])
-
-
-def test_sim_options_reach_the_vehicle() -> None:
-    options = VehicleFaults(armed=True, reboot_down=7.0).options
-    assert (options["armed"], options["reboot_down"]) == (True, 7.0)
-    assert VehicleFaults().options["armed"] is False

@@ -1,18 +1,14 @@
-/** Requests to the service, and its event stream. */
+/** Requests to the service, and its event stream. The token stays in this tab, and is sent in a header only. */
 
 /** Value of X-Author in every request: the page recognizes its own changes by it. */
 export const AUTHOR = `page-${crypto.getRandomValues(new Uint16Array(1))[0].toString(16).padStart(4, "0")}`;
-const BASE = "/api/v1";
 /** Timeout of a request in milliseconds. */
 const REQUEST_TIMEOUT = 15_000;
-/** Milliseconds between two checks whether the service responds. */
-const CHECK_INTERVAL = 10_000;
+/** Milliseconds without an event or comment after which the event stream is opened again. */
+const SILENCE_MAX = 40_000;
 /** Maximum milliseconds between two attempts to open the event stream. */
 const RETRY_INTERVAL_MAX = 10_000;
-const KINDS = [
-  ...["hello", "component", "change", "params", "resynced", "progress", "job", "link", "gap"],
-  ...["extended_change", "extended_params", "extended_progress"],
-];
+const TOKEN = "token";
 
 /** An error of the service; `status` is 0 if it cannot be reached. */
 export class Problem extends Error {
@@ -29,78 +25,79 @@ export class Problem extends Error {
 
 let askForToken = () => Promise.reject(new Problem(401, { detail: "A token is required." }));
 
-/** Sets the function that asks for a token; it resolves when the session has started. */
+/** Sets the function that asks for a token; it resolves when `setToken` has been called with a valid one. */
 export function onToken(ask) {
   askForToken = ask;
 }
 
-/** Returns the path of a component's resource, or of its cached data (`is_kept`). */
+export const setToken = (token) => sessionStorage.setItem(TOKEN, token);
+
+const headers = (token) => ({ "X-Author": AUTHOR, ...(token && { Authorization: `Bearer ${token}` }) });
+
+/** Returns the role of a token, by default that of this tab: "read", "write", or null without a valid one. */
+export async function roleOf(token = sessionStorage.getItem(TOKEN)) {
+  const answer = await attempt("/health", { headers: headers(token), signal: AbortSignal.timeout(REQUEST_TIMEOUT) });
+  if (answer.status === 401) return null;
+  if (!answer.ok) throw new Problem(answer.status, null);
+  return (await answer.json()).role;
+}
+
+/** Returns the path of a component's resource, on its link or in the cache (`is_kept`). */
 export function at(component, what = "", query = {}) {
-  if (component.is_kept) {
-    const search = new URLSearchParams(query);
-    return `/vehicles/${encodeURIComponent(component.key)}/${component.component}${what}?${search}`;
-  }
-  const search = new URLSearchParams({ link: component.link, ...query });
-  return `/components/${component.system}/${component.component}${what}?${search}`;
+  const place = component.is_kept ? { key: component.key } : { link: component.link };
+  return `/api/vehicles/${component.system}/${component.component}${what}?${new URLSearchParams({ ...place, ...query })}`;
 }
 
-/**
- * Sends a request and returns the JSON of the response, or null. `body` is sent as JSON, a File unchanged. If a token
- * is required, asks the user and repeats the request.
- */
-export async function request(method, address, body, { timeout = REQUEST_TIMEOUT } = {}) {
-  const answer = await exchange(method, address, body, timeout);
-  return isJson(answer) ? answer.json() : null;
+/** Sends a request with a JSON body and returns the JSON of the response. `signal` ends it. */
+export async function request(method, address, body, { timeout = REQUEST_TIMEOUT, signal = null } = {}) {
+  const answer = await exchange(method, address, body, timeout, signal);
+  return answer.json();
 }
 
-export const get = (address) => request("GET", address);
+export const get = (address, options) => request("GET", address, undefined, options);
 
 /** Requests a file to save: its name and content. */
 export async function download(address, timeout) {
-  const answer = await exchange("GET", address, undefined, timeout);
+  const answer = await exchange("GET", address, undefined, timeout, null);
   const [, name] = /filename="?([^";]+)/.exec(answer.headers.get("content-disposition") ?? "") ?? [];
   return { name: name ?? "parameters", content: await answer.blob() };
 }
 
-const isJson = (answer) => answer.status !== 204 && (answer.headers.get("content-type") ?? "").includes("json");
-
-async function exchange(method, address, body, timeout) {
+async function exchange(method, address, body, timeout, signal) {
   for (;;) {
-    const answer = await attempt(method, address, body, timeout);
+    const ends = AbortSignal.any([AbortSignal.timeout(timeout), ...(signal ? [signal] : [])]);
+    const options = { method, signal: ends, cache: "no-store", headers: headers(sessionStorage.getItem(TOKEN)) };
+    if (body !== undefined) {
+      options.body = JSON.stringify(body);
+      options.headers["Content-Type"] = "application/json";
+    }
+    const answer = await attempt(address, options);
     if (answer.ok) return answer;
-    if (answer.status !== 401 || address === "/session")
-      throw new Problem(answer.status, isJson(answer) ? readable(await answer.json()) : null);
+    if (answer.status !== 401) throw new Problem(answer.status, await problemOf(answer));
     await askForToken();
   }
 }
 
-async function attempt(method, address, body, timeout) {
-  const ends = AbortSignal.timeout(timeout);
-  const options = { method, signal: ends, headers: { "X-Author": AUTHOR }, cache: "no-store" };
-  if (body instanceof Blob) {
-    options.body = body;
-    options.headers["Content-Type"] = "application/octet-stream";
-  } else if (body !== undefined) {
-    options.body = JSON.stringify(body);
-    options.headers["Content-Type"] = "application/json";
-  }
+async function attempt(address, options) {
   try {
-    return await fetch(BASE + address, options);
-  } catch {
-    throw new Problem(0, ends.aborted ? { detail: `The service did not respond within ${timeout / 1000} s.` } : null);
+    return await fetch(address, options);
+  } catch (error) {
+    if (error.name === "AbortError") throw new Problem(0, { detail: "Stopped." });
+    throw new Problem(0, error.name === "TimeoutError" ? { detail: "The service did not respond in time." } : null);
   }
 }
 
-/** Returns the errors of a body as one sentence. */
-function readable(document) {
-  if (!Array.isArray(document?.detail)) return document;
-  return { ...document, detail: document.detail.map((each) => each.msg).join("; ") };
+async function problemOf(answer) {
+  try {
+    return await answer.json();
+  } catch {
+    return null;
+  }
 }
 
 /**
- * Follows the event stream. Calls `begin()` if everything must be loaded: at the start, after a gap, and after a
- * restart of the service. Calls `take(event)` with every other event, and `changed(isOpen)` when the connection opens
- * or closes.
+ * Follows the event stream. Calls `begin()` if everything must be loaded: at the start, and when events were missed.
+ * Calls `take(event)` with every other event, and `changed(isOpen)` when the connection opens or closes.
  */
 export class Stream {
   constructor({ begin, take, changed }) {
@@ -108,66 +105,73 @@ export class Stream {
     this.take = take;
     this.changed = changed;
     this.last = null;
-    this.run = null;
     this.pause = 500;
-    this.source = null;
+    this.reading = null;
     addEventListener("online", () => this.open());
-    setInterval(() => this.checkConnection(), CHECK_INTERVAL);
   }
 
-  open() {
-    clearTimeout(this.waiting);
-    this.source?.close();
-    const source = new EventSource(`${BASE}/events${this.last ? `?after=${encodeURIComponent(this.last)}` : ""}`);
-    this.source = source;
-    const receive = (message) => {
-      if (message.lastEventId) this.last = message.lastEventId;
-      this.receive(JSON.parse(message.data));
-    };
-    source.onmessage = receive;
-    for (const kind of KINDS) source.addEventListener(kind, receive);
-    source.onerror = () => {
-      if (source !== this.source) return;
-      this.changed(false);
-      if (source.readyState === EventSource.CLOSED) this.retryLater();
-    };
-  }
-
-  receive(event) {
-    if (event.type === "hello") {
-      this.pause = 500;
-      this.changed(true);
-      const isNew = event.run !== this.run || !event.resumed;
-      this.run = event.run;
-      if (isNew) this.begin();
-    } else if (event.type === "gap") this.begin();
-    else this.take(event);
-  }
-
-  /** The browser gives up: a token is required, or no service is running. */
-  retryLater() {
-    this.source?.close();
-    this.waiting = setTimeout(async () => {
+  /** Opens the stream, again after each end. */
+  async open() {
+    this.reading?.abort();
+    const reading = new AbortController();
+    this.reading = reading;
+    while (!reading.signal.aborted) {
       try {
-        await get("/me");
-        this.open();
-      } catch {
-        this.retryLater();
+        await this.read(reading);
+      } catch (error) {
+        if (error.status === 401) {
+          await askForToken();
+          continue;
+        }
       }
-    }, this.pause);
-    this.pause = Math.min(RETRY_INTERVAL_MAX, this.pause * 2);
+      if (reading.signal.aborted) return;
+      this.changed(false);
+      await new Promise((resolve) => setTimeout(resolve, this.pause));
+      this.pause = Math.min(RETRY_INTERVAL_MAX, this.pause * 2);
+    }
   }
 
-  /** Reconnects after silence: a lost network closes no connection. */
-  async checkConnection() {
-    if (document.hidden || this.source?.readyState !== EventSource.OPEN) return;
+  async read(reading) {
+    const silence = new AbortController();
+    let timer = null;
+    const alive = () => {
+      clearTimeout(timer);
+      timer = setTimeout(() => silence.abort(), SILENCE_MAX);
+    };
+    alive();
     try {
-      await fetch("/health", { signal: AbortSignal.timeout(CHECK_INTERVAL / 2), cache: "no-store" });
-      if (this.isNumb) this.open();
-      this.isNumb = false;
-    } catch {
-      this.isNumb = true;
-      this.changed(false);
+      const answer = await fetch("/api/events", {
+        signal: AbortSignal.any([reading.signal, silence.signal]),
+        cache: "no-store",
+        headers: { ...headers(sessionStorage.getItem(TOKEN)), ...(this.last && { "Last-Event-ID": this.last }) },
+      });
+      if (!answer.ok) throw new Problem(answer.status, null);
+      const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
+      let text = "";
+      for (;;) {
+        const { done, value } = await reader.read();
+        if (done) return;
+        alive();
+        const parts = (text + value).split("\n\n");
+        text = parts.pop();
+        for (const part of parts) this.receive(part);
+      }
+    } finally {
+      clearTimeout(timer);
     }
+  }
+
+  receive(part) {
+    const [, id] = /^id: (.*)$/m.exec(part) ?? [];
+    const [, data] = /^data: (.*)$/m.exec(part) ?? [];
+    if (!data) return;
+    const event = JSON.parse(data);
+    const isFirst = this.last === null;
+    this.last = id;
+    if (event.type !== "hello") return this.take(event);
+    this.pause = 500;
+    this.changed(true);
+    if (isFirst || !event.resumed) this.begin();
+    return undefined;
   }
 }

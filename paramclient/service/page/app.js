@@ -89,7 +89,6 @@ const draw = onceAFrame(() => {
 });
 const drawState = onceAFrame(() => {
   drawVehicles();
-  offerDescriptions();
   drawEmpty(grid.rows.length, store.table.rows.size);
 });
 
@@ -293,7 +292,7 @@ const stream = new Stream({
   begin: () =>
     store.begin().catch((error) => {
       showError(error);
-      stream.last = stream.run = null; // begin anew
+      stream.last = null; // begin anew
       setTimeout(() => stream.open(), 2000);
     }),
   take: (event) => store.take(event),

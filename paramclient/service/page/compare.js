@@ -6,16 +6,15 @@ import { closeDialog, openDialog } from "./dialogs.js";
 import { valueText } from "./details.js";
 import { Caution, OUTCOMES, nameOf, outcomesText } from "./review.js";
 import { keyOf, store } from "./store.js";
-import { many, moment, numberText } from "./values.js";
+import { isWhole, many, moment, numberText, textOf } from "./values.js";
 
 /** Maximum size of a parameter file in bytes, as in the service. */
 const FILE_BYTES_MAX = 2 * 2 ** 20;
-/** Maximum size of a file of changed names in bytes, as in the service. */
-const RENAMES_BYTES_MAX = 2 ** 20;
 /** Timeout of a plan in milliseconds. */
 const PLAN_TIMEOUT = 120_000;
-/** Milliseconds between two requests for the state of a job. */
-const JOB_POLL_INTERVAL = 300;
+/** Timeout of an apply in milliseconds, and for each of its values: it may reboot the vehicle. */
+const APPLY_TIMEOUT = 300_000;
+const APPLY_TIMEOUT_PER_VALUE = 400;
 
 /** Asks what to compare with; `file` is a file dropped onto the page. */
 export async function chooseOther(file = null) {
@@ -67,22 +66,23 @@ export function setOther(other) {
 async function fromFile(file) {
   if (file.size > FILE_BYTES_MAX)
     throw new Problem(0, { detail: `${file.name} has ${file.size} bytes; that is no parameter file.` });
-  const read = await request("POST", `/files?${new URLSearchParams({ name: file.name })}`, file);
-  const source = { file: { name: file.name, base64: await base64(file) } };
-  return otherOf(file.name, read.params, source, true, read.notes ?? []);
+  const content = { name: file.name, base64: await base64(file) };
+  const read = await request("POST", "/api/files", content);
+  const own = read.components.find((each) => each.component === store.component.component);
+  const { params } = own ?? read.components[0] ?? { params: {} };
+  return otherOf(file.name, params, { file: content }, true, read.notes);
 }
 
 async function fillSnapshots(component, list, attempt) {
   try {
     const { snapshots } = await get(at(component, "/snapshots"));
-    const kept = [...snapshots].sort((a, b) => b.id - a.id);
-    fill(list, kept, "The cache has no earlier state.", (each) => [
-      `${moment(each.at ?? each.time)}`,
+    fill(list, [...snapshots].reverse(), "The cache has no earlier state.", (each) => [
+      moment(each.time),
       `${each.reason}, ${many(each.size, "parameter")}`,
       () =>
         attempt(async () => {
-          const state = await get(at(component, `/snapshots/${each.id}`));
-          return otherOf(`state of ${moment(each.at ?? each.time)}`, state.params, { snapshot: each.id }, false);
+          const state = await get(at(component, "/params", { snapshot: each.id }));
+          return otherOf(`state of ${moment(each.time)}`, state.params, { snapshot: each.id }, false);
         }),
     ]);
   } catch (error) {
@@ -92,16 +92,20 @@ async function fillSnapshots(component, list, attempt) {
 
 function fillVehicles(component, list, attempt) {
   const others = [...store.components.values(), ...store.unheard].filter((each) => keyOf(each) !== keyOf(component));
-  fill(list, others, "No other vehicle is known.", (each) => {
-    const { key, link, system, component: id } = each;
-    const source = each.is_kept ? { vehicle: { key, component: id } } : { component: { system, component: id, link } };
-    return [
-      nameOf(each),
-      each.is_kept ? `${each.uid ?? key}, in the cache since ${moment(each.last_seen)}` : `on ${link}`,
-      () => attempt(async () => otherOf(nameOf(each), (await get(at(each, "/params"))).params, source, false)),
-    ];
-  });
+  fill(list, others, "No other vehicle is known.", (each) => [
+    nameOf(each),
+    each.is_kept ? `${each.uid ?? each.key}, in the cache since ${moment(each.last_seen)}` : `on ${each.link}`,
+    () =>
+      attempt(async () => {
+        const { params } = await get(at(each, "/params"));
+        const values = Object.entries(params).map(([name, param]) => [name, sendable(param)]);
+        return otherOf(nameOf(each), params, { values: Object.fromEntries(values) }, false);
+      }),
+  ]);
 }
+
+/** Returns a value as it is sent: digits of an integer that a JavaScript number cannot represent. */
+const sendable = (param) => (Number.isSafeInteger(param.value) || !isWhole(param.type) ? param.value : textOf(param));
 
 function fill(list, items, remark, parts) {
   const made = items.map((item) => choice(...parts(item)));
@@ -161,7 +165,7 @@ export async function takeOver() {
   const summary = el("p", { class: "summary", role: "status", text: "Planning the changes …" });
   const body = el("tbody");
   const apply = button("Apply", () => go(), { kind: "strong", disabled: true });
-  const cancel = button("Not now", () => (hasBegun ? stop() : closeDialog()), { kind: "quiet" });
+  const cancel = button("Not now", () => (hasBegun ? stopping.abort() : closeDialog()), { kind: "quiet" });
   const buttons = el("div", { class: "buttons" }, cancel, apply);
   const armed = new Caution(component, () => refresh());
   const all = el("input", {
@@ -176,11 +180,8 @@ export async function takeOver() {
     },
   });
   const table_ = changesTable([el("th", {}, all), "Name", "Now", "New", "Remark"], body);
-  const text = "Changed names: a JSON file with old and new names.";
-  const [renamesInput, renamesLabel] = fileChoice("renames", text, replan, { accept: ".json" });
-  let renames = null;
   let lines = [];
-  let job = null;
+  const stopping = new AbortController();
   let hasBegun = false;
   let isOver = false;
 
@@ -199,72 +200,56 @@ export async function takeOver() {
     if (hasBegun || armed.forbids) return;
     hasBegun = true;
     for (const line of lines) line.box.disabled = true;
-    all.disabled = apply.disabled = renamesInput.disabled = true;
+    all.disabled = apply.disabled = true;
     cancel.replaceChildren(el("span", { text: "Stop" }));
     summary.textContent = "Applying …";
     const include = chosen.filter((line) => line.status !== "set").map((line) => exactly(line.name));
+    const body = {
+      ...other.source,
+      only: chosen.map((line) => exactly(line.name)),
+      include,
+      allow_armed: armed.isNeeded,
+      skip_invalid: true,
+    };
+    const timeout = APPLY_TIMEOUT + chosen.length * APPLY_TIMEOUT_PER_VALUE;
     try {
-      job = await request("POST", at(component, "/apply"), {
-        wanted: other.source,
-        renames,
-        only: chosen.map((line) => exactly(line.name)),
-        include,
-        allow_armed: armed.isArmed,
-        skip_invalid: true,
-        wait: false,
-      });
-      const ended = await followJob(job, (progress) => {
-        if (progress?.total)
-          summary.textContent = `${PHASES[progress.phase] ?? "Applying"}: ${progress.done} of ${progress.total}`;
-      });
-      show(ended, chosen);
+      show(await request("POST", at(component, "/apply"), body, { timeout, signal: stopping.signal }), chosen);
     } catch (error) {
       fault.textContent = error.message;
-      summary.textContent = "";
+      summary.textContent = stopping.signal.aborted ? "Values that were written stay on the vehicle." : "";
     }
-    job = null;
     isOver = true;
     buttons.replaceChildren(button("Done", closeDialog, { kind: "strong" }));
     buttons.querySelector(".strong").focus();
   }
 
-  function show(ended, chosen) {
-    const result = ended.result ?? {};
+  function show(result, chosen) {
     const outcomes = [];
     for (const line of chosen) {
-      const row = result.params?.[line.name] ?? { status: ended.state === "done" ? "unchanged" : "failed" };
+      const row = result.params[line.name] ?? { status: "unchanged" };
       const word = OUTCOMES[row.status] ?? { text: row.status, kind: "warn" };
       const made = row.status === "adjusted" ? `The vehicle changed it to ${numberText(row.actual, row.type)}. ` : "";
       line.remark.replaceChildren(
         el("b", { class: `outcome ${word.kind}`, text: word.text }),
         ` ${made}${row.reason ?? ""}`,
       );
-      const known = table.rows.get(line.here)?.document;
+      const known = table.rows.get(line.name)?.document;
       const isTaken = ["set", "adjusted", "unproven"].includes(row.status);
       outcomes.push({
-        name: line.here,
+        name: line.name,
         status: row.status,
         isTaken,
         before: line.before,
         restore: line.restore ?? known?.value,
       });
     }
-    table.sent = { names: new Set(chosen.map((line) => line.here)), outcomes, at: Date.now() };
-    const late = result.reboot_required ?? [];
+    table.sent = { names: new Set(chosen.map((line) => line.name)), outcomes, at: Date.now() };
+    const late = result.reboot_required;
     summary.textContent = `${outcomesText(outcomes)}${late.length ? ` Takes effect after a reboot of the vehicle: ${late.join(", ")}.` : ""}`;
-    fault.textContent = result.error ?? ended.problem?.detail ?? "";
+    fault.textContent = result.error ?? "";
     announce(summary.textContent);
     store.emit("pending");
     store.emit("table");
-  }
-
-  async function replan(file) {
-    fault.textContent = "";
-    renames = null;
-    if (file && file.size > RENAMES_BYTES_MAX)
-      fault.textContent = `${file.name} has ${file.size} bytes; that is no file of names.`;
-    else if (file) renames = { name: file.name, text: await file.text() };
-    await makePlan();
   }
 
   async function makePlan() {
@@ -272,10 +257,8 @@ export async function takeOver() {
     body.replaceChildren();
     summary.textContent = "Planning the changes …";
     refresh();
-    const planRequest = { wanted: other.source, renames };
     try {
-      const plan = await request("POST", at(component, "/plan"), planRequest, { timeout: PLAN_TIMEOUT });
-      if (planRequest.renames !== renames) return; // another file was chosen meanwhile
+      const plan = await request("POST", at(component, "/plan"), other.source, { timeout: PLAN_TIMEOUT });
       lines = linesOf(plan, table, other, refresh);
       body.replaceChildren(...lines.map((line) => line.element));
       const count = lines.filter((line) => line.status === "set").length;
@@ -290,17 +273,16 @@ export async function takeOver() {
     }
   }
 
-  function stop() {
-    if (job)
-      request("DELETE", `/jobs/${encodeURIComponent(job.id)}`).catch((error) => (fault.textContent = error.message));
-  }
-
   store.whileShown(table_, "table", () => {
     if (!hasBegun) for (const line of lines) line.follow();
   });
+  store.whileShown(table_, "setup", (event) => {
+    if (hasBegun && !isOver && keyOf(event) === keyOf(component) && event.total)
+      summary.textContent = `${PHASES[event.phase] ?? "Applying"}: ${event.done} of ${event.total}`;
+  });
   const opened = openDialog(
     `Take over from ${other.label}`,
-    el("div", {}, armed.element, fault, summary, table_, renamesLabel),
+    el("div", {}, armed.element, fault, summary, table_),
     buttons,
     { isHeld: () => hasBegun && !isOver, kind: "wide", focus: cancel },
   );
@@ -326,11 +308,10 @@ function linesOf(plan, table, other, refresh) {
       ({ name, planned }) =>
         planned &&
         planned.status !== "unchanged" &&
-        (table.rows.has(planned.vehicle_name ?? name) || planned.category === "missing"),
+        (table.rows.has(name) || planned.category === "missing"),
     )
     .map(({ name, planned }) => {
-      const here = planned.vehicle_name ?? name;
-      const row = table.rows.get(here);
+      const row = table.rows.get(name);
       const { status } = planned;
       const isOutOfRange = status === "invalid" && planned.category === "out-of-range";
       const isOut = !row || planned.category === "missing" || (status === "invalid" && !isOutOfRange);
@@ -353,14 +334,14 @@ function linesOf(plan, table, other, refresh) {
         "tr",
         { class: isOut ? "out" : "" },
         el("td", { class: "pick" }, box),
-        el("th", { scope: "row", text: here === name ? name : `${name} (here ${here})` }),
+        el("th", { scope: "row", text: name }),
         now,
         el("td", { class: "new", text: numberText(planned.wanted, row?.type ?? planned.type) }),
         remark,
       );
-      const line = { name, here, status, box, remark, element };
+      const line = { name, status, box, remark, element };
       line.follow = () => {
-        const { text, document } = table.rows.get(here) ?? {};
+        const { text, document } = table.rows.get(name) ?? {};
         line.before = text ?? "";
         line.restore = document?.bits ? { bits: document.bits } : document?.value;
         setText(now, line.before);
@@ -368,18 +349,4 @@ function linesOf(plan, table, other, refresh) {
       line.follow();
       return line;
     });
-}
-
-/** Polls a job until its end, also while the service is unreachable. */
-async function followJob(begun, report) {
-  for (;;) {
-    try {
-      const job = await get(`/jobs/${encodeURIComponent(begun.id)}`);
-      report(job.progress);
-      if (job.state !== "running") return job;
-    } catch (error) {
-      if (error.status !== 0) throw error;
-    }
-    await new Promise((resolve) => setTimeout(resolve, JOB_POLL_INTERVAL));
-  }
 }

@@ -118,7 +118,6 @@ export class Details {
       ["Group", row.group],
       ["Category", info?.category],
       ["Value", TRUST[known.trust] ?? known.trust],
-      ["Received", known.heard_at ? moment(known.heard_at) : null],
       ["Restart", info?.reboot_required && "a new value counts from the next start on"],
       ["Read-only", info?.is_read_only && "the vehicle sets it by itself"],
       ["Changes", info?.is_volatile && "by itself, now and then"],
@@ -165,7 +164,7 @@ export class Details {
 }
 
 /** Returns the time of a history entry in unix seconds. */
-const timeOf = (entry) => entry.at ?? Date.parse(entry.time) / 1000;
+const timeOf = (entry) => Date.parse(entry.time) / 1000;
 
 /** Returns the value of a document, which is a parameter or a number. */
 export function valueText(value, type) {

@@ -1,6 +1,6 @@
 /** Dialogs: one at a time, with the browser's focus handling. */
 
-import { onToken, request } from "./api.js";
+import { onToken, roleOf, setToken } from "./api.js";
 import { button, byId, el, faultText } from "./dom.js";
 
 let asking = null;
@@ -60,25 +60,28 @@ async function ask() {
       on: {
         submit: async (event) => {
           event.preventDefault();
+          const token = field.value.trim();
           try {
-            await request("POST", "/session", { token: field.value.trim() });
-            isDone = true;
-            closeDialog();
+            if ((await roleOf(token)) === null) fault.textContent = "The token is not valid for this service.";
+            else {
+              setToken(token);
+              isDone = true;
+              closeDialog();
+            }
           } catch (error) {
-            fault.textContent =
-              error.status === 401 || error.status === 403 ? "The token is not valid for this service." : error.message;
-            field.select();
+            fault.textContent = error.message;
           }
+          field.select();
         },
       },
     },
-    el("p", { text: "This service requires a token. The browser keeps it until it is closed." }),
+    el("p", { text: "This service requires a token. The browser keeps it until this tab is closed." }),
     el("label", { for: "token", text: "Token" }),
     field,
     fault,
   );
-  const enter = el("button", { type: "submit", form: "token-form", class: "button strong", text: "Go on" });
-  while (!isDone) await openDialog("Token", form, [enter], { kind: "small", isHeld: () => !isDone, focus: field });
+  const enter = el("button", { type: "submit", form: "token-form", class: "button strong", text: "Sign in" });
+  while (!isDone) await openDialog("Sign in", form, [enter], { kind: "small", isHeld: () => !isDone, focus: field });
 }
 
 onToken(askForToken);

@@ -3,12 +3,13 @@
 import { at, get, request } from "./api.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { announce, button, byId, changesTable, el, faultText, setText } from "./dom.js";
-import { Caution, OUTCOMES, nameOf } from "./review.js";
+import { Caution, OUTCOMES, nameOf, statusOf } from "./review.js";
 import { authorOf, keyOf, store } from "./store.js";
 import { isFloat, isWhole, many, numberText, parse } from "./values.js";
 
 /** Prefix of a value that is given as bytes in hexadecimal digits. */
 const HEX = "hex:";
+const EXTENDED = { ext: "true" };
 /** Timeout in milliseconds for a list, and for a change in progress. */
 const EXTENDED_TIMEOUT = 180_000;
 
@@ -34,7 +35,7 @@ function read(text, type) {
   if (isWhole(type) || isFloat(type)) {
     const { error, send, text: digits } = parse(text, type);
     if (error) return { error };
-    return { send: typeof send === "object" ? { number: digits } : send };
+    return { send: typeof send === "object" ? digits : send };
   }
   if (!text.startsWith(HEX)) return { send: text };
   const hex = text.slice(HEX.length).replace(/\s/g, "");
@@ -131,7 +132,7 @@ export async function showExtended() {
 
   async function load() {
     early = [];
-    const found = await get(at(component, "/extended/params"));
+    const found = await get(at(component, "/params", EXTENDED));
     for (const name of [...lines.keys()]) if (!(name in found.params)) drop(name);
     const params = Object.values(found.params).sort((a, b) => (a.name < b.name ? -1 : 1));
     for (const param of params) take(param);
@@ -161,11 +162,8 @@ export async function showExtended() {
 
   store.whileShown(table, "extended", (event) => {
     if (event && keyOf(event) !== key) return;
-    if (event?.type === "extended_change") early ? early.push(event) : change(event);
-    else if (event?.type === "extended_progress") {
-      if (event.done) showCount();
-      else setText(state, `Fetching ${event.received}${event.total ? ` of ${event.total}` : ""} …`);
-    } else attempt(load);
+    if (event) early ? early.push(event) : change(event);
+    else attempt(load);
   });
 
   async function attempt(work) {
@@ -182,7 +180,7 @@ export async function showExtended() {
     fetch_.disabled = true;
     setText(state, "Fetching …");
     await attempt(async () => {
-      const done = await request("POST", at(component, "/extended/fetch"), {}, { timeout: EXTENDED_TIMEOUT });
+      const done = await request("POST", at(component, "/fetch", EXTENDED), {}, { timeout: EXTENDED_TIMEOUT });
       await load();
       const missing = done.missing.length ? `, ${done.missing.length} are missing` : "";
       announce(`${many(done.received, "extended parameter")} received${missing}.`);
@@ -201,16 +199,16 @@ export async function showExtended() {
     line.report("Sending …");
     try {
       const body = { values: { [param.name]: value } };
-      const answer = await request("PATCH", at(component, "/extended/params"), body, { timeout: EXTENDED_TIMEOUT });
-      const { status, problem, param: now } = answer.results[param.name];
-      if (now) {
+      const answer = await request("PATCH", at(component, "/params", EXTENDED), body, { timeout: EXTENDED_TIMEOUT });
+      const { status, reason, actual, actual_hex: hex } = answer.results[0];
+      const now = { ...param, value: actual, hex };
+      if (hex !== null) {
         line.text = field.value; // what was typed is sent
         line.take(now);
       }
-      end(line, status, status === "adjusted" ? textOf(now) : problem?.detail);
+      end(line, status, status === "adjusted" ? textOf(now) : reason);
     } catch (problem) {
-      // only a documented problem: nothing was written
-      end(line, problem.document?.type && problem.status !== 500 ? "not tried" : "unknown", problem.message);
+      end(line, statusOf(problem), problem.message);
     }
     line.isSending = false;
     refresh();

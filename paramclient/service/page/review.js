@@ -27,32 +27,53 @@ export const OUTCOMES = {
   failed: { text: "failed", kind: "bad" },
 };
 
-/**
- * The confirmation for writes to a vehicle, shown while it is armed. `change` is called after a change.
- */
-export class Caution {
-  constructor(component, change) {
-    this.key = keyOf(component);
+/** A confirmation of what may be dangerous, shown while it is needed. `change` is called when its box changes. */
+class Confirmation {
+  constructor(title, text, label, change) {
     this.box = el("input", { type: "checkbox", on: { change } });
     this.element = el(
       "div",
-      { class: "armed", role: "alert", hidden: !this.isArmed },
-      el("p", {}, el("b", { text: "The vehicle is armed. " }), "Its motors may turn, and new values take effect immediately."),
-      el("label", {}, this.box, el("span", { text: "Send anyway" })),
+      { class: "armed", role: "alert", hidden: true },
+      el("p", {}, el("b", { text: `${title} ` }), text),
+      el("label", {}, this.box, el("span", { text: label })),
     );
-    store.whileShown(this.element, "armed", () => {
-      this.element.hidden = !this.isArmed;
-      this.box.checked = false;
-      change();
-    });
   }
 
-  get isArmed() {
-    return Boolean(store.components.get(this.key)?.is_armed);
+  /** Shows or hides it; it must be given again after each change. */
+  show(isNeeded) {
+    if (this.element.hidden === !isNeeded) return;
+    this.element.hidden = !isNeeded;
+    this.box.checked = false;
+  }
+
+  get isNeeded() {
+    return !this.element.hidden;
   }
 
   get forbids() {
-    return this.isArmed && !this.box.checked;
+    return this.isNeeded && !this.box.checked;
+  }
+}
+
+/** The confirmation for writes to a vehicle while it is armed. */
+export class Caution extends Confirmation {
+  constructor(component, change) {
+    const text = "Its motors may turn, and new values take effect immediately.";
+    super("The vehicle is armed.", text, "Send anyway", change);
+    const key = keyOf(component);
+    const look = () => this.show(Boolean(store.components.get(key)?.is_armed));
+    look();
+    store.whileShown(this.element, "armed", () => {
+      look();
+      change();
+    });
+  }
+}
+
+/** The confirmation for values outside the range in the metadata. */
+class RangeCaution extends Confirmation {
+  constructor(change) {
+    super("Values are out of range.", "The firmware may misbehave with them.", "Send them anyway", change);
   }
 }
 
@@ -68,6 +89,7 @@ export async function review() {
   const dropping = el("th", {}, el("span", { class: "unseen", text: "Drop" }));
   const table_ = changesTable(["Name", "Now", "New", "Remark", dropping], el("tbody", {}, elements));
   const armed = new Caution(component, () => refresh());
+  const range = new RangeCaution(() => refresh());
   const summary = el("p", { class: "summary", role: "status" });
   const send = button("", () => go(), { kind: "strong" });
   const cancel = button("Not yet", closeDialog, { kind: "quiet" });
@@ -78,12 +100,15 @@ export async function review() {
   function refresh() {
     const count = lines.size;
     if (isSending || sent) return;
-    send.disabled = !count || armed.forbids;
+    range.show([...lines.values()].some((line) => line.isOutOfRange));
+    send.disabled = !count || armed.forbids || range.forbids;
     send.replaceChildren(el("span", { text: `Send ${many(count, "change")}` }));
   }
 
   store.whileShown(table_, "table", () => {
-    if (!isSending && !sent) for (const line of lines.values()) line.follow();
+    if (isSending || sent) return;
+    for (const line of lines.values()) line.follow();
+    refresh();
   });
 
   function drop(name) {
@@ -97,14 +122,14 @@ export async function review() {
   }
 
   async function go() {
-    if (isSending || armed.forbids) return;
+    if (isSending || armed.forbids || range.forbids) return;
     isSending = true;
     send.disabled = cancel.disabled = true;
     send.replaceChildren(el("span", { text: "Sending …" }));
     sent = { names: new Set(lines.keys()), outcomes: [], at: Date.now() };
     table.sent = sent;
     const queue = [...lines.values()];
-    while (queue.length) sent.outcomes.push(...(await sendBatch(component, queue.splice(0, VALUES_PER_REQUEST))));
+    while (queue.length) sent.outcomes.push(...(await sendBatch(component, queue.splice(0, VALUES_PER_REQUEST), range.isNeeded)));
     for (const each of sent.outcomes) if (each.isTaken) table.pending.delete(each.name);
     isSending = false;
     store.emit("pending");
@@ -120,8 +145,8 @@ export async function review() {
   }
 
   refresh();
-  const focus = armed.isArmed ? armed.box : send;
-  await openDialog(`Review: ${nameOf(component)}`, el("div", {}, armed.element, table_, summary), buttons, {
+  const focus = [armed, range].find((each) => each.isNeeded)?.box ?? send;
+  await openDialog(`Review: ${nameOf(component)}`, el("div", {}, armed.element, range.element, table_, summary), buttons, {
     isHeld: () => isSending,
     kind: "wide",
     focus,
@@ -179,15 +204,17 @@ function lineOf(change, rowNow, drop) {
     button("", drop, { kind: "quiet only", drawing: "close", label: `Drop ${name}` }),
   );
   const element = el("tr", {}, el("th", { scope: "row", text: name }), now, wanted, remark, away);
-  const follow = () => {
+  const line = { change, rowNow, element, remark, away };
+  line.follow = () => {
     const row = rowNow();
     const [doubts, remarks] = remarksOf(change, row);
+    line.isOutOfRange = Boolean(row && warningOf(change.text, row.info, row.type));
     setText(now, inWords(row?.text ?? "", row));
     setText(wanted, inWords(change.text, row));
     remark.replaceChildren(doubts && el("b", { class: "outcome warn", text: `${doubts} ` }), remarks);
   };
-  follow();
-  return { change, rowNow, element, remark, away, follow };
+  line.follow();
+  return line;
 }
 
 /** Returns warnings and notes for a change. */
@@ -210,7 +237,7 @@ function inWords(value, row) {
 }
 
 /** Writes changes in one request, shows each result in its row, and returns the outcomes. */
-async function sendBatch(component, lines) {
+async function sendBatch(component, lines, force) {
   const parts = lines.map((line) => ({ line, outcome: outcomeBefore(line) }));
   const open = parts.filter(({ outcome }) => outcome.status !== "skipped");
   for (const { line } of open) {
@@ -218,7 +245,7 @@ async function sendBatch(component, lines) {
     line.element.classList.add("busy");
     line.remark.textContent = "sending …";
   }
-  if (open.length) await writeValues(component, open);
+  if (open.length) await writeValues(component, open, force);
   for (const { line, outcome } of open) {
     const { text, kind } = OUTCOMES[outcome.status] ?? { text: outcome.status, kind: "warn" };
     line.element.classList.remove("busy");
@@ -244,30 +271,29 @@ function outcomeBefore({ change: { name }, rowNow }) {
   };
 }
 
-/** Sends the changes, and completes their outcomes. */
-async function writeValues(component, parts) {
+/** Sends the changes, and completes their outcomes. `force` sends values that are out of range. */
+async function writeValues(component, parts, force) {
   try {
-    const { results } = await request(
-      "PATCH",
-      at(component, "/params"),
-      { values: Object.fromEntries(parts.map(({ line: { change } }) => [change.name, change.send])) },
-      { timeout: WRITE_TIMEOUT + parts.length * WRITE_TIMEOUT_PER_VALUE },
-    );
-    for (const { line, outcome } of parts) complete(outcome, results[outcome.name], line.change.text);
+    const values = Object.fromEntries(parts.map(({ line: { change } }) => [change.name, change.send]));
+    const timeout = WRITE_TIMEOUT + parts.length * WRITE_TIMEOUT_PER_VALUE;
+    const { results } = await request("PATCH", at(component, "/params"), { values, force }, { timeout });
+    const byName = new Map(results.map((each) => [each.name, each]));
+    for (const { line, outcome } of parts) complete(outcome, byName.get(outcome.name), line.change.text);
   } catch (error) {
-    // only a documented problem: nothing was written
-    const status = error.document?.type && error.status !== 500 ? "not tried" : "unknown";
     for (const { outcome } of parts) {
-      outcome.status = status;
+      outcome.status = statusOf(error);
       outcome.reason = error.message;
     }
   }
 }
 
+/** Returns what is known of a write after an error: only with a documented problem, nothing was written. */
+export const statusOf = (error) => (error.document?.type && error.status !== 500 ? "not tried" : "unknown");
+
 function complete(outcome, result, text) {
   outcome.status = result.status;
   outcome.isTaken = ["accepted", "adjusted"].includes(result.status);
-  if (result.problem) outcome.reason = result.problem.detail ?? result.problem.title;
+  if (result.reason) outcome.reason = result.reason;
   else if (result.status === "adjusted")
     outcome.reason = `The vehicle changed ${text} to ${valueText(result.actual, outcome.type)}.`;
   else outcome.reason = result.note ?? "";

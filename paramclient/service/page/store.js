@@ -1,6 +1,6 @@
 /** The state of the page: vehicles, tables, staged and written changes. */
 
-import { AUTHOR, at, get } from "./api.js";
+import { AUTHOR, at, get, roleOf } from "./api.js";
 import { meaningOf, sameText, textOf } from "./values.js";
 
 /** Milliseconds for which changes by other clients are highlighted. */
@@ -138,10 +138,9 @@ class Table {
 /** The whole state. `on(kind, listener)` returns a function that unsubscribes. */
 class Store {
   constructor() {
-    this.me = { role: "read", name: "", read_only: true };
+    this.role = null;
     this.components = new Map();
     this.tables = new Map();
-    this.links = new Map();
     this.kept = new Map();
     this.selected = null;
     this.isConnected = null;
@@ -186,7 +185,7 @@ class Store {
   }
 
   get mayWrite() {
-    return this.me.role === "write" && !this.me.read_only && !this.component?.is_kept;
+    return this.role === "write" && !this.component?.is_kept;
   }
 
   /** Loads the state of the service; events during the load are applied afterwards. */
@@ -199,11 +198,12 @@ class Store {
       table.seq = table.wanted = -1; // another run counts anew
       table.loads++;
     }
-    const [me, links, found] = await Promise.all([get("/me"), get("/links"), get("/components")]);
+    const found = await get("/api/vehicles");
+    const role = await roleOf();
     if (load !== this.loads) return;
-    this.me = me;
-    this.links = new Map(links.links.map((link) => [link.name, link]));
-    const documents = new Map(found.components.map((each) => [keyOf(each), each]));
+    this.role = role;
+    this.kept = keptOf(found.cached);
+    const documents = new Map(found.vehicles.map((each) => [keyOf(each), each]));
     const before = this.components.get(this.selected);
     if (before && !documents.has(this.selected)) documents.set(this.selected, asLost(before));
     this.components = documents;
@@ -214,19 +214,12 @@ class Store {
     if (!this.component) this.selected = first(this.components);
     this.emit("all");
     this.emit("extended", null);
-    await Promise.all([this.selected && this.loadTable(this.selected), this.loadKept()]);
+    if (this.selected) await this.loadTable(this.selected);
   }
 
-  /** Loads the vehicles in the cache, if there is one. */
+  /** Loads the vehicles in the cache again. */
   async loadKept() {
-    let vehicles = [];
-    try {
-      ({ vehicles } = await get("/vehicles"));
-    } catch (error) {
-      if (!error.status) throw error;
-    }
-    const found = vehicles.flatMap((vehicle) => vehicle.components.map((each) => asCached(vehicle, each)));
-    this.kept = new Map(found.map((each) => [keyOf(each), each]));
+    this.kept = keptOf((await get("/api/vehicles")).cached);
     this.emit("components");
   }
 
@@ -291,25 +284,26 @@ class Store {
       return;
     }
     if (event.type === "link") {
-      const name = event.link ?? event.name;
-      this.links.set(name, { ...this.links.get(name), name, state: event.state, error: event.error });
+      for (const each of this.components.values()) if (each.link === event.link) each.link_state = event.state;
       this.emit("components");
       return;
     }
     const key = keyOf(event);
-    if (event.type === "component") this.takeComponent(key, event);
+    if (event.type === "vehicle") this.takeComponent(key, event);
     else if (event.type === "change") this.takeChange(key, event);
-    else if (event.type === "params") this.reload(key, event.seq);
     else if (event.type === "progress") {
       const component = this.components.get(key);
-      if (component) component.fetch = event.done ? null : event;
+      if (component) component.fetch = event;
       this.emit("components");
-    } else if (event.type.startsWith("extended_")) this.emit("extended", event);
+    } else if (event.type === "extended_change") this.emit("extended", event);
+    else if (event.type === "setup") this.emit("setup", event);
   }
 
   takeComponent(key, event) {
     if (event.seq <= this.seq) return;
-    if (event.why === "forgotten") {
+    const document = event.vehicle;
+    const isForgotten = document === null;
+    if (isForgotten) {
       const before = this.components.get(key);
       if (key === this.selected && before) this.components.set(key, asLost(before));
       else this.components.delete(key);
@@ -317,13 +311,14 @@ class Store {
       const table = this.tables.get(key);
       if (table) table.isLoaded = false; // staged changes wait for the vehicle's return
     } else {
-      const document = event.component_doc;
       const before = this.components.get(key);
       this.components.set(key, document);
+      const isReady = (each) => each && `${each.fetches} ${each.has_metadata} ${each.state === "synced"}`;
+      if (before && isReady(before) !== isReady(document)) this.reload(key, event.seq);
       if (before && Boolean(before.is_armed) !== Boolean(document.is_armed)) this.emit("armed", document);
       if (before && before.is_lost !== document.is_lost) this.emit("lost", document);
     }
-    const isBack = key === this.selected && event.why !== "forgotten" && !this.table.isLoaded && !this.table.isLoading;
+    const isBack = key === this.selected && !isForgotten && !this.table.isLoaded && !this.table.isLoading;
     if (isBack) this.loadTable(key).catch(() => {});
     if (!this.component) {
       const key = first(this.components);
@@ -378,22 +373,14 @@ const NO_TABLE = new Table();
 /** A selected component that the service has removed: only the user changes the selection. */
 const asLost = (component) => ({ ...component, is_lost: true, is_armed: null, state: "lost", silence_s: 0, fetch: null });
 
-/** A cached component in the shape of a connected one: it can be viewed, not changed. */
-const asCached = (vehicle, { component, count, autopilot }) => ({
-  link: CACHED_PREFIX + vehicle.key,
-  system: vehicle.system,
-  component,
-  autopilot,
-  key: vehicle.key,
-  uid: vehicle.uid,
-  count,
-  last_seen: vehicle.last_seen,
-  state: "cached",
-  is_kept: true,
-  is_lost: false,
-  is_armed: null,
-  fetch: null,
-});
+/** The tables in the cache in the shape of connected components: they can be viewed, not changed. */
+const keptOf = (cached) =>
+  new Map(
+    cached.map((each) => {
+      const kept = { ...each, link: CACHED_PREFIX + each.key, state: "cached", is_kept: true, is_lost: false, is_armed: null, fetch: null };
+      return [keyOf(kept), kept];
+    }),
+  );
 
 /** Names the source of a change. */
 export function authorOf(by) {
@@ -403,10 +390,11 @@ export function authorOf(by) {
   return by.startsWith("us for ") ? by.slice(7) : by;
 }
 
-/** Sorts autopilots before other components. */
+/** Returns the key of the lowest autopilot, else of the lowest component: they are sorted. */
 function first(components) {
-  const keys = [...components.keys()];
-  return keys.find((key) => components.get(key).component === 1) ?? keys[0] ?? null;
+  const all = [...components.values()].sort((a, b) => a.system - b.system || a.component - b.component);
+  const chosen = all.find((each) => each.component === 1) ?? all[0];
+  return chosen ? keyOf(chosen) : null;
 }
 
 export const store = new Store();

@@ -1,7 +1,7 @@
 /** Vehicles and their states: the list, the status line, and the actions. */
 
-import { at, download, get, request } from "./api.js";
-import { announce, button, byId, choice, el, faultText, fileChoice, nothing, setAttribute, setText } from "./dom.js";
+import { at, download, request } from "./api.js";
+import { announce, button, byId, choice, el, faultText, nothing, setText } from "./dom.js";
 import { chooseOther } from "./compare.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { offerExtended, showExtended } from "./extended.js";
@@ -18,10 +18,19 @@ const STATES = {
   contested: "contested: several vehicles have this address",
   lost: "lost",
 };
-/** Timeout in milliseconds for saving a table that must be fetched first. */
-const SAVE_TIMEOUT = 180_000;
+/** Timeout in milliseconds for fetching a table, over a slow radio too. */
+const FETCH_TIMEOUT = 900_000;
 /** Timeout in milliseconds for metadata: 100 kB at 2 kB per second. */
 const DESCRIPTION_TIMEOUT = 300_000;
+/** Timeout in milliseconds for saving a table that must be fetched first. */
+const SAVE_TIMEOUT = 180_000;
+const FORMATS = [
+  ["qgc", "QGroundControl", ".params"],
+  ["parm", "MAVProxy, ArduPilot", ".parm"],
+  ["mission-planner", "Mission Planner", ".param"],
+  ["pck", "Packed file of a vehicle", ".pck"],
+  ["json", "paramclient, JSON", ".json"],
+];
 const KINDS = { new: "idle", cached: "warn", partial: "warn", synced: "good", fetching: "busy", contested: "bad", lost: "bad" };
 /** Display names of MAV_TYPE values of vehicles with parameters. */
 const TYPES = {
@@ -42,13 +51,13 @@ const TYPES = {
   26: "gimbal",
   30: "camera",
 };
-const LINK_PROBLEMS = { reconnecting: "link reconnecting", failed: "link failed", opening: "link opening" };
+const LINK_PROBLEMS = { failed: "link failed", opening: "link opening", ended: "end of the log" };
 
 /** Returns the state of a component in words, and the kind of its dot. */
 export function stateOf(component) {
   if (component.is_kept) return { text: `in the cache, heard last ${moment(component.last_seen)}`, kind: "idle" };
-  const link = store.links.get(component.link)?.state ?? component.link_state ?? "open";
-  if (link !== "open") return { text: LINK_PROBLEMS[link] ?? link, kind: "bad" };
+  const link = component.link_state;
+  if (link !== "open") return { text: LINK_PROBLEMS[link] ?? link, kind: link === "ended" ? "idle" : "bad" };
   if (component.is_lost)
     return { text: `lost${component.silence_s ? ` for ${span(component.silence_s)}` : ""}`, kind: "bad" };
   if (component.fetch) return { text: progressText(component.fetch), kind: "busy" };
@@ -171,7 +180,7 @@ export function drawActions() {
   const actions = [
     button("Compare", () => chooseOther(), { drawing: "compare" }),
     button("Save", shown(save), { drawing: "save" }),
-    button("Load descriptions", describe, { drawing: "help", id: "describe", hidden: true }),
+    isHeard && button("Load descriptions", shown(describe), { drawing: "help", id: "describe", hidden: true }),
     button("Extended", shown(showExtended), {
       drawing: "extended",
       label: "Extended parameters of the component: text and 64-bit numbers",
@@ -183,73 +192,53 @@ export function drawActions() {
     isHeard && button("Fetch", shown(fetchAll), { drawing: "refresh", label: "Fetch all parameters from the vehicle" }),
   ];
   byId("actions").replaceChildren(...actions.filter(Boolean));
-  byId("meter-cancel").replaceChildren(button("Stop", shown(stopFetch), { kind: "quiet" }));
+  byId("meter-cancel").replaceChildren(button("Stop", stopFetch, { kind: "quiet" }));
   setText(byId("role"), store.mayWrite ? "" : "read-only");
   offerExtended();
+  offerDescriptions();
+}
+
+/** Offers to load metadata from the vehicle if there is none. */
+export function offerDescriptions() {
+  const { component, table } = store;
+  const offer = byId("describe");
+  if (offer) offer.hidden = !table.rows.size || component?.has_metadata || component?.autopilot !== "px4";
+}
+
+async function describe() {
+  announce("Loading the descriptions.");
+  byId("describe").disabled = true;
+  try {
+    const { count } = await request("POST", at(store.component, "/metadata"), {}, { timeout: DESCRIPTION_TIMEOUT });
+    announce(`${many(count, "parameter")} described.`);
+  } finally {
+    byId("describe").disabled = false;
+  }
 }
 
 /** Returns an action whose error is shown. */
 const shown = (action) => () => action().catch(showError);
 
+/** The running fetch of this page, or null. */
+let fetching = null;
+
 async function fetchAll() {
-  await request("POST", at(store.component, "/fetch"), { refresh: true, wait: false });
   announce("Fetching all parameters.");
+  const own = new AbortController();
+  fetching = own;
+  try {
+    const options = { timeout: FETCH_TIMEOUT, signal: own.signal };
+    await request("POST", at(store.component, "/fetch"), { refresh: true }, options);
+  } catch (error) {
+    if (!own.signal.aborted) throw error;
+  } finally {
+    if (fetching === own) fetching = null;
+  }
 }
 
-/** Loads metadata from the vehicle, which is slow over a radio, or from a file. */
-async function describe() {
-  const { component } = store;
-  const fault = faultText();
-  const state = el("p", { role: "status" });
-  const attempt = async (method, body) => {
-    fault.textContent = "";
-    state.textContent = "Reading …";
-    try {
-      const { count } = await request(method, at(component, "/metadata"), body, { timeout: DESCRIPTION_TIMEOUT });
-      await store.loadTable(keyOf(component));
-      closeDialog();
-      announce(`${many(count, "parameter")} described.`);
-    } catch (error) {
-      fault.textContent = error.message;
-    }
-    state.textContent = "";
-  };
-  const text = "apm.pdef.xml, parameters.json or the like";
-  const [, label] = fileChoice("file", text, (file) => file && attempt("PUT", file));
-  const ask = button("Load from the vehicle", () => attempt("POST", {}), { kind: "strong" });
-  const content = el(
-    "div",
-    {},
-    el("p", {
-      text: "Units, ranges and value names are not loaded yet. A vehicle with PX4 can send them; for others, use a file of their firmware.",
-    }),
-    el("h3", { text: "From a file" }),
-    label,
-    state,
-    fault,
-  );
-  await openDialog(
-    `Descriptions for ${nameOf(component)}`,
-    content,
-    [button("Cancel", closeDialog, { kind: "quiet" }), ask],
-    { focus: ask },
-  );
-}
-
-/** Offers to load metadata if there is none. */
-export function offerDescriptions() {
-  const { table } = store;
-  const isWanted = table.isLoaded && table.rows.size && !store.component?.is_kept;
-  byId("describe").hidden = !isWanted || table.sorted.some((row) => row.info);
-}
-
-async function stopFetch() {
-  const { component } = store;
-  const { jobs } = await get("/jobs");
-  const isOwn = (job) => job.kind === "fetch" && job.state === "running" && keyOf(job) === keyOf(component);
-  const running = jobs.filter(isOwn);
-  for (const job of running) await request("DELETE", `/jobs/${encodeURIComponent(job.id)}`);
-  if (!running.length) announce("The service started this fetch; it cannot be stopped here.");
+function stopFetch() {
+  if (fetching) fetching.abort();
+  else announce("This page did not start the fetch, and cannot stop it.");
 }
 
 async function keepState() {
@@ -261,10 +250,7 @@ async function keepState() {
 /** Asks for a file format and saves the table. */
 async function save() {
   const { component } = store;
-  const { formats } = await get("/formats");
-  const choices = formats
-    .filter((format) => format.writes)
-    .map(({ name, title, endings }) => choice(title, endings.join(", "), () => take(name)));
+  const choices = FORMATS.map(([format, title, ending]) => choice(title, ending, () => take(format)));
   const list = el("ul", { class: "choices" }, choices);
   const state = el("p", { role: "status" });
   const fault = faultText();

@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from paramclient.errors import LinkError, NoReply, UnknownParameter, UsageError
-from paramclient.model.ext_params import ExtParam, ExtParamType
+from paramclient.model.ext_params import ExtParamType
 from paramclient.model.values import ParamType, Trust
 from paramclient.protocol import wire
-from paramclient.protocol.ext.extended import ExtendedParams
-from paramclient.protocol.ext.fetch import ExtFetch, ExtFetches
-from paramclient.protocol.params.list_download import REQUESTED_INDICES_MAX
 from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import (
-    PARAMETERS_MAX,
     Message,
     ParamExtRequestList,
     ParamExtRequestRead,
     ParamExtValue,
 )
-from paramclient.sim import Camera, GenericVehicle, camera_table
+from paramclient.sim import Camera, camera_table
 from tests.protocol.ext.camera import CameraSession, lossy
 
 MANY = {f"PARAM_{number:03}": number for number in range(300)}
@@ -50,18 +43,6 @@ def test_a_fetch_brings_every_type() -> None:
     assert repr(result).startswith("<ExtFetchResult 1/100 16 extended params from stream in 0.")
     assert session.is_idle
     assert session.camera.ext.fetches.last == result
-
-
-def test_each_first_value_is_a_change() -> None:
-    session = CameraSession(Camera({"A": 1, "B": "text"}))
-    session.fetch_ext()
-    assert [(change.name, change.old, change.by) for change in session.changes] == [
-        ("A", None, "vehicle"),
-        ("B", None, "vehicle"),
-    ]
-    before = len(session.changes)
-    session.fetch_ext()
-    assert len(session.changes) == before
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -118,26 +99,6 @@ def test_a_component_without_extended_parameters_is_given_up() -> None:
     assert caught.value.waited < 12.0
     assert session.is_idle
     assert not session.camera.ext.is_spoken
-
-
-def test_a_component_that_has_sent_one_is_given_the_time_to_boot() -> None:
-    camera = Camera({"A": 1}, boot_time=15.0)
-    session = CameraSession(camera)
-    assert session.get_ext("A").value == 1
-    assert session.fetch_ext().complete
-    assert session.now >= 15.0
-
-
-def test_which_components_speak_it() -> None:
-    camera = Camera({"A": 1})
-    other = GenericVehicle({"A": 1}, component=191)
-    session = CameraSession(camera, other)
-    session.run(2.0)
-    assert session.camera.expects_extended, "its MAV_TYPE is that of a camera"
-    assert not session.camera.ext.is_spoken
-    assert not session.station.components[1, 191].expects_extended
-    session.fetch_ext()
-    assert session.camera.ext.is_spoken
 
 
 def test_a_component_that_sends_only_a_value() -> None:
@@ -277,21 +238,6 @@ def test_the_end_of_the_link_ends_everything() -> None:
     assert session.is_idle
 
 
-def test_an_outage_of_the_link_ends_nothing() -> None:
-    camera = Camera(MANY)
-    session = CameraSession(camera)
-    machine = session.camera
-    fetch = machine.begin_ext_fetch(session.now)
-    session.run(0.1)
-    session.station.pause()
-    session.now += 3.0
-    session.air.tick(session.now)
-    session.air.data_to_send()
-    session.station.resume(session.now)
-    assert session.outcome(fetch).complete
-    machine.ext.fetches.end(fetch)
-
-
 def test_a_restart_begins_the_list_again() -> None:
     camera = Camera(MANY)
     session = CameraSession(camera)
@@ -304,19 +250,6 @@ def test_a_restart_begins_the_list_again() -> None:
     assert session.outcome(fetch).complete
     session.camera.ext.fetches.end(fetch)
     assert session.values == camera.ext_values
-
-
-def test_requests_are_of_mavlink_2_whatever_the_component_has_sent() -> None:
-    station = Station(link="sim:test", is_stream=False)
-    beat = wire.encode(wire.Heartbeat(30, 8), system=1, component=100, sequence=0, version=1)
-    station.receive(beat, "peer", 0.0)
-    machine = station.components[1, 100]
-    assert machine.version == 1
-    machine.begin_ext_fetch(0.0)
-    machine.read_ext("A", 0.0)
-    framer = wire.Framer({320, 321}, stream=False)
-    frames = [frame for data, _ in station.data_to_send() for frame in framer.receive(data)]
-    assert [(frame.message_id, frame.version) for frame in frames] == [(321, 2), (320, 2)]
 
 
 def test_a_listener_takes_what_others_request() -> None:
@@ -344,76 +277,3 @@ def test_names_that_no_file_can_hold_are_left_out() -> None:
         message = ParamExtValue(name, b"\7", 1, 5, number)
         station.receive(wire.encode(message, system=1, component=33, sequence=0), "peer", 0.0)
     assert list(station.components[1, 33].ext.table.params) == ["OK"]
-
-
-@pytest.mark.parametrize(("count", "index"), [(0, 0), (65535, 0), (3, 7), (3, 65535)])
-def test_counts_and_indices_that_cannot_be(count: int, index: int) -> None:
-    station = Station(link="sim:test", is_stream=False)
-    message = ParamExtValue("A", b"\7", 1, count, index)
-    station.receive(wire.encode(message, system=1, component=33, sequence=0), "peer", 0.0)
-    table = station.components[1, 33].ext.table
-    assert table.params["A"].index is None
-    assert table.count in (None, 3)
-    assert not table.complete
-
-
-def received_values(count: int, indices: Iterable[int]) -> tuple[ExtendedParams, ExtFetch]:
-    """The extended parameters of a component that has sent these of a list."""
-    host: Any = SimpleNamespace(is_recipient_certain=True, ext_changed=lambda change: None)
-    params = ExtendedParams(Context((1, 100), lambda message: None), host)
-    fetch = params.begin_fetch(0.0)
-    for index in indices:
-        params.receive_value(ParamExtValue(f"P{index:05}", b"x", ExtParamType.CUSTOM, count, index), 0.1)
-    return params, fetch
-
-
-def test_the_values_of_a_list_are_counted_and_each_index_is_looked_at_only_at_the_end(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    looks = 0
-
-    def look(*given: Any) -> list[int]:
-        nonlocal looks
-        looks += 1
-        return missing(*given)
-
-    missing = ExtFetches._missing
-    monkeypatch.setattr(ExtFetches, "_missing", look)
-    _, fetch = received_values(2_000, range(1_999))
-    assert looks == 0
-    _, fetch = received_values(2_000, range(2_000))
-    assert fetch.done
-    assert looks < 5
-
-
-def test_of_many_missing_indices_few_are_read_at_a_time() -> None:
-    params, fetch = received_values(PARAMETERS_MAX, [0])
-    now = 0.1
-    for _ in range(2_000):
-        now = max(now, params.next_deadline())
-        params.tick(now)
-        assert len(fetch.reads) <= REQUESTED_INDICES_MAX
-        assert len(params.reads) <= REQUESTED_INDICES_MAX + 1, "with the control read"
-    assert len(fetch.dead) > REQUESTED_INDICES_MAX
-    assert len(fetch.reads) == REQUESTED_INDICES_MAX
-
-
-def test_at_a_count_that_alternates_only_the_indices_received_since_are_forgotten() -> None:
-    params, _ = received_values(100, range(100))
-    replaced = 0
-
-    class Table(dict[str, ExtParam]):
-        def __setitem__(self, name: str, param: ExtParam) -> None:
-            nonlocal replaced
-            replaced += 1
-            super().__setitem__(name, param)
-
-    params.table.params = Table(params.table.params)
-    assert params.table.use_count(99)
-    assert replaced == 100
-    assert {param.index for param in params.table.params.values()} == {None}
-    for count in (100, 99, 100):
-        assert params.table.use_count(count)
-        params.table.use_index("P00007", 7)
-    assert replaced == 100 + 3 + 2
-    assert [name for name, param in params.table.params.items() if param.index is not None] == ["P00007"]

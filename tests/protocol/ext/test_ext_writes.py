@@ -6,7 +6,6 @@ import pytest
 
 from paramclient.errors import (
     ExtAckResult,
-    ExtSetRefused,
     NoReply,
     Refused,
     SetFailed,
@@ -16,13 +15,9 @@ from paramclient.errors import (
     ValueUnsupported,
 )
 from paramclient.model.ext_params import ExtParam, ExtValue
-from paramclient.model.values import Trust
 from paramclient.protocol import wire
 from paramclient.protocol.ext.writes import LATE_ACK_TIME
-from paramclient.protocol.params.fetch_result import Policy
-from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.requests.retry import EXT_PROGRESS_TIMEOUT
-from paramclient.protocol.station import Station
 from paramclient.protocol.wire import ParamExtAck, ParamExtRequestRead, ParamExtSet
 from paramclient.sim import Camera
 from tests.protocol.ext.camera import CameraSession, lossy
@@ -87,13 +82,6 @@ def test_a_value_that_does_not_fit_is_not_sent() -> None:
     assert session.is_idle
 
 
-def test_a_real32_is_the_nearest() -> None:
-    session = CameraSession(Camera())
-    done = session.set_ext("CAM_EV", 0.1)
-    assert (done.status, done.requested, done.actual) == ("accepted", 0.1, 0.10000000149011612)
-    assert str(done) == "CAM_EV = 0.1"
-
-
 @pytest.mark.parametrize("loss", [0.0, 0.2])
 def test_refusals_are_typed(loss: float) -> None:
     camera = Camera(supported={"CAM_MODE": [0, 1]}, failing=["CAM_ISO"])
@@ -109,16 +97,6 @@ def test_refusals_are_typed(loss: float) -> None:
     assert isinstance(failed.value, Refused)
     assert (camera.ext_values["CAM_MODE"], camera.ext_values["CAM_ISO"]) == (1, 100)
     assert session.is_idle
-
-
-def test_a_result_that_is_not_defined_is_a_refusal() -> None:
-    session = CameraSession(Camera({"A": 1}))
-    session.fetch_ext()
-    session.air.vehicles[0].receive = lambda data, now: None  # type: ignore[method-assign]
-    write = session.camera.write_ext("A", 2, session.now)
-    acknowledge(session, "A", b"\1", 6, 9)
-    assert type(write.error) is ExtSetRefused
-    assert "result 9" in str(write.error)
 
 
 def test_a_value_that_the_camera_changes_is_adjusted() -> None:
@@ -162,17 +140,6 @@ def test_progress_extends_the_wait(seconds: float) -> None:
     assert sets == 1 + int(seconds // EXT_PROGRESS_TIMEOUT) - (seconds == 60.0)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_progress_on_a_link_that_loses_packets(seed: int) -> None:
-    camera = Camera(slow={"CAM_MODE": 3.0}, supported={"CAM_MODE": [0, 1]})
-    session = CameraSession(camera, air=lossy(camera, loss=0.3, seed=seed))
-    session.fetch_ext()
-    began = session.now
-    assert session.set_ext("CAM_MODE", 0).actual == 0
-    assert camera.ext_values["CAM_MODE"] == 0
-    assert session.now - began < 12.0
-
-
 def test_a_lost_result_is_requested_again() -> None:
     camera = Camera(slow={"CAM_MODE": 3.0})
     session = CameraSession(camera)
@@ -185,16 +152,6 @@ def test_a_lost_result_is_requested_again() -> None:
     assert session.outcome(write).actual == 0
     assert session.now - began == pytest.approx(EXT_PROGRESS_TIMEOUT - 1.0, abs=0.2)
     assert len(session.sent_of(ParamExtSet)) == 2
-
-
-def test_a_component_that_falls_silent_at_work() -> None:
-    camera = Camera(slow={"CAM_MODE": 1000.0})
-    session = CameraSession(camera)
-    session.fetch_ext()
-    write = session.camera.write_ext("CAM_MODE", 0, session.now)
-    session.run(1.0)
-    session.camera.ext.writes.cancel(write, session.now)
-    assert session.is_idle
 
 
 def test_a_set_that_nothing_answers() -> None:
@@ -226,34 +183,6 @@ def test_writes_to_one_name_follow_each_other() -> None:
     assert len(session.sent_of(ParamExtSet)) == 1
     assert [session.outcome(write).actual for write in writes] == [2, 3, 4]
     assert camera.ext_values["CAM_MODE"] == 4
-
-
-def test_a_cancelled_write_lets_the_next_one_begin() -> None:
-    session = CameraSession(Camera())
-    session.fetch_ext()
-    first, second, third = (session.camera.write_ext("CAM_MODE", value, session.now) for value in (2, 3, 4))
-    session.camera.ext.writes.cancel(second, session.now)
-    session.camera.ext.writes.cancel(first, session.now)
-    assert session.outcome(third).actual == 4
-    session.camera.ext.writes.cancel(third, session.now)
-    assert session.is_idle
-
-
-def test_a_late_copy_of_an_acknowledgement_proves_nothing() -> None:
-    camera = Camera()
-    session = CameraSession(camera, air=lossy(camera, loss=0.0, delay=0.1))
-    session.fetch_ext()
-    session.set_ext("CAM_MODE", 2)
-    write = session.camera.write_ext("CAM_MODE", 3, session.now)
-    acknowledge(session, "CAM_MODE", b"\2", 5, ExtAckResult.ACCEPTED)
-    acknowledge(session, "CAM_MODE", b"\2", 5, ExtAckResult.ACCEPTED)
-    assert not write.done
-    done = session.outcome(write)
-    assert (done.status, done.actual) == ("accepted", 3)
-    acknowledge(session, "CAM_MODE", b"\2", 5, ExtAckResult.ACCEPTED)
-    assert session.values["CAM_MODE"] == 3
-    session.run(2.0)
-    assert session.values["CAM_MODE"] == 3
 
 
 def test_a_late_copy_of_a_refusal_refuses_nothing() -> None:
@@ -322,30 +251,3 @@ def test_nothing_is_written_while_another_vehicle_may_have_the_address() -> None
     assert not session.sent_of(ParamExtSet)
     assert session.outcome(write).actual == 2
     assert not session.camera.ext.writes.is_awaiting_permission
-
-
-def test_without_reads_a_change_by_another_station_makes_a_value_cached() -> None:
-    station = Station(
-        link="sim:test",
-        is_stream=False,
-        sync_settings=SyncSettings.chosen(None, Policy.CACHE_ONLY, listen_only=False, is_log=False),
-    )
-    session = CameraSession(Camera({"A": 1}), station=station)
-    assert session.get_ext("A").trust is Trust.LIVE
-    acknowledge(session, "A", b"\5", 6, ExtAckResult.ACCEPTED)
-    session.run(1.0)
-    assert (session.params["A"].value, session.params["A"].trust) == (1, Trust.CACHED)
-    assert len(session.sent_of(ParamExtRequestRead)) == 1
-    assert session.set_ext("A", 7).actual == 7
-
-
-def test_moments_are_moved_back_by_a_suspend() -> None:
-    session = CameraSession(Camera({"A": 1}))
-    session.fetch_ext()
-    table = session.camera.ext.table
-    before = table.moments["A"]
-    session.set_ext("A", 2)
-    session.station.handle_suspend(100.0, session.now)
-    assert table.moments["A"] == pytest.approx(session.now - 100.0, abs=0.5)
-    [(replaced, by, moment)] = table.overwritten
-    assert (replaced.value, by, moment) == (1, "vehicle", before - 100.0)

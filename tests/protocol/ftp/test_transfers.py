@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from typing import Any, TypeVar
 
 import pytest
@@ -16,7 +15,6 @@ from paramclient.model.px4_hash import crc32_px4
 from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.protocol.ftp import DirectoryEntry, FileRead, FileTransfers, FileWrite, param_pck
-from paramclient.protocol.ftp.file_read import WINDOW_MIN
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
@@ -24,14 +22,11 @@ from paramclient.protocol.requests.retry import (
     ATTEMPTS_MAX,
     ATTEMPTS_MIN,
     BUSY_TIMEOUT,
-    OPEN_FAILURES_MAX,
     OPENS_MAX,
     REOPENS_MAX,
     SESSION_IDLE_TIME,
-    SLOW_TIME_MAX,
     TIMEOUT_MAX,
     UNANSWERED_ATTEMPTS_MAX,
-    UNANSWERED_OPENS_MAX,
     RetryPolicy,
 )
 from paramclient.protocol.wire import FileTransfer, Message
@@ -180,40 +175,6 @@ class TestReading:
         assert read.done
         assert read.result == b"a" * 239 + b"b" * 61
 
-    def test_only_a_server_that_keeps_our_session_number_gets_an_early_burst_request(self) -> None:
-        for keeps_session, requests in (
-            (True, [Opcode.OPEN_FILE_RO] * 2 + [Opcode.BURST_READ_FILE]),
-            (False, [Opcode.OPEN_FILE_RO]),
-        ):
-            desk = Desk(keeps_session=keeps_session)
-            desk.transfers.read("/A.TXT", desk.now)
-            assert [packet.opcode for packet in desk.take()] == requests
-
-    def test_an_estimate_of_the_size_is_no_end(self) -> None:
-        for size in (0, 10, 100_000):
-            desk = Desk()
-            read, burst = desk.opened(size=size)
-            desk.answer(burst, b"x" * 239)
-            desk.answer(burst, b"y" * 239, offset=239, nth=2)
-            assert not read.done
-            desk.answer(burst, code=FileErrorCode.EOF, offset=478, nth=3)
-            desk.closed()
-            assert read.result == b"x" * 239 + b"y" * 239
-
-    def test_a_server_that_gives_no_size(self) -> None:
-        desk = Desk()
-        read = desk.transfers.read("a", desk.now)
-        desk.answer(desk.opening(), session=9)
-        assert read.size is None
-        burst = desk.next(Opcode.BURST_READ_FILE)
-        desk.answer(burst, b"a" * 239)
-        desk.pass_time(2.1)
-        probe = desk.first(Opcode.READ_FILE)
-        assert probe.offset == 239
-        desk.answer(probe, code=FileErrorCode.EOF)
-        desk.closed()
-        assert read.result == b"a" * 239
-
     def test_an_empty_file(self) -> None:
         desk = Desk()
         read, burst = desk.opened(size=0)
@@ -250,59 +211,6 @@ class TestReading:
         desk.closed()
         assert read.result == b"a" * 239 + b"b" * 239
 
-    def test_the_end_that_a_read_finds_may_lie_before_another(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened(size=1200)
-        desk.now += 0.1
-        desk.answer(burst, b"a" * 239)
-        desk.now += 0.01
-        desk.answer(burst, b"b" * 239, offset=239, nth=2)
-        desk.pass_time(0.1)
-        requested = {packet.offset: packet for packet in desk.take()}
-        desk.answer(requested[717], code=FileErrorCode.EOF)
-        assert not read.done
-        desk.answer(requested[478], b"c" * 100, offset=478)
-        rest = next(packet for packet in desk.take() if packet.offset == 578)
-        desk.answer(rest, code=FileErrorCode.EOF)
-        desk.closed()
-        assert read.result == b"a" * 239 + b"b" * 239 + b"c" * 100
-
-    def test_an_end_without_its_place_is_looked_for(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened("@SYS/a.txt", size=239)
-        desk.answer(burst, b"a" * 239)
-        desk.answer(burst, code=FileErrorCode.EOF, offset=0, nth=2)
-        assert not read.done
-        requested = desk.take()
-        assert requested[0].offset == 239
-        desk.answer(requested[0], code=FileErrorCode.EOF)
-        desk.closed()
-        assert read.result == b"a" * 239
-
-    def test_a_read_of_nothing_is_an_end_too(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened("@SYS/a.txt", size=239)
-        desk.answer(burst, b"a" * 239)
-        desk.answer(burst, code=FileErrorCode.EOF, offset=0, nth=2)
-        desk.answer(desk.take()[0], b"")
-        desk.closed()
-        assert read.result == b"a" * 239
-
-    @given(st.floats(5.0, 1e6), st.floats(1e-9, 1e-6))
-    def test_blocks_that_are_nanoseconds_apart_set_no_pace_below_the_resolution_of_the_clock(
-        self, start: float, gap: float
-    ) -> None:
-        desk = Desk()
-        _, burst = desk.opened(size=48 * 200, read_size=48)
-        desk.now = start
-        desk.answer(burst, bytes(48), offset=48 * 10, nth=11)
-        desk.now += gap
-        desk.answer(burst, bytes(48), offset=48 * 11, nth=12)
-        for _ in range(20):
-            desk.now = max(desk.transfers.next_deadline(), desk.now)
-            desk.transfers.tick(desk.now)
-            assert desk.transfers.next_deadline() > desk.now, "else it is due again and again"
-
     def test_a_burst_that_ends_early_is_followed_by_another(self) -> None:
         desk = Desk()
         read, burst = desk.opened(size=5000)
@@ -334,95 +242,6 @@ class TestReading:
         assert read.result is not None
         assert len(read.result) == 2629
 
-    def test_a_read_that_is_answered_first_does_not_end_a_burst_that_begins_20_ms_later(self) -> None:
-        """As PX4 does it, where another burst request would begin the burst anew."""
-        desk = Desk()
-        desk.lose_some()
-        read = desk.transfers.read("a", desk.now)
-        desk.answer(desk.take()[0], (50_000).to_bytes(4, "little"), session=9)
-        burst, probe, *_ = desk.take()
-        assert (burst.opcode, probe.opcode) == (Opcode.BURST_READ_FILE, Opcode.READ_FILE)
-        desk.now += 0.001
-        desk.answer(probe, b"x" * 239)
-        desk.pass_time(0.019)
-        for block in range(1, 5):
-            desk.answer(burst, b"x" * 239, offset=239 * block, nth=block + 1)
-        assert Opcode.BURST_READ_FILE not in [packet.opcode for packet in desk.take()]
-        desk.answer(burst, code=FileErrorCode.EOF, offset=1195, nth=6)
-        desk.closed()
-        assert read.result == b"x" * 1195
-
-    def test_a_burst_of_which_nothing_arrives_behind_the_answer_to_a_read_is_requested_again(self) -> None:
-        desk = Desk()
-        desk.lose_some()
-        desk.transfers.read("a", desk.now)
-        desk.answer(desk.take()[0], (50_000).to_bytes(4, "little"), session=9)
-        _, probe, *_ = desk.take()
-        desk.answer(probe, b"x" * 239)
-        desk.pass_time(0.04)
-        again = [packet for packet in desk.take() if packet.opcode == Opcode.BURST_READ_FILE]
-        assert [packet.offset for packet in again] == [239]
-
-    def test_nothing_is_read_beyond_an_exact_size(self) -> None:
-        """MAVSDK's server refuses that; the size of what is made at reading is an estimate."""
-        for path, is_exact in (("log/1.ulg", True), ("@SYS/threads.txt", False)):
-            desk = Desk()
-            _, burst = desk.opened(path, size=1000)
-            desk.answer(burst, b"x" * 239)
-            desk.answer(burst, b"x" * 239, offset=239, nth=2, complete=True)
-            desk.pass_time(0.2)
-            reads = [packet for packet in desk.take() if packet.opcode == Opcode.READ_FILE]
-            assert (max(packet.offset + packet.size for packet in reads) == 1000) is is_exact
-
-    def test_a_block_that_a_growing_file_has_behind_its_first_size_is_read_again(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened("log/1.BIN", size=300)
-        for block in (0, 1, 3):
-            desk.answer(burst, b"x" * 239, offset=239 * block, nth=block + 1)
-        desk.answer(burst, code=FileErrorCode.EOF, offset=956, nth=5)
-        gap = next(packet for packet in desk.take() if packet.opcode == Opcode.READ_FILE)
-        assert (gap.offset, gap.size) == (478, 239)
-        desk.answer(gap, b"x" * 239, offset=478)
-        desk.closed()
-        assert read.result == b"x" * 956
-
-    def test_a_file_of_an_exact_size_ends_with_its_last_byte(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened("log/1.ulg", size=300)
-        desk.answer(burst, b"x" * 239)
-        desk.answer(burst, b"x" * 61, offset=239, nth=2)
-        assert not desk.transfers.is_closing, "the burst may bring what was written since"
-        desk.now = desk.transfers.next_deadline()
-        desk.transfers.tick(desk.now)
-        desk.closed()
-        assert read.result == b"x" * 300
-
-    def test_a_burst_that_goes_on_after_a_pause_is_not_requested_again(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened(size=50_000)
-        for block in range(10):
-            desk.now += 0.01
-            desk.answer(burst, b"x" * 239, offset=239 * block, nth=block + 1)
-        desk.pass_time(0.1)
-        assert len(desk.take()) == 1
-        desk.answer(burst, b"x" * 239, offset=2390, nth=11)
-        desk.answer(burst, code=FileErrorCode.EOF, offset=2629, nth=12)
-        desk.closed()
-        assert read.result == b"x" * 2629
-        assert not [packet for packet in desk.take() if packet.opcode == Opcode.BURST_READ_FILE]
-
-    def test_a_response_at_the_moment_of_the_timeout_is_taken(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened()
-        desk.answer(burst, b"b" * 239, offset=239)
-        gap = desk.next(Opcode.READ_FILE)
-        desk.answer(burst, code=FileErrorCode.EOF, offset=478, nth=2)
-        desk.pass_time(0.5)
-        assert len(desk.take()) > 0
-        desk.answer(gap, b"a" * 239, offset=0)
-        desk.closed()
-        assert read.result == b"a" * 239 + b"b" * 239
-
     def test_without_bursts_everything_is_read_singly(self) -> None:
         desk = Desk()
         read, burst = desk.opened(size=600)
@@ -438,19 +257,6 @@ class TestReading:
             desk.pass_time(0.01)
         assert read.result == content
 
-    def test_blocks_that_are_shorter_than_requested(self) -> None:
-        """As boards with little memory give them."""
-        desk = Desk()
-        read, burst = desk.opened(size=100)
-        desk.answer(burst, b"a" * 48)
-        desk.answer(burst, b"c" * 4, offset=96, nth=3)
-        (gap,) = desk.take()
-        assert (gap.offset, gap.size) == (48, 52)
-        desk.answer(burst, code=FileErrorCode.EOF, offset=100, nth=4)
-        desk.answer(gap, b"b" * 48, offset=48)
-        desk.closed()
-        assert read.result == b"a" * 48 + b"b" * 48 + b"c" * 4
-
     def test_a_file_that_is_too_long_is_not_taken(self) -> None:
         desk = Desk()
         read, burst = desk.opened(limit=300)
@@ -459,43 +265,8 @@ class TestReading:
         desk.closed()
         assert "longer than 300 bytes" in str(error_of(read))
 
-    def test_a_block_far_behind_the_limit_is_not_waited_for(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened(limit=100_000)
-        desk.answer(burst, b"x" * 239, offset=0xFFFF_0000)
-        desk.closed()
-        assert "longer than" in str(error_of(read))
-
-    def test_an_end_far_behind_the_limit_is_not_believed(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened(limit=1000)
-        desk.answer(burst, code=FileErrorCode.EOF, offset=0xFFFF_FFFF)
-        for packet in desk.take():
-            desk.answer(packet, code=FileErrorCode.EOF)
-        desk.closed()
-        assert read.result == b""
-
 
 class TestWhatIsNotForUs:
-    def test_answers_to_others(self) -> None:
-        desk = Desk()
-        read = desk.transfers.read("a", desk.now)
-        request = desk.opening()
-        for to in ((254, 190), (255, 191), (254, 0)):
-            desk.hear(Packet(request.sequence + 1, 9, Opcode.ACK, bytes(4), requested=4), to=to)
-        assert is_so(read.size is None)
-        desk.hear(Packet(request.sequence + 1, 9, Opcode.ACK, bytes(4), requested=4), to=(255, 0))
-        assert read.size == 0
-
-    @pytest.mark.parametrize("change", [{"sequence": 7}, {"requested": 5}, {"opcode": 4}])
-    def test_answers_to_something_else(self, change: dict[str, Any]) -> None:
-        desk = Desk()
-        read = desk.transfers.read("a", desk.now)
-        request = desk.opening()
-        good = Packet(request.sequence + 1, 9, Opcode.ACK, bytes(4), requested=4)
-        desk.hear(good._replace(**change))
-        assert read.size is None
-
     def test_blocks_of_another_session_and_of_an_earlier_file(self) -> None:
         desk = Desk()
         first, old = desk.opened("old")
@@ -510,15 +281,6 @@ class TestWhatIsNotForUs:
         desk.closed()
         assert read.result == b"new" * 50
 
-    def test_nothing_is_under_way(self) -> None:
-        desk = Desk()
-        desk.hear(Packet(1, 0, Opcode.ACK))
-        desk.transfers.tick(desk.now)
-        desk.transfers.resume(desk.now)
-        desk.transfers.fail_all(LinkError("gone", link="x"), desk.now)
-        assert desk.take() == []
-        assert desk.transfers.next_deadline() == math.inf
-
     def test_every_file_has_a_session_of_its_own(self) -> None:
         desk = Desk()
         sessions = set()
@@ -529,31 +291,6 @@ class TestWhatIsNotForUs:
             desk.answer(request, code=FileErrorCode.FILE_NOT_FOUND)
             assert read.done
         assert sessions == set(range(1, 256))
-
-    def test_the_first_block_of_a_burst_measures_the_round_trip(self) -> None:
-        desk = Desk()
-        _, burst = desk.opened()
-        smoothed = desk.round_trip.smoothed
-        desk.now += 0.2
-        desk.answer(burst, b"x", offset=239, nth=2)
-        assert desk.round_trip.smoothed == smoothed
-        desk = Desk()
-        _, burst = desk.opened()
-        desk.now += 0.2
-        desk.answer(burst, b"x")
-        assert desk.round_trip.smoothed != smoothed
-
-    def test_numbers_begin_elsewhere_in_another_program(self) -> None:
-        """A server gives its last answer once more to a request with the number of the last one."""
-        numbers = set()
-        for now in (5.0, 5.1, 77.0):
-            desk = Desk()
-            desk.now = now
-            desk.transfers.read("a", now)
-            request = desk.opening()
-            assert 1 <= request.session <= 255
-            numbers.add((request.sequence, request.session))
-        assert len(numbers) == 3
 
 
 class TestRefusals:
@@ -576,21 +313,6 @@ class TestRefusals:
         assert error.is_not_found == (code in (10, 2))
         assert desk.take() == []
         assert desk.transfers.is_idle
-
-    def test_a_nak_without_a_code(self) -> None:
-        desk = Desk()
-        listing = desk.transfers.list("a", desk.now)
-        request = desk.next(Opcode.LIST_DIRECTORY)
-        desk.hear(Packet(request.sequence + 1, 0, Opcode.NAK, requested=Opcode.LIST_DIRECTORY))
-        assert error_of(listing).code == FileErrorCode.FAIL
-
-    def test_a_refusal_in_the_middle_closes_the_session(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened()
-        desk.answer(burst, b"x" * 239)
-        desk.answer(burst, b"\x05", code=FileErrorCode.FAIL_ERRNO, nth=2)
-        desk.closed()
-        assert error_of(read).errno == 5
 
     def test_a_refused_read_closes_the_session(self) -> None:
         desk = Desk()
@@ -646,36 +368,6 @@ class TestRefusals:
         assert BUSY_TIMEOUT <= desk.now - began <= BUSY_TIMEOUT + 2 * SESSION_IDLE_TIME
         assert desk.transfers.is_idle
 
-    def test_each_reply_of_the_server_extends_the_wait_for_the_end_of_a_session(self) -> None:
-        desk = Desk()
-        desk.transfers.read("a", desk.now)
-        request = desk.opening()
-        desk.answer(request, code=FileErrorCode.INVALID_SESSION)
-        for to in (OWN, (254, 190)):  # the refusal of a copy, and what another station reads
-            desk.pass_time(2.0)
-            desk.hear(Packet(9, 77, Opcode.ACK, b"x", requested=Opcode.READ_FILE), to=to)
-        desk.pass_time(SESSION_IDLE_TIME - 0.01)
-        assert desk.take() == []
-        desk.pass_time(0.02)
-        assert desk.opening().session == request.session
-
-    def test_a_session_that_is_waited_for_needs_no_close(self) -> None:
-        desk = Desk()
-        read = desk.transfers.read("a", desk.now)
-        desk.answer(desk.opening(), code=FileErrorCode.INVALID_SESSION)
-        desk.transfers.release(read, desk.now)
-        assert desk.take() == []
-        assert desk.transfers.is_idle
-
-    def test_an_open_that_fails_without_a_reason_is_tried_again_a_few_times(self) -> None:
-        desk = Desk()
-        read = desk.transfers.read("a", desk.now)
-        for _ in range(OPEN_FAILURES_MAX + 1):
-            request = next(packet for packet in desk.take() if packet.opcode == Opcode.OPEN_FILE_RO)
-            desk.answer(request, code=FileErrorCode.FAIL)
-        assert error_of(read).code == FileErrorCode.FAIL
-        assert desk.take() == []
-
 
 class TestSilence:
     def test_an_open_is_repeated_with_the_same_number_and_given_up(self) -> None:
@@ -699,66 +391,6 @@ class TestSilence:
             Opcode.TERMINATE_SESSION,
             Opcode.TERMINATE_SESSION,
         ]
-
-    def test_a_burst_that_never_arrives(self) -> None:
-        desk = Desk()
-        read, _ = desk.opened()
-        desk.pass_time()
-        assert isinstance(read.error, NoReply)
-        assert Opcode.TERMINATE_SESSION in [packet.opcode for packet in desk.take()]
-
-    def test_a_block_that_never_arrives(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened()
-        desk.answer(burst, b"x" * 239, offset=239)
-        desk.answer(burst, code=FileErrorCode.EOF, offset=478, nth=2)
-        desk.pass_time()
-        assert isinstance(read.error, NoReply)
-
-    def test_copies_of_a_read_do_not_make_patience_shorter(self) -> None:
-        desk = Desk()
-        desk.retry.answered(0.0, 0.1, 1)
-        for _ in range(20):
-            desk.retry.timed_out(1)
-        read, burst = desk.opened()
-        desk.answer(burst, b"x" * 239, offset=239)
-        desk.answer(burst, code=FileErrorCode.EOF, offset=478, nth=2)
-        desk.take()
-        desk.pass_time()
-        assert isinstance(read.error, NoReply)
-        reads = [packet for packet in desk.take() if packet.opcode == Opcode.READ_FILE]
-        assert len(reads) >= 2 * read.error.attempts
-        assert read.error.attempts >= ATTEMPTS_MIN
-
-    def test_into_a_silence_only_a_few_reads_go_out(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened(size=100_000)
-        for block in range(0, 200, 2):
-            desk.now += 0.001
-            desk.answer(burst, b"x" * 239, offset=239 * block, nth=block + 1)
-        desk.answer(burst, code=FileErrorCode.EOF, offset=239 * 199, nth=200)
-        desk.retry.answered(0.0, 0.1, 1)
-        desk.pass_time(0.09)
-        assert len(desk.take()) > 2 * WINDOW_MIN
-        desk.pass_time(0.4)
-        desk.take()
-        desk.pass_time(0.5)
-        assert 0 < len(desk.take()) <= 5 * WINDOW_MIN
-        assert not read.done
-
-    def test_a_server_that_sends_the_same_for_ever(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened(size=100_000)
-        for _ in range(3000):
-            if read.done:
-                break
-            desk.answer(burst, b"x" * 239, nth=1, complete=True)
-            for packet in desk.take():
-                if packet.opcode == Opcode.BURST_READ_FILE:
-                    burst = packet
-            desk.now += 0.05
-            desk.transfers.tick(desk.now)
-        assert isinstance(read.error, NoReply)
 
     def test_a_close_without_an_answer_does_not_hold_up_the_next_for_ever(self) -> None:
         desk = Desk()
@@ -786,26 +418,6 @@ class TestSilence:
         desk.closed()
         assert read.error is gone
 
-    def test_the_metadata_is_requested_again_after_a_reconnection(self) -> None:
-        desk = Desk()
-        read = desk.transfers.read("a", desk.now)
-        first = desk.opening()
-        desk.now += 100
-        desk.transfers.resume(desk.now)
-        assert desk.opening() == first
-        desk.answer(first, (5000).to_bytes(4, "little"), session=9)
-        burst = desk.take()[-1]
-        for block in range(3):
-            desk.now += 0.01
-            desk.answer(burst, b"x" * 239, offset=239 * block, nth=block + 1)
-        desk.now += 100
-        desk.transfers.resume(desk.now)
-        requested = desk.next(Opcode.READ_FILE)
-        assert requested.offset == 717
-        desk.answer(requested, code=FileErrorCode.EOF)
-        desk.closed()
-        assert read.result == b"x" * 717
-
 
 class TestNoServer:
     """Many vehicles have none, and say nothing on request."""
@@ -831,33 +443,6 @@ class TestNoServer:
         assert read.ended_at - began <= UNANSWERED_ATTEMPTS_MAX * TIMEOUT_MAX
         assert desk.transfers.is_idle
 
-    def test_a_check_for_which_no_caller_waits_ends_sooner(self) -> None:
-        desk = self.desk_on_a_bad_link()
-        read = desk.transfers.read("a.txt", desk.now)
-        read.yields = True
-        desk.pass_time()
-        assert isinstance(read.error, NoReply)
-        assert read.error.attempts == UNANSWERED_OPENS_MAX
-
-    def test_its_silence_is_no_sign_of_a_bad_link(self) -> None:
-        """Otherwise reads of parameters would wait for seconds, and the next file for an hour."""
-        desk = Desk()
-        for _ in range(20):
-            desk.retry.answered(0.0, 0.02, 1)
-        before = desk.retry.timeout, desk.retry.tries, desk.round_trip.seen_loss
-        for _ in range(10):
-            read = desk.transfers.read("a.txt", desk.now)
-            desk.pass_time()
-            assert isinstance(read.error, NoReply)
-        assert (desk.retry.timeout, desk.retry.tries, desk.round_trip.seen_loss) == before
-
-    def test_the_silence_of_one_that_has_responded_is_a_sign(self) -> None:
-        desk = Desk()
-        desk.opened()
-        before = desk.round_trip.seen_loss
-        desk.pass_time()
-        assert desk.round_trip.seen_loss > before
-
 
 class TestTurns:
     def test_one_after_the_other(self) -> None:
@@ -877,24 +462,6 @@ class TestTurns:
         desk.answer(desk.next(Opcode.CALC_FILE_CRC32), b"\1\2\3\4")
         assert third.result == 0x04030201
         assert desk.transfers.is_idle
-
-    def test_a_transfer_begun_when_another_ends_waits_for_the_close(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened("a")
-        read.on_done.append(lambda: more.append(desk.transfers.read("b", desk.now)))
-        more: list[FileRead] = []
-        desk.answer(burst, code=FileErrorCode.EOF)
-        desk.answer(desk.next(Opcode.TERMINATE_SESSION))
-        assert desk.first(Opcode.OPEN_FILE_RO).data == b"b"
-        assert not more[0].done
-
-    def test_a_released_transfer_that_waits_sends_nothing(self) -> None:
-        desk = Desk()
-        desk.opened("a")
-        waiting = desk.transfers.read("b", desk.now)
-        desk.transfers.release(waiting, desk.now)
-        desk.transfers.release(waiting, desk.now)
-        assert desk.take() == []
 
     def test_a_released_transfer_in_progress_is_closed(self) -> None:
         desk = Desk()
@@ -916,16 +483,6 @@ class TestTurns:
         desk.closed(session=3)
         assert not read.done
 
-    def test_one_whose_open_is_refused_after_that_needs_no_close(self) -> None:
-        desk = Desk()
-        read = desk.transfers.read("a", desk.now)
-        request = desk.opening()
-        desk.transfers.release(read, desk.now)
-        desk.take()
-        desk.answer(request, code=FileErrorCode.INVALID_SESSION)
-        assert desk.take() == []
-        assert desk.transfers.is_idle
-
     def test_one_whose_open_is_never_answered_is_closed_blindly(self) -> None:
         desk = Desk()
         read = desk.transfers.read("a", desk.now)
@@ -940,74 +497,12 @@ class TestTurns:
         assert desk.transfers.is_idle
         assert not read.done
 
-    def test_a_release_of_an_ended_transfer_sends_nothing(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened("a")
-        desk.answer(burst, code=FileErrorCode.EOF)
-        desk.transfers.release(read, desk.now)
-        desk.closed()
-        desk.transfers.release(read, desk.now)
-        assert desk.take() == []
-
 
 class TestHaste:
     def known_link(self) -> Desk:
         desk = Desk()
         desk.retry.answered(0.0, 0.1, 1)
         return desk
-
-    def test_on_a_known_link_the_burst_does_not_wait_for_the_open(self) -> None:
-        desk = self.known_link()
-        read = desk.transfers.read("a", desk.now)
-        first, copy, burst = desk.take()
-        assert first == copy
-        assert (burst.opcode, burst.session) == (Opcode.BURST_READ_FILE, first.session)
-        desk.answer(burst, b"early")
-        assert read.received == 0
-        desk.answer(first, (5).to_bytes(4, "little"))
-        assert desk.take() == []
-        desk.answer(burst, b"abcde")
-        desk.answer(burst, code=FileErrorCode.EOF, offset=5, nth=2)
-        desk.closed(first.session)
-        assert read.result == b"abcde"
-
-    def test_nor_where_requests_were_repeated_and_nothing_was_measured(self) -> None:
-        """The round trip is longer than the first time-out: what arrived before got its answer too late."""
-        desk = Desk()
-        desk.retry.answered(2.0, 2.5, 3)
-        read = desk.transfers.read("a", desk.now)
-        first, _, burst = desk.take()
-        assert (burst.opcode, burst.session) == (Opcode.BURST_READ_FILE, first.session)
-        desk.pass_time(2.5)
-        assert {packet.sequence for packet in desk.take()} == {first.sequence}
-        desk.answer(first, (5).to_bytes(4, "little"))
-        desk.answer(burst, b"abcde")
-        desk.answer(burst, code=FileErrorCode.EOF, offset=5, nth=2)
-        desk.closed(first.session)
-        assert read.result == b"abcde"
-
-    def test_a_burst_is_requested_again_if_the_server_gives_another_session(self) -> None:
-        desk = self.known_link()
-        read = desk.transfers.read("a", desk.now)
-        first, _, early = desk.take()
-        desk.answer(first, bytes(4), session=0)
-        burst = desk.next(Opcode.BURST_READ_FILE)
-        assert burst.session == 0
-        desk.answer(early, code=FileErrorCode.INVALID_SESSION)
-        desk.answer(burst, code=FileErrorCode.EOF)
-        desk.closed(session=0)
-        assert read.result == b""
-
-    def test_a_burst_that_overtook_the_open_is_requested_anew(self) -> None:
-        desk = self.known_link()
-        read = desk.transfers.read("a", desk.now)
-        first, _, early = desk.take()
-        desk.answer(first, bytes(4))
-        desk.answer(early, code=FileErrorCode.FILE_NOT_FOUND)
-        burst = desk.next(Opcode.BURST_READ_FILE)
-        desk.answer(burst, code=FileErrorCode.EOF)
-        desk.closed(first.session)
-        assert read.result == b""
 
     def test_a_lost_response_to_the_open_restarts_the_read_after_the_burst(self) -> None:
         """The file of the burst is unknown: a failed open has no response either."""
@@ -1034,22 +529,6 @@ class TestHaste:
         desk.closed(first.session)
         assert read.result == b"abc"
 
-    def test_a_lost_response_to_the_open_of_a_file_with_known_first_bytes_restarts_nothing(self) -> None:
-        """ArduPilot ends no burst early: the whole file would be sent twice."""
-        desk = self.known_link()
-        read = desk.transfers.read("a", desk.now, magics=(b"up", b"xx"))
-        first, _, burst = desk.take()
-        desk.answer(burst, b"x" * 239)
-        desk.answer(burst, b"y" * 239, offset=239, nth=2)
-        desk.answer(burst, b"z", offset=478, nth=3)
-        assert desk.take() == []
-        assert read.received == 479
-        desk.answer(first, code=FileErrorCode.FAIL)  # to the copy of the open; too late
-        desk.answer(burst, code=FileErrorCode.EOF, offset=479, nth=4)
-        desk.closed(first.session)
-        assert desk.take() == []
-        assert read.result == b"x" * 239 + b"y" * 239 + b"z"
-
     def test_the_first_bytes_show_that_the_burst_was_of_another_file(self) -> None:
         """The refusal of the open was lost: another station's session has its number."""
         desk = self.known_link()
@@ -1070,19 +549,6 @@ class TestHaste:
         desk.closed(again.session)
         assert read.result == b"up"
 
-    def test_a_lost_beginning_of_a_burst_without_a_response_to_its_open_is_read_again(self) -> None:
-        desk = self.known_link()
-        read = desk.transfers.read("a", desk.now, magics=(b"up",))
-        first, _, burst = desk.take()
-        desk.answer(burst, b"x" * 239, offset=239, nth=2)
-        desk.answer(burst, b"y", offset=478, nth=3)
-        desk.answer(burst, code=FileErrorCode.EOF, offset=479, nth=4)
-        for request in [packet for packet in desk.take() if packet.opcode == Opcode.READ_FILE][:1]:
-            assert (request.session, request.offset) == (first.session, 0)
-            desk.answer(request, b"up".ljust(239, b"w"))
-        desk.closed(first.session)
-        assert read.result == b"up".ljust(239, b"w") + b"x" * 239 + b"y"
-
     def test_but_not_for_ever(self) -> None:
         desk = self.known_link()
         desk.transfers.read("a", desk.now)
@@ -1094,96 +560,6 @@ class TestHaste:
                 burst = sent[-1]
             desk.answer(burst, b"x" * 239)
         assert opened == 2 + REOPENS_MAX
-
-    def test_a_lost_burst_is_detected_by_a_read_behind_it(self) -> None:
-        desk = self.known_link()
-        desk.transfers.read("a", desk.now)
-        first, _, _ = desk.take()
-        desk.answer(first, (50_000).to_bytes(4, "little"))
-        desk.pass_time(0.25)
-        read = desk.next(Opcode.READ_FILE)
-        assert (read.session, read.offset) == (first.session, 0)
-        desk.answer(read, b"x" * 239)
-        desk.pass_time(0.04)
-        burst = desk.first(Opcode.BURST_READ_FILE)
-        assert (burst.session, burst.offset) == (first.session, 239)
-
-    def test_a_burst_is_repeated_after_half_a_second_of_silence(self) -> None:
-        desk = self.known_link()
-        desk.transfers.read("a", desk.now)
-        first, _, _ = desk.take()
-        desk.answer(first, bytes(4))
-        opened_at = desk.now
-        desk.pass_time(0.3)
-        desk.answer(first, bytes(4))  # to the copy of the open
-        desk.pass_time(0.49)
-        reads = desk.take()
-        assert {packet.opcode for packet in reads} == {Opcode.READ_FILE}
-        assert {packet.offset for packet in reads} == {0}
-        assert len(reads) <= 4, "ArduPilot has room for 5 requests"
-        desk.pass_time(0.02)
-        assert desk.now < opened_at + 0.82
-        assert desk.first(Opcode.BURST_READ_FILE).session == first.session
-
-    def test_an_open_that_is_answered_late_does_not_repeat_the_burst_beside_it(self) -> None:
-        """On a slow link it waits behind what was sent before it, and its burst is only late as well."""
-        desk = self.known_link()
-        read = desk.transfers.read("a", desk.now)
-        first, _, burst = desk.take()
-        desk.pass_time(0.25)
-        assert {packet.sequence for packet in desk.take()} == {first.sequence}
-        desk.answer(first, (300).to_bytes(4, "little"))
-        desk.pass_time(0.1)
-        assert desk.take() == []
-        desk.answer(burst, b"x" * 239)
-        desk.answer(burst, b"y" * 61, offset=239, nth=2)
-        desk.answer(burst, code=FileErrorCode.EOF, offset=300, nth=3)
-        assert read.received == 300
-        desk.closed(first.session)
-        assert read.result == b"x" * 239 + b"y" * 61
-
-    def test_a_burst_that_was_lost_with_its_open_is_looked_for(self) -> None:
-        desk = self.known_link()
-        desk.transfers.read("a", desk.now)
-        desk.take()
-        desk.pass_time(0.25)
-        again, *_ = desk.take()
-        desk.answer(again, (50_000).to_bytes(4, "little"))
-        desk.pass_time(0.3)
-        read, *_ = desk.take()
-        assert (read.opcode, read.offset) == (Opcode.READ_FILE, 0)
-        desk.answer(read, b"x" * 239)
-        desk.pass_time(0.04)
-        assert desk.first(Opcode.BURST_READ_FILE).offset == 239
-
-    def test_on_a_bad_link_requests_go_out_twice(self) -> None:
-        desk = self.known_link()
-        for _ in range(5):
-            desk.retry.timed_out(1)
-        desk.transfers.read("a", desk.now)
-        first, copy = desk.take()
-        assert first == copy
-        desk.answer(first, (50_000).to_bytes(4, "little"), session=9)
-        burst, *probes = desk.take()
-        assert burst.opcode == Opcode.BURST_READ_FILE
-        assert {(packet.opcode, packet.offset) for packet in probes} == {(Opcode.READ_FILE, 0)}
-        desk.answer(probes[0], b"x" * 239)
-        desk.pass_time(0.04)
-        assert Opcode.BURST_READ_FILE in [packet.opcode for packet in desk.take()]
-
-    def test_a_read_that_was_overtaken_twice_is_requested_at_once(self) -> None:
-        desk = Desk()
-        _, burst = desk.opened()
-        for block in range(1000):  # so many that the loss is small, and nothing is requested twice
-            desk.answer(burst, b"x" * 239, offset=239 * (block + 3), nth=block + 1)
-        first, second, third = desk.take()
-        desk.answer(burst, code=FileErrorCode.EOF, offset=239 * 1003, nth=1001)
-        assert desk.take() == []
-        desk.answer(second, b"x" * 239, offset=second.offset)
-        assert first.offset not in [packet.offset for packet in desk.take()]
-        desk.answer(third, b"x" * 239, offset=third.offset)
-        desk.pass_time(0.05)
-        assert first.offset in [packet.offset for packet in desk.take()]
 
 
 class TestWriting:
@@ -1232,16 +608,6 @@ class TestWriting:
         assert "does not take" in str(error_of(write))
         assert desk.transfers.is_idle
 
-    def test_a_session_that_the_first_request_has_closed(self) -> None:
-        desk = Desk()
-        write = desk.transfers.write("a", b"", desk.now)
-        desk.answer(desk.next(Opcode.CREATE_FILE), session=9)
-        desk.pass_time(1.5)
-        request = desk.take()[-1]
-        desk.answer(request, code=FileErrorCode.INVALID_SESSION)
-        assert write.done
-        assert write.error is None
-
 
 class TestListing:
     def test_in_pieces(self) -> None:
@@ -1261,13 +627,6 @@ class TestListing:
             DirectoryEntry("\t", 0),
         )
         assert [entry.is_directory for entry in listing.result] == [False, True, False, False]
-
-    @pytest.mark.parametrize("code", [None, FileErrorCode.EOF])
-    def test_an_empty_one(self, code: int | None) -> None:
-        desk = Desk()
-        listing = desk.transfers.list("x", desk.now)
-        desk.answer(desk.next(Opcode.LIST_DIRECTORY), code=code)
-        assert listing.result == ()
 
     def test_a_checksum_that_is_refused(self) -> None:
         desk = Desk()
@@ -1305,7 +664,7 @@ packets = st.builds(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.lists(packets, max_size=60), st.sampled_from(("read", "list", "checksum", "write")))
 def test_a_transfer_ends_whatever_packets_the_server_sends(junk: list[Packet], what: str) -> None:
     """Each number is counted from one of the last requests, so that much of this is taken for an answer."""
@@ -1326,31 +685,6 @@ def test_a_transfer_ends_whatever_packets_the_server_sends(junk: list[Packet], w
     desk.pass_time()
     assert job.done
     assert desk.transfers.is_idle
-
-
-@pytest.mark.parametrize("round_trip", [0.1, 3.0, 8.0])
-def test_a_server_that_has_died_at_work_is_given_up_after_a_minute(round_trip: float) -> None:
-    """The autopilot is still heard, and packet loss would explain 60 unanswered requests."""
-    desk = Desk()
-    list_file = desk.transfers.list("a", desk.now)
-    desk.answer(desk.first(Opcode.LIST_DIRECTORY), code=FileErrorCode.EOF)
-    assert list_file.result == ()
-    for _ in range(50):
-        desk.retry.answered(0.0, round_trip, 1)
-        desk.retry.timed_out(1)
-        desk.retry.timed_out(1)
-    assert desk.retry.tries > ATTEMPTS_MAX / 2
-    began = desk.now
-    checksum = desk.transfers.checksum("a", desk.now)
-    sent = []
-    while not checksum.done:
-        sent += [desk.now] * bool(desk.take())
-        desk.now = desk.transfers.next_deadline()
-        desk.transfers.tick(desk.now)
-    assert isinstance(checksum.error, NoReply)
-    assert SLOW_TIME_MAX <= desk.now - began <= SLOW_TIME_MAX + max(TIMEOUT_MAX, desk.retry.timeout)
-    assert ATTEMPTS_MIN <= len(sent) <= desk.retry.tries
-    assert max(after - before for before, after in pairwise(sent)) <= max(TIMEOUT_MAX, desk.retry.timeout)
 
 
 # Whole transfers
@@ -1456,7 +790,7 @@ faults = st.fixed_dictionaries(
         "seed": st.integers(0, 10_000),
     }
 )
-thorough = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+thorough = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 class TestOnTheAir:

@@ -21,7 +21,7 @@ from tests.simulation import Simulation
 
 Make: TypeAlias = Callable[..., Vehicle]
 
-LOSSES = pytest.mark.parametrize("loss", [0.0, 0.1], ids=["clean", "10 %"])
+LOSSES = pytest.mark.parametrize("loss", [0.1], ids=["10 %"])
 UPTIME = 12.0
 """Seconds that a vehicle runs before the first request: longer than its identification takes."""
 
@@ -167,9 +167,7 @@ class TestAListThatStops:
 @LOSSES
 class TestAnotherStation:
     @EVERY_KIND
-    @pytest.mark.parametrize(
-        ("every", "within"), [(0.5, 30.0), (0.1, 60.0)], ids=["twice a second", "ten times a second"]
-    )
+    @pytest.mark.parametrize(("every", "within"), [(0.5, 30.0)], ids=["twice a second"])
     def test_a_fetch_completes_while_another_station_restarts_the_list(
         self, kind: Make, every: float, within: float, loss: float
     ) -> None:
@@ -355,7 +353,7 @@ class TestAReboot:
     @EVERY_KIND
     def test_again_and_again(self, kind: Make, loss: float) -> None:
         vehicle = kind()
-        for count in range(60, 160):
+        for count in range(60, 160, 10):
             vehicle.when_listed(count, lambda: vehicle.reboot(down=3.0))
         world = world_of(vehicle, loss=loss)
         machine = world.machine

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import pytest
 
@@ -12,11 +12,9 @@ from paramclient.model.values import TYPES_BY_NAME, ParamType, Trust, WireValue
 from paramclient.protocol import wire
 from paramclient.protocol.events import Fetched, ParamChanged
 from paramclient.protocol.params.change import Change
-from paramclient.protocol.params.fetch_result import FRESH_HASH, FetchResult
-from paramclient.protocol.params.reads import Read
+from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSetMessage
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
-from paramclient.sim.param_table import Table
 from tests.simulation import Memory, Simulation, is_so, known, listing_ardupilot
 
 VOLATILE = ("CAL_MAG0_XOFF", "COM_FLIGHT_UUID")
@@ -137,24 +135,6 @@ def test_a_vehicle_whose_hash_is_switched_off() -> None:
     assert result.complete
 
 
-def test_a_hash_that_the_vehicle_keeps_silent_on_is_requested_once() -> None:
-    vehicle = PX4Vehicle(table=SMALL, hash_check=False)
-    world = Simulation(vehicle)
-    reads = world.meet().reads
-    requested: list[object] = []
-    ask = reads.ask
-
-    def spy(key: str | int, now: float, *, urgent: bool = True) -> Read:
-        requested.append(key)
-        return ask(key, now, urgent=urgent)
-
-    reads.ask = spy  # type: ignore[method-assign]  # only looks on
-    result = world.fetch()
-    assert result.hash is None
-    assert result.complete
-    assert requested == [HASH_CHECK]
-
-
 # the next time
 
 
@@ -196,46 +176,6 @@ def test_volatile_values_are_read_afresh_after_a_hit() -> None:
     assert world.machine.sync.synced
 
 
-def test_a_second_hit_while_the_first_one_is_refreshed() -> None:
-    world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
-    world.fetch()
-    go_on(world)
-    world.fetch()
-    first = world.machine.refresh
-    world.fetch()
-    second = world.machine.refresh
-    assert first is not None
-    assert second is not None
-    world.until(lambda: first.done and second.done)
-    assert world.machine.refresh is None
-
-
-def test_a_hit_without_anything_volatile_refreshes_nothing() -> None:
-    world = Simulation(PX4Vehicle(table={"A": 1, "B": 2}))
-    world.fetch()
-    go_on(world)
-    assert world.fetch().source == "cache"
-    assert world.machine.refresh is None
-
-
-def test_a_hash_that_was_requested_ahead_costs_nothing_more() -> None:
-    world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
-    world.fetch()
-    go_on(world)
-    world.machine.sync.ask(world.now)
-    world.run(0.3)
-    before = len(world.sent_of(ParamRequestRead))
-    fetch = world.machine.begin_fetch(world.now)
-    assert fetch.done
-    assert fetch.result is not None
-    assert (fetch.result.source, fetch.result.elapsed) == ("cache", 0.0)
-    assert before == 1
-    world.run(FRESH_HASH)
-    world.sent.clear()
-    world.fetch()
-    assert names_read(world)[0] == HASH_CHECK
-
-
 def test_a_change_since_leads_to_the_list() -> None:
     vehicle = PX4Vehicle(table=SMALL)
     world = Simulation(vehicle)
@@ -273,16 +213,6 @@ def test_a_change_that_is_received_before_the_fetch_leads_to_no_list() -> None:
     assert values_of(result) == vehicle.values
 
 
-def test_the_vehicle_may_keep_silent_on_the_hash_that_it_once_had() -> None:
-    vehicle = PX4Vehicle(table=SMALL, hash_check=False)
-    world = Simulation(vehicle)
-    world.meet().use_cached(now=world.now, **memory_of_cache(SMALL))
-    result = world.fetch()
-    assert result.source == "stream"
-    assert result.complete
-    assert values_of(result) == vehicle.values
-
-
 def test_a_parameter_that_the_vehicle_no_longer_lists_leaves_the_table() -> None:
     memory = memory_of_cache([*SMALL, SimParam("GONE", ParamType.INT32, 1)])
     memory["params"] = {**memory["params"], "UNLISTED": known("UNLISTED", 1, index=None)}
@@ -304,54 +234,6 @@ def test_a_refresh_downloads_in_spite_of_the_hash() -> None:
 
 
 # changes while it runs
-
-
-def test_a_change_that_the_stream_still_brings() -> None:
-    vehicle = PX4Vehicle()
-    world = Simulation(vehicle)
-    fetch = world.meet().begin_fetch(world.now)
-    world.run(0.3)
-    vehicle.set_param("SYS_AUTOSTART", 4999)
-    result = world.outcome(fetch)
-    assert result.params["SYS_AUTOSTART"].value == 4999
-    assert result.hash == vehicle.announced_hash()
-
-
-@pytest.mark.parametrize("changes_unsent_value", [False, True])
-def test_a_change_behind_the_streams_back(changes_unsent_value: bool) -> None:
-    vehicle = PX4Vehicle()
-    world = Simulation(vehicle)
-    before = vehicle.announced_hash()
-    fetch = world.meet().begin_fetch(world.now)
-    world.run(0.4)
-    vehicle._entry("BAT1_N_CELLS").store(9)  # has been sent, and no message reports it
-    if changes_unsent_value:
-        vehicle._entry("SYS_AUTOSTART").store(4999)
-    vehicle._hash = None
-    result = world.outcome(fetch)
-    assert result.complete
-    if changes_unsent_value:
-        assert result.hash is None
-        assert "changed during the download" in result.notes[0]
-    else:
-        assert result.hash == before != vehicle.announced_hash()
-
-
-def test_after_a_table_that_changed_our_own_write_does_not_confirm_it() -> None:
-    vehicle = PX4Vehicle(table=STRANGE)
-    world = Simulation(vehicle)
-    fetch = world.meet().begin_fetch(world.now)
-    world.until(lambda: fetch.download is not None and fetch.download.received > 5)
-    vehicle._entry("P00").store(77)  # no message reports it
-    vehicle._hash = None
-    result = world.outcome(fetch)
-    assert result.hash is None
-    world.set("P20", 1234)
-    world.run(2.0)
-    assert world.machine.table.hash is None
-    go_on(world)
-    assert world.fetch().source == "stream"
-    assert world.machine.table.params["P00"].value == 77
 
 
 def test_parameters_that_come_into_use_during_the_download() -> None:
@@ -402,21 +284,6 @@ def test_a_fetch_completes_when_another_station_requests_the_list() -> None:
     assert result.elapsed < 2.5
 
 
-@pytest.mark.parametrize("make", [PX4Vehicle, listing_ardupilot])
-def test_a_list_that_others_begin_again_and_again_is_left_to_them(
-    make: Callable[..., PX4Vehicle | ArduPilotVehicle],
-) -> None:
-    vehicle = make()
-    world = Simulation(vehicle)
-    fetch = world.meet().begin_fetch(world.now)
-    for _ in range(10):
-        world.run(0.3)
-        world.other_station(ParamRequestList(1, 1))
-    result = world.outcome(fetch)
-    assert result.complete
-    assert sum(isinstance(message, ParamRequestList) for _, message in world.sent) == 1
-
-
 # hashes that cannot be computed
 
 
@@ -454,51 +321,6 @@ def test_after_a_hit_with_an_unproven_hash_everything_is_read_afresh() -> None:
     assert world.fetch().source == "cache"
 
 
-ODD = [SimParam(row.name, row.type, row.value, row.volatile or row.name in ("P03", "P04")) for row in SMALL]
-"""A firmware that leaves out a little more than usual."""
-
-
-def test_a_value_that_changes_under_an_equal_hash_is_volatile() -> None:
-    vehicle = PX4Vehicle(table=ODD)
-    world = Simulation(vehicle)
-    world.fetch()
-    assert is_so(not world.machine.table.volatile_known)
-    go_on(world)
-    for name in ("P03", "P04"):
-        vehicle._entry(name).store(77)
-    assert world.fetch().source == "cache"
-    world.run(1.0)
-    table = world.machine.table
-    assert table.volatile_known
-    assert table.volatile == {*VOLATILE, "P03", "P04"}
-    world.set("P20", 500)
-    assert table.hash == vehicle.announced_hash()
-    go_on(world)
-    assert world.fetch().notes == ()
-
-
-def test_a_value_that_changes_with_the_hash_is_not_volatile() -> None:
-    vehicle = PX4Vehicle(table=ODD)
-    world = Simulation(air=Air.symmetric([vehicle], delay=0.05))
-    world.fetch()
-    go_on(world)
-    assert world.fetch().source == "cache"
-    vehicle._entry("P20").store(77)  # behind everybody's back, while all is read afresh
-    vehicle._hash = None
-    world.run(2.0)
-    assert not world.machine.table.volatile_known
-    assert "P20" not in world.machine.table.volatile
-    assert world.machine.table.params["P20"].value == 77
-
-
-def test_an_unproven_hash_without_one_before_stands_for_nothing() -> None:
-    world = Simulation(Headless(table=STRANGE))
-    result = world.fetch()
-    assert result.complete
-    assert result.hash is None
-    assert "No hash was received before" in result.notes[0]
-
-
 def test_after_our_own_write_the_next_session_hits() -> None:
     vehicle = PX4Vehicle(table=SMALL)
     world = Simulation(vehicle)
@@ -511,33 +333,6 @@ def test_after_our_own_write_the_next_session_hits() -> None:
     result = world.fetch()
     assert result.source == "cache"
     assert result.params["P05"].value == 500
-
-
-def test_after_our_own_write_an_unproven_hash_is_not_believed() -> None:
-    """It cannot be computed here, so it may stand for more than our write: for what was not received as
-    well."""
-    vehicle = PX4Vehicle(table=STRANGE)
-    world = Simulation(vehicle)
-    world.fetch()
-    world.set("P20", 500)
-    assert is_so(world.machine.is_settling)
-    world.run(0.5)
-    assert not world.machine.is_settling
-    assert world.machine.table.hash is None
-    assert world.machine.sync.synced
-    go_on(world)
-    assert world.fetch().source == "stream"
-
-
-def test_after_another_stations_change_an_unproven_hash_is_not_believed() -> None:
-    vehicle = PX4Vehicle(table=STRANGE)
-    world = Simulation(vehicle)
-    world.fetch()
-    vehicle.set_param("P21", 1)
-    world.run(1.0)
-    world.set("P20", 500)
-    world.run(1.0)
-    assert world.machine.table.hash is None
 
 
 def test_a_write_that_brings_parameters_into_use() -> None:
@@ -571,17 +366,6 @@ def test_indices_that_are_never_received_are_missing() -> None:
     assert not world.machine.table.complete
     assert not world.machine.sync.synced
     assert world.machine.state == "partial"
-
-
-def test_with_something_missing_no_hash_is_waited_for() -> None:
-    vehicle = PX4Vehicle()
-    world = Simulation(air=Air.symmetric([vehicle], delay=0.05))
-    fetch = world.meet().begin_fetch(world.now)
-    world.until(lambda: fetch.progress(world.now).received > 0)
-    vehicle.reboot(down=math.inf)
-    world.until(lambda: fetch.download is not None and fetch.download.done)
-    assert fetch.result is not None
-    assert fetch.result.missing
 
 
 def test_a_value_that_is_not_received_keeps_its_cached_value() -> None:
@@ -664,29 +448,6 @@ def test_the_last_one_who_waits_ends_it() -> None:
     assert world.fetch().complete
 
 
-def test_cancelling_while_the_hash_is_requested() -> None:
-    world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
-    world.fetch()
-    go_on(world)
-    fetch = world.machine.begin_fetch(world.now)
-    assert HASH_CHECK in world.machine.reads
-    world.machine.end_fetch(fetch, world.now)
-    assert HASH_CHECK not in world.machine.reads
-    world.run(1.0)
-    assert not fetch.done
-
-
-def test_giving_one_back_twice_does_not_end_another() -> None:
-    world = Simulation(PX4Vehicle(table=SMALL))
-    machine = world.meet()
-    first = machine.begin_fetch(world.now)
-    machine.end_fetch(first, world.now)
-    second = machine.begin_fetch(world.now)
-    machine.end_fetch(first, world.now)
-    assert machine.fetch is second
-    assert world.outcome(second).complete
-
-
 def test_a_refresh_joins_a_download_and_turns_a_question_for_the_hash_into_one() -> None:
     world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
     world.fetch()
@@ -722,51 +483,7 @@ def test_progress_and_partial_result_of_a_list_download() -> None:
     assert fetch.progress(world.now).seconds_left == 0.0
 
 
-def test_progress_before_a_hit_and_before_a_count() -> None:
-    world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
-    machine = world.meet()
-    fetch = machine.begin_fetch(world.now)
-    progress = fetch.progress(world.now)
-    assert (progress.received, progress.total, progress.rate, progress.seconds_left) == (0, None, 0.0, None)
-    world.outcome(fetch)
-    machine.end_fetch(fetch, world.now)
-    go_on(world)
-    fetch = world.machine.begin_fetch(world.now)
-    assert fetch.progress(world.now).total == 42
-    with pytest.raises(NoReply):
-        fetch.partial(world.now, "")
-
-
 # the link
-
-
-def test_a_fetch_goes_on_when_the_link_is_back() -> None:
-    vehicle = PX4Vehicle()
-    world = Simulation(vehicle)
-    fetch = world.meet().begin_fetch(world.now)
-    world.run(0.3)
-    world.station.pause()
-    world.air.downlink._loss = 1.0
-    world.run(100.0)
-    world.air.downlink._loss = 0.0
-    assert not fetch.done
-    world.station.resume(world.now)
-    assert world.outcome(fetch).complete
-
-
-def test_the_hash_is_requested_again_after_a_reconnection() -> None:
-    world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
-    world.fetch()
-    go_on(world)
-    fetch = world.machine.begin_fetch(world.now)
-    world.air.uplink._loss = 1.0
-    world.exchange()
-    world.station.pause()
-    world.run(100.0)
-    world.air.uplink._loss = 0.0
-    world.station.resume(world.now)
-    assert world.outcome(fetch).source == "cache"
-    assert names_read(world)[:2] == [HASH_CHECK] * 2
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.05, 0.15, 0.5])
@@ -786,57 +503,12 @@ def test_the_link_goes_for_good_at_any_moment(seconds: float) -> None:
     assert world.fetch().complete  # a later one is not spoilt by it
 
 
-def test_the_link_goes_for_good_while_everything_is_read_afresh() -> None:
-    world = Simulation(air=Air.symmetric([PX4Vehicle(table=STRANGE)], delay=0.05))
-    world.fetch()
-    go_on(world)
-    world.fetch()
-    refresh = world.machine.refresh
-    assert refresh is not None
-    error = LinkError("gone", link="x")
-    world.station.fail_all(error, world.now)
-    assert refresh.error is error
-    assert world.machine.refresh is None
-    assert len(world.machine.reads) == 0
-
-
-def test_a_write_while_everything_is_read_afresh_leaves_the_question_open() -> None:
-    vehicle = PX4Vehicle(table=ODD)
-    world = Simulation(air=Air.symmetric([vehicle], delay=0.05))
-    world.fetch()
-    go_on(world)
-    vehicle._entry("P03").store(77)
-    world.fetch()
-    refresh = world.machine.refresh
-    assert refresh is not None
-    world.until(lambda: refresh.done)
-    world.machine.write("P20", 5, world.now)
-    world.run(0.09)  # the hash arrives before the write is done
-    assert not world.machine.table.volatile_known
-
-
 def test_changes_are_reported_in_order() -> None:
     world = Simulation(PX4Vehicle(table={"A": 1, "B": 2}))
     world.fetch()
     changes = [event.change for event in world.events if isinstance(event, ParamChanged)]
     assert [change.name for change in changes] == ["A", "B"]
     assert all(isinstance(change, Change) and change.old is None for change in changes)
-
-
-TABLES: list[Table] = [SMALL, {"ONLY": 1.5}]
-
-
-@pytest.mark.parametrize("table", TABLES)
-@pytest.mark.parametrize("loss", [0.0, 0.3])
-@pytest.mark.parametrize("seed", range(5))
-def test_small_tables_on_bad_links(table: Table, loss: float, seed: int) -> None:
-    vehicle = PX4Vehicle(table=table)
-    air = Air.symmetric([vehicle], loss=loss, delay=0.05, jitter=0.05, duplicate=0.1, reorder=0.1, seed=seed)
-    world = Simulation(air=air)
-    result = world.fetch()
-    assert result.complete
-    assert values_of(result) == vehicle.values
-    assert result.hash in (None, vehicle.announced_hash())
 
 
 # the file or the list
@@ -849,12 +521,3 @@ def test_an_ardupilot_may_first_say_whether_it_serves_the_file() -> None:
     result = world.outcome(world.machine.begin_fetch(world.now))
     assert result.source == "ftp"
     assert not world.sent_of(ParamRequestList)
-
-
-def test_the_file_of_an_unidentified_component_is_requested() -> None:
-    world = Simulation(air=Air.symmetric([ArduPilotVehicle(live=())], delay=0.05))
-    world.until(lambda: (1, 1) in world.station.components)
-    world.machine.identification.version = lambda message, now: False  # type: ignore[method-assign]  # as if it was lost
-    result = world.outcome(world.machine.begin_fetch(world.now))
-    assert result.source == "ftp"
-    assert result.elapsed < 0.65

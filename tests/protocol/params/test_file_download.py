@@ -269,19 +269,6 @@ def test_an_invalid_file_is_read_twice_and_then_the_list_follows(kind: str) -> N
     assert (again.source, again.notes, len(server.opened)) == ("stream", (), 2)
 
 
-def test_a_file_that_is_invalid_once_is_read_again() -> None:
-    server = Server(vehicle := ArduPilotVehicle(live_period=0))
-    vehicle.files[FULL_PATH] = odd_files()["cut off"]
-    session = Simulation(server)
-    fetch = in_the_middle(session)
-    session.until(lambda: len(server.opened) == 1)
-    session.run(0.15)
-    del vehicle.files[FULL_PATH]
-    result = session.outcome(fetch)
-    assert (result.source, len(server.opened), lists(session)) == ("ftp", 2, 0)
-    assert remembered(session) is True
-
-
 def test_no_file_is_said_and_remembered() -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     assert vehicle._ftp is not None
@@ -297,38 +284,6 @@ def test_no_file_is_said_and_remembered() -> None:
     assert (again.notes, len(server.opened)) == ((), 1)
 
 
-def older_ardupilot() -> ArduPilotVehicle:
-    """One of 4.2, which serves the file without the defaults."""
-    vehicle = ArduPilotVehicle(live_period=0)
-    vehicle._version = replace(vehicle._version, flight_sw_version=0x040200FF)
-    return vehicle
-
-
-def test_a_file_that_an_older_server_lacks_is_requested_without_the_query_too() -> None:
-    vehicle = older_ardupilot()
-    assert vehicle._ftp is not None
-    vehicle._ftp.params = lambda: None
-    server = Server(vehicle)
-    result = Simulation(server).fetch()
-    assert (result.source, server.opened) == ("stream", [FULL_PATH, PARAMETER_FILE])
-
-
-def test_the_file_of_an_older_server_is_requested_without_the_query() -> None:
-    server = Server(vehicle := older_ardupilot())
-    assert vehicle._ftp is not None
-    serve = vehicle._ftp._open_file
-
-    def older(request: Packet, sender: tuple[int, int], now: float) -> Any:
-        is_known = b"?" not in request.data
-        return serve(request if is_known else request._replace(data=b"no such file"), sender, now)
-
-    vehicle._ftp = _with_open(vehicle._ftp, older)
-    session = Simulation(server)
-    result = session.fetch()
-    assert (result.source, is_whole(result, vehicle)) == ("ftp", True)
-    assert {param.default for param in result.params.values()} == {None}
-
-
 def test_a_server_that_keeps_silent_is_remembered_once_the_list_has_arrived() -> None:
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
     server.swallows = lambda request: True
@@ -340,22 +295,6 @@ def test_a_server_that_keeps_silent_is_remembered_once_the_list_has_arrived() ->
     opened = len(server.opened)
     assert session.fetch().source == "stream"
     assert len(server.opened) == opened
-
-
-def test_a_file_of_a_busy_server_is_requested_at_the_next_fetch() -> None:
-    """Another station has left its session open, which ends by its timeout."""
-    server = Server(vehicle := ArduPilotVehicle(live_period=0))
-    session = Simulation(server)
-    session.meet()
-    vehicle.files["a"] = b"a"
-    opened = Packet(2, 200, Opcode.OPEN_FILE_RO, b"a")
-    session.other_station(wire.FileTransfer(0, 1, 1, opened.pack()))
-    session.run(0.1)
-    result = session.fetch()
-    assert (result.source, is_whole(result, vehicle)) == ("stream", True)
-    assert remembered(session) is None
-    session.run(3.2)
-    assert session.fetch().source == "ftp"
 
 
 def test_the_file_of_another_vehicle_is_requested_again() -> None:
@@ -409,23 +348,6 @@ def test_a_reboot_in_the_middle_begins_anew() -> None:
     assert not vehicle.open_files
 
 
-def test_blocks_received_before_an_outage_are_read_again() -> None:
-    server = Server(vehicle := ArduPilotVehicle(live_period=0))
-    session = Simulation(server)
-    fetch = in_the_middle(session)
-    session.until(lambda: fetch.progress(session.now).received > 150)
-    session.station.pause()
-    vehicle.set_param("RELAY1_FUNCTION", 2)  # in what has arrived, and no station receives it
-    session.now += 8.0
-    vehicle.tick(session.now)
-    server.data_to_send()
-    session.station.resume(session.now)
-    result = session.outcome(fetch)
-    assert (result.source, len(server.opened)) == ("ftp", 2)
-    assert result.params["RELAY1_FUNCTION"].value == 2
-    assert is_whole(result, vehicle)
-
-
 def test_a_vehicle_that_stays_lost_is_given_up() -> None:
     server = Server(ArduPilotVehicle(live_period=0))
     session = Simulation(server)
@@ -476,33 +398,6 @@ def test_cancelled_it_closes_the_file_on_board() -> None:
     assert (result.source, is_whole(result, vehicle)) == ("ftp", True)
 
 
-def test_two_callers_share_one_file() -> None:
-    server = Server(vehicle := ArduPilotVehicle(live_period=0))
-    session = Simulation(server)
-    first = in_the_middle(session)
-    second = begin(session, refresh=True)
-    assert second is first
-    session.machine.end_fetch(first, session.now)
-    result = session.outcome(second)
-    assert (is_whole(result, vehicle), server.opened) == (True, [FULL_PATH])
-
-
-def test_a_refresh_while_the_hash_is_awaited_gets_the_received_file() -> None:
-    server = Server(vehicle := PX4Vehicle(ftp=True, ftp_rate=48_500.0))
-    session = Simulation(server, air=Air.symmetric([server], delay=0.1))
-    fetch = begin(session)
-    session.until(lambda: fetch.file is not None and not fetch.file.is_awaited)
-    vehicle.set_param("MC_ROLL_P", 9.5)  # so that the hash of before does not prove it
-    session.until(lambda: fetch.file is not None and fetch.file.done)
-    assert not fetch.done
-    again = begin(session, refresh=True)
-    assert again is fetch
-    whole = fetch.partial(session.now, "over")
-    assert (whole.complete, whole.received, whole.source) == (True, 903, "ftp")
-    assert session.outcome(again).hash is not None
-    assert server.opened == [FULL_PATH]
-
-
 def test_progress_and_partial_result_of_a_file_download() -> None:
     session = Simulation(ArduPilotVehicle(live_period=0))
     fetch = begin(session)
@@ -523,13 +418,6 @@ def test_progress_and_partial_result_of_a_file_download() -> None:
     assert all(left is not None and math.isfinite(left) for left in lefts)
 
 
-def test_a_time_limit_in_the_middle_names_all_as_missing() -> None:
-    session = Simulation(ArduPilotVehicle(live_period=0))
-    result = in_the_middle(session).partial(session.now, "over")
-    assert (result.source, result.count, result.received) == ("ftp", 1382, 0)
-    assert (result.missing, result.notes) == (tuple(range(1382)), ("over",))
-
-
 # Several on one link
 
 
@@ -546,42 +434,6 @@ def test_no_common_list_is_requested_if_one_component_may_have_the_file() -> Non
     assert all(result.complete for result in results)
     assert [each.target_component for each in session.sent_of(wire.ParamRequestList)] == [100]
     assert is_whole(next(result for result in results if result.source == "ftp"), vehicle)
-
-
-def test_files_of_several_vehicles_on_a_radio_take_no_longer_than_one_after_the_other() -> None:
-    def radio(number: int) -> tuple[Simulation, list[ArduPilotVehicle]]:
-        vehicles = [
-            ArduPilotVehicle(system=1 + each, live_period=0, burst=1, period=0.025, ftp_rate=1920.0)
-            for each in range(number)
-        ]
-        air = Air(
-            vehicles,
-            uplink=FaultyLink(rate=5760.0, delay=0.02),
-            downlink=FaultyLink(rate=5760.0, delay=0.02, queue=8192),
-        )
-        session = Simulation(air=air)
-        session.until(
-            lambda: (
-                len(session.station.components) == number
-                and all(machine.identification.settled for machine in session.station.components.values())
-            )
-        )
-        return session, vehicles
-
-    def took(number: int) -> float:
-        session, vehicles = radio(number)
-        began = session.now
-        fetches = [machine.begin_fetch(session.now) for machine in session.station.components.values()]
-        for fetch in fetches:
-            session.outcome(fetch)
-        for vehicle in vehicles:
-            result = session.station.components[vehicle.system, 1].fetches.last
-            assert result is not None
-            assert (result.source, is_whole(result, vehicle)) == ("ftp", True)
-        return session.now - began
-
-    alone = took(1)
-    assert took(3) <= 3 * alone * 1.05
 
 
 # Kept up
@@ -617,16 +469,6 @@ def test_a_file_that_arrives_quickly_is_read_again_every_half_minute() -> None:
     assert lists(session) == 0
 
 
-def test_a_file_that_takes_long_is_not_read_unasked() -> None:
-    server = Server(ArduPilotVehicle(live_period=0, ftp_rate=5_000.0))
-    session = upkept(server)
-    assert session.fetch().elapsed > 1.5
-    opened = len(server.opened)
-    session.run(65.0)  # a twentieth of the time, so 69 s
-    assert len(server.opened) == opened
-    assert lists(session) == 0
-
-
 def test_values_that_the_vehicle_changes_and_sends_are_no_finding_of_the_watch() -> None:
     server = Server(vehicle := ArduPilotVehicle(live_period=11.0))
     session = upkept(server)
@@ -650,14 +492,3 @@ def test_a_value_whose_update_was_lost_is_reported_once() -> None:
     session.run(100.0)
     reported = [event.changed for event in session.events if isinstance(event, TableResynced)]
     assert reported == [("STAT_RUNTIME",)]
-
-
-def _with_open(server: Any, opens: Any) -> Any:
-    class Older(type(server)):  # type: ignore[misc]  # of whatever kind it is
-        __slots__ = ()
-
-        def _open_file(self, *arguments: Any) -> Any:
-            return opens(*arguments)
-
-    server.__class__ = Older
-    return server

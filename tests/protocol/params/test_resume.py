@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from paramclient import ParamCache, ParamClient, Trust
-from paramclient.errors import NoReply
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.protocol.wire import ParamRequestList, ParamRequestRead
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from tests.caches import kill_when, params_on_disk
 from tests.shell import bits, in_simulated_time
-from tests.simulation import Simulation, listed, listing_ardupilot
+from tests.simulation import Simulation, listing_ardupilot
 
 SIZE = 200
 TABLE = {f"P{number:03d}": number for number in range(SIZE)}
@@ -80,110 +78,12 @@ def test_the_next_fetch_goes_on_with_what_is_there(kind: str) -> None:
     assert (result.hash is not None) == (kind == "PX4")
 
 
-def test_with_little_there_the_list_is_measured_to_be_faster() -> None:
-    vehicle = ArduPilotVehicle(ftp=False, table=TABLE, burst=10, period=0.005)
-    world = cancelled(vehicle, 40)
-    there = len(world.machine.table.params)
-    result = world.fetch()
-    assert is_right(result, vehicle)
-    assert result.resumed == there
-    assert requests(world)[0] == 1
-    assert requests(world)[1] < 20
-
-
-@both
-def test_a_list_that_still_runs_brings_the_rest(kind: str) -> None:
-    vehicle = MAKES[kind]()
-    world = Simulation(air=Air.symmetric([vehicle], delay=0.01))
-    machine = world.meet()
-    fetch = machine.begin_fetch(world.now)
-    world.until(lambda: len(machine.table.params) >= SIZE // 4)
-    machine.end_fetch(fetch, world.now)
-    world.sent.clear()
-    assert is_right(world.fetch(), vehicle)
-    assert requests(world) == (0, 0)
-
-
-@both
-@pytest.mark.parametrize("left", range(0, 12, 3))
-def test_a_fetch_right_after_one_that_was_cancelled_near_its_end(kind: str, left: int) -> None:
-    vehicle = MAKES[kind]()
-    world = Simulation(vehicle)
-    machine = world.meet()
-    fetch = machine.begin_fetch(world.now)
-    world.until(lambda: len(machine.table.params) >= SIZE - 10)
-    machine.end_fetch(fetch, world.now)
-    world.run(left * 0.01)
-    assert is_right(world.fetch(), vehicle)
-
-
-def test_a_list_that_was_expected_and_has_broken_off_is_not_the_vehicles_end() -> None:
-    vehicle = MAKES["ArduPilot"]()
-    world = Simulation(vehicle)
-    machine = world.meet()
-    fetch = machine.begin_fetch(world.now)
-    world.until(lambda: len(machine.table.params) >= 150)
-    machine.end_fetch(fetch, world.now)
-    vehicle._position = None
-    result = world.fetch()
-    assert is_right(result, vehicle)
-
-
-@both
-def test_a_table_completed_after_a_cancelled_fetch_is_only_verified(kind: str) -> None:
-    vehicle = MAKES[kind]()
-    world = Simulation(vehicle)
-    machine = world.meet()
-    machine.end_fetch(machine.begin_fetch(world.now), world.now)
-    world.run(10.0)
-    world.sent.clear()
-    result = world.fetch()
-    assert is_right(result, vehicle)
-    assert result.resumed == SIZE
-    assert requests(world) == (0, 1)
-
-
 def test_a_refresh_does_not_go_on_with_anything() -> None:
     world = cancelled(MAKES["PX4"]())
     result = world.fetch(refresh=True)
     assert result.complete
     assert result.resumed == 0
     assert requests(world) == (1, 0)
-
-
-def test_a_refresh_that_joins_begins_anew() -> None:
-    world = cancelled(MAKES["ArduPilot"](), 180)
-    fetch = world.machine.begin_fetch(world.now)
-    assert world.machine.begin_fetch(world.now, refresh=True) is fetch
-    result = world.outcome(fetch)
-    assert result.complete
-    assert result.resumed == 0
-    assert requests(world)[0] >= 1
-
-
-@both
-def test_a_resumed_fetch_lists_dead_indices_as_missing(kind: str) -> None:
-    vehicle = MAKES[kind]()
-    world = cancelled(vehicle, 180)
-    serve = vehicle._by_index
-    vehicle._by_index = lambda index: None if index == 190 else serve(index)  # type: ignore[method-assign]  # a fault that no option has
-    result = world.fetch()
-    assert result.missing == (190,)
-    assert not world.machine.table.complete
-    assert not world.machine.sync.synced
-
-
-@both
-def test_a_vehicle_that_is_gone_gives_no_reply_though_nothing_is_missing(kind: str) -> None:
-    vehicle = MAKES[kind]()
-    world = Simulation(vehicle)
-    machine = world.meet()
-    machine.end_fetch(machine.begin_fetch(world.now), world.now)
-    world.run(10.0)
-    world.air.uplink._loss = 1.0
-    with pytest.raises(NoReply):
-        world.fetch(limit=300.0)
-    assert not machine.sync.synced
 
 
 def test_after_a_changed_count_no_download_is_resumed() -> None:
@@ -200,22 +100,6 @@ def test_after_a_changed_count_no_download_is_resumed() -> None:
     assert result.resumed == 0
     assert requests(world)[0] == 1
     assert result.count == SIZE + 2
-
-
-def test_earlier_indices_do_not_count_after_a_changed_count() -> None:
-    vehicle = ArduPilotVehicle(
-        ftp=False, table=TABLE, groups={"P001": {"GROUP_A": 1, "GROUP_B": 2}}, burst=1, period=0.01
-    )
-    world = cancelled(vehicle, 180)
-    assert world.set("P001", 0).actual == 0
-    table = world.machine.table
-    assert (table.count, listed(table)) == (SIZE, [])
-    assert table.has_outdated_indices
-    result = world.fetch()
-    assert is_right(result, vehicle)
-    assert result.resumed == 0
-    assert not world.machine.table.outdated_indices
-    assert not {"GROUP_A", "GROUP_B"} & table.params.keys(), "what the vehicle no longer has has gone"
 
 
 def test_other_names_under_the_same_count_make_it_worthless() -> None:
@@ -295,17 +179,6 @@ def test_without_a_hash_earlier_values_stay_what_they_are() -> None:
     again = world.fetch(refresh=True)
     assert again.is_confirmed
     assert world.machine.sync.synced
-
-
-@both
-def test_half_of_a_table_is_the_least_that_is_gone_on_with(kind: str) -> None:
-    vehicle = MAKES[kind]()
-    world = cancelled(vehicle, 90)
-    next_session(world)
-    result = world.fetch()
-    assert is_right(result, vehicle)
-    assert result.resumed == 0
-    assert requests(world)[0] == 1
 
 
 @both
@@ -399,23 +272,6 @@ async def fetched(vehicle: Vehicle, path: Path) -> FetchResult:
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.component()
         return await component.fetch_all()
-
-
-@in_simulated_time
-async def test_another_firmware_does_not_go_on_with_the_old_ones_table(path: Path) -> None:
-    old = MAKES["ArduPilot"]()
-    await left_unfinished(old, path)
-    new = MAKES["ArduPilot"]()
-    new._version = replace(new._version, flight_sw_version=new._version.flight_sw_version + 1)
-    await left_unfinished(new, path)
-    again = MAKES["ArduPilot"]()
-    again._version = new._version
-    result = await fetched(again, path)
-    assert result.complete
-    same = MAKES["ArduPilot"]()
-    same._version = new._version
-    with ParamCache(path) as cache:
-        assert cache.component().identity.firmware == new._version.flight_sw_version
 
 
 @in_simulated_time

@@ -147,15 +147,6 @@ def test_an_update_that_was_lost_is_found_within_one_interval() -> None:
     assert trusts(world.machine) == {Trust.LIVE}
 
 
-def test_changes_are_reported_before_the_table_is_in_sync() -> None:
-    world, vehicle = fetched()
-    world.change_silently(vehicle, P07=700)
-    states: list[SyncState] = []
-    world.until(lambda: states.append(world.machine.sync_state) or bool(resynced(world)))  # type: ignore[func-returns-value]  # collects on the way
-    assert dict.fromkeys(states) == dict.fromkeys([SyncState.SYNCED, SyncState.RESYNCING, SyncState.SYNCED])
-    assert [type(event) for event in world.events] == [ParamChanged, TableResynced, Fetched]
-
-
 def test_without_changes_an_interval_costs_one_hash_request_and_the_volatile_values() -> None:
     world, _ = fetched()
     world.run(10 * INTERVAL + 1.0)
@@ -221,12 +212,6 @@ def test_nothing_is_requested_in_low_bandwidth_mode() -> None:
     assert world.requests() == 0
 
 
-def test_a_radio_of_57600_baud_is_no_low_bandwidth_mode() -> None:
-    world, _ = fetched(burst=1, period=0.025)
-    world.run(INTERVAL + 1.0)
-    assert world.requests() == 1 + VOLATILE
-
-
 @pytest.mark.parametrize("sync_settings", [SyncSettings(INTERVAL), SyncSettings(INTERVAL, without_hash=True)])
 def test_a_vehicle_without_a_hash(sync_settings: SyncSettings) -> None:
     vehicle = ArduPilotVehicle(ftp=False, table=PLAIN)
@@ -264,14 +249,6 @@ def test_gaps_bring_about_no_lists() -> None:
     assert len(world.sent_of(ParamRequestList)) == 1
 
 
-def test_a_standard_vehicle_counts_as_one_without_a_hash() -> None:
-    world = World(GenericVehicle(table=PLAIN))
-    world.fetch()
-    world.sent.clear()
-    world.run(5 * INTERVAL)
-    assert world.requests() == 0
-
-
 def test_a_resync_that_fails_is_tried_again() -> None:
     vehicle = PX4Vehicle(table=TABLE)
     tap = Tap(vehicle)
@@ -289,21 +266,6 @@ def test_a_resync_that_fails_is_tried_again() -> None:
     tap.is_deaf = False
     world.run(INTERVAL + 1.0)
     assert resynced(world) == [("P07",)]
-
-
-def test_nothing_is_requested_from_a_component_that_was_lost_during_its_fetch() -> None:
-    world = World(
-        ArduPilotVehicle(ftp=False, table=PLAIN), sync_settings=SyncSettings(INTERVAL, without_hash=True)
-    )
-    world.fetch()
-    fetch = world.machine.begin_fetch(world.now, refresh=True)
-    world.until(lambda: fetch.progress(world.now).received > 0)
-    world.tap.is_mute = True
-    assert world.outcome(fetch).missing
-    assert state(world) is SyncState.LOST
-    world.sent.clear()
-    world.run(3 * INTERVAL)
-    assert world.requests() == 0
 
 
 def test_a_table_received_as_a_file_is_kept_in_sync_by_its_hash_alone() -> None:
@@ -357,60 +319,11 @@ def test_after_a_gap_in_the_heartbeats_the_hash_is_requested() -> None:
     assert world.reported(ComponentLost) == []
 
 
-def test_a_gap_counts_whichever_message_follows_it() -> None:
-    world, _ = fetched()
-    world.away(3.5)
-    world.station.receive(
-        wire.encode(wire.SystemTime(0, int(1000 * world.now)), system=1, component=1, sequence=0),
-        "the only peer",
-        world.now,
-    )
-    world.run(2.0)
-    assert len(world.hashes()) == 1
-
-
 def test_the_usual_interval_of_heartbeats_is_no_gap() -> None:
     world, _ = fetched()
     world.away(1.9)
     world.run(1.0)
     assert world.hashes() == []
-
-
-def checks(world: World) -> list[float]:
-    """When it begins to ask for the hash, from now on; not how often it asks then."""
-    sync, times = world.machine.sync, list[float]()
-    ask = sync.ask
-
-    def noted(now: float) -> None:
-        times.append(now)
-        ask(now)
-
-    sync.ask = noted  # type: ignore[method-assign]  # listens in
-    return times
-
-
-def test_gaps_are_many_on_a_bad_link_and_checks_are_not() -> None:
-    vehicle = PX4Vehicle(table=TABLE)
-    world = World(air=Air.symmetric([vehicle], loss=0.4, seed=3))
-    world.fetch()
-    times = checks(world)
-    world.run(1800.0)
-    apart = [after - before for before, after in pairwise(times)]
-    assert len(times) > 1800.0 / INTERVAL, "there were gaps"
-    assert min(apart) > GAP_CHECK_INTERVAL - 1e-6
-    assert max(apart) <= INTERVAL + 5.0
-    assert state(world) is SyncState.SYNCED
-    assert len(world.reported(TableResynced)) == len(world.reported(ComponentLost))
-
-
-def test_gaps_lead_to_one_check_in_five_seconds() -> None:
-    world, _ = fetched()
-    times = checks(world)
-    for _ in range(20):
-        world.away(2.6)
-        world.run(1.9)
-    assert len(times) >= 15
-    assert min(after - before for before, after in pairwise(times)) > GAP_CHECK_INTERVAL - 1e-6
 
 
 class Rare(Tap):
@@ -456,51 +369,6 @@ def test_a_component_without_heartbeats_is_never_lost() -> None:
     assert world.reported(ComponentLost) == []
     assert world.get("P07").value == 7
     assert world.machine.state != "lost"
-
-
-def test_silence_of_a_component_without_heartbeats_is_no_gap() -> None:
-    world = World(air=Air([Heartless(PX4Vehicle(table=TABLE))]))
-    world.station.receive(
-        wire.encode(wire.ParamValue("P00", bytes(4), 6, 42, 65535), system=1, component=1, sequence=0),
-        "the only peer",
-        world.now,
-    )
-    world.fetch()
-    assert state(world) is SyncState.SYNCED
-    world.sent.clear()
-    for _ in range(3):
-        world.run(7.0)
-        world.station.receive(
-            wire.encode(wire.ParamValue("P00", bytes(4), 6, 42, 0), system=1, component=1, sequence=0),
-            "the only peer",
-            world.now,
-        )
-    world.run(7.0)
-    assert world.requests() == 0, "that it says something after a while is no gap either"
-    world.run(9 * INTERVAL)
-    assert len(world.hashes()) <= 20, "each answer after a silence begs the question whose it is"
-    assert state(world) is SyncState.SYNCED
-
-
-def test_a_component_with_a_slow_heartbeat_is_found_again_in_high_latency_mode() -> None:
-    world = World(air=Air([]))
-
-    def hear(message: wire.Message, at: float) -> None:
-        world.run(at - world.now)
-        world.station.receive(
-            wire.encode(message, system=1, component=1, sequence=0), "the only peer", world.now
-        )
-        world.exchange()
-
-    for at in (0.0, 10.0):
-        hear(wire.Heartbeat(2, wire.MAV_AUTOPILOT_PX4), at)
-    hear(wire.HighLatency2(2, wire.MAV_AUTOPILOT_PX4), 20.0)
-    hear(wire.HighLatency2(2, wire.MAV_AUTOPILOT_PX4), 42.0)
-    machine = world.machine
-    assert world.reported(ComponentLost, ComponentFound)[-2:] == [
-        ComponentLost(machine, 20.0),
-        ComponentFound(machine, 22.0),
-    ]
 
 
 # lost and found
@@ -561,19 +429,6 @@ def test_waiting_calls_end_with_the_loss_and_new_calls_at_once() -> None:
     assert len(machine.reads) == len(machine.writes) == 0
 
 
-def test_a_read_that_a_fetch_shares_with_a_caller_ends_for_the_caller_alone() -> None:
-    world, _ = fetched()
-    machine = world.machine
-    world.tap.is_deaf = True
-    fetch = machine.begin_fetch(world.now)
-    read = machine.read(HASH_CHECK, world.now)
-    world.tap.is_mute = True
-    world.until(lambda: machine.presence.is_lost)
-    assert isinstance(read.error, NoReply)
-    world.tap.is_deaf = world.tap.is_mute = False
-    assert world.outcome(fetch).complete
-
-
 def test_back_with_the_same_table() -> None:
     world, vehicle = fetched()
     machine = world.machine
@@ -610,37 +465,6 @@ def test_back_with_another_table() -> None:
     assert trusts(world.machine) == {Trust.LIVE}
 
 
-def test_back_with_another_count_is_made_good_too() -> None:
-    world, vehicle = fetched(not_in_use=["P30"])
-    world.tap.is_mute = world.tap.is_deaf = True
-    world.machine.receive(
-        wire.ParamValue("P00", bytes(4), ParamType.INT32, 44, 65535), world.now
-    )  # a count that is soon of the past
-    assert not world.machine.table.complete
-    world.away(60.0)
-    world.run(3.0)
-    assert state(world) is SyncState.SYNCED
-    assert vehicle.values.items() <= {n: p.value for n, p in world.machine.table.params.items()}.items()
-
-
-def test_a_table_that_is_not_whole_any_more_is_checked_after_a_reboot_too() -> None:
-    vehicle, other = PX4Vehicle(table=TABLE), GenericVehicle(table=PLAIN, system=2)
-    world = World(vehicle, other)
-    world.fetch()
-    fetched_at = world.now
-    world.run(3.0)
-    world.taps[1].is_deaf = True
-    world.station.components[2, 1].read("P01", world.now)  # the link is busy, so a check has to wait
-    world.machine.receive(wire.ParamValue("P00", bytes(4), ParamType.INT32, 44, 65535), world.now)
-    vehicle.reboot(world.now, down=1.5)
-    world.run(2.1)
-    assert len(world.reported(ComponentRebooted)) == 1
-    assert world.hashes(fetched_at) == []
-    world.taps[1].is_deaf = False
-    world.run(3.0)
-    assert state(world) is SyncState.SYNCED
-
-
 def test_back_without_a_hash_its_values_are_cached_until_they_are_fetched() -> None:
     vehicle = ArduPilotVehicle(ftp=False, table=PLAIN)
     world = World(vehicle)
@@ -659,16 +483,6 @@ def test_back_without_a_hash_its_values_are_cached_until_they_are_fetched() -> N
     assert state(world) is SyncState.SYNCED
     assert trusts(machine) == {Trust.LIVE}
     assert resynced(world) == [()]
-
-
-def test_without_a_watch_it_is_checked_on_return_all_the_same() -> None:
-    world, _ = fetched(sync_settings=SyncSettings())
-    world.away(9.0)
-    world.run(2.0)
-    assert state(world) is SyncState.SYNCED
-    assert len(world.hashes()) == 1
-    world.run(500.0)
-    assert len(world.hashes()) == 1
 
 
 class Berth(Tap):
@@ -710,23 +524,6 @@ def test_another_vehicle_has_taken_the_place(is_alike: bool) -> None:
     assert state(world) is SyncState.UNSYNCED
     result = world.fetch()
     assert result.params.keys() == {row.name for row in rows}
-
-
-def test_a_hash_that_was_requested_before_the_loss_confirms_nothing_after_it() -> None:
-    berth = Berth(PX4Vehicle(table=TABLE, uid=1))
-    world = World(air=Air.symmetric([berth], delay=0.1))
-    world.fetch()
-    berth.is_mute = True
-    world.run(3.9)
-    world.machine.sync.ask(world.now)
-    world.run(1.2)
-    assert world.machine.presence.is_lost
-    berth.moor(PX4Vehicle(table=TABLE, uid=2))
-    berth.is_mute = False
-    world.events.clear()
-    world.run(3.0)
-    assert world.machine.identity.uid == "0000000000000002"
-    assert resynced(world) == [], "the other one has the same hash"
 
 
 def test_a_running_fetch_waits_for_a_lost_vehicle() -> None:
@@ -790,35 +587,6 @@ def test_a_link_that_was_disconnected_for_long_is_checked_like_a_loss() -> None:
     assert world.reported(ComponentLost, ComponentFound)[-2:] == []
 
 
-def test_a_link_that_was_disconnected_for_a_moment_is_a_gap() -> None:
-    world, vehicle = fetched()
-    vehicle.set_param("P07", 700)
-    world.station.pause()
-    world.away(3.5)
-    world.station.resume(world.now)
-    assert state(world) is SyncState.SYNCED
-    assert trusts(world.machine) == {Trust.LIVE}
-    world.run(1.0)
-    assert resynced(world) == [("P07",)]
-
-
-def test_lost_before_the_link_was_disconnected_and_found_after_it() -> None:
-    world, _ = fetched()
-    world.away(6.0)
-    assert world.machine.presence.is_lost
-    world.station.pause()
-    world.away(10.0)
-    world.station.resume(world.now)
-    world.sent.clear()
-    world.until(lambda: not world.machine.presence.is_lost)
-    (found,) = world.reported(ComponentFound)
-    assert isinstance(found, ComponentFound)
-    assert found.silence > 15.0
-    world.run(2.0)
-    assert world.sent_of(CommandLong), "it may be another vehicle by now"
-    assert resynced(world) == [()]
-
-
 # writes wait for it
 
 
@@ -858,20 +626,6 @@ def test_a_write_in_progress_is_held_while_the_identity_is_in_doubt() -> None:
     assert isinstance(write.error, NoReply)
     assert stranger.requests["PARAM_SET"] == 0
     assert stranger.param("P07").value == 7
-
-
-def test_a_write_under_way_goes_on_when_it_is_the_same_vehicle() -> None:
-    world, vehicle = fetched()
-    world.tap.is_deaf = True
-    write = world.machine.write("P07", 700, world.now)
-    world.run(0.3)
-    world.tap.is_deaf = False
-    vehicle.reboot(world.now, down=1.0)
-    world.station.pause()
-    world.run(9.0)
-    world.station.resume(world.now)
-    assert world.outcome(write).actual == 700
-    assert vehicle.param("P07").value == 700
 
 
 def test_writes_to_a_camera_wait_for_its_vehicle() -> None:
@@ -916,21 +670,6 @@ def test_a_reboot_that_takes_its_time_is_a_loss_and_a_reboot() -> None:
     world.run(20.0)
     kinds = [type(event) for event in world.events if not isinstance(event, ParamChanged)]
     assert kinds == [ComponentLost, ComponentFound, ComponentRebooted, TableResynced]
-
-
-def test_a_reboot_at_the_last_question_of_a_fetch_begins_it_anew() -> None:
-    vehicle = PX4Vehicle(
-        table=[SimParam(row.name, row.type, row.value, row.name in ("P03", "P04", "P05")) for row in TABLE]
-    )
-    world = World(air=Air.symmetric([vehicle], delay=0.1))
-    world.meet()
-    world.run(9.0)
-    fetch = world.machine.begin_fetch(world.now)
-    world.until(lambda: fetch.download is not None and fetch.download.done)
-    assert not fetch.done, "which of its values are volatile cannot be found out, so the hash is awaited"
-    vehicle.set_param("P07", 700)
-    vehicle.reboot(world.now, down=0.5)
-    assert world.outcome(fetch).params["P07"].value == 700
 
 
 def test_a_vehicle_that_never_stops_starting_again_ends_a_fetch() -> None:
@@ -999,15 +738,6 @@ def test_cache_only_without_a_cache() -> None:
     assert world.requests() == 0
 
 
-def test_cache_only_gives_what_there_is_of_a_component_that_is_lost() -> None:
-    memory, vehicle = the_memory()
-    world = offline(memory, vehicle, Policy.CACHE_ONLY)
-    world.away(9.0)
-    fetch = world.machine.begin_fetch(world.now)
-    assert fetch.result is not None
-    assert len(fetch.result.params) == 42
-
-
 def test_hash_only_requests_the_hash_and_nothing_more() -> None:
     memory, vehicle = the_memory()
     world = offline(memory, vehicle, Policy.HASH_ONLY)
@@ -1042,17 +772,6 @@ def test_hash_only_says_when_the_hash_is_another_one() -> None:
     world.run(5.0)
     assert state(world) is SyncState.UNSYNCED
     assert world.requests() == len(world.hashes()) == 3, "on return the hash is requested once"
-
-
-def test_hash_only_on_return() -> None:
-    memory, vehicle = the_memory()
-    world = offline(memory, vehicle, Policy.HASH_ONLY)
-    world.fetch()
-    world.away(9.0)
-    world.run(5.0)
-    assert state(world) is SyncState.SYNCED
-    assert resynced(world) == [()]
-    assert world.requests() == len(world.hashes()) == 2
 
 
 @pytest.mark.parametrize("policy", [Policy.CACHE_ONLY, Policy.HASH_ONLY])
@@ -1094,14 +813,3 @@ def test_a_table_that_changed_during_its_download_is_fetched_again() -> None:
     world.run(GAP_CHECK_INTERVAL + 5.0)
     assert state(world) is SyncState.SYNCED
     assert "A_LATE" in world.machine.table.params
-
-
-def test_nothing_is_begun_for_a_component_that_is_lost() -> None:
-    vehicle = ArduPilotVehicle(ftp=False, table=PLAIN)
-    world = World(vehicle, sync_settings=SyncSettings(5.0, without_hash=True))
-    world.fetch()
-    fetch = world.machine.begin_fetch(world.now, refresh=True)
-    vehicle.reboot(world.now, down=math.inf)
-    world.run(60.0)
-    assert fetch.done
-    assert state(world) is SyncState.LOST

@@ -23,7 +23,7 @@ from paramclient.protocol.params.reads import Reads
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.params.writes import Write, Writes
 from paramclient.protocol.requests.context import Context
-from paramclient.protocol.requests.retry import ATTEMPTS_MIN, INITIAL_TIMEOUT, RetryPolicy
+from paramclient.protocol.requests.retry import INITIAL_TIMEOUT, RetryPolicy
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamSetMessage, ParamValue
 from tests.simulation import is_so, known, param_value
 
@@ -125,19 +125,6 @@ def test_the_type_is_learnt_first() -> None:
     assert write.result.param.type is ParamType.INT16
 
 
-def test_each_write_to_one_name_has_its_own_author() -> None:
-    desk = Desk()
-    desk.knows("A", 1.0)
-    writes = [desk.set("A", 2.0, "first"), desk.set("A", 3.0), desk.set("A", 4.0, "third")]
-    reported = []
-    for value in (2.0, 3.0, 4.0):
-        reported.append(desk.writes.author("A"))
-        desk.hear("A", value)
-    assert reported == ["us for first", "us", "us for third"]
-    assert all(write.done and write.error is None for write in writes)
-    assert desk.writes.author("A") is None
-
-
 def test_a_cached_type_is_not_enough_but_a_verified_one_is() -> None:
     desk = Desk()
     desk.table.fill({"A": known("A", 1), "B": known("B", 1)})
@@ -147,38 +134,6 @@ def test_a_cached_type_is_not_enough_but_a_verified_one_is() -> None:
     desk.set("B", 5)
     assert desk.take() == ["read A", "set B 5 INT32"]
     assert desk.table.params["B"].trust is Trust.VERIFIED
-
-
-@pytest.mark.parametrize("is_known", [True, False])
-def test_held_writes_are_reported_until_they_begin(is_known: bool) -> None:
-    """A component with a permission again handles its held writes, however short the interruption."""
-    desk = Desk()
-    if is_known:
-        desk.knows("A", 1.0)
-        desk.may_be_written = False
-        desk.set("A", 2.5)
-    else:  # it becomes uncertain while the type is requested
-        desk.set("A", 2.5)
-        assert desk.take() == ["read A"]
-        desk.may_be_written = False
-        desk.hear("A", 1.0, at=0.1)
-    assert desk.take() == []
-    assert desk.writes.is_awaiting_permission
-    desk.may_be_written = True
-    desk.writes.proceed(0.2)
-    assert desk.take() == ["set A 2.5 REAL32"]
-    assert not desk.writes.is_awaiting_permission
-
-
-def test_a_value_that_arrives_while_nothing_may_be_sent_again_leaves_the_time_outs_as_they_are() -> None:
-    desk = Desk()
-    desk.knows("A", 1.0)
-    write = desk.set("A", 2.5)
-    desk.may_be_written = False
-    desk.writes.resume(3.0)
-    desk.hear("A", 2.5, at=4.0)
-    assert write.done
-    assert desk.round_trip.smoothed is None
 
 
 def test_nothing_is_sent_before_the_encoding_may_be_written() -> None:
@@ -256,15 +211,6 @@ def test_minus_zero_will_do_for_zero_and_one_nan_not_for_another() -> None:
     assert write.result.status == "accepted"
 
 
-def test_writing_what_is_there_already() -> None:
-    desk = Desk()
-    desk.knows("A", 2.5)
-    write = desk.set("A", 2.5)
-    assert not write.done
-    desk.hear("A", 2.5)
-    assert write.done
-
-
 def test_ardupilot_cuts_off_the_fraction() -> None:
     desk = Desk(Encoding.C_CAST)
     desk.knows("A", 0, INT32)
@@ -294,18 +240,6 @@ def test_an_old_value_passing_by_proves_nothing() -> None:
     assert desk.take() == ["set A 2.0 REAL32"]
 
 
-def test_a_stale_answer_to_an_earlier_read_proves_nothing() -> None:
-    desk = Desk()
-    desk.knows("A", 1.0)
-    read = desk.reads.ask("A", desk.now)
-    write = desk.set("A", 2.0)
-    desk.hear("A", 1.0, at=0.1)  # sent before the write had arrived
-    assert read.done
-    assert not write.done
-    desk.hear("A", 2.0, at=0.15)
-    assert write.done
-
-
 def test_a_lost_write_is_seen_by_a_read_and_sent_again() -> None:
     desk = Desk()
     desk.knows("A", 1.0)
@@ -327,29 +261,6 @@ def test_a_write_without_an_answer_is_sent_again_after_the_time_out() -> None:
     desk.pass_time(2.2 * INITIAL_TIMEOUT)
     # after the third the vehicle may be silent on just this write
     assert desk.take() == ["set A 2.0 REAL32"] * 3 + ["read A"]
-
-
-def test_the_read_that_decides_may_bring_the_requested_value() -> None:
-    desk = Desk()
-    desk.knows("A", 1.0)
-    write = desk.set("A", 2.0)
-    desk.pass_time(2.5 * INITIAL_TIMEOUT)
-    desk.hear("A", 2.0)
-    assert write.result is not None
-    assert write.result.status == "accepted"
-    assert len(desk.reads) == 0
-
-
-def test_the_response_to_that_read_is_no_round_trip_sample_of_the_write() -> None:
-    desk = Desk()
-    desk.knows("A", 1.0)
-    write = desk.set("A", 2.0)
-    desk.hear("A", 1.0, at=0.1)
-    desk.pass_time(4.0)
-    assert desk.take().count("read A") == 4
-    desk.hear("A", 2.0)
-    assert write.done
-    assert desk.round_trip.smoothed is None
 
 
 def test_a_value_that_the_vehicle_makes_of_it_twice_is_its_adjustment() -> None:
@@ -379,30 +290,6 @@ def test_another_stations_value_is_not_taken_for_an_adjustment() -> None:
     assert write.result.status == "accepted"
 
 
-def test_another_value_from_a_read_alone_is_no_adjustment() -> None:
-    desk = Desk()
-    desk.knows("A", 1.0)
-    write = desk.set("A", 3.0)
-    for _ in range(3):  # every write is lost, and so was the word of another station's
-        desk.pass_time(2.5)
-        desk.hear("A", 2.0)
-    assert not write.done
-    assert desk.take().count("set A 3.0 REAL32") > 3
-
-
-def test_the_write_before_it_is_not_taken_for_an_adjustment() -> None:
-    desk = Desk()
-    desk.knows("A", 1.0)
-    first, second = desk.set("A", 2.0), desk.set("A", 3.0)
-    desk.writes.cancel(first, desk.now)
-    desk.hear("A", 2.0)  # the answer to the first; the second is lost
-    desk.pass_time(0.9)
-    desk.hear("A", 2.0)
-    desk.hear("A", 3.0)
-    assert second.result is not None
-    assert second.result.status == "accepted"
-
-
 # how it fails
 
 
@@ -430,29 +317,6 @@ def test_without_any_answer_there_is_no_reply() -> None:
     assert write.error.waited == pytest.approx(desk.now)
 
 
-def test_without_any_answer_to_the_first_read_there_is_no_reply() -> None:
-    desk = Desk()
-    write = desk.set("A", 2.0)
-    desk.pass_time()
-    assert isinstance(write.error, NoReply)
-    assert not any(isinstance(message, ParamSetMessage) for message in desk.sent)
-
-
-def test_silence_on_the_write_alone_says_that_it_is_not_applied() -> None:
-    desk = Desk(Encoding.C_CAST)
-    desk.knows("A", 1.0)
-    for _ in range(60):
-        desk.retry.answered(0.0, 0.02, 1)
-    write = desk.set("A", math.nan)
-    error = silent(desk, write, answering_reads=1.0)
-    assert isinstance(error, ValueNotApplied)
-    assert math.isnan(float(error.requested))
-    assert error.actual == 1.0
-    assert write.attempts >= ATTEMPTS_MIN
-    assert desk.now < 5.0
-    assert "keeps A at 1.0" in str(error)
-
-
 def test_a_vehicle_that_answers_every_write_with_the_old_value_does_not_apply_it() -> None:
     desk = Desk()
     desk.knows("A", 1.0)
@@ -465,33 +329,6 @@ def test_a_vehicle_that_answers_every_write_with_the_old_value_does_not_apply_it
         desk.pass_time(0.01)
     assert isinstance(write.error, ValueNotApplied)
     assert write.error.actual == 1.0
-
-
-@pytest.mark.parametrize("tries", range(5, 9))
-def test_giving_up_may_take_other_writes_with_it(tries: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(RetryPolicy, "tries", tries)
-    desk = Desk()
-    desk.knows("A", 1.0)
-    desk.knows("B", 1.0)
-    writes = [desk.set("A", 2.0), desk.set("B", 2.0)]
-    writes[0].on_done.append(lambda: desk.writes.cancel(writes[1], desk.now))
-    writes[1].on_done.append(lambda: desk.writes.cancel(writes[0], desk.now))
-    while len(desk.writes):
-        desk.pass_time(0.01)
-        for each in desk.take():
-            if each.startswith("read "):
-                desk.hear(each.removeprefix("read "), 1.0)
-    assert sorted(isinstance(write.error, ValueNotApplied) for write in writes) == [False, True]
-    assert max(write.attempts for write in writes) == tries
-
-
-def test_the_vehicle_may_fall_silent_while_its_value_is_read() -> None:
-    desk = Desk()
-    desk.knows("A", 1.0)
-    write = desk.set("A", 2.0)
-    desk.hear("A", 1.0)
-    desk.pass_time()
-    assert isinstance(write.error, NoReply)
 
 
 @pytest.mark.parametrize(
@@ -520,19 +357,6 @@ def test_a_refusal_with_a_reason(code: int, kind: type[Exception], old_value: st
         assert write.error.code == code
     desk.pass_time()
     assert desk.take() == []
-
-
-def test_a_refusal_that_is_not_for_a_write() -> None:
-    desk = Desk()
-    desk.knows("A", 1.0)
-    assert not desk.writes.refused(ParamError(255, 190, "A", -1, 1), 0.0)
-    write, learning = desk.set("A", 2.0), desk.set("B", 2.0)
-    assert not desk.writes.refused(ParamError(255, 190, "", 3, 1), 0.0)
-    assert not desk.writes.refused(ParamError(255, 190, "B", -1, 1), 0.0)
-    assert not desk.writes.refused(ParamError(255, 190, "C", -1, 1), 0.0)
-    assert not write.done
-    desk.reads.refused(ParamError(255, 190, "B", -1, 1), 0.0)
-    assert isinstance(learning.error, UnknownParameter)
 
 
 @pytest.mark.parametrize("after_the_value", [False, True])
@@ -583,15 +407,6 @@ def test_a_type_that_changes_twice_is_a_mismatch() -> None:
     assert "INT16" in str(write.error)
 
 
-def test_another_type_that_the_value_does_not_fit_is_a_mismatch() -> None:
-    desk = Desk()
-    desk.knows("A", 1, INT32)
-    write = desk.set("A", 300)
-    desk.hear("A", 1, ParamType.UINT8)
-    assert isinstance(write.error, TypeMismatch)
-    assert "300" in str(write.error)
-
-
 # several
 
 
@@ -611,17 +426,6 @@ def test_writes_to_one_name_go_in_order_and_others_beside_them() -> None:
     assert done == ["B3.0", "A1.0", "A2.0"]
 
 
-def test_a_failure_lets_the_next_one_go() -> None:
-    desk = Desk()
-    desk.knows("A", 0.0)
-    first, second = desk.set("A", 1.0), desk.set("A", 2.0)
-    desk.writes.refused(ParamError(255, 190, "A", -1, 5), 0.0)
-    assert first.done
-    assert desk.take() == ["set A 1.0 REAL32", "set A 2.0 REAL32"]
-    desk.hear("A", 2.0)
-    assert second.result is not None
-
-
 def test_cancelling_the_first() -> None:
     desk = Desk()
     desk.knows("A", 0.0)
@@ -631,36 +435,6 @@ def test_cancelling_the_first() -> None:
     desk.hear("A", 2.0)
     assert second.done
     assert not first.done
-
-
-def test_cancelling_one_that_waits() -> None:
-    desk = Desk()
-    desk.knows("A", 0.0)
-    first, second, third = (desk.set("A", value) for value in (1.0, 2.0, 3.0))
-    desk.writes.cancel(second, desk.now)
-    desk.hear("A", 1.0)
-    assert first.done
-    assert desk.take() == ["set A 1.0 REAL32", "set A 3.0 REAL32"]
-    desk.writes.cancel(third, desk.now)
-    desk.writes.cancel(third, desk.now)
-    assert len(desk.writes) == 0
-
-
-def test_a_cancelled_write_is_not_sent_when_the_type_arrives() -> None:
-    desk = Desk()
-    read = desk.reads.ask("A", desk.now)  # another caller requests the value
-    write = desk.set("A", 1.0)
-    desk.writes.cancel(write, desk.now)
-    desk.hear("A", 0.0)
-    assert read.done
-    assert desk.take() == ["read A"]
-    assert len(desk.reads) == len(desk.writes) == 0
-
-
-def test_cancelling_gives_the_read_back() -> None:
-    desk = Desk()
-    desk.writes.cancel(desk.set("A", 1.0), desk.now)
-    assert len(desk.reads) == 0
 
 
 # the link is lost and reconnected
@@ -681,42 +455,6 @@ def test_when_the_link_is_back_writes_are_sent_again() -> None:
     assert write.attempts == 1
 
 
-def test_a_write_that_no_longer_fits_after_an_outage_fails_alone() -> None:
-    desk = Desk(Encoding.C_CAST)
-    desk.knows("A", 0, INT32)
-    desk.knows("B", 0, INT32)
-    first, second = desk.set("A", 1.5), desk.set("B", 1)
-    desk.table.use_encoding(Encoding.BYTEWISE)
-    desk.writes.resume(1.0)
-    assert isinstance(first.error, UsageError)
-    assert not second.done
-
-
-def test_a_write_that_no_longer_fits_when_it_is_repeated_fails() -> None:
-    desk = Desk(Encoding.C_CAST)
-    desk.knows("A", 0, INT32)
-    write = desk.set("A", 1.5)
-    desk.pass_time(1.5 * INITIAL_TIMEOUT)
-    desk.table.use_encoding(Encoding.BYTEWISE)
-    desk.pass_time()
-    assert isinstance(write.error, UsageError)
-    assert len(desk.reads) == 0
-
-
-def test_a_write_that_no_longer_fits_leaves_no_read_behind() -> None:
-    desk = Desk(Encoding.C_CAST)
-    desk.knows("A", 0, INT32)
-    write = desk.set("A", 1.5)
-    while write.attempts < 4:
-        desk.pass_time(0.01)
-        if "read A" in desk.take():
-            desk.hear("A", 0, INT32)
-    desk.table.use_encoding(Encoding.BYTEWISE)
-    desk.pass_time()
-    assert isinstance(write.error, UsageError)
-    assert len(desk.reads) == 0
-
-
 def test_when_the_link_is_gone_all_fail() -> None:
     desk = Desk()
     desk.knows("A", 0.0)
@@ -730,18 +468,6 @@ def test_when_the_link_is_gone_all_fail() -> None:
     assert [write.done for write in again] == [False]
     assert len(desk.writes) == 1
     assert len(desk.reads) == 0
-
-
-def test_a_write_that_ends_may_take_others_with_it_while_time_passes() -> None:
-    desk = Desk()
-    for name in "AB":
-        desk.knows(name, 0.0)
-    first, second = desk.set("A", 1.0), desk.set("B", 1.0)
-    first.on_done.append(lambda: desk.writes.cancel(second, desk.now))
-    second.on_done.append(lambda: desk.writes.cancel(first, desk.now))
-    desk.pass_time()
-    assert sorted([first.done, second.done]) == [False, True]
-    assert len(desk.writes) == len(desk.reads) == 0
 
 
 # watched after the acknowledgement
@@ -779,18 +505,6 @@ def test_a_change_by_the_vehicle_while_a_value_is_watched_is_an_adjustment() -> 
     assert (write.result.requested, write.result.actual, write.result.param.value) == (80.0, 45.0, 45.0)
 
 
-def test_a_watched_adjustment_stays_one() -> None:
-    desk = Desk(Encoding.C_CAST)
-    desk.knows("A", 1, INT32)
-    write = desk.writes.set("A", 5.7, desk.now, settle=1.0)
-    desk.hear("A", 5, INT32)
-    desk.pass_time(1.1)
-    desk.hear("A", 5, INT32)
-    assert write.result is not None
-    assert write.result.adjusted
-    assert write.result.actual == 5
-
-
 def test_the_next_write_to_a_name_waits_for_the_watch_and_others_do_not() -> None:
     desk = Desk()
     desk.knows("A", 1.0)
@@ -806,19 +520,6 @@ def test_the_next_write_to_a_name_waits_for_the_watch_and_others_do_not() -> Non
     desk.hear("A", 2.0)
     assert first.done
     assert desk.take() == ["read A", "set A 3.0 REAL32"]
-
-
-def test_a_watch_survives_an_absence_of_the_link() -> None:
-    desk = Desk()
-    desk.knows("A", 1.0)
-    write = desk.writes.set("A", 2.0, desk.now, settle=1.0)
-    desk.hear("A", 2.0)
-    desk.take()
-    desk.writes.resume(desk.now)
-    assert desk.take() == []  # it is acknowledged: nothing is sent again
-    desk.pass_time(1.1)
-    desk.hear("A", 2.0)
-    assert write.result is not None
 
 
 def test_a_watch_that_cannot_be_ended_says_that_the_value_was_acknowledged() -> None:
@@ -859,11 +560,3 @@ def test_nan_and_infinity_are_not_sent_unless_forced(value: WireValue) -> None:
     forced = desk.writes.set("A", value, desk.now, force=True)
     assert [each[:5] for each in desk.take()] == ["set A"]
     assert not forced.done
-
-
-def test_the_bits_of_an_infinity_are_an_integer_as_any_other() -> None:
-    desk = Desk()
-    desk.writes.against_non_finite = "it stops"
-    desk.knows("A", 1, INT32)
-    desk.set("A", struct.pack("<f", math.inf))
-    assert desk.take() == ["set A 2139095040 INT32"]

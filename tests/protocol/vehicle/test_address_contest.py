@@ -7,23 +7,20 @@ from collections.abc import Callable, Hashable
 import pytest
 
 from paramclient.errors import ContestedAddress, NoReply
-from paramclient.protocol import station as station_room
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentContested, ComponentReplaced, ComponentUncontested, Event
 from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.requests.retry import PEER_REQUESTS, PEER_REQUESTS_MAX
+from paramclient.protocol.requests.retry import PEER_REQUESTS
 from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle import address_contest as room
 from paramclient.protocol.vehicle.presence import LOST_AFTER
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
-    MAV_AUTOPILOT_GENERIC,
     MAV_AUTOPILOT_PX4,
     MAV_CMD_REQUEST_MESSAGE,
     MAV_TYPE_GCS,
     AutopilotVersion,
-    CommandAck,
     CommandLong,
     Framer,
     Heartbeat,
@@ -219,43 +216,6 @@ def test_the_id_that_every_simulated_px4_has_shows_nothing() -> None:
     assert net.kinds() == ["Contested"]
 
 
-def test_heartbeats_at_20_hz_divert_no_request() -> None:
-    """The forger sends the vehicle's heartbeats and confirms each set; nothing is requested from the vehicle
-    for it."""
-    forger = Speaker(PX4, every=0.05, uid=None, booted_at=None, start=1.0)
-    vehicle = Speaker(PX4, obeys=False)
-    net = Net(vehicle=vehicle, forger=forger)
-    net.run(0.9)
-    net.machine.read("P", net.now)
-    net.run(0.6)
-    write = net.machine.write("P", 5.0, net.now)
-    net.run(2.0)
-    assert not any(isinstance(each, ParamSetMessage) for each in forger.received)
-    assert any(isinstance(each, ParamSetMessage) for each in vehicle.received)
-    forger.say(param_value("P", 5.0, index=0, count=1))
-    forger.say(CommandAck(400, 0, 255, 190))
-    net.run(0.2)
-    assert write.result is None, "its answer does not count"
-    net.run(PEER_REQUESTS.duration)
-    assert net.kinds() == ["Contested"]
-    requested = [each for each in forger.received if isinstance(each, CommandLong)]
-    assert len(requested) <= 3 * PEER_REQUESTS_MAX
-    assert net.machine.table.params["P"].value == 1.0
-
-
-@pytest.mark.parametrize("is_first", [False, True])
-def test_a_peer_that_repeats_the_id_without_a_clock_is_no_path_to_the_vehicle(is_first: bool) -> None:
-    """The id is sent in clear. When the vehicle is silent for 2 s, such a path would get its writes."""
-    start = 0.0 if is_first else 1.0
-    forger, vehicle = Speaker(every=0.05, booted_at=None, start=start), Speaker(start=1.0 - start)
-    net = Net(forger=forger, vehicle=vehicle) if is_first else Net(vehicle=vehicle, forger=forger)
-    net.run(PEER_REQUESTS.duration + 2.0)
-    assert net.kinds() == ["Contested"]
-    forger.booted_at = vehicle.booted_at  # its clock was only lost
-    net.run(2 * PEER_REQUESTS.later)
-    assert net.kinds() == ["Contested", "Uncontested"]
-
-
 def test_requests_go_to_the_peer_that_gives_the_hardware_id() -> None:
     """Also if the forger was received first."""
     vehicle = Speaker(PX4, start=0.4)
@@ -284,74 +244,7 @@ def test_a_contest_ends_when_one_vehicle_was_silent_for_the_heartbeat_timeout() 
     net.machine.write("P", 1.0, net.now)
 
 
-def test_the_other_one_may_be_left() -> None:
-    net = Net(a=silent_after(4.0, uid=1), b=Speaker(ARDUPILOT, uid=2, start=0.5, value=7.0))
-    net.run(0.4)
-    net.machine.read("P", net.now)
-    net.run(0.1)
-    net.run(3.5)
-    assert net.kinds() == ["Contested"]
-    net.run(LOST_AFTER - 1.5)
-    assert net.kinds() == ["Contested"], "it spoke last at 3 s"
-    net.run(3.0)
-    assert net.kinds() == ["Contested", "Uncontested"]
-    assert net.machine.peers.home == "b"
-    assert net.machine.identification.identity.uid == f"{2:016x}"
-    assert net.machine.identification.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
-    assert dict(net.machine.table.params) == {}, "nothing of the other one's"
-    read = net.machine.read("P", net.now)
-    net.run(0.2)
-    assert read.result is not None
-    assert net.machine.table.params["P"].value == 7.0
-
-
 # Several vehicles through one peer
-
-
-@pytest.mark.parametrize("every", [0.5, 1.0, 2.0])
-def test_heartbeats_of_two_autopilots_through_one_peer_are_contested(every: float) -> None:
-    both = Speaker(PX4, ARDUPILOT, every=every)
-    net = Net(both=both)
-    net.run(0.3)
-    both.say(param_value("P", 1.0, index=0, count=1))
-    net.run(every)
-    assert net.station.is_doubted(net.machine), "nothing is kept from the first change on"
-    net.run(2 * every)
-    assert net.kinds() == ["Contested"]
-    both._heartbeats = (PX4,)
-    net.run(LOST_AFTER + 2 * every + 1.0)
-    assert net.kinds() == ["Contested", "Uncontested"]
-    assert dict(net.machine.table.params) == {}
-
-
-def test_hardware_ids_that_alternate_through_one_peer_are_contested() -> None:
-    """Two of one kind behind one radio: each request is answered by both."""
-
-    class Two(Speaker):
-        def receive(self, data: bytes, now: float) -> None:
-            for self.uid in (1, 2):
-                super().receive(data, now)
-
-    net = Net(two=Two())
-    net.run(2.0)
-    assert net.kinds() == ["Contested"]
-    net.run(10.0)
-    assert net.kinds() == ["Contested"], "it is seen on for as long as both answer"
-
-
-def test_a_change_without_return_is_another_vehicle_as_before() -> None:
-    one = Speaker(PX4)
-    net = Net(one=one)
-    net.run(3.0)
-    one._heartbeats, one.uid = (ARDUPILOT,), 2
-    net.run(0.1)
-    one.say(AutopilotVersion(0, uid=2))
-    net.run(1.0)
-    assert net.station.is_doubted(net.machine)
-    net.run(LOST_AFTER + 1.0)
-    assert net.kinds() == []
-    assert net.machine.identification.identity.uid == f"{2:016x}"
-    assert not net.station.is_doubted(net.machine)
 
 
 # Two paths to one vehicle
@@ -376,43 +269,6 @@ def test_two_paths_to_one_vehicle_stay_as_they_were() -> None:
     assert net.kinds() == []
 
 
-def test_a_path_that_could_not_answer_at_first_is_proven_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A second radio that receives nothing for some seconds: requests continue, and the contest ends."""
-    second = Speaker(start=0.4)
-    net = Net(a=Speaker(), b=second)
-    with monkeypatch.context() as deaf:
-        deaf.setattr(second, "receive", lambda data, now: None)
-        net.run(PEER_REQUESTS.duration + 3.0)
-        assert net.kinds() == ["Contested"]
-    net.run(PEER_REQUESTS.later + 1.0)
-    assert net.kinds() == ["Contested", "Uncontested"]
-    assert net.machine.peers.contest is None
-    net.run(20.0)
-    assert net.kinds() == ["Contested", "Uncontested"]
-
-
-def test_an_unidentified_peer_stays_contested_and_is_requested_rarely() -> None:
-    stranger = Speaker(uid=None, booted_at=None, every=0.5)
-    net = Net(a=Speaker(), b=stranger)
-    net.run(PEER_REQUESTS.duration + 1.0)
-    stranger.received.clear()
-    net.run(60.0)
-    assert net.kinds() == ["Contested"]
-    requested = [message for message in stranger.received if isinstance(message, wire.CommandLong)]
-    assert len(requested) <= 3 * (60.0 / PEER_REQUESTS.later + 1)
-
-
-def test_a_vehicle_without_id_and_clock_may_have_two_paths() -> None:
-    """Nothing distinguishes the two."""
-    camera = Heartbeat(30, MAV_AUTOPILOT_GENERIC)
-    net = Net(
-        a=Speaker(camera, uid=None, booted_at=None),
-        b=Speaker(camera, uid=None, booted_at=None, start=0.4),
-    )
-    net.run(PEER_REQUESTS.duration + 5.0)
-    assert net.kinds() == []
-
-
 def test_a_vehicle_that_starts_again_behind_two_paths_is_no_contest() -> None:
     first, second = Speaker(), Speaker(start=0.4)
     net = Net(a=first, b=second)
@@ -432,16 +288,6 @@ def test_ground_stations_with_one_address_are_no_contest() -> None:
         b=Speaker(gcs, uid=None, booted_at=None, start=0.3, system=254),
     )
     net.run(20.0)
-    assert net.kinds() == []
-
-
-def test_a_vehicle_in_place_of_a_ground_station_is_found() -> None:
-    net = Net(a=Speaker(Heartbeat(MAV_TYPE_GCS, 8), uid=None, booted_at=None))
-    net.run(2.0)
-    net.peers["b"] = Speaker()
-    net.peers["a"].end = net.now
-    net.run(4.0)
-    assert net.machine.identification.identity.uid == f"{1:016x}"
     assert net.kinds() == []
 
 
@@ -481,17 +327,6 @@ def test_a_vehicle_that_returns_from_another_port_takes_its_address() -> None:
     assert net.machine.presence.started_at == pytest.approx(3.3, abs=0.1)
 
 
-def test_a_vehicle_whose_port_changes_is_accepted_at_once() -> None:
-    """As behind a mobile network's address translation: the vehicle goes on."""
-    net = Net(a=silent_after(3.0), b=Speaker(start=3.1))
-    net.run(3.5)
-    net.peers["b"].say(param_value("P", 4.0, index=0, count=1))
-    net.run(0.1)
-    assert net.machine.table.params["P"].value == 4.0
-    net.run(room.PATH_SILENCE)
-    assert net.machine.peers.home == "b"
-
-
 def test_another_vehicle_in_place_of_one_that_is_gone_is_identified_anew() -> None:
     net = Net(a=silent_after(3.0, uid=1), b=Speaker(ARDUPILOT, uid=2, start=3.5))
     net.run(2.5)
@@ -503,32 +338,6 @@ def test_another_vehicle_in_place_of_one_that_is_gone_is_identified_anew() -> No
     assert net.machine.peers.home == "b"
     assert net.machine.identification.identity.uid == f"{2:016x}"
     assert dict(net.machine.table.params) == {}
-
-
-def test_further_peers_are_so_many_and_no_more() -> None:
-    net = Net(a=Speaker())
-    net.run(1.0)
-    for number in range(100):
-        data = wire.encode(PX4, system=1, component=1, sequence=0)
-        net.station.receive(data, f"forger {number}", net.now)
-    assert len(net.machine.peers._others) == room.CLAIMS_MAX
-    net.run(LOST_AFTER + 2.0)
-    assert net.machine.peers.next_deadline() == float("inf"), "nothing is looked at any more"
-
-
-def test_where_nothing_is_sent_the_clock_shows_a_second_path() -> None:
-    def listening(**other: object) -> Net:
-        station = Station(link="udpin:test", is_stream=False, sync_settings=SyncSettings(listens_only=True))
-        net = Net(a=Speaker(), b=Speaker(start=0.4, **other), station=station)  # type: ignore[arg-type]
-        for _ in range(20):
-            for speaker in net.peers.values():
-                if net.now >= speaker.start and speaker.booted_at is not None:
-                    speaker.say(SystemTime(0, int(1000 * (net.now - speaker.booted_at))))
-            net.run(0.5)
-        return net
-
-    assert listening().kinds() == []
-    assert listening(booted_at=-50.0).kinds() == ["Contested"]
 
 
 def test_split_peers_are_never_contested() -> None:
@@ -547,16 +356,6 @@ def test_split_peers_are_never_contested() -> None:
     assert values == {"a": 1.0, "b": 7.0}
     assert [each.peer_in_words for each in station.at_peer("b")] == ["b"]
     assert {repr(address) for address in station.components} == {"1/1 at a", "1/1 at b"}
-
-
-def test_a_split_component_that_is_forgotten_leaves_the_other_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(station_room, "COMPONENTS_MAX", 2)
-    station = Station(link="tcpin:test", is_stream=False, split_peers=True)
-    net = Net(a=Speaker(), b=silent_after(2.0), station=station)
-    net.run(9.0)
-    net.peers["c"] = Speaker(uid=3, start=9.0)
-    net.run(5.0)
-    assert sorted(each.peer_in_words for each in station.components.values()) == ["a", "c"]
 
 
 @pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
@@ -606,18 +405,6 @@ def test_a_second_vehicle_that_gives_its_id_first_takes_nothing_over() -> None:
     net.run(STEP)
     assert not fetch.done, "P is wanted of this one as well"
     assert not net.machine.table.complete
-
-
-def test_an_id_that_arrives_over_a_second_path_first_changes_nothing() -> None:
-    net = Net(a=Speaker(uid=None), b=Speaker(start=0.2, uid=1))
-    net.run(0.2)
-    hold(net, "P")
-    net.run(room.UID_GRACE - STEP)
-    net.peers["a"].say(AutopilotVersion(0, uid=1))
-    net.run(1.0)
-    assert net.machine.peers.home == "a"
-    assert [*net.machine.table.params] == ["P"]
-    assert net.kinds() == []
 
 
 def test_nothing_is_taken_from_one_that_does_not_show_to_be_the_vehicle_that_is_silent() -> None:
@@ -676,41 +463,6 @@ def test_nothing_is_written_to_a_peer_without_an_id_while_another_may_be_the_veh
         assert not any(isinstance(each, ParamSetMessage) for each in peer.received)
 
 
-def test_a_vehicle_whose_first_path_has_lost_its_id_is_identified_again_and_written_to() -> None:
-    net = Net(a=Speaker(uid=None), b=Speaker(uid=7, start=15.0))
-    net.run(14.9)
-    hold(net, "P", "Q")
-    assert net.machine.identification.settled
-    net.peers["a"].uid = 7
-    net.run(0.2)
-    write = net.machine.write("P", 5.0, net.now)
-    net.run(3.0)
-    assert write.done
-    assert write.error is None
-    assert net.kinds() == []
-
-
-def test_a_write_does_not_go_to_the_peers_that_are_left_where_a_connection_ends() -> None:
-    station = Station(link="tcpin:test", is_stream=True)
-    net = Net(a=Speaker(obeys=False), station=station)
-    net.run(2.0)
-    hold(net, "P", "Q")
-    write = net.machine.write("P", 5.0, net.now)
-    net.run(0.1)
-    net.peers["b"] = other = Speaker(uid=2, start=net.now)
-    other._beats = 2  # it is connected, and will be silent for 2 s
-    station.receive(b"", "a", net.now)
-    net.peers["a"].end = net.now
-    net.run(1.9)
-    assert {type(each) for each in other.received} == {Heartbeat}
-    net.run(0.5)
-    assert net.machine.peers.home == "b", "what has ended needs no further silence"
-    net.run(8.0)
-    assert isinstance(write.error, NoReply)
-    assert not any(isinstance(each, ParamSetMessage) for each in net.peers["b"].received)
-    assert net.machine.identification.identity.uid == f"{2:016x}"
-
-
 def test_a_vehicle_that_connects_anew_goes_on() -> None:
     station = Station(link="tcpin:test", is_stream=True)
     net = Net(a=Speaker(), station=station)
@@ -752,115 +504,6 @@ def test_a_component_that_no_longer_identifies_itself_is_not_written_to() -> Non
     assert len([each for each in speaker.received if isinstance(each, ParamSetMessage)]) == 1
 
 
-def test_another_vehicle_type_through_one_peer_is_identified() -> None:
-    """As where another vehicle was plugged in within the heartbeat timeout."""
-    port = Speaker(PX4, end=3.0)
-    net = Net(port=port)
-    net.run(2.5)
-    hold(net, "P", "Q")
-    net.run(2.0)
-    port._heartbeats, port.uid, port.end = (ARDUPILOT,), 2, 1e9
-    net.run(2.0)
-    assert net.machine.identification.identity.uid == f"{2:016x}"
-    assert dict(net.machine.table.params) == {}
-
-
-def test_another_vehicle_type_without_an_id_is_not_written_to() -> None:
-    port = Speaker(PX4)
-    net = Net(port=port)
-    net.run(2.5)
-    hold(net, "P", "Q")
-    port._heartbeats, port.uid = (ARDUPILOT,), None
-    net.run(1.5)
-    write = net.machine.write("P", 5.0, net.now)
-    net.run(8.0)
-    assert isinstance(write.error, NoReply)
-    assert net.station.is_doubted(net.machine)
-    port._heartbeats, port.uid = (PX4,), 1
-    net.run(PEER_REQUESTS.later + 3.0)
-    assert not net.station.is_doubted(net.machine)
-    assert any(isinstance(each, ComponentReplaced) for each in net.events), (
-        "values received meanwhile are not those of the vehicle"
-    )
-
-
-@pytest.mark.parametrize("first", [None, 0])
-def test_a_vehicle_with_an_id_after_one_without_is_another_vehicle(first: int | None) -> None:
-    port = Speaker(uid=first, end=6.0)
-    net = Net(port=port)
-    net.run(5.0)
-    hold(net, "P", "Q")
-    write = net.machine.write("P", 5.0, net.now)
-    port._obeys = False
-    net.run(8.0)
-    assert write.done
-    port.end, port.uid, port._obeys = 1e9, 2, True
-    net.run(3.0)
-    assert net.machine.identification.identity.uid == f"{2:016x}"
-    assert {param.value for param in net.machine.table.params.values()} <= {port.value}
-    assert any(isinstance(each, ComponentReplaced) for each in net.events)
-
-
-def test_a_vehicle_that_could_not_answer_for_a_while_is_confirmed_later() -> None:
-    port = Speaker(end=3.0)
-    net = Net(port=port)
-    net.run(9.0)
-    port.end, port.uid = 1e9, None  # its radio receives nothing
-    net.run(20.0)
-    assert net.station.is_doubted(net.machine)
-    port.uid = 1
-    net.run(6.0)
-    assert not net.station.is_doubted(net.machine)
-
-
-def test_two_of_one_kind_behind_one_radio_are_distinguished_by_their_clocks() -> None:
-    radio = Speaker()
-    net = Net(radio=radio)
-    net.run(5.0)
-    for step in range(20):
-        radio.say(SystemTime(0, int(1000 * (net.now + (100.0 if step % 2 else 900.0)))))
-        net.run(0.5)
-    assert net.kinds() == ["Contested"]
-    assert net.machine.peers.contest is not None
-    assert "two times since boot" in net.machine.peers.contest.claimants[0]
-    net.run(30.0)
-    assert net.kinds() == ["Contested", "Uncontested"]
-
-
-def test_late_clocks_after_a_restart_are_no_second_vehicle() -> None:
-    radio = Speaker()
-    net = Net(radio=radio)
-    net.run(5.0)
-    for booted_at in (-100.0, 5.0, -100.0, 5.0, 5.0, 5.0):
-        radio.say(SystemTime(0, int(1000 * (net.now - booted_at))))
-        net.run(0.1)
-    net.run(20.0)
-    assert net.kinds() == []
-
-
-def test_a_slow_clock_is_no_other_vehicle() -> None:
-    """That of a simulation on a busy computer: 5 % slow, and a second path is found after some minutes."""
-    first, second = Speaker(), Speaker(start=301.0)
-    net = Net(a=first, b=second)
-    for _ in range(400):
-        for speaker in (first, second):
-            speaker.booted_at = -100.0 + 0.05 * net.now
-            if net.now >= speaker.start:
-                speaker.say(SystemTime(0, int(1000 * (net.now - speaker.booted_at))))
-        net.run(1.0)
-    assert net.kinds() == []
-
-
-def test_a_satellite_path_contests_nothing() -> None:
-    net = Net(a=Speaker())
-    for _ in range(30):
-        data = wire.encode(wire.HighLatency2(PX4.type, PX4.autopilot), system=1, component=1, sequence=0)
-        net.station.receive(data, "satellite", net.now)
-        net.run(1.0)
-    assert net.kinds() == []
-    assert net.machine.peers.home == "a"
-
-
 def test_a_restart_at_a_new_port_may_take_its_time_to_answer() -> None:
     after = Speaker(uid=None, booted_at=None, start=4.0)
     net = Net(a=silent_after(3.0), b=after)
@@ -892,23 +535,6 @@ def test_the_other_components_go_with_the_autopilot_that_loses_a_contest() -> No
     assert net.kinds() == ["Contested", "Uncontested"]
     assert net.machine.identification.identity.uid == f"{2:016x}"
     assert dict(other.table.params) == {}
-
-
-def test_a_component_at_the_peer_of_a_rival_is_neither_kept_nor_written_to() -> None:
-    net = Net(a=Speaker(uid=1), b=silent_after(12.0, uid=2, start=2.0))
-    net.run(2.2)
-    other = camera(net, "b", 9.0)
-    assert net.station.is_doubted(other)
-    assert not other.may_be_written
-    net.run(PEER_REQUESTS.duration)
-    assert net.machine.peers.contest is not None
-    with pytest.raises(ContestedAddress):
-        other.write("CAM", 1.0, net.now)
-    camera(net, "b", 9.0)
-    assert net.station.is_doubted(other)
-    net.run(15.0)
-    assert net.machine.identification.identity.uid == f"{1:016x}"
-    assert dict(other.table.params) == {}, "it was received from the rival's peer"
 
 
 def test_the_components_of_an_unidentified_autopilot_are_not_written_to() -> None:

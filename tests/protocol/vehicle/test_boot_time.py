@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 
 import pytest
@@ -12,18 +11,7 @@ from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentRebooted, Event, EventMaker
 from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.requests.context import Context
-from paramclient.protocol.requests.retry import (
-    BASELINE_DELAY,
-    CLOCK_REQUEST_INTERVAL,
-    FAST_REQUESTS_TIME,
-    SLOW_REQUEST_INTERVAL,
-)
 from paramclient.protocol.station import Station
-from paramclient.protocol.vehicle.boot_time_requests import BootTimeRequests
-from paramclient.protocol.vehicle.boot_time_sampling import SAMPLE_TIME, BootTimeSampling
-from paramclient.protocol.vehicle.commands import MessageRequests
-from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_PX4,
@@ -48,113 +36,6 @@ CLOCK_REQUEST = CommandLong(1, 1, MAV_CMD_REQUEST_MESSAGE, (float(SYSTEM_TIME_ID
 
 
 # requests
-
-
-class Requests:
-    """A `BootTimeRequests` in a time of its own.
-
-    Attributes:
-        sent: when each request went out.
-        context: of the component.
-    """
-
-    def __init__(self, *, may_send: bool = True) -> None:
-        self.now = 0.0
-        self.sent: list[float] = []
-        self.presence = Presence()
-
-        def send(message: Message) -> None:
-            assert message == CLOCK_REQUEST
-            self.sent.append(self.now)
-
-        self.context = Context((1, 1), send, may_send=may_send)
-        self.requests = BootTimeRequests(self.context, MessageRequests(self.context), self.presence)
-
-    def run(self, until: float) -> list[float]:
-        """Give the requests that are sent until then."""
-        self.sent.clear()
-        while self.requests.next_deadline() <= until:
-            self.now = max(self.now, self.requests.next_deadline())
-            self.requests.tick(self.now)
-        self.now = until
-        return self.sent.copy()
-
-    def report(self, boot_ms: int) -> None:
-        self.presence.system_time(SystemTime(0, boot_ms), self.now)
-
-
-def test_a_baseline_is_requested_from_a_component_without_a_clock() -> None:
-    desk = Requests()
-    desk.requests.want_baseline(desk.now)
-    assert desk.run(BASELINE_DELAY + 0.1) == [BASELINE_DELAY]
-    desk.report(5_000)
-    assert desk.run(60.0) == []
-
-
-def test_requests_for_a_baseline_are_slow() -> None:
-    desk = Requests()
-    desk.requests.want_baseline(desk.now)
-    times = [
-        BASELINE_DELAY + SLOW_REQUEST_INTERVAL * turn
-        for turn in range(int(FAST_REQUESTS_TIME / SLOW_REQUEST_INTERVAL))
-    ]
-    assert desk.run(60.0) == times
-
-
-def test_no_baseline_is_requested_from_a_component_that_sends_its_clock() -> None:
-    desk = Requests()
-    desk.requests.want_baseline(desk.now)
-    desk.run(1.0)
-    desk.report(5_000)
-    assert desk.run(60.0) == []
-
-
-def test_a_clock_that_does_not_arrive_is_given_up() -> None:
-    desk = Requests()
-    desk.requests.want(desk.now)
-    assert desk.run(60.0) == [
-        CLOCK_REQUEST_INTERVAL * turn for turn in range(int(FAST_REQUESTS_TIME / CLOCK_REQUEST_INTERVAL))
-    ]
-
-
-def test_a_clock_from_before_the_request_is_no_response() -> None:
-    desk = Requests()
-    desk.report(5_000)
-    desk.run(10.0)
-    desk.requests.want(desk.now)
-    assert desk.run(10.1) == [10.0]
-    desk.report(300)
-    assert desk.run(60.0) == []
-
-
-def test_after_a_reboot_command_the_clock_is_requested_until_the_vehicle_returns() -> None:
-    desk = Requests()
-    desk.requests.follow(desk.now)
-    sent = desk.run(20.0)
-    assert sent[0] == CLOCK_REQUEST_INTERVAL
-    assert sent[:20] == [CLOCK_REQUEST_INTERVAL * (turn + 1) for turn in range(20)]
-    assert sent[-1] - sent[-2] == SLOW_REQUEST_INTERVAL
-    desk.report(100_000)  # it is still there: that is not the end
-    assert desk.run(22.5) != []
-    desk.requests.want(desk.now)  # joins what is going on
-    desk.requests.stop_following()
-    assert desk.run(60.0) == []
-
-
-def test_a_clock_request_waits_for_another_message_request() -> None:
-    desk = Requests()
-    desk.context.is_requesting_message = True
-    desk.requests.want(desk.now)
-    assert desk.run(1.0) == []
-    desk.context.is_requesting_message = False
-    assert desk.run(1.1) == [1.0]
-
-
-def test_nothing_is_requested_where_nothing_is_sent() -> None:
-    desk = Requests(may_send=False)
-    desk.requests.want(desk.now)
-    desk.requests.follow(desk.now)
-    assert desk.run(60.0) == []
 
 
 # the component
@@ -303,38 +184,7 @@ def test_numbers_that_prove_nothing(after: float, sequence: int) -> None:
     desk.machine.end_reboot(restart, desk.now)
 
 
-def test_numbers_prove_nothing_while_a_clock_goes_on() -> None:
-    desk = Desk()
-    desk.run_connected(100.0)
-    restart = desk.machine.begin_reboot(desk.now)
-    desk.hear(ACCEPTED, sequence=31)
-    desk.run(100.5)
-    desk.machine.boot_clock(ATTITUDE_ID, 160_500, desk.now)
-    desk.run(100.6)
-    desk.hear(COPTER, sequence=0)
-    assert desk.reboots == 0
-    desk.machine.end_reboot(restart, desk.now)
-    assert desk.machine.boot_time_requests.next_deadline() == math.inf
-
-
 # telemetry
-
-
-def test_windows_open_and_close() -> None:
-    chosen: list[bool] = []
-    sampling = BootTimeSampling(chosen.append)
-    first, second = (1, 1), (2, 1)
-    sampling.open(first, 10.0)
-    sampling.open(second, 10.0)
-    assert chosen == [True]
-    sampling.sampled(first, 10.0 + SAMPLE_TIME / 2)
-    assert sampling.is_open(first)
-    sampling.sampled(first, 10.0 + SAMPLE_TIME)
-    assert not sampling.is_open(first)
-    assert sampling.is_open(second)
-    sampling.close(second)
-    sampling.close(second)
-    assert chosen == [True, False]
 
 
 def attitude(boot_ms: int, system: int = 1, component: int = 1) -> bytes:

@@ -8,7 +8,7 @@ import pytest
 
 from paramclient import CommandRefused, CommandResult, LinkError, NoReply, Refused
 from paramclient.protocol.requests.context import Context
-from paramclient.protocol.requests.retry import PROGRESS_TIMEOUT, RetryPolicy
+from paramclient.protocol.requests.retry import RetryPolicy
 from paramclient.protocol.vehicle.commands import Command, Commands
 from paramclient.protocol.wire import CommandAck, CommandLong, Message
 from tests.simulation import is_so
@@ -74,14 +74,6 @@ def test_a_refusal_says_why(result: CommandResult) -> None:
     assert error.name is None
 
 
-def test_a_result_that_is_not_known_keeps_its_number() -> None:
-    desk = Desk()
-    command = desk.commands.begin(NUMBER, (), 0.0)
-    desk.acknowledge(99, 0.2)
-    assert isinstance(command.error, CommandRefused)
-    assert command.error.reason == "result 99"
-
-
 def test_an_unanswered_command_is_repeated_with_a_confirmation_count() -> None:
     desk = Desk()
     command = desk.commands.begin(NUMBER, (), 0.0)
@@ -93,15 +85,6 @@ def test_an_unanswered_command_is_repeated_with_a_confirmation_count() -> None:
     desk.acknowledge(CommandResult.ACCEPTED, timeout * 2.6)
     assert command.done
     assert command.error is None
-
-
-def test_a_measured_link_decides_how_soon_that_is() -> None:
-    desk = Desk()
-    for number in range(20):
-        desk.commands.begin(NUMBER, (), float(number))
-        desk.acknowledge(CommandResult.ACCEPTED, number + 0.05)
-    desk.commands.begin(NUMBER, (), 30.0)
-    assert desk.commands.next_deadline() < 30.2
 
 
 def test_silence_ends_it() -> None:
@@ -129,15 +112,6 @@ def test_one_in_progress_is_waited_for_and_not_sent_again() -> None:
     assert desk.round_trip.smoothed == pytest.approx(0.1)
 
 
-def test_a_command_in_progress_without_further_messages_ends() -> None:
-    desk = Desk()
-    command = desk.commands.begin(NUMBER, (), 0.0)
-    desk.acknowledge(CommandResult.IN_PROGRESS, 0.1)
-    assert desk.run(100.0) == 0.1 + PROGRESS_TIMEOUT
-    assert isinstance(command.error, NoReply)
-    assert len(desk.sent) == 1
-
-
 def test_answers_to_others_are_not_for_us() -> None:
     desk = Desk()
     command = desk.commands.begin(NUMBER, (), 0.0)
@@ -149,53 +123,6 @@ def test_answers_to_others_are_not_for_us() -> None:
     assert command.error is None
     desk.acknowledge(CommandResult.DENIED, 0.3)  # once more, for nothing that is open
     assert command.error is None
-
-
-def test_those_of_one_number_wait_for_each_other() -> None:
-    desk = Desk()
-    first, second = (desk.commands.begin(NUMBER, (each,), 0.0) for each in (1.0, 2.0))
-    other = desk.commands.begin(OTHER, (), 0.0)
-    assert [message.command for message in desk.sent] == [NUMBER, OTHER]
-    assert second.attempts == 0
-    desk.acknowledge(CommandResult.DENIED, 0.1)
-    assert isinstance(first.error, CommandRefused)
-    assert desk.sent[-1].params[0] == 2.0
-    desk.acknowledge(CommandResult.ACCEPTED, 0.2)
-    assert second.done
-    assert second.error is None
-    assert not other.done
-
-
-@pytest.mark.parametrize("is_first", [True, False])
-def test_a_cancelled_command_leaves_nothing_behind(is_first: bool) -> None:
-    desk = Desk()
-    commands = [desk.commands.begin(NUMBER, (each,), 0.0) for each in (1.0, 2.0)]
-    gone, stays = commands if is_first else reversed(commands)
-    desk.commands.cancel(gone, 0.1)
-    desk.commands.cancel(gone, 0.1)
-    assert stays.attempts == 1
-    desk.acknowledge(CommandResult.ACCEPTED, 0.2)
-    assert stays.done
-    assert not gone.done
-    assert len(desk.commands) == 0
-
-
-def test_a_command_without_automatic_repeats_is_repeated_by_its_caller() -> None:
-    desk = Desk()
-    command = desk.commands.begin(NUMBER, (), 0.0, repeats=False)
-    assert desk.commands.next_deadline() == math.inf
-    desk.commands.resume(1.0)
-    assert len(desk.sent) == 1
-    desk.commands.repeat(command, 2.0)
-    assert [message.confirmation for message in desk.sent] == [0, 1]
-
-
-def test_a_link_that_is_back_brings_it_at_once() -> None:
-    desk = Desk()
-    command = desk.commands.begin(NUMBER, (), 0.0)
-    desk.commands.resume(5.0)
-    assert len(desk.sent) == 2
-    assert (command.attempts, command.request.sent_at) == (1, 5.0)
 
 
 @pytest.mark.parametrize("is_lost", [True, False])

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import pytest
 
 from paramclient.model.values import Encoding
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.retry import (
-    DOUBT_REQUEST_INTERVAL,
-    DOUBT_TIME_MIN,
-    FIRST_TIMEOUT,
-    LATER_REQUEST_INTERVAL,
-    LATER_REQUEST_INTERVAL_MAX,
-    VERSION_ATTEMPTS,
     RetryPolicy,
 )
 from paramclient.protocol.vehicle.commands import MessageRequests
@@ -37,7 +30,6 @@ from paramclient.protocol.wire import (
     CommandAck,
     CommandLong,
     Heartbeat,
-    HighLatency2,
     Message,
 )
 from tests.simulation import is_so
@@ -122,17 +114,6 @@ def test_the_first_evidence_there_is_decides(
     assert reason in why
 
 
-def test_evidence_in_order_of_arrival() -> None:
-    desk = Desk()
-    assert is_so(desk.who.encoding is Encoding.BYTEWISE)
-    desk.beat(ARDUPILOT)
-    assert is_so(desk.who.encoding is Encoding.C_CAST)
-    assert "ArduPilot" in desk.who.encoding_reason
-    desk.who.version(AutopilotVersion(CAPABILITY_PARAM_ENCODE_BYTEWISE, uid=1), 0.1)
-    assert desk.who.encoding is Encoding.BYTEWISE
-    assert "capability" in desk.who.encoding_reason
-
-
 def test_when_the_encoding_is_certain() -> None:
     desk = Desk()
     assert not desk.who.encoding_is_certain
@@ -196,76 +177,6 @@ def test_autopilot_version_is_requested_once() -> None:
     assert (identity.autopilot, identity.vehicle_type) == (MAV_AUTOPILOT_PX4, 2)
 
 
-def test_both_version_requests_alternate_until_the_component_is_given_up() -> None:
-    desk = Desk()
-    desk.beat(CAMERA)
-    assert desk.next_deadline() == FIRST_TIMEOUT
-    desk.let_it_be()
-    both = [MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES]
-    assert desk.commands() == [MAV_CMD_REQUEST_MESSAGE, *both * (VERSION_ATTEMPTS - 1)]
-    assert desk.who.settled
-    assert desk.who.identity.uid is None
-    assert desk.who.identity.key == "system:1@udpin:x"
-    desk.beat(CAMERA, 10.0)
-    assert desk.commands() == []
-
-
-def test_an_autopilot_without_any_response_is_requested_with_backoff() -> None:
-    """The link may have carried nothing to it at first."""
-    desk = Desk()
-    desk.beat(PX4)
-    desk.let_it_be()
-    desk.commands()
-    last = FIRST_TIMEOUT * (2 ** (VERSION_ATTEMPTS - 1) - 1)
-    times = [last, *desk.request_times(PX4, 4, 400)]
-    pauses = [after - before for before, after in pairwise(times)]
-    assert pauses[:4] == [LATER_REQUEST_INTERVAL * 2**number for number in range(4)]
-    assert pauses[4:] == [LATER_REQUEST_INTERVAL_MAX] * len(pauses[4:])
-    assert len(pauses) > 6
-    assert desk.who.version(AutopilotVersion(0, uid=7), 401.0) is False
-    assert desk.who.identity.uid == "0000000000000007"
-    assert desk.request_times(PX4, 402, 600) == []
-
-
-def test_the_first_response_of_any_kind_has_the_identity_requested_at_once() -> None:
-    desk = Desk()
-    desk.beat(PX4)
-    desk.let_it_be()
-    desk.commands()
-    times = desk.request_times(PX4, 4, 301)
-    desk.beat(PX4, 301.0)
-    assert desk.next_deadline() == times[-1] + LATER_REQUEST_INTERVAL_MAX > 301.1
-    desk.retry.answered(301.0, 301.1, 1)  # a read, say
-    assert desk.next_deadline() <= 301.1
-    desk.tick(301.1)
-    assert desk.commands() == [MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES]
-    desk.beat(PX4, 302.0)
-    assert desk.next_deadline() == pytest.approx(301.1 + LATER_REQUEST_INTERVAL), "that may be lost too"
-
-
-@pytest.mark.parametrize("kind", ["camera", "high latency", "refuses"])
-def test_the_version_of_a_component_without_one_is_not_requested_again(kind: str) -> None:
-    desk = Desk()
-    heartbeat = CAMERA if kind == "camera" else PX4
-    desk.beat(heartbeat)
-    if kind == "refuses":
-        for number in range(VERSION_ATTEMPTS):
-            command = desk.commands()[-1]
-            desk.messages.acknowledged(CommandAck(command, MAV_RESULT_UNSUPPORTED), 0.1 * number)
-            desk.tick(0.1 * number)
-    else:
-        desk.let_it_be()
-    desk.commands()
-    assert desk.who.settled
-    for second in range(1, 300):
-        if kind == "high latency":
-            desk.who.heartbeat(HighLatency2(2, MAV_AUTOPILOT_PX4))
-            desk.who.receive(float(second))
-        else:
-            desk.beat(heartbeat, float(second))
-        assert desk.next_deadline() == math.inf
-
-
 def test_a_refusal_leads_to_the_other_way_at_once() -> None:
     desk = Desk()
     desk.beat(PX4)
@@ -285,33 +196,11 @@ def test_a_refusal_to_another_station_means_nothing() -> None:
     assert desk.next_deadline() == 0.1
 
 
-def test_refusals_of_other_commands_and_late_refusals_are_ignored() -> None:
-    desk = Desk()
-    desk.beat(PX4)
-    before = desk.next_deadline()
-    desk.messages.acknowledged(CommandAck(400, MAV_RESULT_UNSUPPORTED), 0.1)
-    assert desk.next_deadline() == before
-    desk.who.version(AutopilotVersion(0, uid=7), 0.2)
-    desk.messages.acknowledged(CommandAck(MAV_CMD_REQUEST_MESSAGE, MAV_RESULT_UNSUPPORTED), 0.3)
-    assert desk.next_deadline() == math.inf
-    desk.tick(5.0)
-    assert len(desk.commands()) == 1
-
-
 def test_a_version_that_others_have_requested_is_taken() -> None:
     desk = Desk()
     desk.who.version(AutopilotVersion(0, uid=7), 0.2)
     assert desk.who.settled
     assert desk.trip.smoothed is None
-
-
-def test_a_version_that_arrives_before_the_heartbeat_learns_the_autopilot_from_it() -> None:
-    desk = Desk()
-    desk.who.version(AutopilotVersion(0, uid=7), 0.2)
-    desk.beat(ARDUPILOT, 0.3)
-    assert desk.who.identity.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
-    assert desk.who.identity.vehicle_type == 2
-    assert desk.who.identity.uid == "0000000000000007"
 
 
 # another vehicle
@@ -342,13 +231,6 @@ def test_a_version_without_an_encoding_waits_for_a_heartbeat() -> None:
         assert is_so(desk.who.is_certain)
         assert desk.who.encoding is encoding
         assert desk.next_deadline() == math.inf
-
-
-def test_a_version_with_the_encoding_waits_for_no_heartbeat() -> None:
-    desk = Desk()
-    desk.who.receive(10.0)
-    desk.who.version(AutopilotVersion(CAPABILITY_PARAM_ENCODE_BYTEWISE), 10.1)
-    assert desk.who.is_certain
 
 
 def test_the_identity_is_requested_again_when_it_is_in_doubt() -> None:
@@ -387,24 +269,3 @@ def test_a_missing_response_leaves_what_is_known() -> None:
     assert not desk.who.is_doubted
     assert desk.who.identity.uid == "0000000000000007"
     assert desk.who.settled
-
-
-def test_a_returning_component_is_requested_for_5_s_finally_once_a_second() -> None:
-    desk = settled(7)
-    for _ in range(50):
-        desk.retry.answered(0.0, 0.02, 1)  # a quick link, on which five tries take half a second
-    desk.who.doubt(30.0)
-    times = [30.0]
-    while (deadline := desk.next_deadline()) < math.inf:
-        assert is_so(desk.who.is_doubted)
-        assert not desk.who.is_certain
-        times.append(deadline)
-        desk.tick(deadline)
-    usual = desk.retry.tries
-    assert times[-1] >= 30.0 + DOUBT_TIME_MIN
-    assert all(after - before >= DOUBT_REQUEST_INTERVAL for before, after in pairwise(times[usual - 1 : -1]))
-    assert len(times) <= usual + DOUBT_TIME_MIN / DOUBT_REQUEST_INTERVAL + 2
-    assert desk.who.is_unconfirmed, "it has not said that it is the same"
-    assert not desk.who.is_certain
-    desk.who.version(AutopilotVersion(0, uid=7), 60.0)
-    assert not is_so(desk.context.may_be_another)

@@ -67,7 +67,7 @@ RECORDINGS = {
 FRAME_SIZE_MAX = 280
 """Bytes of the longest frame: 10 of header, 255 of payload, 2 of checksum, 13 of signature."""
 
-thorough = settings(max_examples=300, deadline=None)
+thorough = settings(max_examples=100, deadline=None)
 
 
 class Packer:

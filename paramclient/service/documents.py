@@ -1,0 +1,352 @@
+"""JSON of the service: vehicles and events of its own; parameters and results as the command prints them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, Final
+
+from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson, SummaryJson
+from paramclient.cli.json_output import (
+    ExtParamJson,
+    FetchJson,
+    IdentityJson,
+    InfoJson,
+    ParamJson,
+    SetJson,
+    VehicleJson,
+    WriteJson,
+    WrittenJson,
+    as_json,
+    ext_value_json,
+)
+from paramclient.cli.json_setup import ApplyJson, PlanJson
+from paramclient.model.ext_params import ExtParamType
+from paramclient.model.notation import hash_text, rounded, time_text
+from paramclient.model.values import ParamType, Trust
+from paramclient.protocol.events import Change
+
+if TYPE_CHECKING:
+    from paramclient.cache import CachedSummary, CachedVehicle, ExtHistoryEntry, HistoryEntry, SnapshotSummary
+    from paramclient.files import ParamFile
+    from paramclient.metadata import Metadata
+    from paramclient.model.ext_params import ExtParam
+    from paramclient.model.paramset import ParamSet
+    from paramclient.model.values import Param
+    from paramclient.protocol.events import Change
+    from paramclient.protocol.fetch import FetchResult, Progress
+    from paramclient.protocol.set_results import SetManyResult, SetOutcome
+    from paramclient.provision import ApplyResult, ExtApplyResult, ExtPlan, Plan
+    from paramclient.service.targets import Target
+
+__all__ = [
+    "apply_result",
+    "cached_vehicles",
+    "change",
+    "ext_apply_result",
+    "ext_change",
+    "ext_fetch_result",
+    "ext_history",
+    "ext_param",
+    "ext_plan",
+    "ext_writes",
+    "fetch_result",
+    "history",
+    "param",
+    "param_file",
+    "param_set",
+    "params",
+    "plan",
+    "progress",
+    "snapshots",
+    "vehicle",
+    "vehicle_state",
+    "write",
+    "writes",
+]
+
+CHANGING_MEMBERS: Final = frozenset({"silence_s", "round_trip_s", "params", "fetch"})
+"""Members of a vehicle that change all the time: they cause no event."""
+
+
+# Vehicles
+
+
+def vehicle(target: Target) -> dict[str, Any]:
+    """Return the state of a component on a link.
+
+    `params` is the number of known parameters, `count` the number that the component announces, `fetch` the
+    progress of a running fetch, `fetches` the number of ended ones, `key` the key of its table in the cache.
+    """
+    component, identity, ext = target.component, target.component.identity, target.component.ext
+    contest = component.contest
+    return {
+        **target.address,
+        "link_state": target.link.state,
+        "autopilot": component.autopilot,
+        "vehicle_type": identity.vehicle_type,
+        "key": identity.key,
+        "uid": identity.uid,
+        "identity": as_json(IdentityJson.of(identity)),
+        "encoding": component.encoding.value,
+        "count": component.count,
+        "params": len(component.params),
+        "hash": hash_text(component.hash),
+        "state": component.state,
+        "sync_state": component.sync_state.value,
+        "is_armed": component.is_armed,
+        "is_lost": component.sync_state == "lost",
+        "contest": None if contest is None else contest.difference,
+        "silence_s": round(component.silence, 3),
+        "round_trip_s": rounded(component.round_trip),
+        "fetch": None if target.progress is None else progress(target.progress),
+        "fetches": target.fetches,
+        "has_metadata": target.metadata is not None,
+        "extended": {"is_expected": ext.is_expected, "count": ext.count, "params": len(ext.params)},
+    }
+
+
+def vehicle_state(target: Target) -> dict[str, Any]:
+    """Return the members of a vehicle whose changes are events."""
+    return {name: value for name, value in vehicle(target).items() if name not in CHANGING_MEMBERS}
+
+
+def cached_vehicles(
+    vehicles: Iterable[CachedVehicle], tables: Iterable[CachedSummary]
+) -> list[dict[str, Any]]:
+    """Return the tables of the cache, the last heard first, each with the time when its vehicle was heard."""
+    by_key: dict[str, list[CachedSummary]] = {}
+    for table in tables:
+        by_key.setdefault(table.key, []).append(table)
+    return [
+        {**as_json(SummaryJson.of(table)), "last_seen": each.last_seen}
+        for each in vehicles
+        for table in by_key.get(each.key, ())
+    ]
+
+
+def progress(now: Progress) -> dict[str, Any]:
+    """Return the progress of a fetch: received parameters, their total, rate per second, seconds left."""
+    return {
+        "received": now.received,
+        "total": now.total,
+        "rate": round(now.rate, 1),
+        "seconds_left": rounded(now.seconds_left),
+    }
+
+
+# Parameters
+
+
+def param(known: Param, metadata: Metadata | None = None, *, whole: bool = True) -> dict[str, Any]:
+    """Return a parameter of a table.
+
+    Args:
+        known: the parameter.
+        metadata: the metadata of the vehicle, for the default and the meaning of the value; or None.
+        whole: whether to include the whole metadata of the parameter.
+    """
+    info = None if metadata is None else metadata.find(known.name)
+    found: dict[str, Any] = as_json(ParamJson.of_table(known, info))
+    return found | {"metadata": as_json(InfoJson.of(info))} if whole and info is not None else found
+
+
+def params(
+    known: Iterable[Param], metadata: Metadata | None = None, *, whole: bool = True
+) -> dict[str, dict[str, Any]]:
+    """Return parameters by name."""
+    return {each.name: param(each, metadata, whole=whole) for each in known}
+
+
+def param_set(found: ParamSet) -> dict[str, dict[str, Any]]:
+    """Return the parameters of a set by name."""
+    return {name: as_json(WrittenJson.of(each)) for name, each in found.items()}
+
+
+def param_file(file: ParamFile) -> dict[str, Any]:
+    """Return the content of a file: a set for each component."""
+    sets = [as_json(SetJson.with_sources(each, {})) for each in file.sets]
+    return {"file": file.source, "format": file.file_format, "notes": list(file.notes), "components": sets}
+
+
+def change(found: Change, metadata: Metadata | None) -> dict[str, Any]:
+    """Return the members of an event about a changed, added or removed parameter."""
+    old, new = found.old, found.new
+    return {
+        "name": found.name,
+        "old": None if old is None else param(old, metadata, whole=False),
+        "new": None if new is None else param(new, metadata, whole=False),
+        "by": found.by,
+        "kind": "removed" if new is None else "added" if isinstance(found, Added) else "changed",
+    }
+
+
+# Fetches, writes and set-ups
+
+
+def fetch_result(result: FetchResult, target: Target) -> dict[str, Any]:
+    """Return the result of a fetch, without the parameters."""
+    stats = None if target.link.client is None else target.link.client.stats
+    known = target.component.params
+    found: dict[str, Any] = as_json(
+        FetchJson.of(
+            target.component,
+            result,
+            (),
+            missing=list(result.missing),
+            cached=[name for name, each in known.items() if each.trust is Trust.CACHED],
+            bytes_received=0 if stats is None else stats.bytes_received,
+            bytes_sent=0 if stats is None else stats.bytes_sent,
+            described={},
+        )
+    )
+    del found["params"]
+    return found | {"notes": list(result.notes)}
+
+
+def write(outcome: SetOutcome, target: Target) -> dict[str, Any]:
+    """Return the outcome of a write."""
+    known = target.component.params.get(outcome.name)
+    info = None if target.metadata is None else target.metadata.find(outcome.name)
+    kind = ParamType.REAL64 if known is None else known.type_number
+    found: dict[str, Any] = as_json(WriteJson.of(outcome, kind, info))
+    return found
+
+
+def writes(result: SetManyResult, target: Target) -> dict[str, Any]:
+    """Return the outcomes of several writes in order; `error` says why not all were tried."""
+    return {
+        "vehicle": as_json(VehicleJson.of(target.component)),
+        "results": [write(outcome, target) for outcome in result.outcomes],
+        "error": None if result.error is None else str(result.error),
+    }
+
+
+def plan(found: Plan, target: Target) -> dict[str, Any]:
+    """Return a plan."""
+    component = target.component
+    members: dict[str, Any] = as_json(
+        PlanJson.of(found, system=component.system, component=component.component)
+    )
+    return members
+
+
+def apply_result(result: ApplyResult, target: Target) -> dict[str, Any]:
+    """Return the result of an apply or restore."""
+    component = target.component
+    members: dict[str, Any] = as_json(
+        ApplyJson.of(
+            result,
+            system=component.system,
+            component=component.component,
+            vehicle=VehicleJson.of(component),
+        )
+    )
+    return members
+
+
+# The past
+
+
+def history(entries: Iterable[HistoryEntry]) -> dict[str, Any]:
+    """Return changes of values."""
+    return {"history": [as_json(HistoryLineJson.of(entry)) for entry in entries]}
+
+
+def snapshots(kept: Iterable[SnapshotSummary]) -> dict[str, Any]:
+    """Return snapshots without their parameters."""
+    return {"snapshots": [as_json(SnapshotJson.of(each)) for each in kept]}
+
+
+# Extended parameters
+
+
+def ext_param(known: ExtParam) -> dict[str, Any]:
+    """Return an extended parameter of a table."""
+    found: dict[str, Any] = as_json(ExtParamJson.of_table(known))
+    return found
+
+
+def ext_change(found: Change) -> dict[str, Any]:
+    """Return the members of an event about an extended parameter."""
+    old, new = found.old, found.new
+    return {
+        "name": found.name,
+        "old": None if old is None else ext_param(old),
+        "new": None if new is None else ext_param(new),
+        "by": found.by,
+        "kind": "removed" if new is None else "added" if found.is_added else "changed",
+    }
+
+
+def ext_fetch_result(result: FetchResult) -> dict[str, Any]:
+    """Return the result of a fetch of extended parameters."""
+    return {
+        "system": result.system,
+        "component": result.component,
+        "count": result.count,
+        "received": len(result.params),
+        "source": result.source,
+        "missing": list(result.missing),
+        "elapsed_s": round(result.elapsed, 3),
+    }
+
+
+def ext_writes(outcomes: Iterable[SetOutcome], error: Exception | None = None) -> dict[str, Any]:
+    """Return the outcomes of writes of extended parameters; `error` says why not all were tried."""
+    return {
+        "results": [_ext_write(each) for each in outcomes],
+        "error": None if error is None else str(error),
+    }
+
+
+def _ext_write(outcome: SetOutcome) -> dict[str, Any]:
+    """Return the outcome of a write of an extended parameter; `actual_hex` has the bytes of its value."""
+    now = None if outcome.result is None else outcome.result.param
+    return {
+        "name": outcome.name,
+        "requested": ext_value_json(outcome.requested, ExtParamType.REAL64),
+        "actual": None if now is None else ext_value_json(now.value, now.type),
+        "status": outcome.status.value,
+        "actual_hex": None if now is None else now.raw.hex(),
+        "reason": None if outcome.error is None else str(outcome.error),
+    }
+
+
+def ext_plan(found: ExtPlan) -> dict[str, Any]:
+    """Return what a set-up of extended parameters would write."""
+    return {
+        "system": found.system,
+        "component": found.component,
+        "is_met": found.is_met,
+        "changes": {name: as_json(ExtParamJson.of(each)) for name, each in found.changes.items()},
+        "missing": list(found.missing),
+        "mistyped": list(found.mistyped),
+    }
+
+
+def ext_apply_result(result: ExtApplyResult) -> dict[str, Any]:
+    """Return the result of a set-up of extended parameters."""
+    return {
+        "complete": result.complete,
+        "plan": ext_plan(result.plan),
+        "different": list(result.different),
+        "snapshot": result.snapshot,
+        "elapsed_s": round(result.elapsed, 3),
+        **ext_writes(result.outcomes, result.error),
+    }
+
+
+def ext_history(entries: Iterable[ExtHistoryEntry]) -> dict[str, Any]:
+    """Return changes of extended parameters."""
+    lines = [
+        {
+            "time": time_text(each.at),
+            "component": each.component,
+            "name": each.name,
+            "old": as_json(ExtParamJson.of(each.old)),
+            "new": None if each.new is None else as_json(ExtParamJson.of(each.new)),
+            "by": each.by,
+        }
+        for each in entries
+    ]
+    return {"history": lines}

@@ -1,0 +1,282 @@
+"""Models of request bodies, and the values and parameter sets in them."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from datetime import datetime
+from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictFloat, StrictInt, model_validator
+
+from paramclient.errors import UsageError
+from paramclient.files import FileFormat, ParamFile, loads
+from paramclient.metadata.info import number_of
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import WireValue, check_name, from_bits, type_name
+
+if TYPE_CHECKING:
+    from paramclient.service.targets import Target
+
+__all__ = [
+    "ApplyRequest",
+    "Bits",
+    "FetchRequest",
+    "Hex",
+    "MetadataRequest",
+    "PlanRequest",
+    "RestoreRequest",
+    "SnapshotNumber",
+    "SnapshotRequest",
+    "Timestamp",
+    "UploadedFile",
+    "Value",
+    "WriteManyRequest",
+    "WriteRequest",
+    "range_faults",
+    "resolve_value",
+    "values_set",
+]
+
+FILE_BYTES_MAX: Final = 2 * 2**20
+"""Maximum size of a parameter file in bytes; a table of 10,000 parameters takes 1 MB."""
+VALUES_MAX: Final = 10_000
+"""Maximum number of values of a request: more than a vehicle has."""
+
+
+class Body(BaseModel):
+    """A request body. An unknown member is refused, so that a misspelt one is not ignored."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Bits(Body):
+    """A value by its bits, as in the member `bits` of a parameter."""
+
+    bits: Annotated[str, Field(pattern="^[0-9a-fA-F]{1,16}$")]
+
+
+class Hex(Body):
+    """The bytes of an extended parameter, as in its member `hex`."""
+
+    hex: Annotated[str, Field(pattern="^([0-9a-fA-F]{2}){0,128}$")]
+
+
+def _parse_timestamp(given: object) -> object:
+    if not isinstance(given, str):
+        return given
+    try:
+        return float(given)
+    except ValueError:
+        moment = datetime.fromisoformat(given)
+        if moment.tzinfo is None:
+            raise ValueError("a time needs a time zone, as in 2026-11-20T14:00:00Z") from None
+        return moment.timestamp()
+
+
+Name = Annotated[str, Field(min_length=1, max_length=16)]
+Number: TypeAlias = StrictInt | Annotated[StrictFloat, Field(allow_inf_nan=False)]
+Value = Annotated[
+    Number | Annotated[str, Field(max_length=400)] | Bits | Hex,
+    Field(
+        description='A number, "NaN", "Infinity", the name of a value or of bits in the metadata, or '
+        '{"bits": …}; of an extended parameter also text and {"hex": …}.'
+    ),
+]
+Values = Annotated[dict[Name, Value], Field(min_length=1, max_length=VALUES_MAX)]
+Seconds = Annotated[float | None, Field(gt=0, le=86_400, description="Timeout in seconds.")]
+Patterns = Annotated[
+    tuple[Annotated[str, Field(min_length=1, max_length=64)], ...], Field(max_length=VALUES_MAX)
+]
+SnapshotNumber = Annotated[int, Field(ge=1, lt=1 << 62)]
+Timestamp = Annotated[
+    float,
+    BeforeValidator(_parse_timestamp),
+    Field(
+        ge=0, lt=253_402_300_800, allow_inf_nan=False, description="Unix seconds, or ISO 8601 with a zone."
+    ),
+]
+Force = Annotated[
+    bool, Field(description="Write values outside the range in the metadata, NaN and infinities.")
+]
+Durable = Annotated[bool, Field(description="Respond after value and history are on the disk.")]
+
+
+class WriteRequest(Body):
+    """One value."""
+
+    value: Value
+    settle_s: Annotated[float, Field(ge=0, le=60)] = 0.0
+    force: Force = False
+    durable: Durable = False
+    timeout_s: Seconds = None
+
+
+class WriteManyRequest(Body):
+    """Several values, by name; written in this order, many at a time."""
+
+    values: Values
+    settle_s: Annotated[float, Field(ge=0, le=60)] = 0.0
+    force: Force = False
+    durable: Durable = False
+    timeout_s: Seconds = None
+
+
+class FetchRequest(Body):
+    """Options of a fetch; see `Component.fetch_all`."""
+
+    refresh: bool = False
+    timeout_s: Seconds = None
+
+
+class MetadataRequest(Body):
+    """Timeout of the vehicle's responses."""
+
+    timeout_s: Seconds = None
+
+
+class UploadedFile(Body):
+    """A parameter file, as text or in base64. Its name can indicate its format; `component` selects a set."""
+
+    name: Annotated[str, Field(max_length=255)] = ""
+    text: Annotated[str, Field(max_length=FILE_BYTES_MAX)] | None = None
+    base64: Annotated[str, Field(max_length=FILE_BYTES_MAX * 4 // 3 + 4)] | None = None
+    format: FileFormat | None = None
+    component: Annotated[int, Field(ge=1, le=255)] | None = None
+
+    @model_validator(mode="after")
+    def _is_one(self) -> UploadedFile:
+        if (self.text is None) == (self.base64 is None):
+            raise ValueError("a file needs either `text` or `base64`")
+        return self
+
+    def read(self) -> ParamFile:
+        """Parse the file. Blocks for up to seconds.
+
+        Raises:
+            FileError: the file is invalid.
+            UsageError: the member is not base64.
+        """
+        if self.text is not None:
+            data = self.text.encode("utf-8", "surrogatepass")
+        else:
+            try:
+                data = base64.b64decode(self.base64 or "", validate=True)
+            except (binascii.Error, ValueError) as error:
+                raise UsageError(f"{self.name or 'the file'} is not valid base64: {error}") from None
+        return loads(data, source=self.name, file_format=self.format, params_max=VALUES_MAX)
+
+    def read_set(self, target: Target) -> ParamSet:
+        """Parse the file, and return its set for a component; see `read`."""
+        file, component = self.read(), target.component
+        is_of_several = len({each.system for each in file.sets}) > 1
+        chosen = component.component if self.component is None else self.component
+        return file.choose(chosen, system=component.system if is_of_several else None)
+
+
+class PlanRequest(Body):
+    """Wanted parameters: exactly one of `values`, `file` and `snapshot`, limited to `only`."""
+
+    values: Values | None = None
+    file: UploadedFile | None = None
+    snapshot: SnapshotNumber | None = None
+    only: Patterns | None = None
+    include: Patterns = ()
+    force: Force = False
+
+    @model_validator(mode="after")
+    def _is_one(self) -> PlanRequest:
+        if sum(each is not None for each in (self.values, self.file, self.snapshot)) != 1:
+            raise ValueError("exactly one of `values`, `file` and `snapshot` is needed")
+        return self
+
+
+class ApplyRequest(PlanRequest):
+    """Wanted parameters with options; see `paramclient.provision.apply`."""
+
+    reboot: bool = False
+    allow_armed: bool = False
+    skip_invalid: bool = False
+    durable: Durable = False
+    timeout_s: Seconds = None
+
+
+class RestoreRequest(Body):
+    """The state to restore: a snapshot, a time, or without both the state before the last apply."""
+
+    snapshot: SnapshotNumber | None = None
+    at: Timestamp | None = None
+    include: Patterns = ()
+    force: Force = False
+    reboot: bool = False
+    allow_armed: bool = False
+    dry_run: bool = False
+    timeout_s: Seconds = None
+
+    @model_validator(mode="after")
+    def _is_one(self) -> RestoreRequest:
+        if self.snapshot is not None and self.at is not None:
+            raise ValueError("`snapshot` and `at` exclude each other")
+        return self
+
+    @property
+    def when(self) -> int | float | None:
+        """The number of the snapshot, the time, or None."""
+        return self.at if self.snapshot is None else self.snapshot
+
+
+class SnapshotRequest(Body):
+    """Reason of a snapshot."""
+
+    reason: Annotated[str, Field(min_length=1, max_length=200)]
+
+
+def values_set(values: dict[str, int | float | str | Bits | Hex], target: Target) -> ParamSet:
+    """Return values as a set. A value by its bits takes the type that the vehicle has sent.
+
+    Raises:
+        UsageError: a name or value is invalid.
+    """
+    return ParamSet(
+        {
+            name: WrittenParam(check_name(name), resolve_value(target, name, value))
+            for name, value in values.items()
+        }
+    )
+
+
+def resolve_value(target: Target, name: str, given: int | float | str | Bits | Hex) -> WireValue:
+    """Return the value of a request.
+
+    Raises:
+        UsageError: no value has this name, or the bits do not fit the type.
+    """
+    if isinstance(given, Hex):
+        raise UsageError(f'{name}: {{"hex": …}} is for extended parameters')
+    if isinstance(given, Bits):
+        known, bits = target.component.params.get(name), int(given.bits, 16)
+        if known is None:
+            raise UsageError(f"{name}: the type is not known; read the parameter first")
+        if bits >> (32 if known.is_raw else 8 * known.type.size):
+            raise UsageError(f"{name}: {bits:x} has more bits than {type_name(known.type_number)}")
+        return from_bits(bits, known.type_number, is_raw=known.is_raw)
+    if not isinstance(given, str):
+        return given
+    number = number_of(given)
+    if number is not None:
+        return number
+    info = None if target.metadata is None else target.metadata.find(name)
+    if info is None:
+        raise UsageError(f"{name}: {given!r} is not a number, and there is no metadata with names of values")
+    return info.parse(given)
+
+
+def range_faults(target: Target, values: dict[str, WireValue]) -> dict[str, str]:
+    """Return, by name, why values are outside the range in the metadata."""
+    found = {}
+    for name, value in values.items():
+        info = None if target.metadata is None else target.metadata.find(name)
+        fault = None if info is None else info.problem(value)
+        if fault is not None:
+            found[name] = fault
+    return found

@@ -1,0 +1,328 @@
+"""Routes of set-ups and of the past: files, plan, apply, restore, snapshots, history."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Annotated, Any, Final
+
+import anyio
+import anyio.to_thread
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import JSONResponse, Response
+
+from paramclient.errors import UsageError
+from paramclient.files import FileFormat, dumps
+from paramclient.files.formats import ENDINGS
+from paramclient.model.identity import autopilot_name
+from paramclient.model.paramset import ParamSet
+from paramclient.provision import ApplyProgress, apply, prepare, restore
+from paramclient.provision.apply_restore import restore_categories
+from paramclient.provision.inspection import wait_for_identity
+from paramclient.provision.restore_point import load_state_before_apply
+from paramclient.provision.vehicle_params import fetch_set, load_cached_set, select_non_defaults, set_maker
+from paramclient.service import documents, extended
+from paramclient.service.access import author_of, require_read, require_write
+from paramclient.service.hub import Hub
+from paramclient.service.problems import ServiceError
+from paramclient.service.request_bodies import (
+    ApplyRequest,
+    PlanRequest,
+    RestoreRequest,
+    SnapshotNumber,
+    SnapshotRequest,
+    Timestamp,
+    UploadedFile,
+    values_set,
+)
+from paramclient.service.routes import (
+    VEHICLE,
+    Ext,
+    HubArgument,
+    Key,
+    LinkName,
+    TargetArgument,
+    run_until_disconnect,
+)
+from paramclient.service.targets import Target
+
+__all__ = ["ROUTERS"]
+
+HISTORY_ENTRIES: Final = 100
+"""Default number of entries of a history."""
+PROGRESS_INTERVAL: Final = 0.25
+"""Seconds between two progress events of an apply or restore."""
+
+reading = APIRouter(dependencies=[Depends(require_read)], tags=["set-ups and history"])
+writing = APIRouter(dependencies=[Depends(require_write)], tags=["set-ups and history"])
+ROUTERS: Final = (reading, writing)
+
+
+# files
+
+
+@reading.post("/api/files")
+async def read_file(body: UploadedFile) -> Response:
+    """Parse a parameter file of any format. It is not stored."""
+    return await anyio.to_thread.run_sync(lambda: JSONResponse(documents.param_file(body.read())))
+
+
+@reading.get(f"{VEHICLE}/file", response_class=Response)
+async def file(
+    request: Request,
+    hub: HubArgument,
+    system: int,
+    component: int,
+    link: LinkName = None,
+    key: Key = None,
+    file_format: Annotated[FileFormat, Query(alias="format")] = FileFormat.QGC,
+    changed: Annotated[bool, Query(description="Only parameters that differ from the defaults.")] = False,
+    snapshot: Annotated[SnapshotNumber | None, Query(description="The parameters of this snapshot.")] = None,
+) -> Response:
+    """Return the parameters as a file. Those of a connected vehicle are fetched first, unless in sync."""
+    target = None if key is not None else hub.target(system, component, link)
+    owner = target.component.identity.key if target is not None else key or ""
+    described: dict[str, int | float] = {}
+    if snapshot is not None:
+        found = await hub.read_cache(lambda cache: cache.state_at(owner, component, snapshot))
+    elif target is None:
+        found = await hub.read_cache(lambda cache: load_cached_set(cache, owner, component))
+    else:
+        live = target  # fetched below
+        fetched = await run_until_disconnect(
+            request, lambda: fetch_set(live.component, source=f"link {live.link.name}")
+        )
+        found = fetched.set
+        described = {} if target.metadata is None else target.metadata.defaults_of(found)
+    if changed:
+        found = select_non_defaults(found, described)
+    ending = next((ending for ending, each in ENDINGS.items() if each is file_format), ".txt")
+    name = f"{_stem(found)}{ending}"
+    data = await anyio.to_thread.run_sync(lambda: dumps(found, file_format=file_format, target=name))
+    headers = {"content-disposition": f'attachment; filename="{name}"'}
+    return Response(data, media_type="application/octet-stream", headers=headers)
+
+
+# set-ups
+
+
+@reading.post(f"{VEHICLE}/plan")
+async def plan(
+    request: Request, hub: HubArgument, target: TargetArgument, body: PlanRequest, ext: Ext = False
+) -> dict[str, Any]:
+    """Return which values an apply would write, in which order, and which it would skip, and why."""
+    if ext:
+        return await run_until_disconnect(request, lambda: extended.plan(target, body))
+    wanted = await _wanted(hub, target, body)
+    found = await run_until_disconnect(
+        request,
+        lambda: prepare(
+            target.component, wanted, include=body.include, info=target.metadata, force=body.force
+        ),
+    )
+    return documents.plan(found, target)
+
+
+@writing.post(f"{VEHICLE}/apply")
+async def apply_(
+    request: Request, hub: HubArgument, target: TargetArgument, body: ApplyRequest, ext: Ext = False
+) -> dict[str, Any]:
+    """Write the wanted values in a working order, and verify each of them.
+
+    The progress is in the events. If the client disconnects, the apply ends; written values stay.
+    """
+    author = author_of(request)
+    async with _only_setup(target, author):
+        if ext:
+            return await run_until_disconnect(request, lambda: extended.apply(target, body, author=author))
+        wanted = await _wanted(hub, target, body)
+        result = await run_until_disconnect(
+            request,
+            lambda: apply(
+                target.component,
+                wanted,
+                include=body.include,
+                info=target.metadata,
+                reboot=body.reboot,
+                allow_armed=body.allow_armed,
+                skip_invalid=body.skip_invalid,
+                force=body.force,
+                durable=body.durable,
+                timeout=body.timeout_s,
+                author=author,
+                progress=_Publisher(hub, target),
+            ),
+        )
+    return documents.apply_result(result, target)
+
+
+@writing.post(f"{VEHICLE}/restore")
+async def restore_(
+    request: Request, hub: HubArgument, target: TargetArgument, body: RestoreRequest, ext: Ext = False
+) -> dict[str, Any]:
+    """Restore an earlier state, with the vehicle's own identity and calibration; `dry_run` writes nothing."""
+    author = author_of(request)
+    async with _only_setup(target, author):
+        if ext:
+            return await run_until_disconnect(request, lambda: extended.restore(target, body, author=author))
+        state = await _earlier_state(hub, target, body.when)
+        if body.dry_run:
+            include = (*await restore_categories(target.component, state), *body.include)
+            found = await run_until_disconnect(
+                request,
+                lambda: prepare(
+                    target.component, state, include=include, info=target.metadata, force=body.force
+                ),
+            )
+            return documents.plan(found, target)
+        result = await run_until_disconnect(
+            request,
+            lambda: restore(
+                target.component,
+                state,
+                include=body.include,
+                info=target.metadata,
+                reboot=body.reboot,
+                allow_armed=body.allow_armed,
+                force=body.force,
+                timeout=body.timeout_s,
+                author=author,
+                progress=_Publisher(hub, target),
+            ),
+        )
+    return documents.apply_result(result, target)
+
+
+# the past
+
+
+@reading.get(f"{VEHICLE}/snapshots")
+async def snapshots(
+    hub: HubArgument,
+    system: int,
+    component: int,
+    link: LinkName = None,
+    key: Key = None,
+    ext: Ext = False,
+) -> dict[str, Any]:
+    """Return the snapshots, the newest last."""
+    if key is None:
+        target = hub.target(system, component, link)
+        if ext:
+            return documents.snapshots(await target.component.ext.snapshots())
+        key = target.component.identity.key
+    owner = key
+    return documents.snapshots(await hub.read_cache(lambda cache: cache.snapshots(owner, component)))
+
+
+@writing.post(f"{VEHICLE}/snapshots", status_code=201)
+async def create_snapshot(
+    hub: HubArgument, target: TargetArgument, body: SnapshotRequest, ext: Ext = False
+) -> dict[str, Any]:
+    """Store a snapshot of the known table."""
+    component = target.component
+    if ext:
+        return {"id": await component.ext.store_snapshot(reason=body.reason)}
+    await wait_for_identity(component)
+    if not component.params:
+        raise UsageError("no parameter of the vehicle is known")
+    table = set_maker(component, f"link {target.link.name}")(list(component.params.values()))
+    complete = component.count is not None and len(component.params) >= component.count
+    kept = await hub.read_cache(
+        lambda cache: cache.store_snapshot(
+            component.identity,
+            component.component,
+            table,
+            reason=body.reason,
+            hash=component.hash,
+            complete=complete,
+        )
+    )
+    return {"id": kept}
+
+
+@reading.get(f"{VEHICLE}/history")
+async def history(
+    hub: HubArgument,
+    system: int,
+    component: int,
+    link: LinkName = None,
+    key: Key = None,
+    name: Annotated[str | None, Query(max_length=16)] = None,
+    limit: Annotated[int, Query(ge=1, le=1_000)] = HISTORY_ENTRIES,
+    since: Annotated[Timestamp | None, Query(description="Only from this time on.")] = None,
+    ext: Ext = False,
+) -> Response:
+    """Return the newest changes of values, the newest last."""
+    owner = hub.target(system, component, link).component.identity.key if key is None else key
+    if ext:
+        changes = await hub.read_cache(lambda cache: cache.ext_history(owner, component, name, limit, since))
+        return JSONResponse(documents.ext_history(changes))
+    entries = await hub.read_cache(lambda cache: cache.history(owner, component, name, limit, since))
+    return JSONResponse(documents.history(entries))
+
+
+async def _wanted(hub: Hub, target: Target, body: PlanRequest) -> ParamSet:
+    """Return the wanted parameters of a request."""
+    upload, snapshot = body.file, body.snapshot
+    if upload is not None:
+        found = await anyio.to_thread.run_sync(lambda: upload.read_set(target))
+    elif snapshot is not None:
+        found = await _earlier_state(hub, target, snapshot)
+    else:
+        found = values_set(body.values or {}, target)
+    return found if body.only is None else found.only(body.only)
+
+
+async def _earlier_state(hub: Hub, target: Target, when: float | None) -> ParamSet:
+    """Return a state of a component from the cache; None for that before the last apply."""
+    await wait_for_identity(target.component)
+    key, component = target.component.identity.key, target.component.component
+    if when is None:
+        return await hub.read_cache(lambda cache: load_state_before_apply(cache, key, component))
+    return await hub.read_cache(lambda cache: cache.state_at(key, component, when))
+
+
+@asynccontextmanager
+async def _only_setup(target: Target, author: str) -> AsyncIterator[None]:
+    """Run one apply or restore of a component at a time: two would undo each other's changes.
+
+    Raises:
+        ServiceError: another one is running.
+    """
+    if target.running_setup is not None:
+        detail = f"{target.running_setup} is setting up this vehicle already."
+        raise ServiceError(409, "busy", detail)
+    target.running_setup = author
+    try:
+        yield
+    finally:
+        target.running_setup = None
+
+
+class _Publisher:
+    """Publishes the progress of an apply or restore: each phase, and values at an interval."""
+
+    def __init__(self, hub: Hub, target: Target) -> None:
+        self._hub = hub
+        self._target = target
+        self._phase = ""
+        self._published_at = 0.0
+
+    def __call__(self, progress: ApplyProgress) -> None:
+        now = time.monotonic()
+        if progress.phase == self._phase and now < self._published_at + PROGRESS_INTERVAL:
+            return
+        self._phase, self._published_at = progress.phase, now
+        members = {"phase": progress.phase, "done": progress.done, "total": progress.total}
+        self._hub.feed.publish("setup", **self._target.address, **members)
+
+
+def _stem(params: ParamSet) -> str:
+    """Return a file name with firmware, ids and time, in characters that are safe in headers and files."""
+    autopilot = "params" if params.identity is None else autopilot_name(params.identity.autopilot)
+    ids = [str(each) for each in (params.system, params.component) if each is not None]
+    at = time.strftime("%Y%m%d-%H%M%S", time.gmtime(time.time() if params.at is None else params.at))
+    return re.sub(r"[^A-Za-z0-9._-]", "_", "-".join([autopilot, *ids, at]))[:100]

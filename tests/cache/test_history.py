@@ -1,0 +1,214 @@
+"""History, earlier states, snapshots, and logs that are inserted by time, in a file and in a database."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from paramclient.cache import SNAPSHOTS, ParamCache, StoredParam, TableState, history
+from paramclient.errors import CacheError, UnknownVehicle, UsageError
+from paramclient.model.ext_params import ExtParam, ExtParamType
+from paramclient.model.ext_paramset import ExtParamSet
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import Param, ParamType
+from tests.cache.conftest import Open
+from tests.caches import NOW, PX4, stored, update, values, whole_table
+
+
+def change(cache: ParamCache, value: int, at: float, name: str = "PARAM_0", by: str = "vehicle") -> None:
+    cache.save(update(stored(name, value, at=NOW + at, by=by), at=NOW + at))
+
+
+def lines(cache: ParamCache, name: str | None = None) -> list[tuple[float, str, object, object, str]]:
+    return [
+        (each.at - NOW, each.name, each.old.value, each.new and each.new.value, each.by)
+        for each in cache.history(PX4.key, name=name)
+    ]
+
+
+def test_each_change_has_one_line(cache: ParamCache, open_cache: Open) -> None:
+    cache.save(whole_table(2))
+    change(cache, 5, 1, by="us for Ann")
+    change(open_cache(), 5, 2)  # another program has received the same
+    change(cache, 6, 3, by="station 254/190")
+    cache.save(update(removed={"PARAM_1": NOW + 4}, at=NOW + 4))
+    assert lines(cache) == [
+        (1, "PARAM_0", 0, 5, "us for Ann"),
+        (3, "PARAM_0", 5, 6, "station 254/190"),
+        (4, "PARAM_1", 1, None, "vehicle"),
+    ]
+    assert [each.at - NOW for each in cache.history("1", limit=2)] == [3, 4]
+    assert [each.at - NOW for each in cache.history("1", since=NOW + 2)] == [3, 4]
+    assert cache.history("1", 100) == []
+    with pytest.raises(UnknownVehicle):
+        cache.history("2")
+
+
+def test_zero_and_negative_zero_are_one_value(cache: ParamCache) -> None:
+    for at, bits in enumerate((0, 0x80000000, 0x3F800000)):
+        cache.save(update(stored("A", bits, ParamType.REAL32, at=NOW + at), at=NOW + at))
+    assert lines(cache) == [(2, "A", 0.0, 1.0, "vehicle")]
+
+
+def test_every_observation_of_one_update_counts(cache: ParamCache) -> None:
+    items = [stored("A", value, at=NOW + value, by="us") for value in (1, 2, 3)]
+    cache.save(update(*items, at=NOW + 3))
+    assert lines(cache) == [(2, "A", 1, 2, "us"), (3, "A", 2, 3, "us")]
+
+
+def test_the_newest_lines_are_kept(cache: ParamCache, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(history, "HISTORY_ENTRIES_MAX", 3)
+    cache.save(whole_table(1))
+    for value in range(1, 6):
+        change(cache, value, value)
+    assert [line[3] for line in lines(cache)] == [3, 4, 5]
+    assert cache.state_at("1", 1, NOW + 3)["PARAM_0"].value == 3
+    with pytest.raises(CacheError, match="the history begins at"):
+        cache.state_at("1", 1, NOW + 1)
+
+
+# earlier states
+
+
+def test_the_state_at_a_time(cache: ParamCache) -> None:
+    change(cache, 9, -5)
+    cache.save(whole_table(2))
+    change(cache, 5, 10)
+    cache.save(update(stored("NEW", 1, at=NOW + 20), at=NOW + 20))
+    cache.save(update(removed={"PARAM_1": NOW + 30}, at=NOW + 30))
+    states = {
+        at: {name: each.value for name, each in cache.state_at("1", 1, NOW + at).items()}
+        for at in (0.0, 10.0, 20.0, 30.0)
+    }
+    assert states == {
+        0.0: {"PARAM_0": 0, "PARAM_1": 1},
+        10.0: {"PARAM_0": 5, "PARAM_1": 1},
+        20.0: {"PARAM_0": 5, "PARAM_1": 1, "NEW": 1},
+        30.0: {"PARAM_0": 5, "NEW": 1},
+    }
+    with pytest.raises(CacheError, match="the history begins at"):
+        cache.state_at("1", 1, NOW - 1)
+    with pytest.raises(UsageError):
+        cache.state_at("1", 1, -1.0)
+
+
+def test_the_states_of_a_table_that_was_never_complete_are_unknown(cache: ParamCache) -> None:
+    change(cache, 1, 0)
+    with pytest.raises(CacheError, match="never complete; there is no snapshot"):
+        cache.state_at("1", 1, NOW + 1)
+
+
+def test_the_state_of_extended_parameters(cache: ParamCache) -> None:
+    def save(at: float, text: bytes) -> None:
+        param = ExtParam.of("A", text, ExtParamType.CUSTOM, 0)
+        state = TableState(count=1, complete=True)
+        rows = [StoredParam.of_ext(param, NOW + at)]
+        cache.save(update(*rows, at=NOW + at, table=state, component=100, extended=True))
+
+    save(0, b"tea")
+    save(10, b"milk")
+    assert cache.ext_state_at("1", 100, NOW + 5).params["A"].value == "tea"
+    made = cache.store_ext_snapshot(
+        PX4, 100, ExtParamSet({"A": ExtParam.of("A", b"rum", ExtParamType.CUSTOM, 0)}), reason="by hand"
+    )
+    assert cache.ext_state_at("1", 100, made.id).params["A"].value == "rum"
+    assert cache.ext_snapshots("1") == [made]
+    assert cache.snapshots("1") == []
+
+
+# snapshots
+
+
+def test_a_snapshot_keeps_types_defaults_and_firmware(cache: ParamCache, open_cache: Open) -> None:
+    params = ParamSet(
+        {
+            "B": WrittenParam("B", 1.5, ParamType.REAL32, 2.5),
+            "A": WrittenParam("A", -7, ParamType.INT8),
+            "RAW": WrittenParam("RAW", b"\1\2\3\4", ParamType.INT64),
+        }
+    )
+    made = cache.store_snapshot(PX4, 1, params, reason="before\0apply", at=NOW + 0.0004, hash=7)
+    assert (made.at, made.reason, made.size, made.hash) == (NOW, "before\\x00apply", 3, 7)
+    assert made.complete
+    assert made.ended is None
+    cache.save(update(at=NOW + 9, identity=replace(PX4, firmware=5)))
+    found = open_cache().state_at(PX4.key, 1, made.id)
+    assert dict(found) == dict(params)
+    assert list(found) == ["B", "A", "RAW"]
+    assert found.identity == PX4
+    assert cache.state_at(PX4.key, 1, made.at) == found
+    with pytest.raises(UsageError, match="type"):
+        cache.store_snapshot(PX4, 1, ParamSet({"A": WrittenParam("A", 1)}), reason="untyped")
+
+
+def test_a_snapshot_of_the_cached_table(cache: ParamCache) -> None:
+    default = Param("A", 1, ParamType.INT32, 0, 1, default=3)
+    cache.save(update(StoredParam.of(default, NOW), table=TableState(5, 1, complete=True)))
+    made = cache.snapshot("1", 1, reason="test")
+    change(cache, 2, 1, "A")
+    assert (made.hash, made.complete, made.size) == (5, True, 1)
+    assert cache.state_at("1", 1, made.id)["A"] == WrittenParam("A", 1, ParamType.INT32, 3)
+    with pytest.raises(UnknownVehicle):
+        cache.snapshot("2", 1, reason="test")
+
+
+def test_the_newest_snapshots_are_kept_and_numbers_are_never_used_again(cache: ParamCache) -> None:
+    cache.save(whole_table(1))
+    made = [cache.snapshot("1", 1, reason=str(number)).id for number in range(SNAPSHOTS + 2)]
+    assert [each.id for each in cache.snapshots("1")] == made[2:]
+    with pytest.raises(CacheError, match=rf"there is no snapshot {made[0]} of .* those kept are {made[2]}, "):
+        cache.state_at("1", 1, made[0])
+    cache.remove("1")
+    cache.save(whole_table(1))
+    assert cache.snapshot("1", 1, reason="new").id > made[-1]
+
+
+def test_an_interrupted_apply_is_told_from_one_that_has_ended(cache: ParamCache) -> None:
+    cache.save(whole_table(1))
+    params = cache.state_at("1", 1, cache.snapshot("1", 1, reason="by hand").id)
+    made = [
+        cache.store_snapshot(PX4, 1, params, reason="before apply", is_of_operation=True) for _ in range(2)
+    ]
+    cache.end_operation(made[0].id)
+    assert [each.ended for each in cache.snapshots("1")] == [None, True, False]
+
+
+# logs
+
+
+def test_earlier_observations_are_inserted_by_time(cache: ParamCache) -> None:
+    cache.save(whole_table(2))
+    change(cache, 5, 100, by="us")
+    log = [update(stored("PARAM_0", value, at=NOW + at), at=NOW + at) for at, value in ((50, 3), (60, 0))]
+    for _ in range(2):  # repeating it changes nothing
+        cache.merge(log)
+        assert values(cache) == {"PARAM_0": 5, "PARAM_1": 1}
+        assert lines(cache) == [
+            (50, "PARAM_0", 0, 3, "vehicle"),
+            (60, "PARAM_0", 3, 0, "vehicle"),
+            (100, "PARAM_0", 0, 5, "us"),
+        ]
+    assert cache.state_at("1", 1, NOW + 55)["PARAM_0"].value == 3
+
+
+def test_a_change_that_was_received_live_and_logged_has_one_line(cache: ParamCache) -> None:
+    cache.save(whole_table(1))
+    change(cache, 5, 100, by="us")
+    change(cache, 5, 200)
+    cache.merge([update(stored("PARAM_0", 5, at=NOW + 99), at=NOW + 99)])
+    assert lines(cache) == [(100, "PARAM_0", 0, 5, "us")]
+
+
+def test_a_log_does_not_bring_back_what_the_vehicle_no_longer_has(cache: ParamCache) -> None:
+    cache.save(whole_table(1))
+    cache.merge([update(stored("OLD", 1, at=NOW - 50), at=NOW - 50)])
+    assert values(cache) == {"PARAM_0": 0}
+
+
+def test_a_later_log_continues_the_table_without_its_hash(cache: ParamCache) -> None:
+    cache.save(whole_table(1))
+    state = TableState(0xABC, 1, complete=True)
+    cache.merge([update(stored("PARAM_0", 7, at=NOW + 50), at=NOW + 50, table=state)])
+    assert values(cache) == {"PARAM_0": 7}
+    assert cache.component("1").hash is None

@@ -1,0 +1,223 @@
+"""A file that cannot be used or is set aside, several processes, and a database that cannot be reached."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from paramclient.cache import ParamCache, default_path
+from paramclient.errors import CacheError, UsageError
+from tests.cache.conftest import Open
+from tests.caches import (
+    CACHE_ALONE,
+    full_disk,
+    read_only,
+    rubbish,
+    set_aside,
+    start,
+    stored,
+    update,
+    values,
+    whole_table,
+)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "cache" / "parameters.sqlite3"
+
+
+def filled(path: Path) -> Path:
+    with ParamCache(path) as cache:
+        cache.save(whole_table(3))
+    return path
+
+
+def test_the_users_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert default_path() == tmp_path / "paramclient" / "parameters.sqlite3"
+    with ParamCache() as cache:
+        assert cache.path == default_path()
+        assert cache.place == str(default_path())
+
+
+def test_only_a_write_creates_a_file_and_only_for_the_user(path: Path) -> None:
+    with ParamCache(path) as cache:
+        assert cache.components() == []
+        assert not path.parent.exists()
+        cache.save(whole_table(1))
+        assert {each.stat().st_mode & 0o777 for each in path.parent.iterdir()} == {0o600}
+        assert path.parent.stat().st_mode & 0o777 == 0o700
+
+
+# what is set aside
+
+
+def newer(path: Path) -> None:
+    with closing(sqlite3.connect(filled(path))) as file:
+        file.execute("PRAGMA user_version = 999")
+
+
+def older(path: Path) -> None:
+    with closing(sqlite3.connect(filled(path))) as file:
+        file.execute("PRAGMA user_version = 8")
+
+
+def foreign(path: Path) -> None:
+    path.parent.mkdir()
+    with closing(sqlite3.connect(path)) as file:
+        file.execute("CREATE TABLE notes (text)")
+
+
+def text(path: Path) -> None:
+    path.parent.mkdir()
+    path.write_text("things to do\n" * 100)
+
+
+def damaged(path: Path) -> None:
+    path.parent.mkdir()
+    path.write_bytes(rubbish(20_000))
+
+
+def damaged_inside(path: Path) -> None:
+    content = bytearray(filled(path).read_bytes())
+    content[4096:] = os.urandom(len(content) - 4096)
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("spoil", [newer, older, foreign, text, damaged, damaged_inside])
+@pytest.mark.parametrize("writes_first", [False, True])
+def test_a_file_that_is_no_cache_is_renamed_with_one_warning(
+    spoil: object, writes_first: bool, path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert callable(spoil)
+    spoil(path)
+    content = path.read_bytes()
+    with ParamCache(path) as cache:
+        if writes_first:
+            cache.save(whole_table(2))
+        assert len(cache.components()) == writes_first
+        cache.save(whole_table(2))
+        assert values(cache) == {"PARAM_0": 0, "PARAM_1": 1}
+        [note] = cache.notes
+    [kept] = set_aside(path)
+    assert kept.read_bytes() == content
+    assert kept.name in note
+    assert [record.getMessage() for record in caplog.records] == [note]
+
+
+def test_two_programs_find_one_damaged_file(path: Path) -> None:
+    filled(path)
+    with ParamCache(path) as one, ParamCache(path) as other:
+        assert len(one.components()) == len(other.components()) == 1
+        path.write_bytes(rubbish(20_000))
+        for cache in (one, other):
+            cache.save(whole_table(2))
+        assert values(one) == values(other) == {"PARAM_0": 0, "PARAM_1": 1}
+    assert len(set_aside(path)) == 1
+
+
+def test_a_deleted_file_is_noticed(path: Path) -> None:
+    with ParamCache(path) as cache:
+        cache.save(whole_table(2))
+        before = cache.replacements
+        shutil.rmtree(path.parent)
+        cache.save(update(stored("PARAM_0", 7)))
+        assert cache.replacements == before + 1
+        assert values(cache) == {"PARAM_0": 7}
+
+
+# what cannot be written
+
+
+def test_a_folder_in_which_nothing_can_be_written(path: Path) -> None:
+    filled(path)
+    with read_only(path.parent), ParamCache(path) as cache:
+        assert len(values(cache)) == 3
+        with pytest.raises(CacheError, match="cannot be used"):
+            cache.save(whole_table(1))
+        assert len(values(cache)) == 3
+
+
+def test_a_full_disk_loses_nothing(path: Path) -> None:
+    filled(path)
+    with ParamCache(path) as cache:
+        with full_disk(100), pytest.raises(CacheError, match="cannot be used"):
+            cache.save(whole_table(200))
+        assert len(values(cache)) == 3
+        cache.save(whole_table(4))
+        assert len(values(cache)) == 4
+
+
+def test_a_folder_that_is_a_file(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with ParamCache(tmp_path / "file" / "cache") as cache, pytest.raises(CacheError, match="cannot be used"):
+        cache.save(whole_table(1))
+
+
+# several processes
+
+
+WRITER = f"""{CACHE_ALONE}
+from paramclient.model.identity import Identity
+from paramclient.model.values import Param, ParamType
+number, path = int(sys.argv[1]), sys.argv[2]
+print(flush=True)
+with ParamCache(path) as cache:
+    for step in range(40):
+        at = 1e9 + step + number / 10
+        identity = Identity(number % 2 + 1, "x")
+        items = [StoredParam.of(Param(f"P_{{number}}", step, ParamType.INT32, None, step), at)]
+        cache.save(TableUpdate(identity=identity, component=1, autopilot=12, at=at, params=items))
+"""
+
+
+def test_several_processes_write_to_one_new_place(place: str) -> None:
+    programs = [start(WRITER, number, place) for number in range(4)]
+    running = [program.__enter__() for program in programs]
+    assert [process.wait(60) for process in running] == [0, 0, 0, 0]
+    for program in programs:
+        program.__exit__(None, None, None)
+    with ParamCache(place) as cache:
+        assert len(cache.components()) == 2
+        assert {len(cache.history(each.key)) for each in cache.vehicles()} == {2 * 39}
+        assert cache.notes == ()
+
+
+# a database
+
+
+def test_an_unreachable_database_is_an_error_without_the_password(tmp_path: Path) -> None:
+    url = f"postgresql://me:se%20cret@/fleet?host={tmp_path}"
+    with ParamCache(url) as cache:
+        assert "cret" not in cache.place
+        for _ in range(2):  # the second call fails at once
+            with pytest.raises(CacheError, match="cannot be used") as caught:
+                cache.components()
+            assert "cret" not in str(caught.value)
+
+
+def test_a_url_that_is_none() -> None:
+    with pytest.raises(UsageError, match="not valid"):
+        ParamCache("postgresql://a b")
+
+
+def test_a_lost_connection_is_opened_again(place: str, open_cache: Open) -> None:
+    if not place.startswith("postgresql"):
+        pytest.skip("a file has no connection")
+    import psycopg
+
+    cache = open_cache()
+    cache.save(whole_table(1))
+    with psycopg.connect(place, autocommit=True) as other:
+        other.execute(
+            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity"
+            " WHERE pid != pg_backend_pid() AND datname = current_database()"
+        )
+    cache.save(whole_table(2))
+    assert len(values(cache)) == 2

@@ -1,0 +1,74 @@
+"""A service over simulated vehicles in this process, and a client of it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any
+from unittest import mock
+
+import anyio.to_thread
+import httpx
+
+from paramclient.service import Hub, create_app
+from tests.service.asgi import a_browser
+from tests.shell import simulated_time_loop
+
+V = "/api/vehicles/1/1"
+
+
+@asynccontextmanager
+async def service(
+    *links: Any, app: dict[str, Any] | None = None, **options: Any
+) -> AsyncIterator[tuple[Hub, httpx.AsyncClient]]:
+    """An open hub and a client of it; without a cache, unless one is given. `app`: for `create_app`."""
+    run_sync = anyio.to_thread.run_sync
+
+    async def counted(*arguments: Any, **more: Any) -> Any:
+        simulated_time_loop().threads += 1
+        try:
+            return await run_sync(*arguments, **more)
+        finally:
+            simulated_time_loop().threads -= 1
+
+    with mock.patch.object(anyio.to_thread, "run_sync", counted):
+        async with (
+            Hub(links, **{"cache": False} | options) as hub,
+            a_browser(create_app(hub, **(app or {}))) as browser,
+        ):
+            yield hub, browser
+
+
+async def synced(browser: httpx.AsyncClient, address: str = V) -> dict[str, Any]:
+    """The vehicle, as soon as its table is complete."""
+    return await until(browser, address, lambda found: found["state"] == "synced")
+
+
+async def until(
+    browser: httpx.AsyncClient, address: str, is_so: Callable[[dict[str, Any]], bool]
+) -> dict[str, Any]:
+    """What is at an address, as soon as it is so."""
+    for _ in range(1000):
+        answer = await browser.get(address)
+        if answer.status_code == 200 and is_so(found := answer.json()):
+            return dict(found)
+        await asyncio.sleep(0.1)
+    raise AssertionError(f"{address}: {answer.text[:500]}")
+
+
+def problem(answer: httpx.Response, status: int, kind: str) -> dict[str, Any]:
+    """The members of a problem document, which has to be of this kind."""
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    reported: dict[str, Any] = answer.json()
+    assert (reported["type"], reported["status"]) == (f"urn:paramclient:{kind}", status)
+    assert reported["title"]
+    assert reported["detail"]
+    return reported
+
+
+def value(answer: httpx.Response) -> Any:
+    """The value of a parameter."""
+    assert answer.status_code == 200, answer.text
+    return answer.json()["value"]

@@ -1,0 +1,220 @@
+"""Files, plans, apply, restore, snapshots and history over HTTP."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from paramclient import FileFormat
+from paramclient.files import loads
+from paramclient.sim import ArduPilotVehicle, PX4Vehicle
+from tests.service.hub import V, problem, service, synced, until
+from tests.shell import VALUES, Tap, generic, in_simulated_time, small_px4
+
+FORMATS = ["qgc", "parm", "mission-planner", "pck", "json"]
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> str:
+    return str(tmp_path / "cache.sqlite3")
+
+
+@pytest.mark.parametrize("file_format", FORMATS)
+@in_simulated_time
+async def test_a_table_is_saved_in_every_format_and_read_again(file_format: str) -> None:
+    async with service(generic()) as (_, browser):
+        await synced(browser)
+        answer = await browser.get(f"{V}/file", params={"format": file_format})
+        assert answer.headers["content-disposition"].startswith('attachment; filename="generic-1-1-')
+        (found,) = loads(answer.content, file_format=FileFormat(file_format)).sets
+        assert {name: each.value for name, each in found.items()} == VALUES
+        body = {"name": "", "base64": base64.b64encode(answer.content).decode()}
+        read = (await browser.post("/api/files", json=body)).json()
+        assert read["format"] == file_format
+        (component,) = read["components"]
+        assert {name: each["value"] for name, each in component["params"].items()} == VALUES
+
+
+@in_simulated_time
+async def test_only_what_differs_from_the_defaults_is_saved() -> None:
+    vehicle = ArduPilotVehicle()
+    async with service(vehicle) as (_, browser):
+        await synced(browser)
+        await browser.patch(f"{V}/params", json={"values": {"RTL_ALT": 2345}})
+        answer = await browser.get(f"{V}/file", params={"format": "parm", "changed": "true"})
+        lines = [line.split() for line in answer.text.splitlines() if not line.startswith("#")]
+        assert ["RTL_ALT", "2345"] in [words[:2] for words in lines]
+        assert 0 < len(lines) < len(vehicle.values)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [{"text": "not\0a file of parameters"}, {"text": "{", "format": "json"}, {"base64": "###"}],
+)
+@in_simulated_time
+async def test_an_invalid_file_is_a_problem(body: dict[str, Any]) -> None:
+    async with service(generic()) as (_, browser):
+        answer = await browser.post("/api/files", json=body)
+        assert answer.status_code == 422, answer.text
+        assert answer.headers["content-type"] == "application/problem+json"
+
+
+@in_simulated_time
+async def test_a_plan_writes_nothing_and_an_apply_what_was_planned(cache: str) -> None:
+    vehicle = generic()
+    async with service(vehicle, cache=cache) as (_, browser):
+        await synced(browser)
+        wanted = {"file": {"name": "a.parm", "text": "PARAM_04 44\nPARAM_05 5\nNO_SUCH 1\n"}}
+        plan = (await browser.post(f"{V}/plan", json=wanted)).json()
+        assert plan["counts"]["set"] == 1
+        assert plan["params"]["NO_SUCH"]["category"] == "missing"
+        assert vehicle.param("PARAM_04").value == 4
+        done = (await browser.post(f"{V}/apply", json=wanted)).json()
+        assert done["counts"]["set"] == 1
+        assert done["params"]["PARAM_04"]["status"] == "set"
+        assert vehicle.param("PARAM_04").value == 44
+
+
+@in_simulated_time
+async def test_an_apply_is_limited_to_names_and_refuses_values_out_of_range(cache: str) -> None:
+    vehicle = PX4Vehicle(metadata=True)
+    async with service(vehicle, cache=cache) as (_, browser):
+        await synced(browser)
+        await browser.post(f"{V}/metadata", json={})
+        high = (await browser.get(f"{V}/params/MC_ROLL_P")).json()["metadata"]["maximum"] + 1
+        body: dict[str, Any] = {"values": {"MC_ROLL_P": high, "MC_PITCH_P": 5.0}}
+        problem(await browser.post(f"{V}/apply", json=body), 422, "invalid-parameters")
+        assert vehicle.param("MC_PITCH_P").value != 5.0
+        done = (await browser.post(f"{V}/apply", json={**body, "only": ["MC_PITCH*"]})).json()
+        assert list(done["params"]) == ["MC_PITCH_P"]
+        done = (await browser.post(f"{V}/apply", json={**body, "include": ["MC_ROLL_P"]})).json()
+        assert done["params"]["MC_ROLL_P"]["status"] == "set"
+
+
+@in_simulated_time
+async def test_a_restore_goes_back_to_before_the_last_apply_once(cache: str) -> None:
+    vehicle = generic()
+    async with service(vehicle, cache=cache) as (_, browser):
+        await synced(browser)
+        problem(await browser.post(f"{V}/restore", json={}), 404, "not-in-cache")
+        await browser.post(f"{V}/apply", json={"values": {"PARAM_04": 44}})
+        plan = (await browser.post(f"{V}/restore", json={"dry_run": True})).json()
+        assert plan["params"]["PARAM_04"]["wanted"] == 4
+        done = (await browser.post(f"{V}/restore", json={})).json()
+        assert done["complete"]
+        assert vehicle.param("PARAM_04").value == 4
+        again = problem(await browser.post(f"{V}/restore", json={}), 409, "already-restored")
+        body = {"snapshot": again["before_restore"]}
+        assert (await browser.post(f"{V}/restore", json=body)).json()["complete"]
+        assert vehicle.param("PARAM_04").value == 44
+
+
+@in_simulated_time
+async def test_snapshots_are_stored_listed_read_and_applied(cache: str) -> None:
+    vehicle = small_px4()
+    async with service(vehicle, cache=cache) as (_, browser):
+        await synced(browser)
+        made = await browser.post(f"{V}/snapshots", json={"reason": "before the flight"})
+        assert made.status_code == 201
+        await browser.put(f"{V}/params/PARAM_04", json={"value": 44})
+        (kept,) = (await browser.get(f"{V}/snapshots")).json()["snapshots"]
+        assert (kept["reason"], kept["size"], kept["complete"]) == ("before the flight", 25, True)
+        query = {"snapshot": kept["id"]}
+        params = (await browser.get(f"{V}/params", params=query)).json()["params"]
+        assert params["PARAM_04"]["value"] == 4
+        assert "PARAM_04\t4\t" in (await browser.get(f"{V}/file", params=query)).text
+        plan = (await browser.post(f"{V}/plan", json=query)).json()
+        assert [name for name, each in plan["params"].items() if each["status"] == "set"] == ["PARAM_04"]
+        problem(await browser.get(f"{V}/params?snapshot=99"), 404, "not-in-cache")
+
+
+@in_simulated_time
+async def test_history_has_changes_of_all_or_of_one_name(cache: str) -> None:
+    async with service(generic(), cache=cache) as (_, browser):
+        await synced(browser)
+        for name, value in (("PARAM_04", 9), ("PARAM_05", 8), ("PARAM_04", 7)):
+            await browser.put(f"{V}/params/{name}", json={"value": value, "durable": True})
+            await asyncio.sleep(1)
+        lines = (await browser.get(f"{V}/history")).json()["history"]
+        assert [(each["name"], each["new"]) for each in lines] == [
+            ("PARAM_04", 9),
+            ("PARAM_05", 8),
+            ("PARAM_04", 7),
+        ]
+        of_one = (await browser.get(f"{V}/history?name=PARAM_04&limit=1")).json()["history"]
+        assert [(each["old"], each["new"]) for each in of_one] == [(9, 7)]
+        since = (await browser.get(f"{V}/history", params={"since": lines[1]["time"]})).json()["history"]
+        assert since == lines[1:]
+        at = {"at": lines[1]["time"]}
+        before = (await browser.get(f"{V}/params", params=at)).json()["params"]
+        assert before["PARAM_04"]["value"] == 9
+        problem(await browser.get(f"{V}/history?since=yesterday"), 422, "invalid-request")
+
+
+@in_simulated_time
+async def test_without_a_cache_the_past_is_a_problem() -> None:
+    async with service(generic()) as (_, browser):
+        await synced(browser)
+        for what in ("history", "snapshots"):
+            problem(await browser.get(f"{V}/{what}"), 409, "no-cache")
+        problem(await browser.post(f"{V}/restore", json={}), 409, "no-cache")
+
+
+@in_simulated_time
+async def test_a_vehicle_is_set_up_by_one_at_a_time(cache: str) -> None:
+    async with service(generic(), cache=cache) as (_, browser):
+        await synced(browser)
+        bodies = [{"values": {"PARAM_04": number}} for number in (8, 9)]
+        answers = await asyncio.gather(*(browser.post(f"{V}/apply", json=body) for body in bodies))
+        assert sorted(answer.status_code for answer in answers) == [200, 409]
+        problem(next(answer for answer in answers if answer.status_code == 409), 409, "busy")
+        assert (await browser.post(f"{V}/apply", json=bodies[0])).status_code == 200
+
+
+@in_simulated_time
+async def test_an_armed_vehicle_is_set_up_only_if_that_is_allowed(cache: str) -> None:
+    async with service(generic(armed=True), cache=cache) as (_, browser):
+        await until(browser, V, lambda found: found["is_armed"] is True and found["state"] == "synced")
+        body: dict[str, Any] = {"values": {"PARAM_04": 9}}
+        problem(await browser.post(f"{V}/apply", json=body), 409, "vehicle-armed")
+        assert (await browser.post(f"{V}/apply", json={**body, "allow_armed": True})).json()["complete"]
+
+
+@pytest.mark.parametrize(
+    ("call", "body"),
+    [
+        ("apply", {}),
+        ("apply", {"values": {"PARAM_04": 1}, "snapshot": 1}),
+        ("apply", {"values": {}}),
+        ("plan", {"file": {"name": "x"}}),
+        ("plan", {"values": {"A_NAME_THAT_IS_LONG": 1}}),
+        ("restore", {"snapshot": 1, "at": 1}),
+        ("restore", {"snapshot": 0}),
+        ("snapshots", {"reason": ""}),
+        ("fetch", {"refresh": "maybe", "x": 1}),
+    ],
+)
+@in_simulated_time
+async def test_a_request_that_means_nothing_is_refused(call: str, body: dict[str, Any]) -> None:
+    async with service(generic()) as (_, browser):
+        await synced(browser)
+        problem(await browser.post(f"{V}/{call}", json=body), 422, "invalid-request")
+
+
+@in_simulated_time
+async def test_a_client_that_leaves_ends_its_apply_and_frees_the_vehicle(cache: str) -> None:
+    tap = Tap(generic())
+    async with service(tap, cache=cache) as (_, browser):
+        await synced(browser)
+        tap.is_mute = True
+        body = {"values": {"PARAM_04": 44, "PARAM_05": 55}}
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.5):
+                await browser.post(f"{V}/apply", json=body)
+        tap.is_mute = False
+        await asyncio.sleep(2)
+        assert (await browser.post(f"{V}/apply", json=body)).json()["complete"]

@@ -1,0 +1,323 @@
+"""Vehicles, parameters, fetches and writes over HTTP."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import pytest
+
+from paramclient import ParamCache
+from paramclient.errors import UsageError
+from paramclient.links import SimLink
+from paramclient.model.ext_params import ExtParamType
+from paramclient.model.values import ParamType
+from paramclient.service import Hub, create_app
+from paramclient.sim import ArduPilotVehicle, Camera, PX4Vehicle
+from tests.recordings import DATA
+from tests.service.asgi import a_browser
+from tests.service.hub import V, problem, service, synced, until, value
+from tests.shell import VALUES, FlakyLink, Tap, generic, in_simulated_time, small_px4
+
+CAMERA = "/api/vehicles/1/100"
+EXT = {"ext": "true"}
+
+
+@in_simulated_time
+async def test_a_link_that_cannot_be_opened_is_tried_again_until_its_vehicle_is_fetched() -> None:
+    link = FlakyLink(generic())
+    link.is_offline = True
+    async with service(link) as (_, browser):
+        await asyncio.sleep(3)
+        (reported,) = (await browser.get("/health")).json()["links"]
+        assert reported["state"] == "failed"
+        assert "connection refused" in reported["error"]
+        assert (await browser.get("/api/vehicles")).json()["vehicles"] == []
+        assert 3 <= link.openings <= 6  # with growing delays
+        link.is_offline = False
+        found = await synced(browser)
+        assert (found["link"], found["count"], found["params"]) == (link.name, len(VALUES), len(VALUES))
+
+
+@in_simulated_time
+async def test_a_link_that_fails_for_good_is_opened_with_a_fresh_client() -> None:
+    link = FlakyLink(generic())
+    link.reconnects = False
+    async with service(link) as (_, browser):
+        await synced(browser)
+        await link.drop()
+        await asyncio.sleep(0.1)
+        problem(await browser.get(V), 404, "unknown-vehicle")
+        await synced(browser)
+        assert link.openings == 2
+
+
+@in_simulated_time
+async def test_a_log_is_followed_to_its_end_and_stays() -> None:
+    async with service(f"replay:{DATA / 'px4_full_download.tlog'}?speed=0") as (_, browser):
+        await asyncio.sleep(20)
+        (reported,) = (await browser.get("/health")).json()["links"]
+        assert (reported["state"], reported["error"]) == ("ended", None)
+        assert len((await browser.get(f"{V}/params")).json()["params"]) > 900
+
+
+@in_simulated_time
+async def test_ids_on_two_links_need_the_name_of_the_link() -> None:
+    async with service(SimLink(generic(), "sim:a"), SimLink(generic(), "sim:b")) as (_, browser):
+        await synced(browser, f"{V}?link=sim:b")
+        assert problem(await browser.get(V), 409, "ambiguous")["links"] == ["sim:a", "sim:b"]
+        problem(await browser.get(f"{V}?link=sim:c"), 404, "unknown-vehicle")
+
+
+def test_two_links_cannot_have_one_name() -> None:
+    with pytest.raises(UsageError, match="twice"):
+        Hub(["sim:px4", "sim:px4"], cache=False)
+
+
+@in_simulated_time
+async def test_vehicles_are_sorted_and_those_of_the_cache_are_read_by_key(tmp_path: Path) -> None:
+    cache = str(tmp_path / "cache.sqlite3")
+    async with service(small_px4(system=7), cache=cache) as (_, browser):
+        await synced(browser, "/api/vehicles/7/1")
+    async with service(small_px4(system=3), small_px4_other(), cache=cache) as (_, browser):
+        await synced(browser, "/api/vehicles/2/1")
+        await synced(browser, "/api/vehicles/3/1")
+        found = (await browser.get("/api/vehicles")).json()
+        assert [each["system"] for each in found["vehicles"]] == [2, 3]
+        (kept,) = [each for each in found["cached"] if each["system"] == 7]
+        at = {"key": kept["key"]}
+        params = (await browser.get("/api/vehicles/7/1/params", params=at)).json()["params"]
+        assert params["PARAM_04"]["value"] == 4
+        assert params["PARAM_04"]["trust"] == "cached"
+        text = (await browser.get("/api/vehicles/7/1/file", params={**at, "format": "parm"})).text
+        assert "PARAM_04" in text
+        problem(await browser.get("/api/vehicles/7/1/params?key=nobody"), 404, "not-in-cache")
+
+
+def small_px4_other() -> SimLink:
+    return SimLink(small_px4(system=2, uid=2), "sim:other")
+
+
+@in_simulated_time
+async def test_known_parameters_are_selected_by_name_and_pattern() -> None:
+    async with service(generic()) as (hub, browser):
+        await synced(browser)
+        found = (await browser.get(f"{V}/params", params={"names": ["PARAM_01", "PARAM_2*"]})).json()
+        assert list(found["params"]) == ["PARAM_01", *sorted(name for name in VALUES if "_2" in name)]
+        assert found["seq"] == hub.feed.seq
+        assert value(await browser.get(f"{V}/params/PARAM_03")) == VALUES["PARAM_03"]
+        reported = problem(await browser.get(f"{V}/params/PARAM_99"), 404, "unknown-parameter")
+        assert "PARAM_9" in reported["detail"] or reported["nearest"]
+
+
+@in_simulated_time
+async def test_a_value_is_written_read_back_and_read_from_the_vehicle() -> None:
+    vehicle = generic()
+    async with service(vehicle) as (_, browser):
+        await synced(browser)
+        written = (await browser.put(f"{V}/params/PARAM_04", json={"value": 44})).json()
+        assert written == {"name": "PARAM_04", "requested": 44, "actual": 44, "status": "accepted"}
+        assert vehicle.param("PARAM_04").value == 44
+        assert value(await browser.get(f"{V}/params/PARAM_04?live=true")) == 44
+        problem(await browser.put(f"{V}/params/NO_SUCH", json={"value": 1}), 404, "unknown-parameter")
+
+
+@in_simulated_time
+async def test_many_values_are_written_and_a_refused_one_stops_no_other() -> None:
+    async with service(ArduPilotVehicle(read_only=["RTL_SPEED"], param_error=True)) as (_, browser):
+        await synced(browser)
+        values = {"RTL_ALT": 2000, "RTL_SPEED": 2, "WPNAV_SPEED": 600}
+        found = (await browser.patch(f"{V}/params", json={"values": values})).json()
+        assert [each["status"] for each in found["results"]] == ["accepted", "refused", "accepted"]
+        assert found["results"][1]["error"] == "Refused"
+        assert found["error"] is None
+
+
+@in_simulated_time
+async def test_values_out_of_range_are_refused_before_any_is_written(tmp_path: Path) -> None:
+    vehicle = PX4Vehicle(metadata=True)
+    async with service(vehicle, cache=str(tmp_path / "cache.sqlite3")) as (_, browser):
+        await synced(browser)
+        assert (await browser.post(f"{V}/metadata", json={})).json()["count"] > 900
+        known = (await browser.get(f"{V}/params/MC_ROLL_P")).json()
+        high = known["metadata"]["maximum"] + 1
+        body: dict[str, Any] = {"values": {"MC_PITCH_P": 5.0, "MC_ROLL_P": high}}
+        reported = problem(await browser.patch(f"{V}/params", json=body), 422, "out-of-range")
+        assert reported["names"] == ["MC_ROLL_P"]
+        problem(await browser.put(f"{V}/params/MC_ROLL_P", json={"value": high}), 422, "out-of-range")
+        assert vehicle.param("MC_PITCH_P").value != 5.0
+        done = (await browser.patch(f"{V}/params", json={**body, "force": True})).json()
+        assert [each["status"] for each in done["results"]] == ["accepted", "accepted"]
+        assert vehicle.param("MC_ROLL_P").value == high
+
+
+@in_simulated_time
+async def test_values_are_exact_by_bits_and_words_for_what_json_lacks() -> None:
+    vehicle = generic(table={"REAL": (ParamType.REAL32, 1.0), "WHOLE": (ParamType.INT32, 1)})
+    async with service(vehicle) as (_, browser):
+        await synced(browser)
+        bits = struct.pack(">f", 0.1).hex()
+        assert (await browser.put(f"{V}/params/REAL", json={"value": {"bits": bits}})).json()["actual"] == 0.1
+        await browser.put(f"{V}/params/REAL", json={"value": "NaN", "force": True})
+        assert value(await browser.get(f"{V}/params/REAL")) == "NaN"
+        answer = await browser.put(f"{V}/params/REAL", json={"value": {"bits": "1" + "0" * 9}})
+        problem(answer, 422, "usage-error")
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {},
+        {"value": 1, "settel_s": 1},
+        {"value": True},
+        {"value": None},
+        {"value": [1]},
+        {"value": {"bits": "xyz"}},
+        {"value": 1, "timeout_s": -1},
+        {"value": "x" * 1000},
+    ],
+)
+@in_simulated_time
+async def test_an_invalid_body_is_refused_with_its_faults(body: dict[str, Any]) -> None:
+    async with service(generic()) as (_, browser):
+        await synced(browser)
+        reported = problem(await browser.put(f"{V}/params/PARAM_04", json=body), 422, "invalid-request")
+        assert reported["faults"]
+
+
+@in_simulated_time
+async def test_fetches_at_one_time_share_a_download_and_tell_their_progress() -> None:
+    tap = Tap(small_px4())
+    async with service(tap, fetches=False) as (hub, browser):
+        await until(browser, "/api/vehicles", lambda found: bool(found["vehicles"]))
+        results = await asyncio.gather(*(browser.post(f"{V}/fetch", json={}) for _ in range(3)))
+        assert {answer.json()["received"] for answer in results} == {len(VALUES) + 1}
+        assert len({answer.json()["elapsed_s"] for answer in results}) == 1
+        again = (await browser.post(f"{V}/fetch", json={})).json()
+        assert again["source"] == "cache"
+        assert (await browser.post(f"{V}/fetch", json={"refresh": True})).json()["source"] != "cache"
+        assert (await browser.get(V)).json()["fetches"] >= 3
+        assert hub.feed.seq > 3
+
+
+@in_simulated_time
+async def test_a_vehicle_that_is_lost_answers_no_request_with_a_problem() -> None:
+    tap = Tap(generic())
+    async with service(tap) as (_, browser):
+        await synced(browser)
+        tap.is_mute = tap.is_deaf = True
+        problem(await browser.get(f"{V}/params/PARAM_04?live=true"), 504, "no-reply")
+        await until(browser, V, lambda found: bool(found["is_lost"]))
+        assert value(await browser.get(f"{V}/params/PARAM_04")) == VALUES["PARAM_04"]
+        tap.is_mute = tap.is_deaf = False
+        await synced(browser)
+
+
+@in_simulated_time
+async def test_a_client_that_leaves_ends_its_request() -> None:
+    tap = Tap(generic())
+    async with service(tap) as (_, browser):
+        await synced(browser)
+        tap.is_mute = True
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.5):
+                await browser.put(f"{V}/params/PARAM_04", json={"value": 9, "timeout_s": 60})
+        tap.is_mute = False
+        count = len(tap.received)
+        await asyncio.sleep(0.3)
+        sent = [message for _, _, message in tap.received[count:] if type(message).__name__ == "ParamSet"]
+        assert sent == []
+
+
+@in_simulated_time
+async def test_requests_to_a_closed_service_get_a_problem(tmp_path: Path) -> None:
+    with ParamCache(tmp_path / "cache.sqlite3") as cache:
+        async with service(small_px4(), cache=cache) as (hub, browser):
+            await synced(browser)
+        async with a_browser(create_app(hub)) as late:
+            problem(await late.get("/api/vehicles"), 503, "closing")
+
+
+@in_simulated_time
+async def test_an_unexpected_error_is_a_problem_without_details() -> None:
+    async with service(generic()) as (hub, browser):
+        await synced(browser)
+        with mock.patch.object(type(hub), "target", side_effect=RuntimeError("secret")):
+            answer = await browser.get(V)
+        problem(answer, 500, "internal")
+        assert not {"Traceback", "RuntimeError", "secret"} & set(answer.text.replace('"', " ").split())
+
+
+@in_simulated_time
+async def test_metrics_and_openapi_are_complete() -> None:
+    async with service(generic()) as (_, browser):
+        await synced(browser)
+        text = (await browser.get("/metrics")).text
+        labels = 'component="1",link="sim:custom",system="1"'
+        assert f"paramclient_component_synced{{{labels}}} 1.0" in text
+        assert f"paramclient_component_parameters{{{labels}}} {len(VALUES)}.0" in text
+        assert "paramclient_link_frames_received_total" in text
+        described = (await browser.get("/openapi.json")).json()
+        assert {"get", "put"} <= described["paths"]["/api/vehicles/{system}/{component}/params/{name}"].keys()
+        assert "Problem" in described["components"]["schemas"]
+
+
+# extended parameters
+
+
+def camera() -> Camera:
+    return Camera(component=100)
+
+
+@in_simulated_time
+async def test_extended_parameters_are_fetched_written_and_followed() -> None:
+    async with service(camera()) as (_, browser):
+        await until(browser, CAMERA, lambda found: bool(found["extended"]["is_expected"]))
+        fetched = (await browser.post(f"{CAMERA}/fetch", params=EXT, json={})).json()
+        known = (await browser.get(f"{CAMERA}/params", params=EXT)).json()["params"]
+        assert fetched["received"] == len(known) > 0
+        text = next(name for name, each in known.items() if each["type"] == "CUSTOM")
+        done = await browser.put(f"{CAMERA}/params/{text}", params=EXT, json={"value": "Rear"})
+        assert (done.json()["status"], done.json()["actual"]) == ("accepted", "Rear")
+        body = {"values": {text: {"hex": "ff00fe"}}}
+        (result,) = (await browser.patch(f"{CAMERA}/params", params=EXT, json=body)).json()["results"]
+        assert (result["actual"], result["actual_hex"]) == (None, "ff00fe")
+        live = await browser.get(f"{CAMERA}/params/{text}", params={**EXT, "live": "true"})
+        assert live.json()["hex"] == "ff00fe"
+        problem(await browser.get(f"{CAMERA}/params/NOPE", params=EXT), 404, "unknown-parameter")
+
+
+@in_simulated_time
+async def test_64_bit_numbers_of_extended_parameters_may_be_written_as_text() -> None:
+    wide = Camera(component=100, table={"WIDE": (ExtParamType.INT64, 1)})
+    async with service(wide) as (_, browser):
+        await until(browser, CAMERA, lambda found: bool(found["extended"]["is_expected"]))
+        body = {"value": "9007199254740993"}
+        done = (await browser.put(f"{CAMERA}/params/WIDE", params=EXT, json=body)).json()
+        assert done["actual"] == 9007199254740993
+
+
+@in_simulated_time
+async def test_extended_parameters_are_set_up_and_restored(tmp_path: Path) -> None:
+    async with service(camera(), cache=str(tmp_path / "cache.sqlite3")) as (_, browser):
+        await until(browser, CAMERA, lambda found: bool(found["extended"]["is_expected"]))
+        await browser.post(f"{CAMERA}/fetch", params=EXT, json={})
+        known = (await browser.get(f"{CAMERA}/params", params=EXT)).json()["params"]
+        text = next(name for name, each in known.items() if each["type"] == "CUSTOM")
+        before, body = known[text]["hex"], {"values": {text: "Rear"}}
+        planned = (await browser.post(f"{CAMERA}/plan", params=EXT, json=body)).json()
+        assert list(planned["changes"]) == [text]
+        applied = (await browser.post(f"{CAMERA}/apply", params=EXT, json=body)).json()
+        assert applied["complete"]
+        (kept,) = (await browser.get(f"{CAMERA}/snapshots", params=EXT)).json()["snapshots"]
+        assert kept["id"] == applied["snapshot"]
+        query = {**EXT, "snapshot": kept["id"]}
+        assert (await browser.get(f"{CAMERA}/params", params=query)).json()["params"][text]["hex"] == before
+        restored = (await browser.post(f"{CAMERA}/restore", params=EXT, json={})).json()
+        assert restored["complete"]
+        await asyncio.sleep(1)
+        history = (await browser.get(f"{CAMERA}/history", params=EXT)).json()["history"]
+        assert [each["new"]["hex"] for each in history] == ["52656172", before]

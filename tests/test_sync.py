@@ -1,0 +1,189 @@
+"""The blocking client: a whole session, its streams, callbacks, interruption, threads and ends."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from paramclient import (
+    Changed,
+    ClientClosed,
+    FileTransferError,
+    LinkError,
+    NoReply,
+    ParamCache,
+    ParamSet,
+    Progress,
+    UnknownParameter,
+    UsageError,
+    WrittenParam,
+)
+from paramclient.sync import Component, Discovered, ParamClient, apply, apply_all, restore, verify
+from tests.sync_stub import STUB, stub
+
+NAME = "MC_ROLL_P"
+SILENT = "udpin:127.0.0.1:0"
+
+
+def test_the_types_are_those_of_the_asynchronous_client() -> None:
+    assert STUB.read_text(encoding="utf-8") == stub(), "make sync"
+
+
+def test_a_whole_session(tmp_path: Path) -> None:
+    client = ParamClient("sim:px4", cache=tmp_path / "cache")
+    events = client.events()
+    with client:
+        found = next(events)
+        vehicle = client.only_component()
+        assert isinstance(found, Discovered)
+        assert found.component is vehicle is client.component() is client.components[1, 1]
+        assert client.autopilots == client.find_autopilots(expect=1) == [vehicle]
+        assert isinstance(vehicle, Component)
+        progress: list[int | None] = []
+        result = vehicle.fetch_all(progress=lambda each: progress.append(vehicle.count))
+        assert (result.received, result.missing) == (903, ())
+        assert set(progress) == {903}
+        changes = vehicle.changes()
+        assert vehicle.set(NAME, 6.0).actual == 6.0
+        change = next(changes)
+        assert isinstance(change, Changed)
+        assert (change.name, change.new.value) == (NAME, 6.0)
+        with pytest.raises(TimeoutError):
+            changes.next(timeout=0.01)
+        done = vehicle.set_many((name, 7.0) for name in [NAME] if vehicle.get(name).value == 6.0)
+        assert done.is_complete
+        assert [len(vehicle.params), vehicle.params[NAME].value] == [903, 7.0]
+        assert sum(1 for name in vehicle.params if vehicle.params[name].value == 7.0) >= 1
+        assert vehicle.silence < 5.0
+        with pytest.raises(UnknownParameter):
+            vehicle.get("NO_SUCH_NAME")
+        with pytest.raises(NoReply):
+            vehicle.ext.fetch_all(timeout=0.05)
+        with pytest.raises(FileTransferError):
+            client.ftp(vehicle).read("/no/such/file")
+    assert next(changes).name == NAME, "what was queued"
+    with pytest.raises(ClientClosed):
+        next(changes)
+    with pytest.raises(ClientClosed):
+        vehicle.get(NAME)
+    assert vehicle.params[NAME].value == 7.0
+    assert "closed" in repr(client)
+    with ParamCache(tmp_path / "cache") as cache:
+        assert cache.component().params[NAME].value == 7.0
+
+
+def test_a_vehicle_is_set_up_and_restored() -> None:
+    wanted = ParamSet({NAME: WrittenParam(NAME, 6.5)})
+    asked: list[float | int | bytes] = []
+    with ParamClient("sim:px4", cache=False) as client:
+        vehicle = client.only_component()
+        result = apply(vehicle, wanted, before_writing=lambda: asked.append(vehicle.get(NAME).value))
+        assert (result.complete, asked) == (True, [4.0])
+        assert verify(vehicle, wanted).is_met
+        assert restore(vehicle, result.before).complete
+        seen: list[Component] = []
+        done = apply_all([vehicle], lambda each: wanted, progress=lambda each, _: seen.append(each))
+        assert done.results[1, 1].complete
+        assert set(seen) == {vehicle}
+    assert not apply_all([], wanted).results
+
+
+def test_an_error_of_a_callback_ends_the_call() -> None:
+    with ParamClient("sim:px4", cache=False) as client:
+        vehicle = client.only_component()
+
+        def fail(_: Progress) -> None:
+            raise ZeroDivisionError
+
+        with pytest.raises(ZeroDivisionError):
+            vehicle.fetch_all(progress=fail)
+        assert vehicle.get(NAME).value == 4.0
+
+
+def test_open_and_close() -> None:
+    client = ParamClient("sim:px4", cache=False)
+    with pytest.raises(ClientClosed, match="not open"):
+        client.component()
+    assert client.open() is client
+    with pytest.raises(UsageError, match="only once"):
+        client.open()
+    vehicle = client.component()
+    assert vehicle.get(NAME).value == 4.0
+    client.close()
+    client.close()
+    with pytest.raises(ClientClosed):
+        client.component()
+    with pytest.raises(UsageError, match="HTTP"):
+        ParamClient("http://127.0.0.1:8765")
+    with pytest.raises(LinkError), ParamClient("tcp:127.0.0.1:1", cache=False):
+        pass
+    assert not [each for each in threading.enumerate() if each.name.startswith("paramclient")]
+
+
+def test_threads_share_a_client_and_closing_ends_their_calls() -> None:
+    with ParamClient("sim:px4", cache=False) as client, ThreadPoolExecutor() as threads:
+        vehicle = client.only_component()
+        names = [NAME, "MC_PITCH_P", "MC_YAW_P"]
+        assert [each.name for each in threads.map(vehicle.get, names)] == names
+        begun = threading.Event()
+
+        def wait() -> None:
+            changes = vehicle.changes()
+            begun.set()
+            changes.next()
+
+        waiting = threads.submit(wait)
+        begun.wait()
+        client.close()
+        assert isinstance(waiting.exception(), ClientClosed)
+
+
+@pytest.mark.parametrize(
+    "call", [lambda client: client.component(timeout=None), lambda client: client.events().next()]
+)
+def test_ctrl_c_ends_a_call_and_the_client_goes_on(call: Callable[[ParamClient], object]) -> None:
+    with ParamClient(SILENT, cache=False) as client:
+        timer = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
+        timer.start()
+        with pytest.raises(KeyboardInterrupt):
+            call(client)
+        with pytest.raises(NoReply):
+            client.component(timeout=0.01)
+
+
+PROGRAM = """
+import sys, gc
+from paramclient.sync import ParamClient
+client = ParamClient("sim:px4", cache=sys.argv[1]).open()
+vehicle = client.component()
+vehicle.set("MC_ROLL_P", 6.0)
+"""
+
+
+@pytest.mark.parametrize("end", ["", "del client, vehicle; gc.collect()", "1 / 0"])
+def test_a_program_that_does_not_close_its_client_keeps_its_values(tmp_path: Path, end: str) -> None:
+    path = tmp_path / "cache"
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM + end, path], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == (1 if "/" in end else 0), done.stderr
+    with ParamCache(path) as cache:
+        assert cache.component().params[NAME].value == 6.0
+
+
+def test_a_forgotten_client_ends() -> None:
+    client = ParamClient("sim:px4", cache=False).open()
+    (thread,) = [each for each in threading.enumerate() if each.name.startswith("paramclient")]
+    del client
+    gc.collect()
+    thread.join(10.0)
+    assert not thread.is_alive()
