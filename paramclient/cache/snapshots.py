@@ -20,7 +20,6 @@ from paramclient.cache.tables import (
     time_cell,
 )
 from paramclient.errors import NotInCache, UsageError
-from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import bits_of, from_bits
@@ -32,7 +31,6 @@ __all__ = [
     "end_operation",
     "load_snapshots",
     "load_state",
-    "rows_of_ext_set",
     "rows_of_set",
     "rows_of_table",
     "store_snapshot",
@@ -64,19 +62,13 @@ class EarlierState(NamedTuple):
     source: str
 
     @property
-    def plain(self) -> ParamSet:
-        """The state of a table of plain parameters."""
+    def params(self) -> ParamSet:
+        """The state as a set."""
         params = {}
         for name, (number, bits, is_raw), default in self.rows:
             value = from_bits(int.from_bytes(bits, "little"), number, is_raw=bool(is_raw))
             params[name] = WrittenParam(name, value, number, default_value(default, number))
         return ParamSet(params, self.component, self.identity.system, self.identity, self.at, self.source)
-
-    @property
-    def extended(self) -> ExtParamSet:
-        """The state of a table of extended parameters."""
-        params = {name: value.ext_param(name) for name, value, _ in self.rows}
-        return ExtParamSet(params, self.identity.system, self.component, self.at, self.source, self.identity)
 
 
 def store_snapshot(
@@ -202,11 +194,6 @@ def rows_of_set(params: ParamSet) -> list[SnapshotRow]:
             default = written_value(number, bits_of(each.default, number), is_raw=False).value
         rows.append((name, value, default))
     return rows
-
-
-def rows_of_ext_set(params: ExtParamSet) -> list[SnapshotRow]:
-    """Return the parameters of a set of extended ones as those of a snapshot."""
-    return [(name, StoredValue(int(each.type), each.raw, 0), None) for name, each in params.params.items()]
 
 
 def _of_snapshot(tx: Transaction, table: StoredTable, number: int) -> EarlierState:

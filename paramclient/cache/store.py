@@ -13,14 +13,11 @@ from typing import TypeVar
 import platformdirs
 
 from paramclient.cache import history, snapshots, tables
-from paramclient.cache.history import Line
 from paramclient.cache.lookup import find_vehicle
 from paramclient.cache.records import (
     CachedComponent,
-    CachedExtTable,
     CachedSummary,
     CachedVehicle,
-    ExtHistoryEntry,
     HistoryEntry,
     SnapshotSummary,
     StoredParam,
@@ -31,7 +28,6 @@ from paramclient.cache.snapshots import SnapshotRow
 from paramclient.cache.sqlite import SqliteStore
 from paramclient.cache.updates import ensure_table, save_table
 from paramclient.errors import NotInCache, UsageError
-from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 
@@ -181,23 +177,14 @@ class ParamCache:
         if updates:
             self._store.run(work, writing=True)
 
-    def load(self, key: str, component: int) -> CachedComponent | None:
+    def load(self, key: str, component: int, *, extended: bool = False) -> CachedComponent | None:
         """Return the table of a vehicle's component; None if there is none.
 
         Args:
             key: `Identity.key`.
             component: component id.
         """
-        return self._read(lambda tx: tables.load_component(tx, key, component))
-
-    def load_ext(self, key: str, component: int) -> CachedExtTable | None:
-        """Return the extended parameters of a vehicle's component; None if there are none.
-
-        Args:
-            key: `Identity.key`.
-            component: component id.
-        """
-        return self._read(lambda tx: tables.load_extended(tx, key, component))
+        return self._read(lambda tx: tables.load_component(tx, key, component, extended=extended))
 
     def vehicles(self) -> list[CachedVehicle]:
         """Return all vehicles, the last seen first."""
@@ -220,24 +207,32 @@ class ParamCache:
         )
 
     def component(
-        self, vehicle: str | None = None, *, system: int | None = None, component: int = 1
+        self,
+        vehicle: str | None = None,
+        *,
+        system: int | None = None,
+        component: int = 1,
+        extended: bool = False,
     ) -> CachedComponent:
         """Return the only table that matches.
 
         Args:
             vehicle: as for `components`.
             system: its system id.
-            component: component id; the autopilot's is 1.
+            component: component id; the autopilot's is 1, that of a camera 100.
+            extended: the extended parameters of the component, instead of the plain ones.
 
         Raises:
             UnknownVehicle: no table matches. `vehicles` and the message list the existing ones.
             AmbiguousVehicle: tables of several vehicles match. `vehicles` and the message list them.
+            NotInCache: the component has no extended parameters in the cache.
         """
 
         def work(tx: Transaction) -> CachedComponent:
             key = self._choose(tx, vehicle, system=system, component=component)
-            found = tables.load_component(tx, key, component)
-            assert found is not None, "what was chosen exists for the whole transaction"
+            found = tables.load_component(tx, key, component, extended=extended)
+            if found is None:  # only of extended parameters: a component has a plain table
+                raise NotInCache(f"{key}, component {component}, has no extended parameters in the cache")
             return found
 
         return self._read(work)
@@ -275,6 +270,8 @@ class ParamCache:
         name: str | None = None,
         limit: int | None = None,
         since: float | None = None,
+        *,
+        extended: bool = False,
     ) -> list[HistoryEntry]:
         """Return the changes of a vehicle's values, newest last.
 
@@ -286,25 +283,18 @@ class ParamCache:
             name: only changes of this parameter.
             limit: maximum number of changes, the newest.
             since: only changes from this time on, in unix seconds.
+            extended: those of extended parameters, instead of the plain ones.
 
         Raises:
             UnknownVehicle: no vehicle in the cache has this name.
             AmbiguousVehicle: several vehicles have this name.
         """
-        lines = self._lines(vehicle, component, name, limit, since, extended=False)
-        return [history.plain_entry(number, line) for number, line in lines]
-
-    def ext_history(
-        self,
-        vehicle: str,
-        component: int | None = None,
-        name: str | None = None,
-        limit: int | None = None,
-        since: float | None = None,
-    ) -> list[ExtHistoryEntry]:
-        """Return the changes of a vehicle's extended parameters; as `history`."""
-        lines = self._lines(vehicle, component, name, limit, since, extended=True)
-        return [history.extended_entry(number, line) for number, line in lines]
+        lines = self._read(
+            lambda tx: history.load_history(
+                tx, self._choose(tx, vehicle), component, name, limit, since, extended=extended
+            )
+        )
+        return [history.entry_of(number, line) for number, line in lines]
 
     def snapshot(
         self, vehicle: str, component: int, *, reason: str, at: float | None = None
@@ -337,6 +327,7 @@ class ParamCache:
         hash: int | None = None,  # noqa: A002  # the word of the record
         complete: bool = True,
         is_of_operation: bool = False,
+        extended: bool = False,
     ) -> SnapshotSummary:
         """Store a snapshot of given parameters, and return it.
 
@@ -353,6 +344,7 @@ class ParamCache:
             complete: whether these are all parameters of the vehicle.
             is_of_operation: whether an `apply` or `restore` is about to write; it calls `end_operation` at
                 its end.
+            extended: whether these are extended parameters.
 
         Raises:
             UsageError: the type of a parameter is unknown.
@@ -368,21 +360,8 @@ class ParamCache:
             hash=hash,
             complete=complete,
             is_of_operation=is_of_operation,
+            extended=extended,
         )
-
-    def store_ext_snapshot(
-        self,
-        vehicle: Identity | str,
-        component: int,
-        params: ExtParamSet,
-        *,
-        reason: str,
-        at: float | None = None,
-        complete: bool = True,
-    ) -> SnapshotSummary:
-        """Store a snapshot of given extended parameters, and return it; as `store_snapshot`."""
-        rows = snapshots.rows_of_ext_set(params)
-        return self._keep(vehicle, component, rows, reason=reason, at=at, complete=complete, extended=True)
 
     def end_operation(self, snapshot: int) -> None:
         """Record that the `apply` or `restore` that has stored a snapshot has ended.
@@ -392,24 +371,29 @@ class ParamCache:
         """
         self._store.run(lambda tx: snapshots.end_operation(tx, snapshot), writing=True)
 
-    def snapshots(self, vehicle: str, component: int | None = None) -> list[SnapshotSummary]:
+    def snapshots(
+        self, vehicle: str, component: int | None = None, *, extended: bool = False
+    ) -> list[SnapshotSummary]:
         """Return the snapshots of a vehicle's tables, without parameters, newest last.
 
         Args:
             vehicle: as for `components`.
             component: only snapshots of this component.
+            extended: those of extended parameters, instead of the plain ones.
 
         Raises:
             UnknownVehicle: no vehicle in the cache has this name.
             AmbiguousVehicle: several vehicles have this name.
         """
-        return self._snapshots(vehicle, component, extended=False)
 
-    def ext_snapshots(self, vehicle: str, component: int | None = None) -> list[SnapshotSummary]:
-        """Return the snapshots of a vehicle's extended parameters; as `snapshots`."""
-        return self._snapshots(vehicle, component, extended=True)
+        def work(tx: Transaction) -> list[SnapshotSummary]:
+            found = tables.load_tables(tx, self._choose(tx, vehicle), component, extended=extended)
+            kept = [each for table in found for each in snapshots.load_snapshots(tx, table)]
+            return sorted(kept, key=lambda each: each.id)
 
-    def state_at(self, vehicle: str, component: int, when: float) -> ParamSet:
+        return self._read(work)
+
+    def state_at(self, vehicle: str, component: int, when: float, *, extended: bool = False) -> ParamSet:
         """Return a table as it was at a given time.
 
         It is computed backwards from the current table with the history lines, and has the last values
@@ -421,6 +405,7 @@ class ParamCache:
             vehicle: as for `components`.
             component: component id.
             when: a float is a time, in unix seconds; an int is the id of a snapshot.
+            extended: that of extended parameters, instead of the plain ones.
 
         Raises:
             UsageError: the time is not in unix seconds.
@@ -431,44 +416,13 @@ class ParamCache:
         """
 
         return self._read(
-            lambda tx: snapshots.load_state(tx, self._table(tx, vehicle, component), when).plain
-        )
-
-    def ext_state_at(self, vehicle: str, component: int, when: float) -> ExtParamSet:
-        """Return the extended parameters of a component as they were at a given time; as `state_at`."""
-
-        return self._read(
             lambda tx: (
-                snapshots.load_state(tx, self._table(tx, vehicle, component, extended=True), when).extended
+                snapshots.load_state(tx, self._table(tx, vehicle, component, extended=extended), when).params
             )
         )
 
     def _read(self, work: Callable[[Transaction], T]) -> T:
         return self._store.run(work, writing=False)
-
-    def _lines(
-        self,
-        vehicle: str,
-        component: int | None,
-        name: str | None,
-        limit: int | None,
-        since: float | None,
-        *,
-        extended: bool,
-    ) -> list[tuple[int, Line]]:
-        return self._read(
-            lambda tx: history.load_history(
-                tx, self._choose(tx, vehicle), component, name, limit, since, extended=extended
-            )
-        )
-
-    def _snapshots(self, vehicle: str, component: int | None, *, extended: bool) -> list[SnapshotSummary]:
-        def work(tx: Transaction) -> list[SnapshotSummary]:
-            found = tables.load_tables(tx, self._choose(tx, vehicle), component, extended=extended)
-            kept = [each for table in found for each in snapshots.load_snapshots(tx, table)]
-            return sorted(kept, key=lambda each: each.id)
-
-        return self._read(work)
 
     def _keep(
         self,
