@@ -30,24 +30,19 @@ from paramclient.files.formats import FileFormat
 from paramclient.files.json_reader import Checks, Place, Reader, between, found, read_json_text, typed
 from paramclient.files.param_file import ParamFile, TooManyParams
 from paramclient.files.text import as_type, is_plain, time_of
-from paramclient.model.ext_params import (
+from paramclient.model.ext_values import (
     EXT_VALUE_SIZE,
-    ExtParam,
-    ExtParamType,
-    ExtValue,
     check_ext_value,
     encode_ext_value,
-    ext_type_name,
-    ext_type_number,
+    ext_param,
+    own_bytes,
 )
-from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.notation import value_json, value_written
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import (
     TYPES_BY_NAME,
     ParamType,
-    Trust,
     WireValue,
     check_name,
     from_bits,
@@ -71,6 +66,7 @@ _KEY: Final = "paramclient"
 _EXT_KEY: Final = "paramclient_extended"
 """The key with the version of a document of extended parameters."""
 _NUMBER_EXPECTED: Final = "expected a number (or NaN, Infinity, 0x and 8 digits for raw bytes)"
+_CUSTOM: Final = ParamType.CUSTOM
 _WORDS: Final = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 _raw: Final = re.compile(r"0x([0-9a-fA-F]{8})").fullmatch
 _type_number: Final = re.compile(r"TYPE_([0-9]{1,3})").fullmatch
@@ -103,7 +99,7 @@ def read_json(text: str, source: str, params_max: int | None = None) -> ParamFil
     return ParamFile(sets, FileFormat.JSON, source, tuple(document.get("header", [])))
 
 
-def read_ext_json(text: str, source: str) -> ExtParamSet:
+def read_ext_json(text: str, source: str) -> ParamSet:
     """Read a document of extended parameters.
 
     Raises:
@@ -124,7 +120,8 @@ def read_ext_json(text: str, source: str) -> ExtParamSet:
     reader.problems.raise_if_any()
     if not params:
         raise FileError("the file contains no parameters", source=source)
-    return ExtParamSet(params, head.get("system"), head.get("component"), head.get("at"), source)
+    ids = head.get("component"), head.get("system")
+    return ParamSet(params, *ids, None, head.get("at"), source)
 
 
 def _set(reader: Reader, content: object, place: Place) -> ParamSet:
@@ -161,7 +158,7 @@ def _param(reader: Reader, name: str, content: object, place: Place) -> WrittenP
         return None
 
 
-def ext_param_of_fields(name: str, fields: object) -> ExtParam:
+def ext_param_of_fields(name: str, fields: object) -> WrittenParam:
     """Return the parameter that a document has under a name: `value` or `hex`, and `type`.
 
     Raises:
@@ -172,21 +169,20 @@ def ext_param_of_fields(name: str, fields: object) -> ExtParam:
     if not isinstance(fields, dict) or not fields.keys() <= {"value", "hex", "type"}:
         raise ValueError("expected value or hex, and type")
     written = fields.get("type")
-    number = ext_type_number(written if isinstance(written, str) else repr(written))
+    number = _CUSTOM if written == _CUSTOM.name else _type(written)
     if ("value" in fields) == ("hex" in fields):
         raise ValueError("expected either value or hex")
     if "hex" in fields:
         raw = bytes.fromhex(_text(fields["hex"]))
-        param = ExtParam.of(name, raw, number, None, Trust.CACHED)
-        if len(raw) > EXT_VALUE_SIZE or param.raw != raw:
-            raise ValueError(f"hex is not a value of type {ext_type_name(number)}")
-        return param
+        if len(raw) > EXT_VALUE_SIZE or own_bytes(raw, number) != raw:
+            raise ValueError(f"hex is not a value of type {type_name(number)}")
+        return WrittenParam.of(ext_param(name, raw, number))
     value = fields["value"]
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise ValueError("the value must be a number or text")
-    if number != ExtParamType.CUSTOM and isinstance(value, str):
+    if number != _CUSTOM and isinstance(value, str):
         value = _WORDS.get(value, value)
-    return ExtParam.of(name, encode_ext_value(check_ext_value(value), number), number, None, Trust.CACHED)
+    return WrittenParam.of(ext_param(name, encode_ext_value(check_ext_value(value), number), number))
 
 
 _text: Final = typed(str, "text")
@@ -315,19 +311,19 @@ def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
     yield "}"
 
 
-def write_ext_json(content: ExtParamSet) -> Iterator[str]:
+def write_ext_json(content: ParamSet) -> Iterator[str]:
     """Generate the lines of a document of extended parameters."""
     yield "{"
     for key, each in {_EXT_KEY: VERSION, **_about(content)}.items():
         if each is not None:
             yield f"  {_json(key)}: {_json(each)},"
     yield '  "params": {'
-    yield from _rows({param.name: _ext_fields(param) for param in content.params.values()}, "    ")
+    yield from _rows({param.name: _ext_fields(param) for param in content.values()}, "    ")
     yield "  }"
     yield "}"
 
 
-def _about(params: ParamSet | ExtParamSet) -> dict[str, object]:
+def _about(params: ParamSet) -> dict[str, object]:
     return {
         "system": params.system,
         "component": params.component,
@@ -357,17 +353,18 @@ def _fields(param: WrittenParam) -> dict[str, object]:
     return fields
 
 
-def _ext_fields(param: ExtParam) -> dict[str, object]:
+def _ext_fields(param: WrittenParam) -> dict[str, object]:
     """Return the fields of an extended parameter; reading them gives the same bytes."""
-    value: ExtValue = param.value
-    kind = ext_type_name(param.type)
-    if isinstance(value, bytes):
-        return {"hex": param.raw.hex(), "type": kind}
+    number = param.type_number or ParamType.UNKNOWN
+    value, raw = param.settable, encode_ext_value(param.settable, number)
+    kind = type_name(number)
     if isinstance(value, float):
-        value = value_json(value, ParamType(param.type))
-        if isinstance(value, str) and encode_ext_value(_WORDS[value], param.type) != param.raw:
-            return {"hex": param.raw.hex(), "type": kind}  # a NaN with payload bits
-    return {"value": value, "type": kind}
+        written = value_json(value, ParamType(number))
+        if not isinstance(written, str) or encode_ext_value(_WORDS[written], number) == raw:
+            return {"value": written, "type": kind}  # else a NaN with payload bits
+    elif not isinstance(value, bytes):
+        return {"value": value, "type": kind}
+    return {"hex": raw.hex(), "type": kind}
 
 
 def _encodable(text: str) -> str:

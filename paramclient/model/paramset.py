@@ -17,6 +17,7 @@ from paramclient.model.values import (
     Value,
     WireValue,
     bits_of,
+    byte_length,
     format_value,
     known_type,
     repr_of_param,
@@ -69,9 +70,9 @@ class WrittenParam:
         is_raw: bool = False,
         type_number: int | None = None,
     ) -> None:
-        if isinstance(value, bytes):
-            value, is_raw = int.from_bytes(value, "little"), True
         number = None if type is None else known_type(type or type_number or 0)
+        if isinstance(value, bytes) and number != ParamType.CUSTOM:
+            value, is_raw = int.from_bytes(value, "little"), True
         kind = number if number is None or isinstance(number, ParamType) else ParamType.UNKNOWN
         default = None if isinstance(default, bytes) else default
         given = (name, value, kind, default, comment, line, is_raw, number)
@@ -84,7 +85,10 @@ class WrittenParam:
     @property
     def settable(self) -> WireValue:
         """The value as `set` takes it: the number, or the four raw bytes where `is_raw`."""
-        return int(self.value).to_bytes(WIRE_SIZE, "little") if self.is_raw else self.value
+        if not self.is_raw:
+            return self.value
+        bits = int(self.value)
+        return bits.to_bytes(max(WIRE_SIZE, byte_length(bits)), "little")
 
     @classmethod
     def of(cls, param: Param) -> WrittenParam:

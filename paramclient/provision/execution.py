@@ -29,7 +29,6 @@ from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
 from paramclient.model.values import WireValue
-from paramclient.protocol.requests.write_window import WRITES_IN_FLIGHT_MAX
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
 from paramclient.provision.callbacks import call_and_wait
@@ -371,25 +370,15 @@ class ApplyRun:
             ParamClientError: not all values were tried.
         """
         self._is_verified = False
-        # ArduPilot may get all of them at once, as a file
-        in_flight = len(steps) if self._component.autopilot == "ardupilot" else WRITES_IN_FLIGHT_MAX
         by_name = {step.name: step for step in steps}
         before = frozenset(self.sent)
-        ended = 0
-
-        def take(outcome: SetOutcome) -> None:
-            nonlocal ended
-            ended += 1
-            self.sent.update(step.name for step in steps[: ended + in_flight])
-            self._take(by_name[outcome.name], outcome)
-
-        self.sent.update(step.name for step in steps[:in_flight])
+        self.sent.update(by_name)
         try:
             done = await self._component.set_many(
                 [(step.name, step.value) for step in steps],
                 force=self._options.force,
                 author=self._options.author,
-                progress=take,
+                progress=lambda outcome: self._take(by_name[outcome.name], outcome),
             )
         except ParamClientError:
             self.sent &= before
