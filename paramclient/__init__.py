@@ -14,156 +14,97 @@ To find the module of a rule, see "Find the code" in `docs/internals/design.md`.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
-
+from paramclient.cache import CachedComponent, ParamCache
+from paramclient.client.client import ParamClient
+from paramclient.client.component import Component, ComponentState
+from paramclient.client.events import (
+    Discovered,
+    Event,
+    Found,
+    Lost,
+    Rebooted,
+    Resynced,
+)
+from paramclient.client.files import Ftp
+from paramclient.client.fleet_fetch import FetchedAll
+from paramclient.client.reset import ResetResult
+from paramclient.client.signing import Signing, read_key
+from paramclient.client.streams import Changes, Events
+from paramclient.errors import (
+    AlreadyRestored,
+    AmbiguousVehicle,
+    AnotherVehicle,
+    CacheError,
+    ClientClosed,
+    CommandRefused,
+    FileError,
+    FileTransferError,
+    InvalidParameters,
+    LinkError,
+    MetadataError,
+    NoReply,
+    NotDurable,
+    NotInCache,
+    ParamClientError,
+    Refused,
+    TypeMismatch,
+    UnknownParameter,
+    UnknownVehicle,
+    UsageError,
+    ValueNotApplied,
+    VehicleArmed,
+    VehicleError,
+)
+from paramclient.files import ParamFile, read_file, write_file
+from paramclient.model.comparison import Comparison, compare
+from paramclient.model.identity import Identity
+from paramclient.model.params import ParamMap
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import Encoding, Param, ParamType, Settable, Trust, Value
+from paramclient.protocol.addresses import Address
+from paramclient.protocol.events import Change
+from paramclient.protocol.fetch import FetchResult, Policy, Progress
+from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
+from paramclient.protocol.watch import SyncState
 from paramclient.version import __version__
-
-if TYPE_CHECKING:
-    from paramclient.cache import (
-        CachedComponent,
-        CachedExtTable,
-        CachedVehicle,
-        ExtHistoryEntry,
-        HistoryEntry,
-        ParamCache,
-        SnapshotSummary,
-    )
-    from paramclient.cache.records import CachedSummary
-    from paramclient.client.client import ParamClient
-    from paramclient.client.component import Component, ComponentState
-    from paramclient.client.events import Discovered, Event, Found, Lost, Rebooted, Resynced
-    from paramclient.client.files import Ftp
-    from paramclient.client.fleet_fetch import FetchedAll
-    from paramclient.client.reset import ResetResult
-    from paramclient.client.signing import Signing, key_from_environment, read_key
-    from paramclient.client.streams import Changes, Events
-    from paramclient.client.traffic import ComponentTraffic, MessageTraffic, RadioStatus, TrafficReport
-    from paramclient.errors import (
-        AlreadyRestored,
-        AmbiguousVehicle,
-        AnotherVehicle,
-        CacheError,
-        ClientClosed,
-        CommandRefused,
-        CommandResult,
-        ExtAckResult,
-        ExtSetRefused,
-        FileError,
-        FileErrorCode,
-        FileTransferError,
-        InvalidParameters,
-        LinkError,
-        MetadataError,
-        NoReply,
-        NotDurable,
-        NotInCache,
-        PackError,
-        ParamClientError,
-        ParamErrorCode,
-        Refused,
-        SetFailed,
-        TypeMismatch,
-        UnknownParameter,
-        UnknownVehicle,
-        UsageError,
-        ValueNotApplied,
-        ValueUnsupported,
-        VehicleArmed,
-        VehicleError,
-    )
-    from paramclient.files import FileFormat, ParamFile, read_file, read_renames, write_file
-    from paramclient.files.formats import LogFormat
-    from paramclient.model.comparison import (
-        ChangedSide,
-        Comparison,
-        Difference,
-        DifferenceStatus,
-        compare,
-        defaults_of,
-        same_value,
-    )
-    from paramclient.model.ext_params import ExtParam, ExtParamType, ExtSettable, ExtValue
-    from paramclient.model.ext_paramset import ExtParamSet
-    from paramclient.model.identity import Identity
-    from paramclient.model.params import ParamMap
-    from paramclient.model.paramset import ParamSet, WrittenParam
-    from paramclient.model.renames import Rename, Renames
-    from paramclient.model.values import Encoding, Param, ParamType, Settable, Trust, Value, WireValue
-    from paramclient.protocol.addresses import Address
-    from paramclient.protocol.events import Change
-    from paramclient.protocol.fetch import FetchResult, FetchSource, Policy, Progress
-    from paramclient.protocol.ftp import DirectoryEntry
-    from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
-    from paramclient.protocol.watch import SyncState
-    from paramclient.wire.messages import AutopilotVersion, Heartbeat
-    from paramclient.wire.signing import Refusal, SigningKey, SigningPolicy, SigningReport, SigningStream
+from paramclient.wire.signing import SigningKey, SigningPolicy
 
 __all__ = [
     "Address",
     "AlreadyRestored",
     "AmbiguousVehicle",
     "AnotherVehicle",
-    "AutopilotVersion",
     "CacheError",
     "CachedComponent",
-    "CachedExtTable",
-    "CachedSummary",
-    "CachedVehicle",
     "Change",
     "Changes",
     "ClientClosed",
     "CommandRefused",
-    "CommandResult",
     "Comparison",
     "Component",
     "ComponentState",
-    "ComponentTraffic",
-    "Difference",
-    "DirectoryEntry",
+    "Discovered",
     "Encoding",
     "Event",
     "Events",
-    "ExtAckResult",
     "FetchResult",
-    "ExtHistoryEntry",
-    "ExtParam",
-    "ExtParamSet",
-    "ExtParamType",
-    "SetManyResult",
-    "SetOutcome",
-    "ExtSetRefused",
-    "SetResult",
-    "ExtSettable",
-    "ExtValue",
-    "FetchSource",
     "FetchedAll",
     "FileError",
-    "FileErrorCode",
-    "FileFormat",
     "FileTransferError",
     "Found",
     "Ftp",
-    "Discovered",
-    "Heartbeat",
-    "HistoryEntry",
     "Identity",
     "InvalidParameters",
     "LinkError",
-    "LogFormat",
     "Lost",
-    "MessageTraffic",
     "MetadataError",
-    "ChangedSide",
     "NoReply",
     "NotDurable",
     "NotInCache",
-    "PackError",
     "Param",
     "ParamCache",
     "ParamClient",
     "ParamClientError",
-    "ParamErrorCode",
     "ParamFile",
     "ParamMap",
     "ParamSet",
@@ -171,25 +112,18 @@ __all__ = [
     "Policy",
     "Progress",
     "Rebooted",
-    "RadioStatus",
-    "Refusal",
     "Refused",
-    "Rename",
-    "Renames",
     "ResetResult",
     "Resynced",
-    "SetFailed",
+    "SetManyResult",
+    "SetOutcome",
+    "SetResult",
     "SetStatus",
     "Settable",
     "Signing",
     "SigningKey",
     "SigningPolicy",
-    "SigningReport",
-    "SigningStream",
-    "SnapshotSummary",
-    "DifferenceStatus",
     "SyncState",
-    "TrafficReport",
     "Trust",
     "TypeMismatch",
     "UnknownParameter",
@@ -197,184 +131,15 @@ __all__ = [
     "UsageError",
     "Value",
     "ValueNotApplied",
-    "ValueUnsupported",
     "VehicleArmed",
     "VehicleError",
-    "WireValue",
     "WrittenParam",
     "__version__",
     "compare",
-    "defaults_of",
-    "key_from_environment",
-    "read_key",
     "read_file",
-    "read_renames",
-    "same_value",
+    "read_key",
     "write_file",
 ]
-
-_HOMES: Final = {
-    "paramclient.cache": (
-        "CachedComponent",
-        "CachedExtTable",
-        "CachedVehicle",
-        "ExtHistoryEntry",
-        "HistoryEntry",
-        "ParamCache",
-        "SnapshotSummary",
-    ),
-    "paramclient.cache.records": ("CachedSummary",),
-    "paramclient.client.client": ("ParamClient",),
-    "paramclient.client.component": ("Component",),
-    "paramclient.client.events": (
-        "Event",
-        "Events",
-        "Found",
-        "Discovered",
-        "Lost",
-        "Rebooted",
-        "Resynced",
-    ),
-    "paramclient.client.extended_params": ("Component",),
-    "paramclient.client.fetch_all": ("FetchedAll",),
-    "paramclient.client.files": ("Ftp",),
-    "paramclient.client.reset": ("ResetResult",),
-    "paramclient.client.signing": (
-        "Signing",
-        "key_from_environment",
-        "read_key",
-    ),
-    "paramclient.client.stats": ("ClientStats",),
-    "paramclient.client.subscription": ("Changes", "Changes"),
-    "paramclient.errors": (
-        "AlreadyRestored",
-        "AmbiguousVehicle",
-        "AnotherVehicle",
-        "CacheError",
-        "ClientClosed",
-        "CommandRefused",
-        "CommandResult",
-        "ExtAckResult",
-        "ExtSetRefused",
-        "FileError",
-        "FileErrorCode",
-        "FileTransferError",
-        "InvalidParameters",
-        "LinkError",
-        "MetadataError",
-        "NoReply",
-        "NotDurable",
-        "NotInCache",
-        "PackError",
-        "ParamClientError",
-        "ParamErrorCode",
-        "Refused",
-        "SetFailed",
-        "TypeMismatch",
-        "UnknownParameter",
-        "UnknownVehicle",
-        "UsageError",
-        "ValueNotApplied",
-        "ValueUnsupported",
-        "VehicleArmed",
-        "VehicleError",
-    ),
-    "paramclient.files": (
-        "FileFormat",
-        "ParamFile",
-        "read_file",
-        "read_renames",
-        "write_file",
-    ),
-    "paramclient.files.formats": ("LogFormat",),
-    "paramclient.model.comparison": (
-        "Comparison",
-        "Difference",
-        "ChangedSide",
-        "DifferenceStatus",
-        "compare",
-        "defaults_of",
-        "same_value",
-    ),
-    "paramclient.model.ext_params": (
-        "ExtParam",
-        "ExtParamType",
-        "ExtSettable",
-        "ExtValue",
-    ),
-    "paramclient.model.ext_paramset": ("ExtParamSet",),
-    "paramclient.model.identity": ("Identity",),
-    "paramclient.model.params": ("ParamMap",),
-    "paramclient.model.paramset": (
-        "ParamSet",
-        "WrittenParam",
-    ),
-    "paramclient.model.renames": (
-        "Rename",
-        "Renames",
-    ),
-    "paramclient.model.values": (
-        "Encoding",
-        "Param",
-        "ParamType",
-        "Settable",
-        "Trust",
-        "Value",
-        "WireValue",
-    ),
-    "paramclient.protocol.addresses": ("Address",),
-    "paramclient.protocol.ext.change": ("Change",),
-    "paramclient.protocol.ext.fetch": ("FetchResult",),
-    "paramclient.protocol.ext.write_batch": (
-        "SetManyResult",
-        "SetOutcome",
-    ),
-    "paramclient.protocol.ext.writes": ("SetResult",),
-    "paramclient.protocol.ftp": ("DirectoryEntry",),
-    "paramclient.protocol.params.change": ("Change",),
-    "paramclient.protocol.params.fetch_result": (
-        "FetchResult",
-        "FetchSource",
-        "Policy",
-        "Progress",
-    ),
-    "paramclient.protocol.params.sync": ("ComponentState", "SyncState"),
-    "paramclient.protocol.params.write_batch": (
-        "SetManyResult",
-        "SetOutcome",
-        "SetStatus",
-    ),
-    "paramclient.protocol.params.writes": ("SetResult",),
-    "paramclient.protocol.stats.traffic": (
-        "ComponentTraffic",
-        "MessageTraffic",
-        "RadioStatus",
-        "TrafficReport",
-    ),
-    "paramclient.protocol.vehicle.address_contest": ("Contest",),
-    "paramclient.protocol.wire": (
-        "AutopilotVersion",
-        "Heartbeat",
-        "Refusal",
-        "SigningKey",
-        "SigningPolicy",
-        "SigningReport",
-        "SigningStream",
-    ),
-}
-"""The modules of the public names. A module is imported at the first use of one of its names: the command
-needs few of them, and shell completion almost none."""
-_HOME_OF: Final = {name: module for module, names in _HOMES.items() for name in names}
-
-
-if not TYPE_CHECKING:  # type checkers would take any name for one of the package
-
-    def __getattr__(name: str) -> Any:
-        module = _HOME_OF.get(name)
-        if module is None:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        value = globals()[name] = getattr(import_module(module), name)
-        return value
 
 
 def __dir__() -> list[str]:
