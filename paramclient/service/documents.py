@@ -20,17 +20,16 @@ from paramclient.cli.json_output import (
     ext_value_json,
 )
 from paramclient.cli.json_setup import ApplyJson, PlanJson
-from paramclient.model.ext_params import ExtParamType
+from paramclient.model.ext_values import ext_bytes
 from paramclient.model.notation import hash_text, rounded, time_text
 from paramclient.model.values import ParamType, Trust
-from paramclient.protocol.events import Change
+from paramclient.protocol.kinds import expects_extended
 
 if TYPE_CHECKING:
-    from paramclient.cache import CachedSummary, CachedVehicle, ExtHistoryEntry, HistoryEntry, SnapshotSummary
+    from paramclient.cache import CachedSummary, CachedVehicle, HistoryEntry, SnapshotSummary
     from paramclient.files import ParamFile
     from paramclient.metadata import Metadata
-    from paramclient.model.ext_params import ExtParam
-    from paramclient.model.paramset import ParamSet
+    from paramclient.model.paramset import ParamSet, WrittenParam
     from paramclient.model.values import Param
     from paramclient.protocol.events import Change
     from paramclient.protocol.fetch import FetchResult, Progress
@@ -49,6 +48,7 @@ __all__ = [
     "ext_param",
     "ext_plan",
     "ext_writes",
+    "ext_written",
     "fetch_result",
     "history",
     "param",
@@ -78,7 +78,6 @@ def vehicle(target: Target) -> dict[str, Any]:
     progress of a running fetch, `fetches` the number of ended ones, `key` the key of its table in the cache.
     """
     component, identity, ext = target.component, target.component.identity, target.component.ext
-    contest = component.contest
     return {
         **target.address,
         "link_state": target.link.state,
@@ -95,13 +94,16 @@ def vehicle(target: Target) -> dict[str, Any]:
         "sync_state": component.sync_state.value,
         "is_armed": component.is_armed,
         "is_lost": component.sync_state == "lost",
-        "contest": None if contest is None else contest.difference,
         "silence_s": round(component.silence, 3),
         "round_trip_s": rounded(component.round_trip),
         "fetch": None if target.progress is None else progress(target.progress),
         "fetches": target.fetches,
         "has_metadata": target.metadata is not None,
-        "extended": {"is_expected": ext.is_expected, "count": ext.count, "params": len(ext.params)},
+        "extended": {
+            "is_expected": expects_extended(identity.vehicle_type, component.component),
+            "count": ext.count,
+            "params": len(ext.params),
+        },
     }
 
 
@@ -176,7 +178,7 @@ def change(found: Change, metadata: Metadata | None) -> dict[str, Any]:
         "old": None if old is None else param(old, metadata, whole=False),
         "new": None if new is None else param(new, metadata, whole=False),
         "by": found.by,
-        "kind": "removed" if new is None else "added" if isinstance(found, Added) else "changed",
+        "kind": found.kind,
     }
 
 
@@ -185,7 +187,7 @@ def change(found: Change, metadata: Metadata | None) -> dict[str, Any]:
 
 def fetch_result(result: FetchResult, target: Target) -> dict[str, Any]:
     """Return the result of a fetch, without the parameters."""
-    stats = None if target.link.client is None else target.link.client.stats
+    client = target.link.client
     known = target.component.params
     found: dict[str, Any] = as_json(
         FetchJson.of(
@@ -194,8 +196,8 @@ def fetch_result(result: FetchResult, target: Target) -> dict[str, Any]:
             (),
             missing=list(result.missing),
             cached=[name for name, each in known.items() if each.trust is Trust.CACHED],
-            bytes_received=0 if stats is None else stats.bytes_received,
-            bytes_sent=0 if stats is None else stats.bytes_sent,
+            bytes_received=0 if client is None else client.bytes_received,
+            bytes_sent=0 if client is None else client.bytes_sent,
             described={},
         )
     )
@@ -260,10 +262,15 @@ def snapshots(kept: Iterable[SnapshotSummary]) -> dict[str, Any]:
 # Extended parameters
 
 
-def ext_param(known: ExtParam) -> dict[str, Any]:
+def ext_param(known: Param) -> dict[str, Any]:
     """Return an extended parameter of a table."""
     found: dict[str, Any] = as_json(ExtParamJson.of_table(known))
     return found
+
+
+def ext_written(known: WrittenParam) -> dict[str, Any]:
+    """Return an extended parameter of a set."""
+    return {"name": known.name} | as_json(ExtParamJson.written(known))
 
 
 def ext_change(found: Change) -> dict[str, Any]:
@@ -274,7 +281,7 @@ def ext_change(found: Change) -> dict[str, Any]:
         "old": None if old is None else ext_param(old),
         "new": None if new is None else ext_param(new),
         "by": found.by,
-        "kind": "removed" if new is None else "added" if found.is_added else "changed",
+        "kind": found.kind,
     }
 
 
@@ -304,10 +311,10 @@ def _ext_write(outcome: SetOutcome) -> dict[str, Any]:
     now = None if outcome.result is None else outcome.result.param
     return {
         "name": outcome.name,
-        "requested": ext_value_json(outcome.requested, ExtParamType.REAL64),
-        "actual": None if now is None else ext_value_json(now.value, now.type),
+        "requested": ext_value_json(outcome.requested, ParamType.REAL64),
+        "actual": None if now is None else ext_value_json(now.value, now.type_number),
         "status": outcome.status.value,
-        "actual_hex": None if now is None else now.raw.hex(),
+        "actual_hex": None if now is None else ext_bytes(now).hex(),
         "reason": None if outcome.error is None else str(outcome.error),
     }
 
@@ -318,7 +325,7 @@ def ext_plan(found: ExtPlan) -> dict[str, Any]:
         "system": found.system,
         "component": found.component,
         "is_met": found.is_met,
-        "changes": {name: as_json(ExtParamJson.of(each)) for name, each in found.changes.items()},
+        "changes": {name: as_json(ExtParamJson.written(each)) for name, each in found.changes.items()},
         "missing": list(found.missing),
         "mistyped": list(found.mistyped),
     }
@@ -336,7 +343,7 @@ def ext_apply_result(result: ExtApplyResult) -> dict[str, Any]:
     }
 
 
-def ext_history(entries: Iterable[ExtHistoryEntry]) -> dict[str, Any]:
+def ext_history(entries: Iterable[HistoryEntry]) -> dict[str, Any]:
     """Return changes of extended parameters."""
     lines = [
         {

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 from paramclient.errors import UnknownParameter, UsageError
 from paramclient.metadata.info import number_of
-from paramclient.model.ext_params import ExtParam, ExtParamType, ExtValue, check_ext_value, encode_ext_value
-from paramclient.model.ext_paramset import ExtParamSet
-from paramclient.model.values import Trust
+from paramclient.model.ext_values import check_ext_value, encode_ext_value, ext_param
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import Param, ParamType, WireValue
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision import apply_extended, load_extended_state, restore_extended, verify_extended
 from paramclient.service import documents
@@ -99,10 +99,10 @@ async def restore(target: Target, body: RestoreRequest, *, author: str) -> dict[
 async def state(target: Target, when: float | None) -> dict[str, dict[str, Any]]:
     """Return the parameters of a snapshot or at a time."""
     found = await load_extended_state(target.component, when)
-    return {name: documents.ext_param(each) for name, each in found.params.items()}
+    return {name: documents.ext_written(each) for name, each in found.items()}
 
 
-async def _wanted(target: Target, body: PlanRequest) -> ExtParamSet:
+async def _wanted(target: Target, body: PlanRequest) -> ParamSet:
     """Return the wanted parameters, in the types that the component reports."""
     if body.file is not None:
         raise UsageError("extended parameters are given in `values` or `snapshot`, not in a file")
@@ -111,16 +111,16 @@ async def _wanted(target: Target, body: PlanRequest) -> ExtParamSet:
     wanted = {}
     for name, given in (body.values or {}).items():
         known = await _known(target, name)
-        raw = encode_ext_value(check_ext_value(await _resolve(target, name, given)), known.type)
-        wanted[name] = ExtParam.of(name, raw, known.type, None, Trust.CACHED)
-    return ExtParamSet(wanted)
+        raw = encode_ext_value(check_ext_value(await _resolve(target, name, given)), known.type_number)
+        wanted[name] = WrittenParam.of(ext_param(name, raw, known.type_number))
+    return ParamSet(wanted)
 
 
-async def _known(target: Target, name: str) -> ExtParam:
+async def _known(target: Target, name: str) -> Param:
     return target.component.ext.params.get(name) or await target.component.ext.get(name)
 
 
-async def _resolve(target: Target, name: str, given: int | float | str | Bits | Hex) -> ExtValue:
+async def _resolve(target: Target, name: str, given: int | float | str | Bits | Hex) -> WireValue:
     """Return the value of a request. Text for a number type is a number: JavaScript rounds 64-bit integers.
 
     Raises:
@@ -131,7 +131,7 @@ async def _resolve(target: Target, name: str, given: int | float | str | Bits | 
         return bytes.fromhex(given.hex)
     if isinstance(given, Bits):
         raise UsageError(f'{name}: {{"bits": …}} is for plain parameters; give {{"hex": …}}')
-    if not isinstance(given, str) or (await _known(target, name)).type == ExtParamType.CUSTOM:
+    if not isinstance(given, str) or (await _known(target, name)).type == ParamType.CUSTOM:
         return given
     number = number_of(given)
     if number is None:

@@ -17,11 +17,10 @@ import anyio.to_thread
 
 from paramclient.cache import ParamCache
 from paramclient.client.client import ParamClient
-from paramclient.client.events import Discovered, Event, Found, Rebooted, Resynced, Uncontested
+from paramclient.client.events import Discovered, Event, Found, Rebooted, Resynced
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata import Metadata, MetadataStore, metadata_of
-from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Progress
 from paramclient.service import documents
 from paramclient.service.event_feed import EventFeed
@@ -226,7 +225,7 @@ class Hub:
             target.fetches += 1
         self._check(target)
         listens_only = link.client is not None and link.client.listens_only
-        if isinstance(event, Discovered | Found | Rebooted | Uncontested) and not listens_only:
+        if isinstance(event, Discovered | Found | Rebooted) and not listens_only:
             tasks.start_soon(self._load, target)
 
     async def _load(self, target: Target) -> None:
@@ -235,8 +234,6 @@ class Hub:
             return
         with suppress(ParamClientError):
             await self.fetch(target)
-            await target.component.refreshed()
-            target.fetches += 1
 
     async def _load_known_metadata(self, target: Target) -> None:
         """Load the metadata of the firmware of a component that this computer has, if any."""
@@ -254,7 +251,7 @@ class Hub:
         """
         with suppress(ParamClientError):
             async for change in target.component.changes():
-                if isinstance(change, Added) or not isinstance(change, FirstValue):
+                if change.kind != "first":
                     members = documents.change(change, target.metadata)
                     self.feed.publish("change", **target.address, **members)
             return  # the end of a log
@@ -264,7 +261,7 @@ class Hub:
         """Publish the changes of extended parameters."""
         with suppress(ParamClientError):
             async for change in target.component.ext.changes():
-                if change.old is not None or change.is_added:
+                if change.kind != "first":
                     members = documents.ext_change(change)
                     self.feed.publish("extended_change", **target.address, **members)
 

@@ -210,11 +210,11 @@ async def snapshots(
     """Return the snapshots, the newest last."""
     if key is None:
         target = hub.target(system, component, link)
-        if ext:
-            return documents.snapshots(await target.component.ext.snapshots())
         key = target.component.identity.key
     owner = key
-    return documents.snapshots(await hub.read_cache(lambda cache: cache.snapshots(owner, component)))
+    return documents.snapshots(
+        await hub.read_cache(lambda cache: cache.snapshots(owner, component, extended=ext))
+    )
 
 
 @writing.post(f"{VEHICLE}/snapshots", status_code=201)
@@ -223,21 +223,21 @@ async def create_snapshot(
 ) -> dict[str, Any]:
     """Store a snapshot of the known table."""
     component = target.component
-    if ext:
-        return {"id": await component.ext.store_snapshot(reason=body.reason)}
     await wait_for_identity(component)
-    if not component.params:
+    shown = component.ext if ext else component
+    if not shown.params:
         raise UsageError("no parameter of the vehicle is known")
-    table = set_maker(component, f"link {target.link.name}")(list(component.params.values()))
-    complete = component.count is not None and len(component.params) >= component.count
+    table = set_maker(component, f"link {target.link.name}")(list(shown.params.values()))
+    complete = shown.count is not None and len(shown.params) >= shown.count
     kept = await hub.read_cache(
         lambda cache: cache.store_snapshot(
             component.identity,
             component.component,
             table,
             reason=body.reason,
-            hash=component.hash,
+            hash=shown.hash,
             complete=complete,
+            extended=ext,
         )
     )
     return {"id": kept}
@@ -257,11 +257,10 @@ async def history(
 ) -> Response:
     """Return the newest changes of values, the newest last."""
     owner = hub.target(system, component, link).component.identity.key if key is None else key
-    if ext:
-        changes = await hub.read_cache(lambda cache: cache.ext_history(owner, component, name, limit, since))
-        return JSONResponse(documents.ext_history(changes))
-    entries = await hub.read_cache(lambda cache: cache.history(owner, component, name, limit, since))
-    return JSONResponse(documents.history(entries))
+    entries = await hub.read_cache(
+        lambda cache: cache.history(owner, component, name, limit, since, extended=ext)
+    )
+    return JSONResponse(documents.ext_history(entries) if ext else documents.history(entries))
 
 
 async def _wanted(hub: Hub, target: Target, body: PlanRequest) -> ParamSet:

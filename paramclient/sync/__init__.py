@@ -19,22 +19,18 @@ from __future__ import annotations
 
 from paramclient import diagnosis, metadata, provision
 from paramclient.client.events import (
-    Contested,
     Discovered,
     Event,
     Found,
     Lost,
     Rebooted,
     Resynced,
-    Uncontested,
 )
 from paramclient.provision.fleet import Wanted
 from paramclient.sync.proxy import (
     Changes,
     Component,
     Events,
-    ExtChanges,
-    ExtParams,
     Ftp,
     ParamClient,
     blocking,
@@ -43,19 +39,15 @@ from paramclient.sync.proxy import (
 __all__ = [
     "Changes",
     "Component",
-    "Contested",
     "Discovered",
     "Event",
     "Events",
-    "ExtChanges",
-    "ExtParams",
     "Found",
     "Ftp",
     "Lost",
     "ParamClient",
     "Rebooted",
     "Resynced",
-    "Uncontested",
     "Wanted",
     "apply",
     "apply_all",
