@@ -14,15 +14,15 @@ from unittest import mock
 
 import anyio
 import anyio.to_thread
+from paramclient.protocol.component import ComponentMachine
 
 from paramclient import Component, Param, ParamClient, ParamType
 from paramclient.client import cache_writer
 from paramclient.client.worker_thread import Worker
 from paramclient.errors import LinkError
 from paramclient.links import Peer, SimLink
-from paramclient.protocol import wire
-from paramclient.protocol.component import ComponentMachine
 from paramclient.sim import Endpoint, GenericVehicle, PX4Vehicle, SimParam
+from paramclient.wire import frames, messages
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -186,11 +186,11 @@ class Tap:
     """
 
     def __init__(self, endpoint: Endpoint) -> None:
-        self.received: list[tuple[float, wire.Frame, wire.Message]] = []
+        self.received: list[tuple[float, frames.Frame, messages.Message]] = []
         self.is_deaf = False
         self.is_mute = False
         self._endpoint = endpoint
-        self._framer = wire.Framer(wire.DECODED_IDS, stream=False)
+        self._framer = frames.Framer(messages.DECODED_IDS, stream=False)
 
     def messages(self, kind: type[T]) -> list[T]:
         """What the station has sent, of one kind."""
@@ -198,7 +198,7 @@ class Tap:
 
     def receive(self, data: bytes, now: float) -> None:
         for frame in self._framer.receive(data):
-            message = wire.decode(frame)
+            message = messages.decode(frame)
             assert message is not None
             self.received.append((now, frame, message))
         if not self.is_deaf:

@@ -9,9 +9,9 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
+from paramclient.protocol.params import reads, table
 
 from paramclient.protocol import component
-from paramclient.protocol.params import reads, table
 
 ROOT = Path(__file__).parent.parent
 FUZZ = ROOT / "fuzz"

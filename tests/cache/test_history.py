@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from paramclient.model.ext_params import ExtParam, ExtParamType
+from paramclient.model.ext_paramset import ExtParamSet
 
 from paramclient.cache import SNAPSHOTS, ParamCache, StoredParam, TableState, history
 from paramclient.errors import CacheError, UnknownVehicle, UsageError
-from paramclient.model.ext_params import ExtParam, ExtParamType
-from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Param, ParamType
 from tests.cache.conftest import Open

@@ -10,10 +10,10 @@ from random import Random
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from paramclient.model.ext_params import ExtParam, ExtParamType
 
 from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.errors import CacheError, UsageError
-from paramclient.model.ext_params import ExtParam, ExtParamType
 from paramclient.model.identity import Identity
 from paramclient.model.px4_hash import hash_params
 from paramclient.model.values import Param, ParamType, Trust, from_bits

@@ -31,9 +31,9 @@ from paramclient.cli.output import printable
 from paramclient.errors import ClientClosed, ParamClientError
 from paramclient.links import Peer, SimLink
 from paramclient.model.notation import hash_text
-from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.sim.param_table import Entry
+from paramclient.wire import frames, messages
 from tests.commands import Command, Outcome, Put, behind, in_process, leaping, strict
 from tests.shell import in_simulated_time
 from tests.simulated_on_udp import flying
@@ -414,14 +414,14 @@ class Unchanging(GenericVehicle):
 class Mistyped(GenericVehicle):
     """A vehicle that reports a wrong type for every set."""
 
-    def _on_set(self, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
+    def _on_set(self, request: messages.ParamSet, sender: frames.Frame) -> None:
         self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
 
 
 class SilentOnParams(GenericVehicle):
     """A vehicle with heartbeats that answers no parameter requests."""
 
-    def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
+    def _on_read(self, request: messages.ParamRequestRead, sender: frames.Frame) -> None:
         pass
 
     _on_set = _on_read  # type: ignore[assignment]  # the message is ignored
@@ -836,7 +836,7 @@ class Modem(PX4Vehicle):
         frames = super().data_to_send()
         if frames:
             status = b"\x03\x00\x02\x00\xc8\xbe\x60\x28\x2a"
-            frames.append(wire.build_frame(109, status, system=51, component=68, sequence=0))
+            frames.append(frames.build_frame(109, status, system=51, component=68, sequence=0))
             frames.append(b"\xfd\x01\x00\x00\x00\x33\x44\xff\xff\x7f" + b"abc")
         return frames
 
@@ -1207,7 +1207,7 @@ def test_every_error_has_an_exit_code() -> None:
 
 def test_signal_handlers_are_restored(command: Command, put: Callable[[Endpoint], str]) -> None:
     class Interrupting(SilentOnParams):
-        def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
+        def _on_read(self, request: messages.ParamRequestRead, sender: frames.Frame) -> None:
             signal.raise_signal(signal.SIGTERM)
 
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
@@ -1277,15 +1277,17 @@ class RemoteEnd:
         self._socket.settimeout(TIMEOUT)
         self._socket.connect(("127.0.0.1", int(url.rpartition(":")[2])))
 
-    def ask(self, *requests: wire.Message) -> None:
+    def ask(self, *requests: messages.Message) -> None:
         for request in requests:
-            self._socket.send(wire.encode(request, system=255, component=190, sequence=0))
+            self._socket.send(messages.encode(request, system=255, component=190, sequence=0))
 
-    def until(self, is_last: Callable[[wire.Frame, wire.Message | None], bool]) -> list[wire.Message | None]:
-        messages: list[wire.Message | None] = []
+    def until(
+        self, is_last: Callable[[frames.Frame, messages.Message | None], bool]
+    ) -> list[messages.Message | None]:
+        messages: list[messages.Message | None] = []
         while True:
-            [frame] = wire.Framer(stream=False).receive(self._socket.recv(300))
-            messages.append(wire.decode(frame))
+            [frame] = frames.Framer(stream=False).receive(self._socket.recv(300))
+            messages.append(messages.decode(frame))
             if is_last(frame, messages[-1]):
                 return messages
 
@@ -1300,46 +1302,46 @@ def test_sim_with_dead_indices_and_lists_that_stop() -> None:
     misfortunes = ["--dead", "3", "--dead", "ATT_EN", "--list-stops-at", 10, "--list-stops", "inf"]
     with simulated("px4", *map(str, misfortunes)) as url, RemoteEnd(url) as far:
         dead = PX4Vehicle().param("ATT_EN").index
-        far.ask(wire.ParamRequestList(1, 1))
+        far.ask(messages.ParamRequestList(1, 1))
         for _ in range(2):
-            found = far.until(lambda _, message: isinstance(message, wire.Heartbeat))
-            listed = [each.param_index for each in found if isinstance(each, wire.ParamValue)][1:]
+            found = far.until(lambda _, message: isinstance(message, messages.Heartbeat))
+            listed = [each.param_index for each in found if isinstance(each, messages.ParamValue)][1:]
             if listed:
                 break
         assert listed == [index for index in range(12) if index not in (3, dead)]
-        far.ask(wire.ParamRequestRead(1, 1, "", 3), wire.ParamRequestRead(1, 1, "", 100))
-        *_, answer = far.until(lambda _, message: isinstance(message, wire.ParamValue))
-        assert isinstance(answer, wire.ParamValue)
+        far.ask(messages.ParamRequestRead(1, 1, "", 3), messages.ParamRequestRead(1, 1, "", 100))
+        *_, answer = far.until(lambda _, message: isinstance(message, messages.ParamValue))
+        assert isinstance(answer, messages.ParamValue)
         assert answer.param_index == 100
 
 
 def test_sim_that_boots_and_reboots_in_mid_stream() -> None:
-    def says(status: int) -> Callable[[wire.Frame, wire.Message | None], bool]:
-        return lambda _, message: isinstance(message, wire.Heartbeat) and message.system_status == status
+    def says(status: int) -> Callable[[frames.Frame, messages.Message | None], bool]:
+        return lambda _, message: isinstance(message, messages.Heartbeat) and message.system_status == status
 
     misfortunes = ["--boot-time", "1", "--reboot-at", "50", "--reboot-down", "0.2"]
     with simulated("ardupilot", *misfortunes) as url, RemoteEnd(url) as far:
-        far.ask(wire.Heartbeat(6, 8))
+        far.ask(messages.Heartbeat(6, 8))
         far.until(says(3))
-        far.ask(wire.ParamRequestList(1, 1))
-        found = far.until(says(wire.MAV_STATE_BOOT))
-        assert sum(isinstance(each, wire.ParamValue) for each in found) <= 50
+        far.ask(messages.ParamRequestList(1, 1))
+        found = far.until(says(messages.MAV_STATE_BOOT))
+        assert sum(isinstance(each, messages.ParamValue) for each in found) <= 50
 
 
 def test_sim_on_a_satellite_link_beside_another_station() -> None:
     misfortunes = ["--system", "7", "--high-latency", "--other-list-every", "0.2"]
     with simulated("px4", *misfortunes) as url, RemoteEnd(url) as far:
-        far.ask(wire.Heartbeat(6, 8))
+        far.ask(messages.Heartbeat(6, 8))
         received = set()
 
-        def is_both(frame: wire.Frame, message: wire.Message | None) -> bool:
-            if isinstance(message, wire.ParamRequestList):
-                assert message == wire.ParamRequestList(7, 1)
+        def is_both(frame: frames.Frame, message: messages.Message | None) -> bool:
+            if isinstance(message, messages.ParamRequestList):
+                assert message == messages.ParamRequestList(7, 1)
             received.add((frame.system, type(message)))
-            return {(7, wire.HighLatency2), (254, wire.ParamRequestList)} <= received
+            return {(7, messages.HighLatency2), (254, messages.ParamRequestList)} <= received
 
         far.until(is_both)
-        assert {kind for system, kind in received if system == 7} == {wire.HighLatency2}
+        assert {kind for system, kind in received if system == 7} == {messages.HighLatency2}
 
 
 def test_a_closed_pipe_ends_the_command_silently(warm: Path) -> None:
@@ -1458,12 +1460,12 @@ class Hostile:
         return [self._renamed(data) for data in self.vehicle.data_to_send()]
 
     def _renamed(self, data: bytes) -> bytes:
-        [frame] = wire.Framer(stream=False).receive(data)
-        message = wire.decode(frame)
-        if isinstance(message, wire.ParamValue):
+        [frame] = frames.Framer(stream=False).receive(data)
+        message = messages.decode(frame)
+        if isinstance(message, messages.ParamValue):
             name = self.NAMES["ABCD".index(message.param_id)]
             message = message._replace(param_id=name)
-            return wire.encode(message, system=1, component=1, sequence=frame.sequence)
+            return messages.encode(message, system=1, component=1, sequence=frame.sequence)
         return data
 
 
@@ -1573,28 +1575,30 @@ def test_sim_sends_first_on_udpout() -> None:
         link = f"udpout:127.0.0.1:{free.getsockname()[1]}"
         with process("sim", "px4", "--link", link) as started:
             assert line_of(started.stdout) == f"px4 1/1 speaks to {link}; Ctrl-C ends it\n"
-            [heartbeat] = wire.Framer(stream=False).receive(free.recv(300))
+            [heartbeat] = frames.Framer(stream=False).receive(free.recv(300))
     assert (heartbeat.message_id, heartbeat.system) == (0, 1)
 
 
 def test_sim_on_a_byte_stream_joins_split_frames() -> None:
-    request = wire.encode(wire.ParamRequestRead(1, 1, "MC_ROLL_P"), system=255, component=190, sequence=0)
-    framer = wire.Framer()
-    messages: list[wire.Message | None] = []
+    request = messages.encode(
+        messages.ParamRequestRead(1, 1, "MC_ROLL_P"), system=255, component=190, sequence=0
+    )
+    framer = frames.Framer()
+    messages: list[messages.Message | None] = []
     with process("sim", "px4", "--link", "tcpin:127.0.0.1:0") as started:
         found = re.search(r":([0-9]+);", line_of(started.stdout))
         assert found is not None
         with socket.create_connection(("127.0.0.1", int(found[1])), TIMEOUT) as connection:
 
             def receive(heartbeats: int) -> None:
-                while sum(isinstance(each, wire.Heartbeat) for each in messages) < heartbeats:
-                    messages.extend(map(wire.decode, framer.receive(connection.recv(4096))))
+                while sum(isinstance(each, messages.Heartbeat) for each in messages) < heartbeats:
+                    messages.extend(map(messages.decode, framer.receive(connection.recv(4096))))
 
             connection.sendall(request[:9])
             receive(2)  # the first half has been read by then
             connection.sendall(request[9:])
             receive(4)
-    values = [each.param_id for each in messages if isinstance(each, wire.ParamValue)]
+    values = [each.param_id for each in messages if isinstance(each, messages.ParamValue)]
     assert values == ["MC_ROLL_P"]
 
 

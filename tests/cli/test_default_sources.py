@@ -10,8 +10,8 @@ import pytest
 
 from paramclient.files import read_file
 from paramclient.model.values import ParamType
-from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
+from paramclient.wire import messages
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import Tap
 
@@ -68,7 +68,7 @@ def test_it_is_remembered_for_the_firmware(command: Command, put: Put) -> None:
     assert list(done.json["params"]) == ["MC_ROLL_P"]
     param = done.json["params"]["MC_ROLL_P"]
     assert (param["default"], param["default_source"]) == (4, "metadata")
-    assert not tap.messages(wire.FileTransfer)
+    assert not tap.messages(messages.FileTransfer)
     everything = command("fetch", put(quad()), "--json").json["params"]
     assert {name: each["default_source"] for name, each in everything.items()} == dict.fromkeys(
         TABLE, "metadata"
@@ -79,7 +79,7 @@ def test_without_changed_nothing_is_requested_for_defaults(command: Command, put
     tap = Tap(quad())
     done = command("fetch", put(tap), "--json")
     assert "default" not in done.json["params"]["MC_ROLL_P"]
-    assert not tap.messages(wire.FileTransfer)
+    assert not tap.messages(messages.FileTransfer)
 
 
 def test_the_default_of_the_vehicle_has_priority(command: Command, put: Put, tmp_path: Path) -> None:

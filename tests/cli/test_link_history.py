@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 
 import pytest
+from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.stats.traffic import Traffic
 
 from paramclient.cli.block_characters import ASCII, BLOCKS, Piece
 from paramclient.cli.link import SCALES
@@ -18,9 +20,7 @@ from paramclient.cli.link_history import (
     sparkline,
 )
 from paramclient.cli.output import wrapped
-from paramclient.protocol.requests.round_trip import RoundTrip
-from paramclient.protocol.stats.traffic import Traffic
-from paramclient.protocol.wire import Heartbeat, encode
+from paramclient.wire.messages import Heartbeat, encode
 
 ADDRESS = (1, 1)
 UNKNOWN = (None,) * HISTORY_LENGTH

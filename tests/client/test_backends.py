@@ -38,11 +38,11 @@ from paramclient.client import reconnect_delays
 from paramclient.errors import LinkError
 from paramclient.links import Link, create_link, serve_endpoint
 from paramclient.metadata import metadata_of
-from paramclient.protocol import wire
-from paramclient.protocol.ftp.packets import Opcode, Packet
-from paramclient.protocol.vehicle_selection import LOOK_TIME
+from paramclient.protocol.ftp import Opcode, Packet
+from paramclient.protocol.selection import LOOK_TIME
 from paramclient.provision import apply, prepare, restore, verify
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, Vehicle
+from paramclient.wire import messages
 from tests.cable import TIMEOUT, Cable
 from tests.shell import FlakyLink, Tap, a_client, bits, generic, residue, small_px4
 
@@ -416,7 +416,7 @@ async def test_a_scope_around_a_client_has_the_file_closed_before_it_ends() -> N
         assert scope.cancelled_caught
         assert not vehicle.open_files
         assert client.components[1, 1].core.machine.files.is_idle, "the acknowledgement was awaited"
-        *_, last = tap.messages(wire.FileTransfer)
+        *_, last = tap.messages(messages.FileTransfer)
         assert Packet.unpack(last.payload).opcode == Opcode.TERMINATE_SESSION
         async with a_client(tap) as client:
             again = await (await client.component()).fetch_all()

@@ -33,9 +33,9 @@ from paramclient.cache import CachedComponent
 from paramclient.client import cache_writer
 from paramclient.client import component_core as component_module
 from paramclient.model.paramset import ParamSet
-from paramclient.protocol import wire
 from paramclient.provision import apply
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
+from paramclient.wire import frames, messages
 from tests.caches import changes as history_of
 from tests.caches import full_disk, kill_when, read_only, rubbish, set_aside
 from tests.shell import (
@@ -125,9 +125,9 @@ async def test_an_unchanged_vehicle_is_not_downloaded_again(
         )
         await component.refreshed()
         assert trusts(component, volatile) == {Trust.LIVE}
-    reads = [message.param_id for message in tap.messages(wire.ParamRequestRead)]
-    assert sorted(reads) == sorted([wire.HASH_CHECK, *volatile])
-    assert not tap.messages(wire.ParamRequestList)
+    reads = [message.param_id for message in tap.messages(messages.ParamRequestRead)]
+    assert sorted(reads) == sorted([messages.HASH_CHECK, *volatile])
+    assert not tap.messages(messages.ParamRequestList)
     assert kept(path) == bits(vehicle.params)
 
 
@@ -279,13 +279,15 @@ async def test_a_vehicle_without_a_hash_is_shown_from_the_cache_and_downloaded(p
         assert trusts(component) == {Trust.CACHED}
         assert (await component.fetch_all()).source == "stream"
         assert trusts(component) == {Trust.LIVE}
-    assert not [each for each in tap.messages(wire.ParamRequestRead) if each.param_id == wire.HASH_CHECK]
+    assert not [
+        each for each in tap.messages(messages.ParamRequestRead) if each.param_id == messages.HASH_CHECK
+    ]
 
 
 @in_simulated_time
 async def test_everyone_on_the_link_starts_from_the_cache(path: Path) -> None:
     vehicles = [small_px4(system=system) for system in (1, 2, 3)]
-    camera = generic(system=1, component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)
+    camera = generic(system=1, component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
     for source in ("stream", "cache"):
         async with ParamClient(Air([*vehicles, camera]), cache=path) as client:
             everything = await client.fetch_all()
@@ -303,17 +305,17 @@ async def test_everyone_on_the_link_starts_from_the_cache(path: Path) -> None:
 class Reticent(PX4Vehicle):
     """It can ignore messages of some kinds."""
 
-    unanswered: tuple[type[wire.Message], ...] = ()
+    unanswered: tuple[type[messages.Message], ...] = ()
 
-    def _take(self, frame: wire.Frame) -> None:
-        if not isinstance(wire.decode(frame), self.unanswered):
+    def _take(self, frame: frames.Frame) -> None:
+        if not isinstance(messages.decode(frame), self.unanswered):
             super()._take(frame)
 
 
-PARAMETER_REQUESTS = (wire.ParamRequestRead, wire.ParamRequestList)
+PARAMETER_REQUESTS = (messages.ParamRequestRead, messages.ParamRequestList)
 
 
-@pytest.mark.parametrize("unanswered", [PARAMETER_REQUESTS, (*PARAMETER_REQUESTS, wire.CommandLong)])
+@pytest.mark.parametrize("unanswered", [PARAMETER_REQUESTS, (*PARAMETER_REQUESTS, messages.CommandLong)])
 @in_simulated_time
 async def test_a_silent_component_with_a_cached_table_delays_no_other_component(
     path: Path, unanswered: Any
@@ -404,7 +406,7 @@ async def test_another_vehicle_takes_the_place_while_the_cache_is_read(path: Pat
     await session(small_px4(uid=0xA), path)
     tap = Tap(small_px4(uid=0xA))
     token = anyio.lowlevel.current_token()
-    version = wire.encode(wire.AutopilotVersion(0, uid=0xB), system=1, component=1, sequence=0)
+    version = messages.encode(messages.AutopilotVersion(0, uid=0xB), system=1, component=1, sequence=0)
 
     class Interrupted(ParamCache):
         def load(self, key: str, component: int) -> CachedComponent | None:
@@ -428,7 +430,7 @@ async def test_another_vehicle_takes_the_place_while_the_cache_is_read(path: Pat
 @in_simulated_time
 async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
     vehicle = Reticent(table=VALUES)
-    vehicle.unanswered = (wire.CommandLong,)
+    vehicle.unanswered = (messages.CommandLong,)
     async with ParamClient(vehicle, cache=path) as client:
         began = anyio.current_time()
         component = await client.component()
@@ -460,7 +462,7 @@ async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
 async def test_an_identity_that_arrives_long_after_the_values(path: Path, fetched: bool) -> None:
     await session(PX4Vehicle(table=VALUES), path)
     changed = Reticent(table={**VALUES, "PARAM_01": 99}, not_in_use=["PARAM_02"])
-    changed.unanswered = (wire.CommandLong,)
+    changed.unanswered = (messages.CommandLong,)
     tap = Tap(changed)
     async with ParamClient(tap, cache=path) as client:
         component = await client.component()
@@ -646,8 +648,8 @@ async def test_a_change_by_another_station_is_in_the_history_with_its_address(pa
         component = await client.component()
         await component.fetch_all()
         await asyncio.sleep(1.0)
-        message = wire.ParamSetMessage(1, 1, "PARAM_01", (55).to_bytes(4, "little"), 6)
-        radio.other = [wire.encode(message, system=254, component=190, sequence=0)]
+        message = messages.ParamSet(1, 1, "PARAM_01", (55).to_bytes(4, "little"), 6)
+        radio.other = [messages.encode(message, system=254, component=190, sequence=0)]
         await anext(component.changes())
         await component.set("PARAM_02", 22)
         vehicle.set_param("PARAM_04", 44)
@@ -964,11 +966,11 @@ async def test_a_vehicle_without_the_parameter_file_is_remembered_for_its_firmwa
     assert (first.source, first.complete) == ("stream", True)
     assert "as a list instead of a file" in first.notes[0]
     assert said(path)[1] is False
-    assert requested.messages(wire.FileTransfer)
+    assert requested.messages(messages.FileTransfer)
     requested.received.clear()
     second = await session(requested, path)
     assert (second.source, second.notes) == ("stream", ())
-    assert not requested.messages(wire.FileTransfer)
+    assert not requested.messages(messages.FileTransfer)
     vehicle._ftp, server.params = server, rows
     assert (await session(requested, path)).source == "stream", "nothing was requested"
     vehicle._version = replace(vehicle._version, flight_sw_version=67502081)

@@ -17,6 +17,7 @@ from typing import Any
 import anyio
 import anyio.abc
 import pytest
+from paramclient.client.component_core import IDENTITY_TIMEOUT
 
 from paramclient import (
     Change,
@@ -36,11 +37,10 @@ from paramclient import (
     ValueNotApplied,
 )
 from paramclient.client import arguments, link_task, reconnect_delays
-from paramclient.client.component_core import IDENTITY_TIMEOUT
 from paramclient.links import Peer, create_link, serve_endpoint
-from paramclient.protocol import wire
 from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
+from paramclient.wire import frames, messages
 from tests.shell import (
     TIMEOUT,
     VALUES,
@@ -345,12 +345,14 @@ async def test_the_heartbeat_of_a_ground_station_goes_out_every_second() -> None
     async with a_client(tap, system=200, component=25):
         await asyncio.sleep(5.5)
     beats = [
-        (when, frame, message) for when, frame, message in tap.received if isinstance(message, wire.Heartbeat)
+        (when, frame, message)
+        for when, frame, message in tap.received
+        if isinstance(message, messages.Heartbeat)
     ]
     assert [round(when - beats[0][0], 3) for when, _, _ in beats] == [0, 1, 2, 3, 4, 5]
     for _, frame, message in beats:
         assert (frame.system, frame.component) == (200, 25)
-        assert (message.type, message.autopilot) == (wire.MAV_TYPE_GCS, wire.MAV_AUTOPILOT_INVALID)
+        assert (message.type, message.autopilot) == (messages.MAV_TYPE_GCS, messages.MAV_AUTOPILOT_INVALID)
 
 
 @in_simulated_time
@@ -402,7 +404,7 @@ async def test_bytes_are_counted_both_ways() -> None:
 
 @in_simulated_time
 async def test_the_first_autopilot_is_the_component() -> None:
-    camera = generic(component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)
+    camera = generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
     async with a_client(Air([camera, generic(system=7, component=1), generic(system=9)])) as client:
         component = await client.component()
         assert (component.system, component.component) == (7, 1)
@@ -431,8 +433,8 @@ async def test_a_component_that_is_heard_before_its_heartbeat(monkeypatch: pytes
     vehicle = small_px4()
     answer = vehicle._on_command
 
-    def without_heartbeat(request: wire.CommandLong, sender: wire.Frame) -> None:
-        if request.params[0] != wire.HEARTBEAT_ID:
+    def without_heartbeat(request: messages.CommandLong, sender: frames.Frame) -> None:
+        if request.params[0] != messages.message_id(messages.Heartbeat):
             answer(request, sender)
 
     monkeypatch.setattr(vehicle, "_on_command", without_heartbeat)
@@ -463,8 +465,8 @@ class Mute:
     """Sends one PARAM_VALUE at the beginning, and nothing else ever."""
 
     def __init__(self) -> None:
-        value = wire.ParamValue("A", bytes(4), 6, 1, 0)
-        self.out = [wire.encode(value, system=1, component=7, sequence=0)]
+        value = messages.ParamValue("A", bytes(4), 6, 1, 0)
+        self.out = [messages.encode(value, system=1, component=7, sequence=0)]
 
     def receive(self, data: bytes, now: float) -> None:
         """Take it and do nothing."""
@@ -491,7 +493,7 @@ class Mute:
     ],
 )
 async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str) -> None:
-    async with a_client(generic(autopilot=wire.MAV_AUTOPILOT_INVALID)) as client:
+    async with a_client(generic(autopilot=messages.MAV_AUTOPILOT_INVALID)) as client:
         with pytest.raises(NoReply) as caught:
             await client.component(**wanted, timeout=2.5)
         error = caught.value
@@ -504,7 +506,7 @@ async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str)
 
 @in_simulated_time
 async def test_a_component_that_is_not_there_and_what_was_received_instead() -> None:
-    async with a_client(generic(autopilot=wire.MAV_AUTOPILOT_INVALID)) as client:
+    async with a_client(generic(autopilot=messages.MAV_AUTOPILOT_INVALID)) as client:
         with pytest.raises(NoReply, match=rf"Heard on {re.escape(client.link.name)} so far: 1/1 generic\.$"):
             await client.component(timeout=2.5)
 
@@ -587,7 +589,7 @@ async def test_writes_to_one_name_are_done_in_order_and_others_beside() -> None:
         assert anyio.current_time() - began < 0.65, "three round trips, and not six"
     sent = [
         (message.param_id, int.from_bytes(message.raw, "little"))
-        for message in tap.messages(wire.ParamSetMessage)
+        for message in tap.messages(messages.ParamSet)
     ]
     assert [value for name, value in sent if name == "PARAM_01"] == [10, 11, 12]
     assert vehicle.param("PARAM_01").value == 12
@@ -602,14 +604,14 @@ async def test_a_write_learns_the_type_first() -> None:
         assert (result.status, result.requested, result.actual, result.attempts) == ("accepted", 2, 2.0, 1)
         assert result.param == await component.get("PARAM_03")
         await component.set("PARAM_03", 3)
-    assert [message.param_type for message in tap.messages(wire.ParamSetMessage)] == [ParamType.REAL32] * 2
-    assert len(tap.messages(wire.ParamRequestRead)) - len(reads_of_hash(tap)) == 2, (
+    assert [message.param_type for message in tap.messages(messages.ParamSet)] == [ParamType.REAL32] * 2
+    assert len(tap.messages(messages.ParamRequestRead)) - len(reads_of_hash(tap)) == 2, (
         "once to learn, once to get"
     )
 
 
-def reads_of_hash(tap: Tap) -> list[wire.ParamRequestRead]:
-    return [each for each in tap.messages(wire.ParamRequestRead) if each.param_id == wire.HASH_CHECK]
+def reads_of_hash(tap: Tap) -> list[messages.ParamRequestRead]:
+    return [each for each in tap.messages(messages.ParamRequestRead) if each.param_id == messages.HASH_CHECK]
 
 
 @in_simulated_time
@@ -663,9 +665,9 @@ class Stubborn(GenericVehicle):
 class Retyping(GenericVehicle):
     """It calls its parameters REAL32 when they are read, and INT32 when they are written."""
 
-    def _on_set(self, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
+    def _on_set(self, request: messages.ParamSet, sender: frames.Frame) -> None:
         kind = ParamType.REAL32 if request.param_type == ParamType.INT32 else ParamType.INT32
-        self._send(wire.ParamValue(request.param_id, request.raw, kind, 24, 1))
+        self._send(messages.ParamValue(request.param_id, request.raw, kind, 24, 1))
 
 
 @in_simulated_time
@@ -729,7 +731,7 @@ async def test_a_value_that_turns_out_not_to_fit_is_not_written() -> None:
         component = await client.component()
         with pytest.raises(UsageError):
             await component.set("PARAM_01", 1.5)
-        assert not tap.messages(wire.ParamSetMessage)
+        assert not tap.messages(messages.ParamSet)
 
 
 # Time-outs
@@ -839,7 +841,7 @@ async def test_a_first_fetch_waits_to_hear_whether_there_is_a_file(refresh: bool
 @in_simulated_time
 async def test_a_first_fetch_does_not_wait_for_long_to_hear_that() -> None:
     class Unknown(ArduPilotVehicle):
-        def _on_command(self, request: wire.CommandLong, sender: wire.Frame) -> None:
+        def _on_command(self, request: messages.CommandLong, sender: frames.Frame) -> None:
             """It never says who it is."""
 
     async with a_client(Unknown()) as client:
@@ -895,7 +897,7 @@ async def test_several_vehicles_are_fetched_side_by_side() -> None:
     vehicles: dict[tuple[int, int], Any] = {
         (1, 1): small_px4(period=0.1, burst=1),
         (1, 100): generic(
-            component=100, autopilot=wire.MAV_AUTOPILOT_INVALID, table={"ZOOM": 1, "FOCUS": 2.5}
+            component=100, autopilot=messages.MAV_AUTOPILOT_INVALID, table={"ZOOM": 1, "FOCUS": 2.5}
         ),
         (2, 1): generic(system=2, table={"OTHER": 7}),
         (3, 1): ArduPilotVehicle(system=3),
@@ -914,22 +916,22 @@ async def test_several_vehicles_are_fetched_side_by_side() -> None:
 
 @in_simulated_time
 async def test_one_request_is_enough_for_all_components_of_a_system() -> None:
-    camera = generic(component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)
+    camera = generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
     tap = Tap(Air([generic(), camera]))
     async with a_client(tap) as client:
         await client.component()
         both = await client.fetch_all(1)
         assert both.results.keys() == {(1, 1), (1, 100)}
         assert both.complete
-    assert [(each.target_system, each.target_component) for each in tap.messages(wire.ParamRequestList)] == [
-        (1, 0)
-    ]
+    assert [
+        (each.target_system, each.target_component) for each in tap.messages(messages.ParamRequestList)
+    ] == [(1, 0)]
 
 
 @in_simulated_time
 async def test_a_fetch_under_way_is_not_begun_again_for_all_components() -> None:
     vehicle = generic(burst=1, period=0.1)
-    camera = generic(component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)
+    camera = generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
     async with a_client(Air([vehicle, camera])) as client:
         component = await client.component()
         one = asyncio.create_task(component.fetch_all())
@@ -943,12 +945,12 @@ async def test_a_fetch_under_way_is_not_begun_again_for_all_components() -> None
 class Silent(GenericVehicle):
     """A component that sends heartbeats and nothing else."""
 
-    def _take(self, frame: wire.Frame) -> None:
+    def _take(self, frame: frames.Frame) -> None:
         return
 
 
 @in_simulated_time
-@pytest.mark.parametrize("autopilot", [wire.MAV_AUTOPILOT_GENERIC, wire.MAV_AUTOPILOT_INVALID])
+@pytest.mark.parametrize("autopilot", [messages.MAV_AUTOPILOT_GENERIC, messages.MAV_AUTOPILOT_INVALID])
 async def test_a_silent_component_delays_no_other_component(autopilot: int) -> None:
     silent = Silent(VALUES, component=100, autopilot=autopilot), Silent(VALUES, system=2, autopilot=autopilot)
     async with a_client(Air([*silent, generic()])) as client:
@@ -979,7 +981,7 @@ async def test_fetch_all_includes_a_vehicle_that_is_heard_late() -> None:
 
 @in_simulated_time
 async def test_a_link_without_an_autopilot_can_be_fetched() -> None:
-    async with a_client(generic(component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)) as client:
+    async with a_client(generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)) as client:
         assert (await client.fetch_all()).results.keys() == {(1, 100)}
         assert (await client.fetch_all(1)).results.keys() == {(1, 100)}
         with pytest.raises(NoReply, match="system 2"):
@@ -991,14 +993,14 @@ async def test_no_parameters_are_requested_from_a_ground_station() -> None:
     class Station(Silent):
         def __init__(self) -> None:
             super().__init__(VALUES, system=254, component=190)
-            self._heartbeat = wire.Heartbeat(wire.MAV_TYPE_GCS, wire.MAV_AUTOPILOT_INVALID)
+            self._heartbeat = messages.Heartbeat(messages.MAV_TYPE_GCS, messages.MAV_AUTOPILOT_INVALID)
 
     tap = Tap(Air([Station(), generic()]))
     async with a_client(tap) as client:
         everything = await client.fetch_all()
         assert everything.results.keys() == {(1, 1)}
         assert not everything.silent
-    assert not [each for each in tap.messages(wire.ParamRequestList) if each.target_system == 254]
+    assert not [each for each in tap.messages(messages.ParamRequestList) if each.target_system == 254]
 
 
 @in_simulated_time
@@ -1121,8 +1123,8 @@ async def test_changes_by_other_stations_are_distinguished_from_the_vehicles_own
         component = await client.component()
         await component.fetch_all()
         changes = component.changes()
-        message = wire.ParamSetMessage(1, 1, "PARAM_01", (55).to_bytes(4, "little"), ParamType.INT32)
-        radio.other.append(wire.encode(message, system=254, component=190, sequence=0))
+        message = messages.ParamSet(1, 1, "PARAM_01", (55).to_bytes(4, "little"), ParamType.INT32)
+        radio.other.append(messages.encode(message, system=254, component=190, sequence=0))
         change = await anext(changes)
         assert (change.name, change.by) == ("PARAM_01", "station 254/190")
         vehicle.set_param("PARAM_02", 66)
@@ -1352,7 +1354,7 @@ class Chatter(Tap):
         while self._next_at <= now:
             self._count += 1
             payload = self._count.to_bytes(4, "little").rjust(28, b"\1")
-            self.say(wire.build_frame(30, payload, system=1, component=1, sequence=0))
+            self.say(frames.build_frame(30, payload, system=1, component=1, sequence=0))
             self._next_at += self._interval
 
     def next_deadline(self) -> float:
@@ -1435,8 +1437,8 @@ async def test_a_change_waits_for_the_end_of_a_rest_at_the_most() -> None:
         for value in range(20):
             await asyncio.sleep(0.0137)
             began = anyio.current_time()
-            message = wire.ParamValue("PARAM_01", bytes((value + 1, 0, 0, 0)), ParamType.INT32, 24, 1)
-            vehicle.say(wire.encode(message, system=1, component=1, sequence=0))
+            message = messages.ParamValue("PARAM_01", bytes((value + 1, 0, 0, 0)), ParamType.INT32, 24, 1)
+            vehicle.say(messages.encode(message, system=1, component=1, sequence=0))
             with anyio.fail_after(1.0):
                 assert (await anext(changes)).name == "PARAM_01"
             assert anyio.current_time() - began < link_task.READ_PAUSE + 0.001
@@ -1464,7 +1466,7 @@ async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyP
         async with a_client(vehicle) as client:
             component = await known_component(client)
             vehicle.received.clear()
-            await until(lambda: vehicle.messages(wire.Heartbeat))
+            await until(lambda: vehicle.messages(messages.Heartbeat))
             await asyncio.sleep(0.05)
             began = anyio.current_time()
             await CALLS[call](client, component)

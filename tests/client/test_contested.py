@@ -10,6 +10,7 @@ from typing import Any
 
 import anyio
 import pytest
+from paramclient.protocol.vehicle.presence import LOST_AFTER
 
 from paramclient import (
     AmbiguousVehicle,
@@ -23,9 +24,8 @@ from paramclient import (
 from paramclient.client import cache_writer
 from paramclient.links import create_link, serve_endpoint
 from paramclient.links.udp import UdpIn
-from paramclient.protocol import wire
-from paramclient.protocol.vehicle.presence import LOST_AFTER
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
+from paramclient.wire import messages
 from tests.commands import Command, behind, in_process, leaping
 from tests.shell import Late, PeersLink, in_simulated_time, outcome, until
 from tests.simulation import param_value
@@ -202,7 +202,7 @@ class Reporting(Late):
         if self._on_at <= now < self._off_at and now >= self._report_at:
             self._report_at = now + 0.5
             value = param_value("A", 99.0, index=0, count=2)
-            self._out.append(wire.encode(value, system=1, component=1, sequence=0))
+            self._out.append(messages.encode(value, system=1, component=1, sequence=0))
 
     def next_deadline(self) -> float | None:
         deadline = super().next_deadline()

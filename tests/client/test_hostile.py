@@ -11,38 +11,39 @@ from unittest import mock
 
 import anyio
 import pytest
+from paramclient.protocol.ftp.blocks import Blocks
+from paramclient.protocol.params import change_origin as authors_room
+from paramclient.protocol.params import list_download as download_room
+from paramclient.protocol.params import sync as sync_room
+from paramclient.protocol.params import table as table_room
+from paramclient.protocol.params import value_check
+from paramclient.protocol.params.change_origin import Authors
+from paramclient.protocol.params.sync import SyncSettings
+from paramclient.protocol.params.table import NameQuota, Table
+from paramclient.protocol.requests.retry import INITIAL_TIMEOUT
+from paramclient.protocol.stats import traffic as traffic_room
+from paramclient.protocol.vehicle.presence import LOST_AFTER
 
 from paramclient import FileTransferError, NoReply, ParamCache, ParamClient
 from paramclient.cli import run as run_command
 from paramclient.cli import session as session_room
 from paramclient.client import cache_writer
 from paramclient.client import subscription as subscription_room
-from paramclient.client.subscription import Changes
+from paramclient.client.streams import Changes
 from paramclient.links import SimLink
 from paramclient.protocol import component as component_room
 from paramclient.protocol import station as station_room
-from paramclient.protocol.events import ComponentForgotten
+from paramclient.protocol.events import Change, ComponentForgotten
+from paramclient.protocol.ftp import DATA_SIZE_MAX
 from paramclient.protocol.ftp import blocks as blocks_room
 from paramclient.protocol.ftp import file_read as reading_room
 from paramclient.protocol.ftp import transfers as transfers_room
-from paramclient.protocol.ftp.blocks import Blocks
-from paramclient.protocol.ftp.packets import DATA_SIZE_MAX
-from paramclient.protocol.params import change_origin as authors_room
-from paramclient.protocol.params import list_download as download_room
-from paramclient.protocol.params import sync as sync_room
-from paramclient.protocol.params import table as table_room
-from paramclient.protocol.params import value_check
-from paramclient.protocol.params.change import Change
-from paramclient.protocol.params.change_origin import Authors
-from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.params.table import NameQuota, Table
-from paramclient.protocol.requests.retry import INITIAL_TIMEOUT
 from paramclient.protocol.station import Station
-from paramclient.protocol.stats import traffic as traffic_room
-from paramclient.protocol.vehicle.presence import LOST_AFTER
-from paramclient.protocol.wire import (
+from paramclient.sim import Air
+from paramclient.wire.messages import (
     NO_INDEX,
     PARAMETERS_MAX,
+    TEXTS_MAX,
     AutopilotVersion,
     Heartbeat,
     Message,
@@ -51,8 +52,6 @@ from paramclient.protocol.wire import (
     encode,
     text_of,
 )
-from paramclient.protocol.wire.codec import TEXTS_MAX
-from paramclient.sim import Air
 from tests.hostile_vehicle import ESCAPE, LIES, HostileVehicle
 from tests.shell import bits, generic, in_simulated_time, small_px4
 from tests.simulation import PEER, Simulation, known, listing_ardupilot, param_value

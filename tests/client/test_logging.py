@@ -11,13 +11,13 @@ from pathlib import Path
 
 import anyio
 import pytest
+from paramclient.protocol.stats.trace import LazyMessageText
 
 from paramclient import UnknownParameter
 from paramclient.cli import run
-from paramclient.protocol import wire
 from paramclient.protocol.station import Station
-from paramclient.protocol.stats.trace import LazyMessageText
 from paramclient.sim import Air
+from paramclient.wire import messages
 from tests.shell import FlakyLink, Tap, a_client, generic, in_simulated_time, small_px4
 
 WATCHED = "paramclient"
@@ -111,8 +111,8 @@ asyncio.run(main())
 def test_trace_lines_are_formatted_only_when_tracing_is_on() -> None:
     lines: list[tuple[object, ...]] = []
     station = Station(link="test", is_stream=False, trace=lambda *line: lines.append(line))
-    beat = wire.Heartbeat(2, wire.MAV_AUTOPILOT_PX4, system_status=4)
-    station.receive(wire.encode(beat, system=1, component=1, sequence=0), "peer", 0.0)
+    beat = messages.Heartbeat(2, messages.MAV_AUTOPILOT_PX4, system_status=4)
+    station.receive(messages.encode(beat, system=1, component=1, sequence=0), "peer", 0.0)
     assert [type(line[-1]) for line in lines] == [LazyMessageText]
     assert str(lines[0][-1]) == "COMMAND_LONG 512 (148)"
 
@@ -120,13 +120,16 @@ def test_trace_lines_are_formatted_only_when_tracing_is_on() -> None:
 @pytest.mark.parametrize(
     ("message", "words"),
     [
-        (wire.ParamRequestRead(1, 1, "A", -1), "PARAM_REQUEST_READ A"),
-        (wire.ParamRequestRead(1, 1, "", 17), "PARAM_REQUEST_READ 17"),
-        (wire.FileTransfer(0, 1, 1, bytes((0, 0, 0, 4)) + bytes(247)), "FILE_TRANSFER_PROTOCOL operation 4"),
-        (wire.StatusText(6, "secret"), "StatusText"),
+        (messages.ParamRequestRead(1, 1, "A", -1), "PARAM_REQUEST_READ A"),
+        (messages.ParamRequestRead(1, 1, "", 17), "PARAM_REQUEST_READ 17"),
+        (
+            messages.FileTransfer(0, 1, 1, bytes((0, 0, 0, 4)) + bytes(247)),
+            "FILE_TRANSFER_PROTOCOL operation 4",
+        ),
+        (messages.StatusText(6, "secret"), "StatusText"),
     ],
 )
-def test_messages_in_words(message: wire.Message, words: str) -> None:
+def test_messages_in_words(message: messages.Message, words: str) -> None:
     assert str(LazyMessageText(message)) == words
 
 
@@ -195,8 +198,8 @@ async def test_losses_are_counted_on_request() -> None:
 
 def test_damage_is_counted_over_all_peers_that_ever_were() -> None:
     station = Station(link="test", is_stream=True)
-    beat = wire.Heartbeat(2, wire.MAV_AUTOPILOT_PX4, system_status=4)
-    good = wire.encode(beat, system=1, component=1, sequence=0)
+    beat = messages.Heartbeat(2, messages.MAV_AUTOPILOT_PX4, system_status=4)
+    good = messages.encode(beat, system=1, component=1, sequence=0)
     bad = good[:-1] + bytes((good[-1] ^ 1,))
     for peer in range(300):
         station.receive(b"no" + bad + good, peer, 0.0)

@@ -13,6 +13,8 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.params.table import Table
 
 from paramclient import Param, ParamCache, ParamType
 from paramclient.cache import HistoryEntry
@@ -21,11 +23,9 @@ from paramclient.client.cache_writer import CacheWriter
 from paramclient.client.link_task import LinkTask
 from paramclient.links import Peer
 from paramclient.links.clock_offset import seconds_ahead
-from paramclient.protocol import wire
-from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.params.table import Table
 from paramclient.protocol.station import Station
-from paramclient.protocol.wire import NO_INDEX, AutopilotVersion, Heartbeat, Message, ParamValue
+from paramclient.wire import messages
+from paramclient.wire.messages import NO_INDEX, AutopilotVersion, Heartbeat, Message, ParamValue
 from tests.shell import a_client, in_simulated_time, simulated_time_loop, small_px4, until
 from tests.simulation import param_value
 
@@ -289,7 +289,7 @@ class Programs(RuleBasedStateMachine):
     def announce(self, message: Message, at: int) -> None:
         """Send a message: it arrives in one socket a little later than in the other one."""
         self.sequence = (self.sequence + 1) % 256
-        data = wire.encode(message, system=1, component=1, sequence=self.sequence)
+        data = messages.encode(message, system=1, component=1, sequence=self.sequence)
         for number, side in enumerate(self.sides):
             if at & 1 << number:
                 self.now += 1e-5

@@ -18,25 +18,25 @@ from typing import Any
 import anyio
 import anyio.lowlevel
 import pytest
+from paramclient.client.fetch_all import FleetFetch
+from paramclient.client.loop_scheduler import TURN_MAX
+from paramclient.client.suspend_detection import SUSPEND_MIN
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.params.fetch import Fetch
 
 from paramclient import ParamCache, ParamClient
 from paramclient.cache import CachedComponent
 from paramclient.client import link_task, loop_scheduler
-from paramclient.client.fetch_all import FleetFetch
 from paramclient.client.link_task import LOOP_LATENCY_MIN, TIMEOUT_DELAY_MAX, LinkTask
-from paramclient.client.loop_scheduler import TURN_MAX
-from paramclient.client.suspend_detection import SUSPEND_MIN
 from paramclient.errors import NoReply
 from paramclient.links import Peer
 from paramclient.model.values import ParamType
 from paramclient.protocol import scheduler, wire
 from paramclient.protocol import station as station_room
-from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentLost
-from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.station import Station
-from paramclient.protocol.wire import MAV_AUTOPILOT_PX4, Heartbeat
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, SimParam, Vehicle
+from paramclient.wire.messages import MAV_AUTOPILOT_PX4, Heartbeat
 from tests.shell import Tap, in_simulated_time, simulated_time_loop
 
 MANY = 250

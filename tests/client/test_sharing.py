@@ -13,14 +13,14 @@ from pathlib import Path
 
 import anyio
 import pytest
+from paramclient.protocol.params.fetch import Fetch
 
 from paramclient import ParamCache
 from paramclient.model.values import ParamType
-from paramclient.protocol import wire
-from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.station import Station
-from paramclient.protocol.wire import ParamRequestList
 from paramclient.sim import Air, OtherStation, PX4Vehicle, SimParam, Vehicle
+from paramclient.wire import messages
+from paramclient.wire.messages import ParamRequestList
 from tests.simulation import Simulation, listing_ardupilot
 
 Make = Callable[[], Vehicle]
@@ -104,7 +104,7 @@ def test_values_requested_by_another_station_fill_the_table(kind: str) -> None:
 def test_a_fetch_reads_what_a_stopped_list_of_another_station_lacks() -> None:
     world = Shared(PX4Vehicle(list_stops_at=500))
     world.meet()
-    message = wire.encode(ParamRequestList(1, 1), system=253, component=190, sequence=0)
+    message = messages.encode(ParamRequestList(1, 1), system=253, component=190, sequence=0)
     world.air.receive(message, world.now)
     began = world.now
     world.run(lambda: world.now >= began + 0.3)

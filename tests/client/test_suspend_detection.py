@@ -8,13 +8,13 @@ from collections.abc import Callable
 
 import anyio
 import pytest
+from paramclient.client.suspend_detection import SUSPEND_MIN, SuspendDetector, time_asleep
+from paramclient.protocol.vehicle.presence import Presence
 
 from paramclient import Component, Event, Events, Lost, NoReply, Rebooted, Resynced, SyncState, Trust
 from paramclient.client import suspend_detection
-from paramclient.client.suspend_detection import SUSPEND_MIN, SuspendDetector, time_asleep
-from paramclient.protocol.vehicle.presence import Presence
-from paramclient.protocol.wire import ParamSetMessage, SystemTime
 from paramclient.sim import Air, Endpoint
+from paramclient.wire.messages import ParamSet, SystemTime
 from tests.shell import (
     FlakyLink,
     Tap,
@@ -146,7 +146,7 @@ async def test_a_write_does_not_reach_another_vehicle_at_the_address(sleep: Slee
         berth.is_deaf = False
         sleep(HOURS)
         assert "another vehicle" in str(await writing)
-        assert berth.messages(ParamSetMessage) == []
+        assert berth.messages(ParamSet) == []
         assert stranger.params["PARAM_02"].value == 2
 
 
@@ -159,7 +159,7 @@ async def test_nor_does_a_list_that_is_requested_before_the_loss_is_detected(sle
         sleep(HOURS)
         berth.moor(small_px4(uid=2))
         assert "another vehicle" in str(await _error_of(component, "PARAM_02", 22))
-        assert berth.messages(ParamSetMessage) == []
+        assert berth.messages(ParamSet) == []
 
 
 @in_simulated_time

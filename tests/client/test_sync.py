@@ -34,10 +34,10 @@ from paramclient import (
     UsageError,
 )
 from paramclient.client.events import EVENTS_MAX
-from paramclient.client.subscription import Changes
-from paramclient.protocol import wire
-from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSetMessage
+from paramclient.client.streams import Changes
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle
+from paramclient.wire import frames, messages
+from paramclient.wire.messages import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet
 from tests.shell import (
     VALUES,
     FlakyLink,
@@ -54,7 +54,7 @@ from tests.shell import (
 )
 
 VOLATILE = {"CAL_ACC0_XOFF", "PARAM_03"}
-MISSES = (ParamRequestRead, ParamRequestList, ParamSetMessage)
+MISSES = (ParamRequestRead, ParamRequestList, ParamSet)
 
 
 @pytest.fixture
@@ -348,9 +348,9 @@ async def test_a_write_waits_until_it_is_known_who_it_is() -> None:
         tap.received.clear()
         assert (await component.set("PARAM_02", 22)).actual == 22
         order = [type(message) for _, _, message in tap.received]
-        assert order.index(wire.CommandLong) < order.index(ParamSetMessage)
+        assert order.index(messages.CommandLong) < order.index(ParamSet)
         times = {type(message): when for when, _, message in reversed(tap.received)}
-        assert times[ParamSetMessage] - times[wire.CommandLong] > 0.5, "a round trip"
+        assert times[ParamSet] - times[messages.CommandLong] > 0.5, "a round trip"
 
 
 @in_simulated_time
@@ -435,7 +435,7 @@ class LateVersion(Tap):
     is_late = True
 
     def data_to_send(self) -> list[bytes]:
-        frames = [(wire.Framer(stream=False).receive(data)[0], data) for data in super().data_to_send()]
+        frames = [(frames.Framer(stream=False).receive(data)[0], data) for data in super().data_to_send()]
         return [data for frame, data in frames if not self.is_late or frame.message_id not in (148, 77)]
 
 

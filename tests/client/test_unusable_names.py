@@ -13,8 +13,8 @@ from paramclient.files import FileFormat, dumps, loads
 from paramclient.model.paramset import ParamSet as Parameters
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import ParamType, is_portable_name
-from paramclient.protocol.wire import NO_INDEX, ParamError, ParamSetMessage, ParamValue, encode
 from paramclient.sim import ArduPilotVehicle, GenericVehicle
+from paramclient.wire.messages import NO_INDEX, ParamError, ParamSet, ParamValue, encode
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import in_simulated_time
 from tests.simulation import PEER, Simulation, known, param_value
@@ -51,7 +51,7 @@ def put(monkeypatch: pytest.MonkeyPatch) -> Put:
     return behind(monkeypatch, "sim:px4")
 
 
-def say(session: Simulation, message: ParamValue | ParamSetMessage | ParamError, system: int = 1) -> None:
+def say(session: Simulation, message: ParamValue | ParamSet | ParamError, system: int = 1) -> None:
     """Receive a message under an address."""
     session.station.receive(encode(message, system=system, component=1, sequence=0), PEER, session.now)
 
@@ -86,7 +86,7 @@ def test_messages_with_unusable_names_are_dropped_and_counted(name: str) -> None
     say(session, param_value(name, 5.0, index=NO_INDEX, count=2))
     say(session, param_value(name, 5.0, index=0, count=7))
     say(session, ParamError(*session.station.own_address, name, -1, 1))
-    say(session, ParamSetMessage(1, 1, name, bytes(4), 9), system=254)
+    say(session, ParamSet(1, 1, name, bytes(4), 9), system=254)
     table = session.machine.table
     assert ([*table.params], table.count, table.left_out, table.left_out_name) == (["A", "B"], 2, 4, name)
     result = session.fetch(refresh=True)

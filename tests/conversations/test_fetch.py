@@ -243,5 +243,3 @@ def test_a_group_that_appears_changes_the_count_and_all_is_fetched() -> None:
             assert set(third.params) == set(first.params)
 
     run(main)
-
-

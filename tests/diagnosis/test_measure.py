@@ -28,7 +28,6 @@ from paramclient.links import SimLink
 from paramclient.links.tlog import read_records
 from paramclient.model.identity import Identity
 from paramclient.model.values import Encoding, ParamType
-from paramclient.protocol import wire
 from paramclient.sim import (
     Air,
     ArduPilotVehicle,
@@ -38,6 +37,7 @@ from paramclient.sim import (
     PX4Vehicle,
     SimParam,
 )
+from paramclient.wire import frames, messages
 from tests.commands import Command, Put, behind, in_process, leaping
 
 UID = "0002000000003338470e3034"
@@ -187,17 +187,17 @@ def test_nothing_is_changed(command: Command, put: Put, tmp_path: Path) -> None:
         command("check", put(vehicle), "--tlog", log)
         sent: Counter[str] = Counter()
         for record in read_records(io.BytesIO(log.read_bytes())):
-            for frame in wire.Framer(stream=False).receive(record.data):
+            for frame in frames.Framer(stream=False).receive(record.data):
                 if frame.system != 255:
                     continue
-                message = wire.decode(frame)
-                sent[wire.message_name(frame.message_id)] += 1
-                if isinstance(message, wire.CommandLong):
+                message = messages.decode(frame)
+                sent[frames.message_name(frame.message_id)] += 1
+                if isinstance(message, messages.CommandLong):
                     assert message.command in (
-                        wire.MAV_CMD_REQUEST_MESSAGE,
-                        wire.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
+                        messages.MAV_CMD_REQUEST_MESSAGE,
+                        messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
                     )
-                if isinstance(message, wire.FileTransfer):
+                if isinstance(message, messages.FileTransfer):
                     # terminate, reset, list, open to read, read, burst
                     assert message.payload[3] in (1, 2, 3, 4, 5, 15)
         assert set(sent) == {

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from paramclient.model.ext_params import ExtParam, ExtParamType
+from paramclient.model.ext_paramset import ExtParamSet
 
 from paramclient.errors import FileError
 from paramclient.files import read_file
@@ -18,8 +20,6 @@ from paramclient.files.disk import (
     read_extended_file,
     write_extended_file,
 )
-from paramclient.model.ext_params import ExtParam, ExtParamType
-from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.values import Trust
 from paramclient.sim import Camera
 

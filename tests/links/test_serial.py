@@ -24,11 +24,11 @@ from paramclient.client import reconnect_delays
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link, refusals, serial
 from paramclient.links.serial_transport import UNREAD_BYTES_MAX, Transport
-from paramclient.protocol import wire
+from paramclient.wire import messages
 from tests.cable import TIMEOUT, Cable
 from tests.shell import a_client, bits, generic, small_px4, until
 
-HEARTBEAT = wire.encode(wire.Heartbeat(6, 8), system=255, component=190, sequence=0)
+HEARTBEAT = messages.encode(messages.Heartbeat(6, 8), system=255, component=190, sequence=0)
 RATE = 40_000.0
 NO_PORTS = "This computer has no serial ports: is the device plugged in and switched on?"
 """Bytes per second in each direction. With 57600 baud (5,760 bytes per second), tests would take seconds."""

@@ -12,6 +12,7 @@ from functools import partial
 from typing import Final
 
 import anyio
+from paramclient.protocol.vehicle.reboot_command import SAVING_TIME
 
 from paramclient import (
     Component,
@@ -19,7 +20,7 @@ from paramclient import (
     ParamClient,
     Rebooted,
 )
-from paramclient.client.events import Events
+from paramclient.client.streams import Events
 from paramclient.errors import (
     ParamClientError,
     Refused,
@@ -29,7 +30,6 @@ from paramclient.errors import (
 )
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, type_name
-from paramclient.protocol.vehicle.reboot_command import SAVING_TIME
 from paramclient.provision import ApplyStatus, apply, restore
 from tests.live.choice import another_value
 from tests.live.journal import check_disarmed

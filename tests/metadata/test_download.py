@@ -20,11 +20,9 @@ from paramclient.errors import MetadataError
 from paramclient.metadata import Metadata, MetadataStore, download, metadata_cache, metadata_of
 from paramclient.model.identity import Identity
 from paramclient.model.px4_hash import crc32_px4
-from paramclient.protocol.wire import (
-    FileTransfer,
-)
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle
 from paramclient.sim.metadata import GENERAL_FILE, METADATA_FILE
+from paramclient.wire.messages import FileTransfer
 from tests.shell import (
     Tap,
     a_client,

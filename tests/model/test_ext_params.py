@@ -9,8 +9,6 @@ import struct
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from paramclient.errors import UsageError
 from paramclient.model.ext_params import (
     EXT_VALUE_SIZE,
     ExtParam,
@@ -21,6 +19,8 @@ from paramclient.model.ext_params import (
     decode_ext_value,
     encode_ext_value,
 )
+
+from paramclient.errors import UsageError
 from paramclient.model.values import TYPES_BY_NAME
 
 KINDS = ExtParamType

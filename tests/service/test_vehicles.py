@@ -9,11 +9,11 @@ from typing import Any
 from unittest import mock
 
 import pytest
+from paramclient.model.ext_params import ExtParamType
 
 from paramclient import ParamCache
 from paramclient.errors import UsageError
 from paramclient.links import SimLink
-from paramclient.model.ext_params import ExtParamType
 from paramclient.model.values import ParamType
 from paramclient.service import Hub, create_app
 from paramclient.sim import ArduPilotVehicle, Camera, PX4Vehicle

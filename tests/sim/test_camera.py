@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from paramclient.model.ext_params import ExtParamType
 
 from paramclient.errors import ExtAckResult, UsageError
-from paramclient.model.ext_params import ExtParamType
-from paramclient.protocol import wire
-from paramclient.protocol.wire import (
+from paramclient.sim import Camera
+from paramclient.wire import frames, messages
+from paramclient.wire.messages import (
     Message,
     ParamExtAck,
     ParamExtRequestList,
@@ -17,7 +18,6 @@ from paramclient.protocol.wire import (
     ParamExtSet,
     ParamExtValue,
 )
-from paramclient.sim import Camera
 
 UINT32 = ExtParamType.UINT32
 
@@ -26,10 +26,10 @@ def ask(camera: Camera, message: Message, now: float = 1.0, *, until: float | No
     """What the camera sends in answer."""
     camera.tick(0.0)
     camera.data_to_send()
-    camera.receive(wire.encode(message, system=255, component=190, sequence=0), now)
+    camera.receive(messages.encode(message, system=255, component=190, sequence=0), now)
     camera.tick(now if until is None else until)
-    framer = wire.Framer({322, 324}, stream=False)
-    found = [wire.decode(frame) for data in camera.data_to_send() for frame in framer.receive(data)]
+    framer = frames.Framer({322, 324}, stream=False)
+    found = [messages.decode(frame) for data in camera.data_to_send() for frame in framer.receive(data)]
     return [message for message in found if message is not None]
 
 
