@@ -14,7 +14,6 @@ from unittest import mock
 
 import anyio
 import anyio.to_thread
-from paramclient.protocol.component import ComponentMachine
 
 from paramclient import Component, Param, ParamClient, ParamType
 from paramclient.client import cache_writer
@@ -368,20 +367,10 @@ def bits(params: Mapping[str, Param]) -> dict[str, int]:
     return {name: param.bits for name, param in params.items()}
 
 
-def machine_of(component: Component) -> ComponentMachine:
-    """What stands behind a component, wherever its link is."""
-    return component.core.machine
-
-
 def residue(component: Component) -> list[object]:
-    """What is still registered with a component: reads, writes, a fetch, waiters."""
-    machine = machine_of(component)
-    left: list[object] = [f"{len(machine.reads)} reads"] if len(machine.reads) else []
-    left += [f"{len(machine.writes)} writes"] if len(machine.writes) else []
-    left += [f"{len(machine.write_batches)} batches of writes"] if len(machine.write_batches) else []
-    left += [machine.fetch] if machine.fetch is not None else []
-    left += [machine.refresh] if machine.refresh is not None else []
-    return left
+    """What is still under way with a component: messages that a call waits for, and a fetch."""
+    left: list[object] = [key for key, waiting in component.node.channel._inboxes.items() if waiting]
+    return [*left, "fetch"] if component.session.fetching.is_running else left
 
 
 async def outcome(call: Awaitable[T]) -> T | Exception:

@@ -33,6 +33,8 @@ T = TypeVar("T")
 Key: TypeAlias = object
 """What a conversation waits for: a message class, or one with a name, an index or a command."""
 
+PATIENCE_MIN: Final = 2.0
+"""Seconds until a request is given up, at least: a vehicle that writes to its flash may be silent for one."""
 SILENCE_MAX: Final = 20.0
 """Seconds without a message of a component without heartbeats after which requests are given up."""
 LATE_WAKE_UP: Final = 0.05
@@ -262,6 +264,17 @@ class Channel:
         """Seconds of silence after which requests are given up."""
         return min(self._presence.timeout, SILENCE_MAX)
 
+    def is_hopeless(self, attempts: int, began: float, now: float, attempts_max: int | None = None) -> bool:
+        """Return whether to give up a request that was sent so often since `began`.
+
+        Without `attempts_max`, loss must not explain the silence, and the component must have had time.
+        """
+        if self.silence_since(began, now) >= self.silence_max:
+            return True
+        if attempts_max is not None:
+            return attempts >= attempts_max
+        return attempts >= self.timing.attempts_max and now - began >= PATIENCE_MIN
+
     async def exchange(
         self,
         request: Message | Callable[[int], Message],
@@ -303,8 +316,7 @@ class Channel:
             if answer is not None:
                 self._measure(attempt, now - sent, now - began)
                 return answer
-            limit = self.timing.attempts_max if attempts is None else attempts
-            if attempt >= limit or self.silence_since(began, now) >= self.silence_max:
+            if self.is_hopeless(attempt, began, now, attempts):
                 raise NoReply(what, attempts=attempt, waited=now - began)
 
     async def wait_for(

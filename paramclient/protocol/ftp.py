@@ -499,7 +499,7 @@ class _FileReader:
                 paced_at = now
                 allowed -= copies
                 tried = attempts.get(at, 0)
-                if tried >= timing.attempts_max or channel.silence_since(began, now) >= channel.silence_max:
+                if channel.is_hopeless(tried, began, now):
                     what = f"{self._path} of {channel.system}/{channel.component} at byte {at}"
                     raise NoReply(what, attempts=tried, waited=now - began)
                 await channel.gate.wait()

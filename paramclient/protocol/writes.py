@@ -182,7 +182,7 @@ class _Write:
 
     async def run(self) -> SetResult:
         """Send the set until its outcome is proven."""
-        channel, timing = self.channel, self.channel.timing
+        channel = self.channel
         key = self.session.dialect.value
         keys = [(key, self.name), StatusText]
         if self.session.dialect.has_ack:
@@ -202,10 +202,7 @@ class _Write:
                 now = anyio.current_time()
                 if answer is None:
                     unanswered += 1
-                    if (
-                        unanswered >= timing.attempts_max
-                        or channel.silence_since(began, now) >= channel.silence_max
-                    ):
+                    if channel.is_hopeless(unanswered, began, now):
                         what = f"the acknowledgement of {self.name} by {channel.system}/{channel.component}"
                         raise NoReply(what, attempts=self.attempts, waited=now - began)
                     continue

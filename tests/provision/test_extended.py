@@ -9,13 +9,12 @@ import pytest
 from paramclient import (
     CacheError,
     Component,
-    ExtParam,
-    ExtParamSet,
-    ExtSetOutcome,
-    ExtValue,
     NoReply,
     NotInCache,
     ParamCache,
+    ParamSet,
+    SetOutcome,
+    Value,
     SetStatus,
     UsageError,
 )
@@ -43,12 +42,12 @@ def small() -> Camera:
     )
 
 
-def wanted(camera: Camera, **values: ExtValue) -> ExtParamSet:
+def wanted(camera: Camera, **values: Value) -> ParamSet:
     """The set of a camera with some values changed."""
     other = Camera({name: (param.type, param.value) for name, param in camera.ext_params.items()})
     for name, value in values.items():
         other.set_ext_param(name, value)
-    return ExtParamSet({name: param for name, param in other.ext_params.items() if name in values})
+    return ParamSet.of({name: param for name, param in other.ext_params.items() if name in values})
 
 
 async def the_camera(client: object, number: int = 100) -> Component:
@@ -62,14 +61,14 @@ async def test_a_set_is_compared_and_nothing_is_written() -> None:
     async with a_client(camera) as client:
         component = await the_camera(client)
         content = wanted(camera, MODE=2, NAME="Front", KEY=b"\1")
-        more = {"LOST": ExtParam.of("LOST", b"x", 11), "EV": ExtParam.of("EV", b"x", 11)}
-        plan = await verify_extended(component, ExtParamSet({**content.params, **more}))
+        more = {"LOST": Param.of("LOST", b"x", 11), "EV": Param.of("EV", b"x", 11)}
+        plan = await verify_extended(component, ParamSet.of({**content.params, **more}))
         assert (list(plan.changes), plan.missing, plan.mistyped) == (["MODE", "KEY"], ("LOST",), ("EV",))
         assert (plan.is_possible, plan.is_met) == (False, False)
         assert (await verify_extended(component, wanted(camera, NAME="Front"))).is_met
         assert camera.ext_values["MODE"] == 1
         with pytest.raises(UsageError, match="of component 101, and 1/100 is chosen"):
-            await verify_extended(component, ExtParamSet({}, component=101))
+            await verify_extended(component, ParamSet.of({}, component=101))
 
 
 @in_simulated_time
@@ -78,7 +77,7 @@ async def test_what_differs_is_written_and_read_back(tmp_path: Path, path: Path)
     with ParamCache(path) as cache:
         async with a_client(camera, cache=cache) as client:
             component = await the_camera(client)
-            reported: list[ExtSetOutcome] = []
+            reported: list[SetOutcome] = []
             result = await apply_extended(
                 component,
                 wanted(camera, MODE=2, NAME="Rear", KEY=b"\xff\0\xfe", CLOCK=2**62 + 3),
