@@ -207,7 +207,7 @@ async def test_a_port_that_others_would_share_is_in_use(kind: str, ours: str) ->
         if kind == "tcpin":
             other.listen()
         port = other.getsockname()[1]
-        with pytest.raises(LinkError, match=f"port {port} is in use by this program itself"):
+        with pytest.raises(LinkError, match=f"port {port} is in use by another link or program"):
             await create_link(f"{kind}:{ours}:{port}").open()
 
 
