@@ -658,14 +658,6 @@ class ComponentMachine:
         self._report(changes)
         self.sync.compare(now)
 
-    def renew(self, params: Mapping[str, Param], moments: Mapping[str, float] | None = None) -> None:
-        """Replace values that are only *cached* here with those that another station has received since.
-
-        Args:
-            params, moments: as in `use_cached`.
-        """
-        self._report(self.table.renew(params, moments))
-
     # requests
 
     def read(self, key: Key, now: float) -> Read:

@@ -159,7 +159,7 @@ class ExtendedParams(Machine):
             self._host.ext_changed(change)
 
     def use_cached(self, params: Mapping[str, ExtParam], moments: Mapping[str, float]) -> None:
-        """Load the cached table, also one that another station has written since.
+        """Load the cached table.
 
         Args:
             params: the cached parameters.

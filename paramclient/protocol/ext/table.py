@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import Final
 
 from paramclient.model.ext_params import ExtParam
@@ -145,23 +145,8 @@ class ExtTable:
         for name in self.params:
             self.dirty.setdefault(name, "vehicle")
 
-    def put_back(
-        self,
-        dirty: Mapping[str, str],
-        gone: Mapping[str, float],
-        overwritten: Sequence[tuple[ExtParam, str, float]],
-    ) -> None:
-        """Take back what was not written."""
-        self.overwritten = [*overwritten, *self.overwritten][-EXT_OVERWRITTEN_MAX:]
-        for name, by in dirty.items():
-            if name in self.params:
-                self.dirty.setdefault(name, by)
-        for name, at in gone.items():
-            if name not in self.params:
-                self.gone.setdefault(name, at)
-
     def restore(self, params: Mapping[str, ExtParam], moments: Mapping[str, float]) -> list[ExtChange]:
-        """Load a cached table, also one that another station has written since. Values received on this link
+        """Load a cached table. Values received on this link
         stay."""
         changes = []
         for name, param in params.items():

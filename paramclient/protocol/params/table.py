@@ -4,7 +4,7 @@ them."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from struct import unpack
 from typing import Final, NamedTuple
 
@@ -124,8 +124,6 @@ class Table:
         suspended: seconds of system suspend by which moments were moved back, see `age`.
         left_out: PARAM_VALUEs ignored because no parameter file can hold their name, see `leave_out`.
         left_out_name: the last such name, or an empty text.
-        keeps_all: whether `overwritten` keeps every value that was replaced before it reached the cache
-            (while the cache cannot be written), rather than only values related to our writes.
         overwritten: values that never reached the cache and are no longer current: values that our writes set
             or replaced, and the first observation of a changed value that was received again.
     """
@@ -149,7 +147,6 @@ class Table:
         self.doubts = 0
         self.dirty: dict[str, str] = {}
         self.overwritten: list[Observation] = []
-        self.keeps_all = False
         self.left_out = 0
         self.left_out_name = ""
         self._hash: int | None = None
@@ -482,31 +479,6 @@ class Table:
                 changes.append(self._change(name, None, new))
         return changes
 
-    def renew(self, params: Mapping[str, Param], moments: Mapping[str, float] | None = None) -> list[Change]:
-        """Replace values that are only *cached* here with those that another station has received since.
-
-        Args:
-            params: the present table in the cache.
-            moments: as in `fill`.
-        """
-        seen = {} if moments is None else moments
-        changes: list[Change] = []
-        for name, cached in as_params(params).compact.items():
-            old = self._compact.get(name)
-            if old is None or trust_of(old) != CACHED or name in self.dirty or same_compact(old, cached):
-                continue
-            _, number, _, _, place = unpack_fields(old)
-            is_same_type = unpack_fields(cached)[1] == number
-            before = self._defaults.get(name) if is_same_type else self._defaults.pop(name, None)
-            new = self._compact[name] = with_index(with_trust_number(cached, CACHED), place)
-            if name in seen:
-                self._moments[name] = seen[name]
-            self._wire.pop(name, None)  # the same value from the vehicle must then count as a change
-            if self._hash is not None:
-                self._invalidate_hash(name)
-            changes.append(_new(Changed, (name, old, new, "vehicle", self._defaults.get(name), before)))
-        return changes
-
     def change_count(self, count: int) -> None:
         """Take a changed count: all indices become invalid."""
         if self.count is not None:
@@ -664,40 +636,6 @@ class Table:
                 overwritten.append(Observation(self.params[name], by, moment))
         return overwritten
 
-    @property
-    def changed(self) -> dict[str, tuple[float, str]]:
-        """When each value changed since the last `take_overwritten`, and the author of the change."""
-        return self._changed.copy()
-
-    def restore_unwritten(
-        self,
-        dirty: Mapping[str, str],
-        overwritten: Sequence[Observation],
-        removed_at: Mapping[str, float],
-        changed: Mapping[str, tuple[float, str]],
-        params: Params,
-    ) -> None:
-        """Take back changes that could not be written to the cache: they are dirty again, with their moments.
-
-        A value that was replaced meanwhile is kept in `overwritten`.
-
-        Args:
-            dirty, overwritten, removed_at, changed: as they were taken.
-            params: the dirty parameters as they were then.
-        """
-        replaced = []
-        for name, by in dirty.items():
-            received_at = params.moments.get(name)
-            if received_at is None or name not in params.compact:
-                continue
-            if name in self._changed or name not in self._compact:
-                replaced.append(Observation(params[name], by, received_at))
-            elif changed.get(name, (math.inf, ""))[0] == received_at:  # otherwise `overwritten` has it
-                self._changed[name] = changed[name]
-        self.dirty = {**dirty, **self.dirty}
-        self.overwritten = [*overwritten, *replaced, *self.overwritten][-OVERWRITTEN_MAX:]
-        self.removed_at = {**removed_at, **self.removed_at}
-
     def take_removed_at(self) -> dict[str, float]:
         """Return when each name removed since the last call was found missing."""
         removed_at, self.removed_at = self.removed_at, {}
@@ -755,7 +693,7 @@ class Table:
         """Record that a value has changed, at the moment that the table already has for it.
 
         The cache receives each value that our writes have set, however short its life, and the values that
-        they replaced; with `keeps_all`, every value.
+        they replaced.
 
         Args:
             name, by: the parameter and the author of the change.
@@ -764,7 +702,7 @@ class Table:
         """
         before = self.dirty.get(name)
         if old is not None:
-            if before is not None and (self.keeps_all or is_ours(before) or is_ours(by)):
+            if before is not None and (is_ours(before) or is_ours(by)):
                 since, author = self._changed.get(name, (seen_at, before))
                 param = param_of(name, old, default)
                 if since < seen_at:
