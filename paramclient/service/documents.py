@@ -211,8 +211,7 @@ def write(outcome: SetOutcome, target: Target) -> dict[str, Any]:
     known = target.component.params.get(outcome.name)
     info = None if target.metadata is None else target.metadata.find(outcome.name)
     kind = ParamType.REAL64 if known is None else known.type_number
-    found: dict[str, Any] = as_json(WriteJson.of(outcome, kind, info))
-    return found
+    return dict(as_json(WriteJson.of(outcome, kind, info)))
 
 
 def writes(result: SetManyResult, target: Target) -> dict[str, Any]:
@@ -227,24 +226,22 @@ def writes(result: SetManyResult, target: Target) -> dict[str, Any]:
 def plan(found: Plan, target: Target) -> dict[str, Any]:
     """Return a plan."""
     component = target.component
-    members: dict[str, Any] = as_json(
-        PlanJson.of(found, system=component.system, component=component.component)
-    )
-    return members
+    return dict(as_json(PlanJson.of(found, system=component.system, component=component.component)))
 
 
 def apply_result(result: ApplyResult, target: Target) -> dict[str, Any]:
     """Return the result of an apply or restore."""
     component = target.component
-    members: dict[str, Any] = as_json(
-        ApplyJson.of(
-            result,
-            system=component.system,
-            component=component.component,
-            vehicle=VehicleJson.of(component),
+    return dict(
+        as_json(
+            ApplyJson.of(
+                result,
+                system=component.system,
+                component=component.component,
+                vehicle=VehicleJson.of(component),
+            )
         )
     )
-    return members
 
 
 # The past
@@ -265,8 +262,7 @@ def snapshots(kept: Iterable[SnapshotSummary]) -> dict[str, Any]:
 
 def ext_param(known: ExtParam) -> dict[str, Any]:
     """Return an extended parameter of a table."""
-    found: dict[str, Any] = as_json(ExtParamJson.of_table(known))
-    return found
+    return dict(as_json(ExtParamJson.of_table(known)))
 
 
 def ext_change(found: ExtChange) -> dict[str, Any]:
