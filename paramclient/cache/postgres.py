@@ -21,8 +21,9 @@ CONNECT_WAIT_MAX: Final = 5
 """Seconds for which a call waits for a new connection."""
 SERVER_SILENCE_MAX: Final = 20
 """Seconds after which a server that does not respond counts as unreachable."""
-RETRY_INTERVAL: Final = 5.0
-"""Seconds after a failed connection in which calls fail at once: each would wait for the connection."""
+RETRY_INTERVAL_MIN: Final = 0.25
+"""Minimum seconds after a failed connection in which calls fail at once; otherwise as long as that took: each
+call would wait for the connection."""
 
 _SCHEMA: Final = f"paramclient_{SCHEMA_VERSION}"
 _WRITE_LOCK: Final = 0x5041524D
@@ -114,10 +115,12 @@ class PostgresStore:
     def _connect(self) -> psycopg.Connection:
         if self._failure is not None and time.monotonic() < self._failure[0]:
             raise CacheError(self._failure[1])
+        began = time.monotonic()
         try:
             connection = psycopg.connect(**self._options, autocommit=True)
         except psycopg.Error as error:
-            self._failure = (time.monotonic() + RETRY_INTERVAL, str(self._error(error)))
+            now = time.monotonic()
+            self._failure = (now + max(now - began, RETRY_INTERVAL_MIN), str(self._error(error)))
             raise
         self._failure = None
         try:

@@ -22,6 +22,7 @@ from paramclient.cache import (
     StoredParam,
     TableState,
     TableUpdate,
+    is_database_url,
 )
 from paramclient.errors import CacheError, UsageError
 from paramclient.links.clock_offset import seconds_ahead
@@ -44,6 +45,10 @@ PENDING_MAX: Final = 1_024
 written later. They take four minutes of changes without a pause."""
 CLOSE_WAIT_MAX: Final = 6.0
 """Seconds for which `close` waits for the cache: longer than another process may lock a file."""
+DATABASE_WAIT_MAX: Final = 2.0
+"""Seconds for which `close` waits for a database that is away: about those of its restart."""
+DATABASE_RETRY_INTERVAL: Final = 0.3
+"""Seconds between two attempts of `close` to reach a database."""
 CLOCK_STEP_MAX: Final = 5.0
 """Seconds by which the clock may be set back without an effect: later values keep later times."""
 
@@ -118,7 +123,12 @@ class CacheWriter:
         if cache is None:
             return
         with anyio.move_on_after(CLOSE_WAIT_MAX, shield=True):
-            is_written = await self.flush() and await self.flush()  # the second rewrites a replaced file
+            give_up_at = anyio.current_time() + (DATABASE_WAIT_MAX if is_database_url(cache.place) else 0)
+            # the second flush rewrites a replaced file
+            while not (is_written := await self.flush() and await self.flush()):
+                if anyio.current_time() >= give_up_at:
+                    break
+                await anyio.sleep(DATABASE_RETRY_INTERVAL)
         for kept in self._cached.values():
             machine = kept.machine
             if not is_written and (kept.pending or machine.table.dirty or machine.ext.table.dirty):
