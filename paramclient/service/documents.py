@@ -41,32 +41,6 @@ if TYPE_CHECKING:
     from paramclient.provision import ApplyResult, ExtApplyResult, ExtPlan, Plan
     from paramclient.service.targets import Target
 
-__all__ = [
-    "apply_result",
-    "cached_vehicles",
-    "change",
-    "ext_apply_result",
-    "ext_change",
-    "ext_fetch_result",
-    "ext_history",
-    "ext_param",
-    "ext_plan",
-    "ext_writes",
-    "fetch_result",
-    "history",
-    "param",
-    "param_file",
-    "param_set",
-    "params",
-    "plan",
-    "progress",
-    "snapshots",
-    "vehicle",
-    "vehicle_state",
-    "write",
-    "writes",
-]
-
 CHANGING_MEMBERS: Final = frozenset({"silence_s", "round_trip_s", "params", "fetch"})
 """Members of a vehicle that change all the time: they cause no event."""
 

@@ -21,7 +21,7 @@ from paramclient.errors import NotInCache, UnknownParameter
 from paramclient.metadata import Metadata
 from paramclient.model.patterns import NameChoice
 from paramclient.model.similar_names import did_you_mean, nearest_names
-from paramclient.model.values import Param
+from paramclient.model.values import Param, WireValue
 from paramclient.protocol.params.write_batch import SetOutcome, SetStatus
 from paramclient.service import documents, extended
 from paramclient.service.access import author_of, holder_of, require_write
@@ -34,6 +34,7 @@ from paramclient.service.request_bodies import (
     SnapshotNumber,
     Timestamp,
     WriteManyRequest,
+    WriteOptions,
     WriteRequest,
     range_faults,
     resolve_value,
@@ -279,20 +280,8 @@ async def set_param(
             request, lambda: extended.set_one(target, name, body, author=author)
         )
     value = resolve_value(target, name, body.value)
-    if not body.force:
-        _check_range(range_faults(target, {name: value}))
-    result = await run_until_disconnect(
-        request,
-        lambda: target.component.set(
-            name,
-            value,
-            settle=body.settle_s,
-            force=body.force,
-            durable=body.durable,
-            timeout=body.timeout_s,
-            author=author,
-        ),
-    )
+    options = _write_options(target, {name: value}, body, author)
+    result = await run_until_disconnect(request, lambda: target.component.set(name, value, **options))
     return documents.write(SetOutcome(name, value, SetStatus(result.status), result), target)
 
 
@@ -309,19 +298,8 @@ async def set_params(
     if ext:
         return await run_until_disconnect(request, lambda: extended.set_many(target, body, author=author))
     values = {name: resolve_value(target, name, given) for name, given in body.values.items()}
-    if not body.force:
-        _check_range(range_faults(target, values))
-    result = await run_until_disconnect(
-        request,
-        lambda: target.component.set_many(
-            values,
-            settle=body.settle_s,
-            force=body.force,
-            durable=body.durable,
-            timeout=body.timeout_s,
-            author=author,
-        ),
-    )
+    options = _write_options(target, values, body, author)
+    result = await run_until_disconnect(request, lambda: target.component.set_many(values, **options))
     return documents.writes(result, target)
 
 
@@ -354,10 +332,25 @@ def _chosen(known: dict[str, Result], names: list[str] | None) -> dict[str, Resu
     return {name: each for name, each in known.items() if choice.has(name)}
 
 
-def _check_range(faults: dict[str, str]) -> None:
+def _write_options(
+    target: Target, values: dict[str, WireValue], body: WriteOptions, author: str
+) -> dict[str, Any]:
+    """Return the arguments that `set` and `set_many` have in common.
+
+    Raises:
+        ServiceError: 422, values are out of range.
+    """
+    faults = {} if body.force else range_faults(target, values)
     if faults:
         detail = f"{'; '.join(list(faults.values())[:5])}. Nothing was written; `force` writes it anyway."
         raise ServiceError(422, "out-of-range", detail, names=list(faults))
+    return {
+        "settle": body.settle_s,
+        "force": body.force,
+        "durable": body.durable,
+        "timeout": body.timeout_s,
+        "author": author,
+    }
 
 
 class _EventStream(Response):
