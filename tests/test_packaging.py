@@ -23,10 +23,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parent.parent
 SOURCES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient").rglob("*.py")}
 PLUGIN = "pytest_paramclient.py"
-SERVED = {
-    path.relative_to(ROOT).as_posix()
-    for path in (ROOT / "paramclient/service/page").glob("*.*")
-}
+SERVED = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient/service/page").glob("*.*")}
 TABLES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient/sim/tables").glob("*.csv")}
 
 

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 from paramclient.errors import FileErrorCode, FileTransferError, UsageError
 from paramclient.protocol.ftp.blocks import Blocks
-from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, FRAME_OVERHEAD, Opcode, Packet
+from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.ftp.transfer_job import FileTransferJob, FtpChannel
 from paramclient.protocol.requests.retry import (
     OVERTAKING_READS,
@@ -39,9 +39,6 @@ BLOCK_GAP_DEFAULT: Final = 0.01
 BLOCK_GAP_MIN: Final = 1e-5
 """Seconds between two blocks that calculations assume, at least. Two blocks processed together can be
 nanoseconds apart, and deadlines from such a pace are too close for any clock."""
-RATE_BLOCKS_MIN: Final = 16
-"""Blocks of one burst, at least, whose pace is that of the link for later transfers: a shorter burst may wait
-in buffers on its way."""
 TAIL_BLOCKS: Final = 4
 """Missing blocks at the end of a file up to which single reads are better than a new burst."""
 TAIL_SHARE: Final = 0.15
@@ -325,8 +322,6 @@ class FileRead(FileTransferJob[bytes]):
         blocks = (packet.offset - offset) / self._read_size
         if blocks > 0 and now > began_at:
             self._gap = max((now - began_at) / blocks, BLOCK_GAP_MIN)
-            if blocks >= RATE_BLOCKS_MIN:
-                self._line.byte_rate = (self._read_size + FRAME_OVERHEAD) / self._gap
 
     def _end_of_burst(self, packet: Packet, is_latest: bool, now: float) -> None:
         code = self._code(packet)

@@ -10,8 +10,6 @@ __all__ = ["Opcode", "Packet"]
 
 DATA_SIZE_MAX: Final = 239
 """Bytes of a file in one message, at most."""
-FRAME_OVERHEAD: Final = 27
-"""Bytes of the frame of such a message besides the bytes of the file: 12 of MAVLink 2, 15 of MAVFTP."""
 
 
 class Opcode(IntEnum):

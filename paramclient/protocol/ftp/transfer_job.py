@@ -45,8 +45,6 @@ class FtpChannel:
         target: system and component.
         retry: the component's policy, which decides when to repeat the requests.
         received_at: when the server's last message to us was received.
-        byte_rate: bytes per second of the last file that was read in a burst, with the overhead of its
-            frames; 0 before.
     """
 
     def __init__(
@@ -57,7 +55,6 @@ class FtpChannel:
         self.target = context.target
         self.retry: RetryPolicy = context.retry
         self.received_at = -math.inf
-        self.byte_rate = 0.0
         self._context = context
         self._send = context.send
         # The first number differs between runs of the program: a server repeats its last response to a

@@ -127,11 +127,6 @@ class FileTransfers(Machine):
         return self._job is None
 
     @property
-    def byte_rate(self) -> float:
-        """Bytes per second of the last file that was read in a burst; 0 before."""
-        return 0.0 if self._line is None else self._line.byte_rate
-
-    @property
     def is_closing(self) -> bool:
         """Whether the transfer in progress was released, and its session is still to be closed."""
         return self._job is not None and self._job.is_ended

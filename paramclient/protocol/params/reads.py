@@ -166,10 +166,6 @@ class ValueReads(Machine, Generic[Response]):
             return key in self._table.params
         return self._table.count is None or key < self._table.count
 
-    def awaits(self, message: Response) -> bool:
-        """Return whether this is the response to an open read."""
-        return message.param_id in self._open or message.param_index in self._open
-
     def ask(self, key: Key, now: float, *, urgent: bool = True) -> ValueRead[Response]:
         """Begin a read, or join an open one of the same parameter. Give it back with `release`."""
         read = self._open.get(key)
