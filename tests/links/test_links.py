@@ -557,9 +557,6 @@ async def test_udpin_sends_to_every_known_vehicle() -> None:
                     sock.recv(1000)
 
 
-TELEMETRY = wire.build_frame(30, bytes(range(1, 29)), system=1, component=1, sequence=0)
-
-
 async def got(sock: socket.socket) -> list[bytes]:
     """Return all data that a socket has received."""
     sock.setblocking(False)
