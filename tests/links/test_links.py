@@ -460,28 +460,6 @@ async def test_a_cancelled_receive_loses_nothing(kind: str) -> None:
     assert b"".join(got) == b"".join(sent)
 
 
-@pytest.mark.asyncio
-@pytest.mark.parametrize("kind", KINDS)
-async def test_a_cancelled_send_sends_all_or_nothing(kind: str) -> None:
-    async with connected(kind) as (link, far):
-        done: list[int] = []
-
-        async def send(number: int) -> None:
-            await link.send(frame(number), None)
-            done.append(number)
-
-        for steps in range(5):
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(send, steps)
-                for _ in range(steps):
-                    await anyio.lowlevel.checkpoint()
-                tasks.cancel_scope.cancel()
-        assert 0 < len(done) < 5
-        await link.send(HEARTBEAT, None)
-        expected = b"".join(map(frame, done)) + HEARTBEAT
-        assert stream_of(far, len(expected)) == expected
-
-
 # UDP
 
 
@@ -684,14 +662,6 @@ async def test_empty_datagrams_are_skipped() -> None:
 
 
 @pytest.mark.asyncio
-@pytest.mark.parametrize("kind", ["udpin", "udpout"])
-async def test_a_permanent_socket_error_is_a_link_error(kind: str) -> None:
-    async with connected(kind) as (link, _):
-        with pytest.raises(LinkError, match="cannot send: Message too long"):
-            await link.send(bytes(70_000), None)
-
-
-@pytest.mark.asyncio
 @pytest.mark.parametrize(
     ("name", "text"),
     [
@@ -833,20 +803,6 @@ async def test_tcp_drops_a_peer_that_does_not_read(
 
 
 @pytest.mark.asyncio
-@pytest.mark.parametrize("kind", ["tcp", "tcpin"])
-async def test_closing_ends_a_waiting_send(kind: str) -> None:
-    async with connected(kind) as (link, _), anyio.create_task_group() as tasks:
-
-        async def send() -> None:
-            with pytest.raises(LinkError, match="closed"):
-                await link.send(bytes(50_000_000), None)
-
-        tasks.start_soon(send)
-        await anyio.wait_all_tasks_blocked()
-        await link.close()
-
-
-@pytest.mark.asyncio
 @pytest.mark.parametrize("leave", [socket.socket.close, reset])
 async def test_tcpin_continues_when_a_client_disconnects(leave: Callable[[socket.socket], None]) -> None:
     async with opened("tcpin:127.0.0.1:0") as link:
@@ -870,20 +826,6 @@ async def test_tcpin_continues_when_a_client_disconnects(leave: Callable[[socket
                 [(peer, data)] = await collect(link, 1)
                 assert data == frame(6)
                 assert peer not in peer_of.values()
-
-
-@pytest.mark.asyncio
-async def test_tcpin_closes_a_client_that_does_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with connected("tcpin") as (link, far):
-        with socket.create_connection(link.address, timeout=TIMEOUT) as stuck:
-            stuck.send(frame(1))
-            [(peer, _)] = await collect(link, 1)
-            with monkeypatch.context() as patch:
-                patch.setattr(tcp, "SEND_TIMEOUT", 0.05)
-                await link.send(bytes(50_000_000), peer)
-            assert await collect(link, 1) == [(peer, b"")]
-        await link.send(frame(2), None)
-        assert far.recv(1000) == frame(2)
 
 
 @pytest.mark.asyncio
