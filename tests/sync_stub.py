@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
-from paramclient import diagnosis, metadata, provision
+from paramclient import metadata, provision
 from paramclient.client import client, component, events, extended_params, files, subscription
 from paramclient.provision import fleet
 
@@ -32,7 +32,7 @@ FUNCTIONS: list[Callable[..., object]] = [
     *(provision.prepare, provision.apply, provision.verify, provision.restore),
     *(provision.apply_all, provision.verify_all, provision.restore_all),
     *(provision.apply_extended, provision.verify_extended, provision.restore_extended),
-    *(provision.load_extended_state, metadata.metadata_of, diagnosis.check_vehicle),
+    *(provision.load_extended_state, metadata.metadata_of),
 ]
 STREAMS = {"Changes": "Change", "ExtChanges": "ExtChange", "Events": "Event"}
 OWN = {name for names in CLASSES.values() for name in names} | {each.__name__ for each in FUNCTIONS}

@@ -1,15 +1,22 @@
-"""The lines that `watch` prints: changes of parameters and events of the component, as text or JSON."""
+"""The subcommand watch: changes of parameters and events of the component, as text or JSON."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator
-from contextlib import aclosing
+from collections.abc import AsyncGenerator, Sequence
+from contextlib import aclosing, suppress
 from typing import Final, TypeAlias
 
+import anyio
+
+from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.extended import ext_value_text, read_extended
 from paramclient.cli.json_output import ExtParamJson
-from paramclient.cli.output import local_time, print_json, print_line, printable
-from paramclient.cli.session import CommandSession
+from paramclient.cli.options import LinkOptions
+from paramclient.cli.output import local_time, print_json, print_line, printable, say
+from paramclient.cli.param_names import ChosenNames, check_given, may_appear
+from paramclient.cli.read_commands import fetch_table, get_chosen, report_all
+from paramclient.cli.session import CommandSession, connect, report_others
 from paramclient.client.events import (
     Contested,
     Discovered,
@@ -22,22 +29,99 @@ from paramclient.client.events import (
     Uncontested,
 )
 from paramclient.client.subscription import Changes, ExtChanges
-from paramclient.model.ext_params import ExtParam, ExtValue, format_ext_value
+from paramclient.errors import CacheError, ParamClientError
+from paramclient.model.ext_params import ExtParam
 from paramclient.model.notation import hash_text, time_text, value_json
-from paramclient.model.patterns import NameChoice
+from paramclient.model.patterns import NameChoice, is_pattern
 from paramclient.model.values import Param, format_value
+from paramclient.model.wording import counted
 from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.params.change import Added, Change
 
-__all__ = ["HEX", "ext_value_text", "print_changes_and_events"]
+__all__ = ["watch"]
 
-HEX: Final = "hex:"
-"""The prefix of a value that is given as bytes in hexadecimal."""
+_DEFAULTS: Final = LinkOptions()
 
 _ComponentEvent: TypeAlias = Lost | Found | Rebooted | Resynced | Contested | Uncontested
 
 
-async def print_changes_and_events(
+async def watch(url: str, /, *names: str, extended: bool = False, options: LinkOptions = _DEFAULTS) -> int:
+    """Print changes of values by any source, as they happen, until Ctrl-C or --timeout.
+
+    Updates the table first, and also prints values that have changed since the cache was written. Also prints
+    when the vehicle is lost, found or rebooted, and when its table is in sync again. Parameters that appear
+    later, such as after a change of an *_ENABLE parameter, are watched too if a name or pattern matches.
+
+    Args:
+        url: The link.
+        names: The parameters to watch, or patterns such as "MC_*". Default: all.
+        extended: Extended parameters (PARAM_EXT_*), such as a camera's.
+    """
+    given = check_given(names)
+    async with connect(url, options, is_live=True) as session:
+        feed = session.component.ext.changes() if extended else session.component.changes()
+        events = session.client.events()
+        known: set[str] | None = None
+        if not session.client.listens_only:
+            code = await (_begin_extended if extended else _begin)(session, given)
+            if code:
+                return code
+            known = set(session.component.ext.params if extended else session.component.params)
+        count = len(session.component.ext.params if extended else session.component.params)
+        everything = counted(count, "extended parameter" if extended else "parameter")
+        say(printable(f"watching {', '.join(given) or everything} of {session.label}"))
+        await report_others([session])
+        failure: Exception | None = None
+        async with anyio.create_task_group() as tasks:
+            if given and not extended and not any(map(is_pattern, given)) and known is not None:
+                tasks.start_soon(_follow_groups, session)
+            with anyio.move_on_after(session.deadline.left()):
+                try:
+                    choice = NameChoice(given) if given else None
+                    await _print_changes_and_events(session, feed, events, known, choice)
+                except Exception as error:  # raised here, the task group would wrap it in a group
+                    failure = error
+            tasks.cancel_scope.cancel()
+        if failure is not None:
+            raise failure
+    return ExitCode.DONE
+
+
+async def _begin(session: CommandSession, given: Sequence[str]) -> int:
+    """Update the table, and report the names that the vehicle does not have; return the exit code.
+
+    A name or pattern of a group that the vehicle currently hides may appear later, and is no error.
+    """
+    patterns = [text for text in given if is_pattern(text)]
+    if patterns or not given:
+        with suppress(CacheError):  # with an empty cache, all received parameters are new
+            await fetch_table(session)
+    if not given:
+        return ExitCode.DONE
+    _, errors = await get_chosen(session, [text for text in given if not is_pattern(text)])
+    errors |= ChosenNames.of(session.component, patterns).errors
+    hidden = [name for name in errors if may_appear(name, session.component)]
+    if hidden:
+        say(printable(f"not there at present: {', '.join(hidden)}"))
+    return report_all(error for name, error in errors.items() if name not in hidden)
+
+
+async def _begin_extended(session: CommandSession, given: Sequence[str]) -> int:
+    """Update the extended parameters, and report unknown names; return the exit code."""
+    if not given or any(map(is_pattern, given)):
+        with suppress(CacheError):
+            await session.component.ext.fetch_all(timeout=session.deadline.left())
+    _, errors = await read_extended(session, [name for name in given if not is_pattern(name)])
+    return report_all(errors)
+
+
+async def _follow_groups(session: CommandSession) -> None:
+    """Fetch the table, so that added and removed parameters are noticed. Values were read already."""
+    with suppress(ParamClientError):  # the events and the end of the changes report it
+        await session.component.fetch_all()
+
+
+async def _print_changes_and_events(
     session: CommandSession,
     changes: Changes | ExtChanges,
     events: Events,
@@ -166,8 +250,3 @@ def _event_text(event: _ComponentEvent) -> str:
             count = len(event.changed)
             text = f"resynced: {count or 'no'} {'value' if count == 1 else 'values'} had changed"
     return f"{event.component.system}/{event.component.component} {text}"
-
-
-def ext_value_text(value: ExtValue, number: int) -> str:
-    """Return the text of an extended value, as subcommands print and take it."""
-    return f"{HEX}{value.hex()}" if isinstance(value, bytes) else format_ext_value(value, number)
