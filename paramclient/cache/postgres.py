@@ -76,24 +76,18 @@ class PostgresStore:
         with self._lock:
             if self._is_closed:
                 raise CacheError(f"the cache {self.place} is closed")
-            was_connected = self._connection is not None
-            try:
-                return self._transact(work, writing=writing)
-            except psycopg.OperationalError as error:
-                self._drop()
-                if not was_connected:
-                    raise self._error(error) from None
-            except psycopg.Error as error:
-                self._drop()
-                raise self._error(error) from None
-            except BaseException:
-                self._drop()
-                raise
-            try:  # the server may have been restarted since the last call
-                return self._transact(work, writing=writing)
-            except psycopg.Error as error:
-                self._drop()
-                raise self._error(error) from None
+            while True:
+                was_connected = self._connection is not None
+                try:
+                    return self._transact(work, writing=writing)
+                except psycopg.Error as error:
+                    self._drop()
+                    # the server may have been restarted since the last call
+                    if not (was_connected and isinstance(error, psycopg.OperationalError)):
+                        raise self._error(error) from None
+                except BaseException:
+                    self._drop()
+                    raise
 
     def close(self) -> None:
         """See `Store.close`."""

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from paramclient.model.ext_params import ExtParam
 from paramclient.model.identity import Identity, autopilot_name
-from paramclient.model.params import CACHED, COMPACT_NO_INDEX, CompactParam, ParamMap, Params
+from paramclient.model.params import CACHED, COMPACT_NO_INDEX, CompactParam, ParamMap, Params, compact_param
 from paramclient.model.values import Param, ParamType, Trust, WireValue, bits_of, from_bits, same_bits
 
 __all__ = [
@@ -102,16 +102,8 @@ class StoredParam(NamedTuple):
         cls, param: Param, heard_at: float, volatile: bool | None = None, by: str = BY_VEHICLE
     ) -> StoredParam:
         """Return an observation of a plain parameter; its trust is not stored."""
-        number = int(param.type_number)
-        return cls(
-            param.name,
-            StoredValue(number, _bits_cell(param.bits), int(param.is_raw)),
-            param.index,
-            None if volatile is None else int(volatile),
-            heard_at,
-            None if param.default is None else _bits_cell(bits_of(param.default, number)),
-            by,
-        )
+        flag = None if volatile is None else int(volatile)
+        return cls.of_compact(param.name, compact_param(param), param.default, flag, heard_at, by)
 
     @classmethod
     def of_compact(

@@ -32,8 +32,7 @@ __all__ = [
     "end_operation",
     "load_snapshots",
     "load_state",
-    "rows_of_ext_set",
-    "rows_of_set",
+    "rows_of",
     "rows_of_table",
     "store_snapshot",
 ]
@@ -185,12 +184,16 @@ def rows_of_table(rows: Mapping[str, StoredParam]) -> list[SnapshotRow]:
     return [(name, row.stored, row.default) for name, row in rows.items()]
 
 
-def rows_of_set(params: ParamSet) -> list[SnapshotRow]:
+def rows_of(params: ParamSet | ExtParamSet) -> list[SnapshotRow]:
     """Return the parameters of a set as those of a snapshot.
 
     Raises:
         UsageError: the type of a parameter is unknown, or does not hold its value.
     """
+    if isinstance(params, ExtParamSet):
+        return [
+            (name, StoredValue(int(each.type), each.raw, 0), None) for name, each in params.params.items()
+        ]
     rows: list[SnapshotRow] = []
     for name, each in params.items():
         number = each.type_number
@@ -202,11 +205,6 @@ def rows_of_set(params: ParamSet) -> list[SnapshotRow]:
             default = written_value(number, bits_of(each.default, number), is_raw=False).value
         rows.append((name, value, default))
     return rows
-
-
-def rows_of_ext_set(params: ExtParamSet) -> list[SnapshotRow]:
-    """Return the parameters of a set of extended ones as those of a snapshot."""
-    return [(name, StoredValue(int(each.type), each.raw, 0), None) for name, each in params.params.items()]
 
 
 def _of_snapshot(tx: Transaction, table: StoredTable, number: int) -> EarlierState:

@@ -13,7 +13,6 @@ from typing import TypeVar
 import platformdirs
 
 from paramclient.cache import history, snapshots, tables
-from paramclient.cache.history import Line
 from paramclient.cache.lookup import find_vehicle
 from paramclient.cache.records import (
     CachedComponent,
@@ -27,7 +26,6 @@ from paramclient.cache.records import (
     TableUpdate,
 )
 from paramclient.cache.schema import Store, Transaction
-from paramclient.cache.snapshots import SnapshotRow
 from paramclient.cache.sqlite import SqliteStore
 from paramclient.cache.updates import ensure_table, save_table
 from paramclient.errors import NotInCache, UsageError
@@ -291,8 +289,9 @@ class ParamCache:
             UnknownVehicle: no vehicle in the cache has this name.
             AmbiguousVehicle: several vehicles have this name.
         """
-        lines = self._lines(vehicle, component, name, limit, since, extended=False)
-        return [history.plain_entry(number, line) for number, line in lines]
+        which = (component, name, limit, since, False)
+        found = self._read(lambda tx: history.load_history(tx, self._choose(tx, vehicle), *which))
+        return [history.plain_entry(number, line) for number, line in found]
 
     def ext_history(
         self,
@@ -303,34 +302,15 @@ class ParamCache:
         since: float | None = None,
     ) -> list[ExtHistoryEntry]:
         """Return the changes of a vehicle's extended parameters; as `history`."""
-        lines = self._lines(vehicle, component, name, limit, since, extended=True)
-        return [history.extended_entry(number, line) for number, line in lines]
-
-    def snapshot(
-        self, vehicle: str, component: int, *, reason: str, at: float | None = None
-    ) -> SnapshotSummary:
-        """Store a snapshot of a cached table as a restore point, and return it.
-
-        The cache keeps the newest `SNAPSHOTS` (50) of each table.
-
-        Args:
-            vehicle: as for `components`.
-            component: component id.
-            reason: the reason, as text.
-            at: unix seconds; None for now.
-
-        Raises:
-            UnknownVehicle: there is no such table.
-            AmbiguousVehicle: several vehicles have this name.
-        """
-
-        return self._keep(vehicle, component, None, reason=reason, at=at)
+        which = (component, name, limit, since, True)
+        found = self._read(lambda tx: history.load_history(tx, self._choose(tx, vehicle), *which))
+        return [history.extended_entry(number, line) for number, line in found]
 
     def store_snapshot(
         self,
         vehicle: Identity | str,
         component: int,
-        params: ParamSet,
+        params: ParamSet | ExtParamSet | None = None,
         *,
         reason: str,
         at: float | None = None,
@@ -338,7 +318,7 @@ class ParamCache:
         complete: bool = True,
         is_of_operation: bool = False,
     ) -> SnapshotSummary:
-        """Store a snapshot of given parameters, and return it.
+        """Store a snapshot of a table as a restore point, and return it.
 
         The cached table does not change. The cache keeps the newest `SNAPSHOTS` (50) of each table.
 
@@ -346,7 +326,8 @@ class ParamCache:
             vehicle: identity of the vehicle, which is added to the cache if it is new; or the name of a
                 cached vehicle, as for `components`.
             component: component id.
-            params: names, values, types and defaults are stored; comments and lines are not.
+            params: names, values, types and defaults are stored; comments and lines are not. None: those of
+                the cached table, with its hash.
             reason: the reason, as text.
             at: unix seconds; None for now.
             hash: the vehicle's hash of these parameters, if known.
@@ -359,30 +340,32 @@ class ParamCache:
             UnknownVehicle: a name was given, and there is no such table.
             AmbiguousVehicle: several vehicles have this name.
         """
-        return self._keep(
-            vehicle,
-            component,
-            snapshots.rows_of_set(params),
-            reason=reason,
-            at=at,
-            hash=hash,
-            complete=complete,
-            is_of_operation=is_of_operation,
-        )
+        moment = time.time() if at is None else at
+        extended = isinstance(params, ExtParamSet)
+        rows = None if params is None else snapshots.rows_of(params)
 
-    def store_ext_snapshot(
-        self,
-        vehicle: Identity | str,
-        component: int,
-        params: ExtParamSet,
-        *,
-        reason: str,
-        at: float | None = None,
-        complete: bool = True,
-    ) -> SnapshotSummary:
-        """Store a snapshot of given extended parameters, and return it; as `store_snapshot`."""
-        rows = snapshots.rows_of_ext_set(params)
-        return self._keep(vehicle, component, rows, reason=reason, at=at, complete=complete, extended=True)
+        def work(tx: Transaction) -> SnapshotSummary:
+            if isinstance(vehicle, str):
+                table = self._table(tx, vehicle, component, extended=extended)
+                [known] = tables.load_vehicles(tx, table.key)
+                identity = known.identity
+            else:
+                identity = vehicle
+                table = ensure_table(tx, identity, component, moment, extended=extended)
+            kept = snapshots.rows_of_table(tables.load_rows(tx, table.owner)) if rows is None else rows
+            return snapshots.store_snapshot(
+                tx,
+                table,
+                identity,
+                kept,
+                at=moment,
+                reason=reason,
+                hash=table.state.hash if rows is None else hash,
+                complete=table.state.complete if rows is None else complete,
+                is_of_operation=is_of_operation,
+            )
+
+        return self._store.run(work, writing=True)
 
     def end_operation(self, snapshot: int) -> None:
         """Record that the `apply` or `restore` that has stored a snapshot has ended.
@@ -392,22 +375,27 @@ class ParamCache:
         """
         self._store.run(lambda tx: snapshots.end_operation(tx, snapshot), writing=True)
 
-    def snapshots(self, vehicle: str, component: int | None = None) -> list[SnapshotSummary]:
+    def snapshots(
+        self, vehicle: str, component: int | None = None, *, extended: bool = False
+    ) -> list[SnapshotSummary]:
         """Return the snapshots of a vehicle's tables, without parameters, newest last.
 
         Args:
             vehicle: as for `components`.
             component: only snapshots of this component.
+            extended: those of extended parameters.
 
         Raises:
             UnknownVehicle: no vehicle in the cache has this name.
             AmbiguousVehicle: several vehicles have this name.
         """
-        return self._snapshots(vehicle, component, extended=False)
 
-    def ext_snapshots(self, vehicle: str, component: int | None = None) -> list[SnapshotSummary]:
-        """Return the snapshots of a vehicle's extended parameters; as `snapshots`."""
-        return self._snapshots(vehicle, component, extended=True)
+        def work(tx: Transaction) -> list[SnapshotSummary]:
+            found = tables.load_tables(tx, self._choose(tx, vehicle), component, extended=extended)
+            kept = [each for table in found for each in snapshots.load_snapshots(tx, table)]
+            return sorted(kept, key=lambda each: each.id)
+
+        return self._read(work)
 
     def state_at(self, vehicle: str, component: int, when: float) -> ParamSet:
         """Return a table as it was at a given time.
@@ -445,69 +433,6 @@ class ParamCache:
 
     def _read(self, work: Callable[[Transaction], T]) -> T:
         return self._store.run(work, writing=False)
-
-    def _lines(
-        self,
-        vehicle: str,
-        component: int | None,
-        name: str | None,
-        limit: int | None,
-        since: float | None,
-        *,
-        extended: bool,
-    ) -> list[tuple[int, Line]]:
-        return self._read(
-            lambda tx: history.load_history(
-                tx, self._choose(tx, vehicle), component, name, limit, since, extended=extended
-            )
-        )
-
-    def _snapshots(self, vehicle: str, component: int | None, *, extended: bool) -> list[SnapshotSummary]:
-        def work(tx: Transaction) -> list[SnapshotSummary]:
-            found = tables.load_tables(tx, self._choose(tx, vehicle), component, extended=extended)
-            kept = [each for table in found for each in snapshots.load_snapshots(tx, table)]
-            return sorted(kept, key=lambda each: each.id)
-
-        return self._read(work)
-
-    def _keep(
-        self,
-        vehicle: Identity | str,
-        component: int,
-        rows: Sequence[SnapshotRow] | None,
-        *,
-        reason: str,
-        at: float | None,
-        hash: int | None = None,  # noqa: A002  # the word of the record
-        complete: bool = True,
-        is_of_operation: bool = False,
-        extended: bool = False,
-    ) -> SnapshotSummary:
-        """Store a snapshot of these rows; without any, of the stored table."""
-        moment = time.time() if at is None else at
-
-        def work(tx: Transaction) -> SnapshotSummary:
-            if isinstance(vehicle, str):
-                table = self._table(tx, vehicle, component, extended=extended)
-                [known] = tables.load_vehicles(tx, table.key)
-                identity = known.identity
-            else:
-                identity = vehicle
-                table = ensure_table(tx, identity, component, moment, extended=extended)
-            kept = snapshots.rows_of_table(tables.load_rows(tx, table.owner)) if rows is None else rows
-            return snapshots.store_snapshot(
-                tx,
-                table,
-                identity,
-                kept,
-                at=moment,
-                reason=reason,
-                hash=table.state.hash if rows is None else hash,
-                complete=table.state.complete if rows is None else complete,
-                is_of_operation=is_of_operation,
-            )
-
-        return self._store.run(work, writing=True)
 
     def _table(
         self, tx: Transaction, vehicle: str, component: int, *, extended: bool = False

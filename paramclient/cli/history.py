@@ -63,7 +63,7 @@ def history(
     with ParamCache(options.cache) as cache:
         key, component = tables_in(cache, vehicle)[0].key, component_of(vehicle)
         if snapshots:
-            found = cache.ext_snapshots(key, component) if extended else cache.snapshots(key, component)
+            found = cache.snapshots(key, component, extended=extended)
             kept = [each for each in found if begin is None or each.at >= begin]
             _print_snapshots(kept[-limit:] if limit else kept, options)
         else:

@@ -299,7 +299,7 @@ class ExtParams:
             raise UsageError(f"no extended parameter of {self._core.label} is known; fetch them first")
         identity = await self._written_identity()
         params, number = ExtParamSet(dict(self.params)), self._machine.component
-        store = partial(cache.store_ext_snapshot, identity, number, params, reason=reason)
+        store = partial(cache.store_snapshot, identity, number, params, reason=reason)
         return (await client.cache_writer.run_in_thread(partial(store, complete=self.is_complete))).id
 
     async def snapshots(self) -> list[SnapshotSummary]:
@@ -315,7 +315,7 @@ class ExtParams:
 
         def read() -> list[SnapshotSummary]:
             try:
-                return cache.ext_snapshots(key, number)
+                return cache.snapshots(key, number, extended=True)
             except UnknownVehicle:  # no vehicle that was named, but one on the link
                 return []
 

@@ -210,7 +210,7 @@ async def create_snapshot(
             complete=complete,
         )
     )
-    return {"id": kept}
+    return {"id": kept.id}
 
 
 @reading.get(f"{VEHICLE}/history")

@@ -125,8 +125,8 @@ def known(path: Path) -> None:
             cache.save(update(*(stored(*item, at=at, by=BY_US) for item in items), table=DONE, at=at))
         at = HOUR_AGO + 1300
         cache.save(update(stored("C", 1, at=at), stored("C", 2, at=at), component=154, at=at))
-        cache.snapshot(PX4.key, 1, reason="before apply \x1b[31m.parm", at=HOUR_AGO + 1500)
-        cache.snapshot(PX4.key, 154, reason="by hand", at=HOUR_AGO + 1900)
+        cache.store_snapshot(PX4.key, 1, reason="before apply \x1b[31m.parm", at=HOUR_AGO + 1500)
+        cache.store_snapshot(PX4.key, 154, reason="by hand", at=HOUR_AGO + 1900)
 
 
 @pytest.mark.usefixtures("known")
