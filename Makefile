@@ -25,7 +25,7 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 TESTS ?=
 SESSIONS ?= 10000
 KILLS ?= 1000
-TARGETS ?= component files framer metadata pack service signing tlog
+TARGETS ?= component files framer metadata pack signing tlog
 SECONDS ?= 1800
 LINK ?=
 KIND ?=
@@ -36,6 +36,7 @@ READ_ONLY ?=
 REBOOT ?=
 
 MEASURED = 'model/*' 'protocol/*' 'sim/*' 'cache/*' 'files/*' errors.py
+
 # more workers than cores: many tests wait for a process, a socket or a timeout
 WORKERS ?= $(shell $(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 2)')
 

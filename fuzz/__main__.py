@@ -17,9 +17,7 @@ import atheris
 
 HERE: Final = Path(__file__).parent
 TARGETS: Final = sorted(
-    path.stem
-    for path in HERE.glob("*.py")
-    if path.stem not in ("__init__", "__main__", "draw", "keep")
+    path.stem for path in HERE.glob("*.py") if path.stem not in ("__init__", "__main__", "draw", "keep")
 )
 
 

@@ -3,10 +3,10 @@
 - `client`: the client over a link.
 - `sync`: the same client for scripts and notebooks, without `await`.
 - `protocol`, `links`: the sans-I/O core, and the bytes in and out.
-- `cache`, `files`, `metadata`, `logs`, `provision`, `diagnosis`: cached tables, parameter files, units
+- `cache`, `files`, `metadata`, `logs`, `provision`: cached tables, parameter files, units
   and ranges, telemetry logs, setting up vehicles, the check of a vehicle.
 - `model`, `errors`, `version`: plain data, exceptions, the version.
-- `service`, `documents`, `cli`: the HTTP service, JSON documents, the command line.
+- `service`, `cli`: the HTTP service, the command line.
 - `sim`, `testing`: simulated vehicles, and fixtures for tests.
 
 To find the module of a rule, see "Find the code" in `docs/internals/design.md`.
@@ -17,14 +17,7 @@ from __future__ import annotations
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component, ComponentState
-from paramclient.client.events import (
-    Discovered,
-    Event,
-    Found,
-    Lost,
-    Rebooted,
-    Resynced,
-)
+from paramclient.client.events import Discovered, Event, Found, Lost, Rebooted, Resynced
 from paramclient.client.files import Ftp
 from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.reset import ResetResult

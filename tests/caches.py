@@ -14,7 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import paramclient
-from paramclient.cache import BY_VEHICLE, HistoryEntry, ParamCache, StoredParam, TableState, TableUpdate
+from paramclient.cache import (
+    BY_VEHICLE,
+    CachedExtTable,
+    HistoryEntry,
+    ParamCache,
+    StoredParam,
+    TableState,
+    TableUpdate,
+)
 from paramclient.cache.sqlite import APPLICATION_ID
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, ParamType, from_bits
@@ -87,6 +95,14 @@ def changes(cache: ParamCache, name: str | None = None) -> list[HistoryEntry]:
     """The history of the only table, or of one of its parameters."""
     table = cache.component()
     return cache.history(table.key, table.component, name)
+
+
+def extended(cache: ParamCache, key: str | None = None) -> CachedExtTable:
+    """The only table of extended parameters, or that of a vehicle."""
+    [table] = [each for each in cache.ext_sizes() if key in (None, each[0])]
+    found = cache.load_ext(*table)
+    assert found is not None
+    return found
 
 
 def rubbish(size: int, seed: int = 1) -> bytes:

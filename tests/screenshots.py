@@ -88,7 +88,8 @@ def _phone(browser: Browser, bench: Bench) -> None:
     page.get_by_role("searchbox").blur()
     page.get_by_label("Group", exact=True).select_option("MC")
     _save(page, "page-phone.png")
-    page.locator("#rows .row", has_text="MC_PITCH_P").tap()
+    page.get_by_role("searchbox").fill("MC_ROLL_P")
+    page.locator("#rows .row").first.tap()
     expect(page.locator(".past li").first).to_be_visible()
     _save(page, "page-phone-edit.png")
 

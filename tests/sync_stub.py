@@ -10,30 +10,35 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
-from paramclient import diagnosis, metadata, provision
-from paramclient.client import client, component, events, files, streams
+from paramclient import metadata, provision
+from paramclient.client import client, component, events, extended_params, files, subscription
 from paramclient.provision import fleet
 
 STUB = Path(__file__).parent.parent / "paramclient" / "sync" / "__init__.pyi"
 
 CLASSES: dict[ModuleType, list[str]] = {
-    streams: ["Changes", "Events"],
+    subscription: ["Changes", "ExtChanges"],
+    extended_params: ["ExtParams"],
     files: ["Ftp"],
     component: ["Component"],
     fleet: ["Wanted"],
-    events: ["Discovered", "Lost", "Found", "Rebooted", "Resynced", "Event"],
+    events: [
+        *("Discovered", "Lost", "Found", "Rebooted", "Resynced", "Contested", "Uncontested"),
+        *("Event", "Events"),
+    ],
     client: ["ParamClient"],
 }
 FUNCTIONS: list[Callable[..., object]] = [
     *(provision.prepare, provision.apply, provision.verify, provision.restore),
     *(provision.apply_all, provision.verify_all, provision.restore_all),
     *(provision.apply_extended, provision.verify_extended, provision.restore_extended),
-    *(provision.load_extended_state, metadata.metadata_of, diagnosis.check_vehicle),
+    *(provision.load_extended_state, metadata.metadata_of),
 ]
-STREAMS = {"Changes": "Change", "Events": "Event"}
+STREAMS = {"Changes": "Change", "ExtChanges": "ExtChange", "Events": "Event"}
 OWN = {name for names in CLASSES.values() for name in names} | {each.__name__ for each in FUNCTIONS}
 ATTRIBUTES = {
     "Component": ("system: int", "component: int", "params: ParamMap"),
+    "ExtParams": ("params: Mapping[str, ExtParam]",),
     "ParamClient": ("cache: ParamCache | None",),
 }
 """The public attributes that `__init__` sets."""

@@ -39,12 +39,10 @@ MAY_IMPORT = {
     "files": {"errors", "model", "protocol"},
     "metadata": SHELL,
     "client": SHELL | {"sim"},
-    "diagnosis": SHELL | {"metadata"},
     "provision": SHELL | {"files"},
     "logs": SHELL | {"files"},
-    "sync": SHELL | {"sim", "metadata", "diagnosis", "provision"},
+    "sync": SHELL | {"sim", "metadata", "provision"},
     "testing": {"errors", "sim"},
-    "documents": SHELL | {"files", "metadata", "provision", "logs", "diagnosis"},
     "": SHELL | {"files"},
 }
 """The rooms that a room may import. A name covers the rooms inside; the empty name is the public face. The
@@ -305,7 +303,7 @@ def test_names_in_all_exist_once() -> None:
 def test_importing_the_package_loads_nothing_that_only_some_need() -> None:
     """Start-up is part of the command's promise; mavutil, besides, changes the process that imports it."""
     unwanted = {"pymavlink.mavutil", "pydantic", "filelock", *LIBRARIES} - {"pymavlink", "asyncio"}
-    rooms = ("sim", "testing", "cli", "provision", "documents", "service", "sync")
+    rooms = ("sim", "testing", "cli", "provision", "service", "sync")
     unwanted |= {f"paramclient.{room}" for room in rooms}
     program = f"import sys; from paramclient import *; print(sorted({unwanted!r} & sys.modules.keys()))"
     run = subprocess.run(

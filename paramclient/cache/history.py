@@ -95,7 +95,6 @@ def load_history(
     name: str | None,
     limit: int | None,
     since: float | None,
-    *,
     extended: bool,
 ) -> list[tuple[int, Line]]:
     """Return the changes of a vehicle's values with their component ids, newest last."""

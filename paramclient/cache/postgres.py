@@ -21,8 +21,9 @@ CONNECT_WAIT_MAX: Final = 5
 """Seconds for which a call waits for a new connection."""
 SERVER_SILENCE_MAX: Final = 20
 """Seconds after which a server that does not respond counts as unreachable."""
-RETRY_INTERVAL: Final = 5.0
-"""Seconds after a failed connection in which calls fail at once: each would wait for the connection."""
+RETRY_INTERVAL_MIN: Final = 0.25
+"""Minimum seconds after a failed connection in which calls fail at once; otherwise as long as that took: each
+call would wait for the connection."""
 
 _SCHEMA: Final = f"paramclient_{SCHEMA_VERSION}"
 _WRITE_LOCK: Final = 0x5041524D
@@ -75,24 +76,18 @@ class PostgresStore:
         with self._lock:
             if self._is_closed:
                 raise CacheError(f"the cache {self.place} is closed")
-            was_connected = self._connection is not None
-            try:
-                return self._transact(work, writing=writing)
-            except psycopg.OperationalError as error:
-                self._drop()
-                if not was_connected:
-                    raise self._error(error) from None
-            except psycopg.Error as error:
-                self._drop()
-                raise self._error(error) from None
-            except BaseException:
-                self._drop()
-                raise
-            try:  # the server may have been restarted since the last call
-                return self._transact(work, writing=writing)
-            except psycopg.Error as error:
-                self._drop()
-                raise self._error(error) from None
+            while True:
+                was_connected = self._connection is not None
+                try:
+                    return self._transact(work, writing=writing)
+                except psycopg.Error as error:
+                    self._drop()
+                    # the server may have been restarted since the last call
+                    if not (was_connected and isinstance(error, psycopg.OperationalError)):
+                        raise self._error(error) from None
+                except BaseException:
+                    self._drop()
+                    raise
 
     def close(self) -> None:
         """See `Store.close`."""
@@ -114,10 +109,12 @@ class PostgresStore:
     def _connect(self) -> psycopg.Connection:
         if self._failure is not None and time.monotonic() < self._failure[0]:
             raise CacheError(self._failure[1])
+        began = time.monotonic()
         try:
             connection = psycopg.connect(**self._options, autocommit=True)
         except psycopg.Error as error:
-            self._failure = (time.monotonic() + RETRY_INTERVAL, str(self._error(error)))
+            now = time.monotonic()
+            self._failure = (now + max(now - began, RETRY_INTERVAL_MIN), str(self._error(error)))
             raise
         self._failure = None
         try:

@@ -31,7 +31,7 @@ __all__ = [
     "end_operation",
     "load_snapshots",
     "load_state",
-    "rows_of_set",
+    "rows_of",
     "rows_of_table",
     "store_snapshot",
 ]
@@ -177,7 +177,7 @@ def rows_of_table(rows: Mapping[str, StoredParam]) -> list[SnapshotRow]:
     return [(name, row.stored, row.default) for name, row in rows.items()]
 
 
-def rows_of_set(params: ParamSet) -> list[SnapshotRow]:
+def rows_of(params: ParamSet) -> list[SnapshotRow]:
     """Return the parameters of a set as those of a snapshot.
 
     Raises:

@@ -24,7 +24,6 @@ from paramclient.cache.records import (
     TableUpdate,
 )
 from paramclient.cache.schema import Store, Transaction
-from paramclient.cache.snapshots import SnapshotRow
 from paramclient.cache.sqlite import SqliteStore
 from paramclient.cache.updates import ensure_table, save_table
 from paramclient.errors import NotInCache, UsageError
@@ -289,38 +288,15 @@ class ParamCache:
             UnknownVehicle: no vehicle in the cache has this name.
             AmbiguousVehicle: several vehicles have this name.
         """
-        lines = self._read(
-            lambda tx: history.load_history(
-                tx, self._choose(tx, vehicle), component, name, limit, since, extended=extended
-            )
-        )
-        return [history.entry_of(number, line) for number, line in lines]
-
-    def snapshot(
-        self, vehicle: str, component: int, *, reason: str, at: float | None = None
-    ) -> SnapshotSummary:
-        """Store a snapshot of a cached table as a restore point, and return it.
-
-        The cache keeps the newest `SNAPSHOTS` (50) of each table.
-
-        Args:
-            vehicle: as for `components`.
-            component: component id.
-            reason: the reason, as text.
-            at: unix seconds; None for now.
-
-        Raises:
-            UnknownVehicle: there is no such table.
-            AmbiguousVehicle: several vehicles have this name.
-        """
-
-        return self._keep(vehicle, component, None, reason=reason, at=at)
+        which = (component, name, limit, since, extended)
+        found = self._read(lambda tx: history.load_history(tx, self._choose(tx, vehicle), *which))
+        return [history.entry_of(number, line) for number, line in found]
 
     def store_snapshot(
         self,
         vehicle: Identity | str,
         component: int,
-        params: ParamSet,
+        params: ParamSet | None = None,
         *,
         reason: str,
         at: float | None = None,
@@ -329,7 +305,7 @@ class ParamCache:
         is_of_operation: bool = False,
         extended: bool = False,
     ) -> SnapshotSummary:
-        """Store a snapshot of given parameters, and return it.
+        """Store a snapshot of a table as a restore point, and return it.
 
         The cached table does not change. The cache keeps the newest `SNAPSHOTS` (50) of each table.
 
@@ -337,7 +313,8 @@ class ParamCache:
             vehicle: identity of the vehicle, which is added to the cache if it is new; or the name of a
                 cached vehicle, as for `components`.
             component: component id.
-            params: names, values, types and defaults are stored; comments and lines are not.
+            params: names, values, types and defaults are stored; comments and lines are not. None: those of
+                the cached table, with its hash.
             reason: the reason, as text.
             at: unix seconds; None for now.
             hash: the vehicle's hash of these parameters, if known.
@@ -351,17 +328,31 @@ class ParamCache:
             UnknownVehicle: a name was given, and there is no such table.
             AmbiguousVehicle: several vehicles have this name.
         """
-        return self._keep(
-            vehicle,
-            component,
-            snapshots.rows_of_set(params),
-            reason=reason,
-            at=at,
-            hash=hash,
-            complete=complete,
-            is_of_operation=is_of_operation,
-            extended=extended,
-        )
+        moment = time.time() if at is None else at
+        rows = None if params is None else snapshots.rows_of(params)
+
+        def work(tx: Transaction) -> SnapshotSummary:
+            if isinstance(vehicle, str):
+                table = self._table(tx, vehicle, component, extended=extended)
+                [known] = tables.load_vehicles(tx, table.key)
+                identity = known.identity
+            else:
+                identity = vehicle
+                table = ensure_table(tx, identity, component, moment, extended=extended)
+            kept = snapshots.rows_of_table(tables.load_rows(tx, table.owner)) if rows is None else rows
+            return snapshots.store_snapshot(
+                tx,
+                table,
+                identity,
+                kept,
+                at=moment,
+                reason=reason,
+                hash=table.state.hash if rows is None else hash,
+                complete=table.state.complete if rows is None else complete,
+                is_of_operation=is_of_operation,
+            )
+
+        return self._store.run(work, writing=True)
 
     def end_operation(self, snapshot: int) -> None:
         """Record that the `apply` or `restore` that has stored a snapshot has ended.
@@ -379,7 +370,7 @@ class ParamCache:
         Args:
             vehicle: as for `components`.
             component: only snapshots of this component.
-            extended: those of extended parameters, instead of the plain ones.
+            extended: those of extended parameters.
 
         Raises:
             UnknownVehicle: no vehicle in the cache has this name.
@@ -390,6 +381,8 @@ class ParamCache:
             found = tables.load_tables(tx, self._choose(tx, vehicle), component, extended=extended)
             kept = [each for table in found for each in snapshots.load_snapshots(tx, table)]
             return sorted(kept, key=lambda each: each.id)
+
+        return self._read(work)
 
         return self._read(work)
 
@@ -423,45 +416,6 @@ class ParamCache:
 
     def _read(self, work: Callable[[Transaction], T]) -> T:
         return self._store.run(work, writing=False)
-
-    def _keep(
-        self,
-        vehicle: Identity | str,
-        component: int,
-        rows: Sequence[SnapshotRow] | None,
-        *,
-        reason: str,
-        at: float | None,
-        hash: int | None = None,  # noqa: A002  # the word of the record
-        complete: bool = True,
-        is_of_operation: bool = False,
-        extended: bool = False,
-    ) -> SnapshotSummary:
-        """Store a snapshot of these rows; without any, of the stored table."""
-        moment = time.time() if at is None else at
-
-        def work(tx: Transaction) -> SnapshotSummary:
-            if isinstance(vehicle, str):
-                table = self._table(tx, vehicle, component, extended=extended)
-                [known] = tables.load_vehicles(tx, table.key)
-                identity = known.identity
-            else:
-                identity = vehicle
-                table = ensure_table(tx, identity, component, moment, extended=extended)
-            kept = snapshots.rows_of_table(tables.load_rows(tx, table.owner)) if rows is None else rows
-            return snapshots.store_snapshot(
-                tx,
-                table,
-                identity,
-                kept,
-                at=moment,
-                reason=reason,
-                hash=table.state.hash if rows is None else hash,
-                complete=table.state.complete if rows is None else complete,
-                is_of_operation=is_of_operation,
-            )
-
-        return self._store.run(work, writing=True)
 
     def _table(
         self, tx: Transaction, vehicle: str, component: int, *, extended: bool = False

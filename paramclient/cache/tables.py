@@ -118,17 +118,13 @@ def find_table(tx: Transaction, key: str, component: int, *, extended: bool = Fa
 def load_vehicles(tx: Transaction, key: str | None = None) -> list[CachedVehicle]:
     """Return all vehicles, the last seen first; or the one with this key."""
     components: dict[str, list[int]] = defaultdict(list)
-    which = ("", ()) if key is None else (" AND vehicle = ?", (key,))
-    for vehicle, component in tx.all(
-        f"SELECT vehicle, component FROM component WHERE extended = 0{which[0]} ORDER BY component", which[1]
-    ):
-        components[vehicle].append(component)
-    which = ("", ()) if key is None else (" WHERE key = ?", (key,))
+    for table in load_tables(tx, key):
+        components[table.key].append(table.component)
+    where, values = ("", ()) if key is None else (" WHERE key = ?", (key,))
+    rows = tx.all(f"SELECT key, first_seen, last_seen, {IDENTITY} FROM vehicle{where}", values)
     found = [
         CachedVehicle(vehicle, read_identity(cells), first, last, tuple(components[vehicle]))
-        for vehicle, first, last, *cells in tx.all(
-            f"SELECT key, first_seen, last_seen, {IDENTITY} FROM vehicle{which[0]}", which[1]
-        )
+        for vehicle, first, last, *cells in rows
     ]
     return sorted(found, key=lambda each: (-each.last_seen, each.key))
 

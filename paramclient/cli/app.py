@@ -168,43 +168,18 @@ _app: Final = App(
     )
     + _EXIT_CODES,
     version=f"paramclient {__version__}",
-    default_parameter=Parameter(negative=()),
+    default_parameter=Parameter(negative=(), show_default=False),
     help_format="plaintext",
     version_format="plaintext",
 )
-_cache: Final = App(
-    name="cache",
-    help="Show, remove or copy tables in the cache. Needs no link.",
-    help_epilogue=_examples(
-        "cache list",
-        "cache path",
-        "cache remove 1",
-    ),
-)
-
-_signing: Final = App(
-    name="signing",
-    help="Set and remove the signing key of a vehicle.",
-    help_epilogue=_examples(
-        "signing setup udpin:0.0.0.0:14550 --signing-key vehicle.key",
-        "signing disable udpin:0.0.0.0:14550 --signing-key vehicle.key",
-    ),
-)
+_cache: Final = App(name="cache", help="List or remove tables in the cache. Needs no link.")
+_signing: Final = App(name="signing", help="Set and remove the signing key of a vehicle.")
 _metadata: Final = App(
-    name="metadata",
-    help="Add, list or remove metadata files, which describe parameters. Needs no link.",
-    help_epilogue=_examples(
-        "metadata add apm.pdef.xml",
-        "metadata add apm.pdef.xml --firmware 4.6",
-        "metadata list",
-        "metadata remove copter --firmware 4.6",
-    ),
+    name="metadata", help="Add, list or remove metadata files, which describe parameters. Needs no link."
 )
 
 
-def _add(
-    group: App, function: str, *examples: str, arguments: str | None = None, name: str | None = None
-) -> None:
+def _add(group: App, function: str, arguments: str | None = None, *examples: str) -> None:
     """Add a subcommand, named like its function without the group and a trailing underscore.
 
     The function is named and not imported: a subcommand loads only its own modules, which halves the time
@@ -213,11 +188,10 @@ def _add(
     Args:
         group: the group, or the whole command line.
         function: module of `paramclient.cli`, and function.
-        examples: arguments of the examples in the help.
         arguments: the arguments in the usage line, if they are not the function's names.
-        name: the name of the subcommand, if it is not that of the function.
+        examples: arguments of the examples in the help.
     """
-    name = name or function.partition(":")[2].removesuffix("_").removeprefix(f"{group.name[0]}_")
+    name = function.partition(":")[2].removesuffix("_").removeprefix(f"{group.name[0]}_")
     words = name if group is _app else f"{group.name[0]} {name}"
     group.command(
         f"paramclient.cli.{function}",
@@ -227,128 +201,51 @@ def _add(
     )
 
 
-_add(
-    _app,
-    "read_commands:fetch",
-    "udpin:0.0.0.0:14550",
-    "sim:px4 --json",
-    "tcp:127.0.0.1:5760 --system 3",
-    "udpin:0.0.0.0:14550 --only 'MC_*'",
-    arguments="URL",
-)
-_add(
-    _app,
-    "read_commands:get",
-    "udpin:0.0.0.0:14550 MC_ROLL_P MC_PITCH_P",
-    "sim:ardupilot 'rtl_*'",
-    arguments="URL NAME [NAME...]",
-)
+_add(_app, "read_commands:fetch", "URL", "sim:px4 --only 'MC_*'", "tcp:127.0.0.1:5760 --vehicle 3 --json")
+_add(_app, "read_commands:get", "URL NAME [NAME...]", "udpin:0.0.0.0:14550 MC_ROLL_P 'MC_PITCH*'")
 _add(
     _app,
     "set_command:set_",
+    "URL NAME VALUE|NAME=VALUE [NAME VALUE|NAME=VALUE...]",
     "udpin:0.0.0.0:14550 MC_ROLL_P 6.5 MC_PITCH_P 6.5",
     "udpin:0.0.0.0:14550 FLTMODE1=Loiter --metadata apm.pdef.xml",
-    arguments="URL NAME VALUE|NAME=VALUE [NAME VALUE|NAME=VALUE...]",
 )
 _add(
     _app,
     "reset_command:reset",
+    "URL NAME [NAME...]|--all|--changed",
     "udpin:0.0.0.0:14550 MC_ROLL_P 'MC_PITCH*'",
     "udpin:0.0.0.0:14550 --changed --dry-run",
-    arguments="URL NAME [NAME...]|--all|--changed",
 )
-_add(
-    _app,
-    "read_commands:watch",
-    "udpin:0.0.0.0:14550",
-    "udpin:0.0.0.0:14550 MC_ROLL_P --json",
-    arguments="URL [NAME...]",
-)
-_add(_app, "link:link", "udpin:0.0.0.0:14550", "udpin:0.0.0.0:14550 --seconds 10 --json")
-_add(
-    _app,
-    "check:check",
-    "udpin:0.0.0.0:14550",
-    "serial:/dev/ttyUSB0:57600 --report check.md",
-    "sim:px4 --json",
-)
-_add(
-    _app,
-    "offline:show",
-    *("", "1", "1 MC_ROLL_P", "00020000 --json", "quad.params"),
-    arguments="[FILE|VEHICLE [NAME...]]",
-)
-_add(
-    _app,
-    "diff:diff",
-    "before.params after.params",
-    "quad.param udpin:0.0.0.0:14550 --only 'MC_*'",
-    "1 2 --base defaults",
-    arguments="LEFT RIGHT",
-)
-_add(
-    _app,
-    "history:history",
-    *("1 MC_ROLL_P", "1 'MC_*' --since '2h ago'", "1 --snapshots"),
-    arguments="[VEHICLE] [NAME...]",
-)
-_add(
-    _app,
-    "search:search",
-    *("roll rate", "battery voltage --vehicle 1", "geofence --metadata apm.pdef.xml"),
-    arguments="WORD [WORD...]",
-)
-_add(_app, "search:info", "MC_ROLL_P", "rtl_alt --vehicle 1 --json")
-_add(
-    _app,
-    "save:save",
-    "udpin:0.0.0.0:14550 quad.json",
-    "sim:ardupilot tuned.param --changed",
-    "1 before.params --all",
-    arguments="URL|LOG|VEHICLE FILE",
-)
+_add(_app, "watch:watch", "URL [NAME...]", "udpin:0.0.0.0:14550 MC_ROLL_P --json")
+_add(_app, "link:link", None, "udpin:0.0.0.0:14550 --seconds 10 --json")
+_add(_app, "check:check", None, "udpin:0.0.0.0:14550")
+_add(_app, "offline:show", "[FILE|VEHICLE [NAME...]]", "", "1 MC_ROLL_P", "quad.params")
+_add(_app, "diff:diff", "LEFT RIGHT", "quad.param udpin:0.0.0.0:14550 --only 'MC_*'", "1 2 --base defaults")
+_add(_app, "history:history", "VEHICLE [NAME...]", "1 'MC_*' --since '2h ago'", "1 --snapshots")
+_add(_app, "search:search", "WORD [WORD...]", "roll rate", "geofence --metadata apm.pdef.xml")
+_add(_app, "search:info", None, "MC_ROLL_P", "rtl_alt --vehicle 1 --json")
+_add(_app, "save:save", "URL|LOG|VEHICLE FILE", "udpin:0.0.0.0:14550 quad.params", "1 tuned.param --changed")
 _add(
     _app,
     "apply:apply",
+    "URL FILE",
     "udpin:0.0.0.0:14550 quad.params --dry-run",
-    "udpin:0.0.0.0:14550 quad.params --reboot --backup before.json",
-    "udpin:0.0.0.0:14550 fleet.param --all --overlay 'own/{system}.param'",
-    "sim:ardupilot copter.param",
-    arguments="URL FILE",
+    "udpin:0.0.0.0:14550 fleet.param --vehicle all --overlay 'own/{system}.param'",
 )
-_add(
-    _app,
-    "apply:restore",
-    "udpin:0.0.0.0:14550 --dry-run",
-    "udpin:0.0.0.0:14550 '2h ago'",
-    "udpin:0.0.0.0:14550 before.json",
-    "udpin:0.0.0.0:14550 --all --expect 5",
-    arguments="URL [WHEN|FILE]",
-)
-_add(_app, "logs:import_", "flight.tlog", "logs/*.tlog --json", arguments="FILE [FILE...]")
-_add(
-    _app,
-    "serve:serve",
-    "udpin:0.0.0.0:14550",
-    "serial:/dev/ttyACM0:57600 udpin:0.0.0.0:14550 --listen 127.0.0.1:0",
-    arguments="LINK [LINK...]",
-)
-_add(_app, "token:token", "anna --file tokens", "wall-display --file tokens --read")
-_app.command(_cache)
-_app.command(_metadata)
-_add(_app, "ports:ports", "", "--json")
-_add(
-    _app,
-    "simulate:sim",
-    "px4 --link udpout:127.0.0.1:14550 --loss 0.05 --seed 1",
-    "ardupilot --link udpin:127.0.0.1:0",
-)
-_app.command(_signing)
-_add(_signing, "signing:setup")
-_add(_signing, "signing:disable")
-_add(_metadata, "metadata_files:metadata_add")
+_add(_app, "restore:restore", "URL [WHEN|FILE]", "sim:px4 --dry-run", "udpin:0.0.0.0:14550 '2h ago'")
+_add(_app, "logs:import_", "FILE [FILE...]", "flight.tlog")
+_add(_app, "serve:serve", "LINK [LINK...]", "serial:/dev/ttyACM0:57600 --listen 127.0.0.1:0")
+_add(_app, "token:token", None, "anna --file tokens", "wall-display --file tokens --read")
+_add(_app, "ports:ports")
+_add(_app, "simulate:sim", None, "px4 --link udpout:127.0.0.1:14550 --loss 0.05 --seed 1")
+for _group in (_cache, _metadata, _signing):
+    _app.command(_group)
+_add(_signing, "signing:setup", None, "udpin:0.0.0.0:14550 --signing-key vehicle.key")
+_add(_signing, "signing:disable", None, "udpin:0.0.0.0:14550 --signing-key vehicle.key")
+_add(_metadata, "metadata_files:metadata_add", None, "apm.pdef.xml --firmware 4.6")
 _add(_metadata, "metadata_files:metadata_list")
-_add(_metadata, "metadata_files:metadata_remove")
+_add(_metadata, "metadata_files:metadata_remove", None, "copter --firmware 4.6")
 _add(_cache, "offline:cache_list")
 _add(_cache, "offline:cache_path")
-_add(_cache, "offline:cache_remove")
+_add(_cache, "offline:cache_remove", None, "1")

@@ -1,46 +1,40 @@
-"""The subcommand check: measures a vehicle and its link, and prints or saves the report."""
+"""The subcommand check: measures a vehicle and its link, and prints slow or unusual results."""
 
 from __future__ import annotations
 
-import json
 import platform
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass
 from importlib.metadata import version
-from pathlib import Path
-from statistics import median
-from typing import TYPE_CHECKING, Final
+from typing import Annotated, Final
 
+from cyclopts import Parameter
+
+from paramclient.cli.check_measurements import ListCheck, Measurements, Report
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.options import Id, Seconds, TrafficOptions
-from paramclient.cli.output import (
-    Coloured,
-    milliseconds,
-    print_document,
-    print_line,
-    print_table,
-    printable,
-    say,
-)
-from paramclient.cli.session import VEHICLE_TIMEOUT, Deadline, listen, wait_for_vehicle
-from paramclient.cli.vehicle_name import VehicleName, check_uid
-from paramclient.diagnosis import Finding, Severity, VehicleReport, check_vehicle, findings_of
+from paramclient.cli.options import Seconds, TrafficOptions
+from paramclient.cli.output import Coloured, milliseconds, print_json, print_line, print_table, say
+from paramclient.cli.session import VEHICLE_TIMEOUT, ChosenVehicle, Deadline, listen, wait_for_vehicle
 from paramclient.errors import UsageError
 from paramclient.model.identity import version_text
-from paramclient.model.wording import first_of
 from paramclient.version import __version__
-
-if TYPE_CHECKING:
-    from paramclient.documents.check import CheckDoc, VersionsDoc
 
 __all__ = ["check"]
 
 CHECK_TIMEOUT: Final = 60.0
 """Seconds for the whole measurement without --timeout: a list at 57600 baud takes 35."""
-ENTRIES_SHOWN_MAX: Final = 8
-"""Files and directories that a row names, so that it stays one line; it gives the number of further ones."""
+NOTABLE_LOSS: Final = 0.005
+"""Share of lost frames from which downloads noticeably repeat requests."""
+SEVERE_LOSS: Final = 0.1
+"""Share of lost frames from which downloads take several times as long."""
+ROUND_TRIP_LONG: Final = 0.5
+"""Seconds from which a round trip is reported as long: each repeat of a lost request costs at least one."""
+LIST_RATE_SLOW: Final = 200.0
+"""Values per second below which a list is reported as slow. ArduPilot sends 1,680 and PX4 1,000 over UDP or
+USB (measured); a 57600 baud radio carries 40."""
 _DEFAULTS: Final = TrafficOptions()
-_STYLES: Final = {Severity.PROBLEM: "red", Severity.SLOW: "yellow", Severity.NOTE: ""}
+_STYLES: Final = {"problem": "red", "slow": "yellow"}
 """Styles of rich for each severity."""
 
 
@@ -48,11 +42,8 @@ async def check(
     url: str,
     /,
     *,
-    vehicle: str | None = None,
-    system: Id = None,
-    component: Id = None,
+    vehicle: Annotated[str | None, Parameter(name="--vehicle")] = None,
     timeout: Seconds = None,
-    report: Path | None = None,
     options: TrafficOptions = _DEFAULTS,
 ) -> int:
     """Measure a vehicle and its link: identity, services and their speed. Report slow or unusual results.
@@ -62,212 +53,181 @@ async def check(
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
-        vehicle: The vehicle to measure: 4 or 4/1, px4 or ardupilot, or a hardware id or key of the
-            cache. Instead of --system.
-        system: The system to measure, 1 to 255. Default: the first one received.
-        component: The component to measure, 1 to 255. Default: the autopilot.
+        vehicle: The vehicle: 4 or 4/1 (system and component id), or uid:HARDWARE-ID.
         timeout: Timeout for the whole measurement in seconds. Default: 60.
-        report: Also write the result to this new file, to attach it to an issue.
     """
-    if report is not None:
-        _check_is_new(report)
-    named = VehicleName.chosen(vehicle, system, component)
+    choice = ChosenVehicle.parse(vehicle)
+    if choice.is_all:
+        raise UsageError("check measures one vehicle")
     deadline = Deadline(CHECK_TIMEOUT if timeout is None else timeout)
     async with listen(url, options) as client:
         if client.listens_only:
             raise UsageError(f"{client.link.name} is a log: check needs a link to a vehicle")
         heartbeat_timeout = VEHICLE_TIMEOUT if timeout is None else deadline.left()
-        found = await wait_for_vehicle(
-            client, named.system, named.component, kind=named.kind, timeout=heartbeat_timeout
-        )
-        await check_uid(client, found, named.uid)
-        left = deadline.left()
-        assert left is not None
-        measured = await check_vehicle(
-            client, found, timeout=left, progress=_show_progress if sys.stderr.isatty() else None
-        )
-    findings = findings_of(measured)
-    if options.json or report is not None:
-        document = _document(measured, findings)
-        if options.json:
-            print_document(document)
-        if report is not None:
-            _write(report, measured, findings, document)
-    if not options.json:
-        print_table(("what", "measured"), _rows(measured))
+        found = await wait_for_vehicle(client, choice, timeout=heartbeat_timeout)
+        progress = _say_step if sys.stderr.isatty() else None
+        report = await Measurements(client, found, deadline, progress).take()
+    findings = list(_findings(report))
+    if options.json:
+        versions = {
+            "paramclient": __version__,
+            "pymavlink": version("pymavlink"),
+            "python": platform.python_version(),
+            "system": platform.platform(),
+        }
+        written = [{"severity": each.severity, "text": each.text, "advice": each.advice} for each in findings]
+        print_json({**report.as_json(), "findings": written, "versions": versions})
+    else:
+        print_table(("what", "measured"), _rows(report))
         print_line("")
         if findings:
-            print_table(
-                ("severity", "slow or unusual"),
-                ((Coloured(each.severity, _STYLES[each.severity]), _sentence(each)) for each in findings),
-            )
+            rows = ((each.cell, f"{each.text} {each.advice}".rstrip()) for each in findings)
+            print_table(("severity", "slow or unusual"), rows)
         else:
             print_line("Nothing slow or unusual.")
-    if report is not None:
-        say(f"written to {report}")
-    is_whole = measured.list is not None and measured.list.error is None and not measured.list.missing
+    listed = report.list_
+    is_whole = listed is not None and listed.error is None and not listed.missing
     return ExitCode.DONE if is_whole else ExitCode.INCOMPLETE
 
 
-def _check_is_new(path: Path) -> None:
-    if path.exists():
-        raise UsageError(f"{path} exists already; name a file that does not")
-
-
-def _show_progress(measurement: str) -> None:
+def _say_step(measurement: str) -> None:
     say(f"measuring: {measurement}")
 
 
 # Tables
 
 
-def _sentence(finding: Finding) -> str:
-    return f"{finding.text} {finding.advice}".rstrip()
-
-
-def _rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
-    yield "vehicle", _vehicle(report)
-    yield from _identity_rows(report)
-    yield "encoding", f"{report.encoding}: {report.encoding_reason}"
-    yield from _link_rows(report)
-    yield from _service_rows(report)
-    stations = ", ".join(f"{each.system}/{each.component}" for each in report.link.stations)
-    yield "other stations", stations or "none"
-    if report.link.autopilots:
-        named = ", ".join(f"{system}/{component}" for system, component in report.link.autopilots)
-        yield "other autopilots", named
-    yield "measured in", f"{report.elapsed:.1f} s"
-
-
-def _vehicle(report: VehicleReport) -> str:
+def _rows(report: Report) -> Iterator[tuple[str, str]]:
     kind = " ".join(dict.fromkeys(filter(None, (report.autopilot, report.vehicle_type))))
     armed = {True: ", armed", False: ", disarmed", None: ""}[report.is_armed]
-    return f"{report.system}/{report.component} {kind}{armed}"
-
-
-def _identity_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
-    identity = report.identity
-    if not report.has_version:
-        yield "firmware", "unknown: no AUTOPILOT_VERSION received"
-        return
-    git_hash = f", commit {identity.git_hash}" if identity.git_hash.strip("0") else ""
-    yield "firmware", f"{version_text(identity.firmware)}{git_hash}"
-    yield "hardware id", identity.uid or "none"
-    yield "capabilities", f"0x{identity.capabilities:x}"
-
-
-def _link_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
-    link = report.link
-    signed = ", signed" if link.signed else ""
-    yield "protocol", f"MAVLink {link.mavlink}{signed}" if link.mavlink else "no frame received"
-    trips = link.round_trips
-    if trips:
-        spread = f"{milliseconds(trips[0])} to {milliseconds(trips[-1])}"
-        yield "round trip", f"{milliseconds(median(trips))} ({spread}, {len(trips)} commands)"
+    yield "vehicle", f"{report.system}/{report.component} {kind}{armed}"
+    if report.has_version:
+        yield "firmware", version_text(report.identity.firmware)
+        yield "hardware id", report.identity.uid or "none"
     else:
+        yield "firmware", "unknown: no AUTOPILOT_VERSION received"
+    yield "encoding", f"{report.encoding}: {report.encoding_reason}"
+    link, trip = report.link, report.link.round_trip
+    if trip is None:
         yield "round trip", "no command was acknowledged"
+    else:
+        spread = f"{milliseconds(trip.min_s)} to {milliseconds(trip.max_s)}"
+        yield "round trip", f"{milliseconds(trip.median_s)} ({spread}, {trip.count} commands)"
     loss = "unknown" if link.loss is None else f"{link.loss:.1%}"
     yield "loss", f"{loss} ({link.lost:,} of the vehicle's frames in {link.seconds:.1f} s)"
-
-
-def _service_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
     none = "not measured: no time left"
-    reads, listed, files, found = report.reads, report.list, report.files, report.hash
+    reads, listed, files = report.reads, report.list_, report.files
     if reads is None:
         yield "single reads", none
-    elif reads.single is None:
+    elif reads.single_s is None:
         yield "single reads", "no response"
     else:
-        rate = f", {reads.rate:.0f} per second with {reads.in_flight} at once" if reads.rate else ""
-        repeats = reads.requests - reads.in_flight
-        again = f", {repeats} repeated" if repeats else ""
-        yield "single reads", f"{milliseconds(reads.single)} each{rate}{again}"
-    if listed is None:
-        yield "list", none
-    elif listed.error is not None:
-        yield "list", listed.error
-    else:
-        rate = f", {listed.rate:,.0f} per second" if listed.rate else ""
-        gaps = f", {listed.lost} requested again" if listed.lost else ""
-        missing = f", {listed.missing} missing" if listed.missing else ""
-        yield "list", f"{listed.received} of {listed.count} in {listed.elapsed:.2f} s{rate}{gaps}{missing}"
+        rate = f", {reads.per_s:.0f} per second with {reads.in_flight} at once" if reads.per_s else ""
+        yield "single reads", f"{milliseconds(reads.single_s)} each{rate}"
+    yield "list", none if listed is None else _list_text(listed)
     if files is None:
-        yield "MAVFTP", none
+        yield "parameter file", none
+    elif files.size is not None and files.elapsed_s is not None:
+        found = f"{files.parameters} parameters, {files.size:,} bytes in {files.elapsed_s:.2f} s"
+        yield "parameter file", f"{found}, {'with' if files.defaults else 'without'} defaults"
     else:
-        entries = f": {first_of(files.entries, ENTRIES_SHOWN_MAX)}" if files.entries else ""
-        yield "MAVFTP", f"served{entries}" if files.is_serving else f"not served: {files.error}"
-        if files.size is not None and files.elapsed is not None:
-            yield (
-                "parameter file",
-                f"{files.parameters} parameters, {files.size:,} bytes in {files.elapsed:.2f} s",
-            )
-        else:
-            yield "parameter file", files.error or "none"
-        yield "defaults", "in the parameter file" if files.defaults else "not provided by the vehicle"
-    yield "descriptions", report.descriptions or "not provided by the vehicle"
-    if found is None:
-        yield "hash", none
-    elif found.before is None:
-        yield "hash", found.error or "none"
-    else:
-        after = "no response" if found.after is None else f"{found.after:08x}"
-        holds = f"the same after {found.seconds:.1f} s" if found.after == found.before else f"then {after}"
-        yield "hash", f"{found.before:08x}, {holds}"
+        yield "parameter file", files.error or "none"
+    yield "hash", none if report.hash is None else report.hash.before or report.hash.error or "none"
+    yield "other autopilots", ", ".join(link.autopilots) or "none"
+    yield "measured in", f"{report.elapsed_s:.1f} s"
 
 
-# JSON and Markdown
+def _list_text(listed: ListCheck) -> str:
+    if listed.error is not None:
+        return listed.error
+    rate = f", {listed.per_s:,.0f} per second" if listed.per_s else ""
+    gaps = f", {listed.lost} requested again" if listed.lost else ""
+    missing = f", {listed.missing} missing" if listed.missing else ""
+    return f"{listed.received} of {listed.count} in {listed.elapsed_s:.2f} s{rate}{gaps}{missing}"
 
 
-def _document(report: VehicleReport, findings: Iterable[Finding]) -> CheckDoc:
-    from paramclient.documents.check import CheckDoc, VersionsDoc  # only here: loads pydantic
-
-    versions = VersionsDoc(
-        paramclient=__version__,
-        pymavlink=version("pymavlink"),
-        python=platform.python_version(),
-        system=platform.platform(),
-    )
-    return CheckDoc.of(report, findings, versions)
+# Findings
 
 
-def _write(path: Path, report: VehicleReport, findings: list[Finding], document: CheckDoc) -> None:
-    """Write the result as Markdown: the tables, then all figures as JSON.
+@dataclass(frozen=True, slots=True)
+class _Finding:
+    """One slow or unusual result, its likely cause, and what to do."""
 
-    Raises:
-        UsageError: the file cannot be written.
-    """
-    versions = document.versions
-    lines = [
-        f"# paramclient check {report.link.name}",
-        "",
-        f"paramclient {versions.paramclient}, {_platform(versions)}",
-        "",
-        "| what | measured |",
-        "| --- | --- |",
-        *(f"| {what} | {_cell(text)} |" for what, text in _rows(report)),
-        "",
-        "## Slow or unusual",
-        "",
-        *([f"- **{each.severity}**: {_cell(_sentence(each))}" for each in findings] or ["Nothing."]),
-        "",
-        "## All figures",
-        "",
-        "```json",
-        json.dumps(document.as_json(), indent=2, allow_nan=False),
-        "```",
-        "",
-    ]
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write("\n".join(lines))
-    except OSError as error:
-        raise UsageError(f"{path} cannot be written: {error.strerror}") from error
+    severity: str
+    text: str
+    advice: str = ""
+
+    @property
+    def cell(self) -> Coloured:
+        """The severity as a cell of a table."""
+        return Coloured(self.severity, _STYLES.get(self.severity, ""))
 
 
-def _platform(versions: VersionsDoc) -> str:
-    return f"pymavlink {versions.pymavlink}, Python {versions.python}, {versions.system}"
+def _findings(report: Report) -> Iterator[_Finding]:
+    """Yield the findings: identity, loss, round trip, list, and how a table is confirmed or downloaded."""
+    if not report.has_version:
+        yield _Finding(
+            "problem",
+            "The vehicle did not answer the request for AUTOPILOT_VERSION: another vehicle with this system "
+            "id would be taken for it.",
+        )
+    yield from _about_link(report)
+    yield from _about_list(report)
+    files, found = report.files, report.hash
+    if report.autopilot == "px4" and found is not None and found.before is None:
+        yield _Finding(
+            "slow", f"{found.error}: each session downloads the table anew.", "Set MAV_HASH_CHK_EN to 1."
+        )
+    if report.autopilot == "ardupilot" and files is not None and files.size is None:
+        yield _Finding(
+            "slow",
+            f"The packed parameter file cannot be read ({files.error}), so tables are downloaded as lists, "
+            "without defaults.",
+            "Check that BRD_OPTIONS does not turn MAVFTP off (bit 1), and that the firmware is 4.1 or newer.",
+        )
 
 
-def _cell(text: str) -> str:
-    """Return text escaped for a Markdown cell: text of the vehicle may contain any character."""
-    return printable(text).replace("|", "\\|").replace("`", "'").replace("<", "&lt;")
+def _about_link(report: Report) -> Iterator[_Finding]:
+    link = report.link
+    if link.loss is not None and link.loss >= NOTABLE_LOSS:
+        yield _Finding(
+            "problem" if link.loss >= SEVERE_LOSS else "slow",
+            f"{link.loss:.1%} of the vehicle's frames were lost ({link.lost:,}).",
+            "Check antenna, distance and baud rate, or send less telemetry on this link.",
+        )
+    if link.round_trip is None:
+        yield _Finding(
+            "problem",
+            "No command was acknowledged: frames to the vehicle are lost, another station was first on a "
+            "port that answers only one (PX4 over UDP), or the vehicle expects signed frames.",
+            "Close other ground stations and restart the vehicle's link; with signing, give --signing-key.",
+        )
+    elif link.round_trip.median_s >= ROUND_TRIP_LONG:
+        yield _Finding(
+            "slow",
+            f"The round trip is {link.round_trip.median_s:.2f} s. Each repeat of a lost request takes at "
+            "least as long.",
+        )
+
+
+def _about_list(report: Report) -> Iterator[_Finding]:
+    listed = report.list_
+    if listed is None:
+        return
+    if listed.error is not None:
+        yield _Finding("problem", f"The list could not be downloaded: {listed.error}.")
+    elif listed.is_cut_short:
+        yield _Finding("slow", f"The list was cut short after {listed.elapsed_s:.0f} s by the time limit.")
+    elif listed.missing:
+        yield _Finding(
+            "problem",
+            f"{listed.missing} of {listed.count} parameters stayed missing: the vehicle counts parameters "
+            "that it does not send.",
+        )
+    if listed.per_s is not None and listed.per_s < LIST_RATE_SLOW:
+        yield _Finding(
+            "slow",
+            f"The list is received at {listed.per_s:.0f} values per second: a slow port, a radio, or a "
+            "low-bandwidth mode.",
+            "Raise the port's baud rate or data rate (PX4: MAV_n_RATE, ArduPilot: SERIALn_BAUD).",
+        )

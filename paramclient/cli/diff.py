@@ -8,16 +8,16 @@ from typing import Annotated, Final
 
 from cyclopts import Parameter
 
-from paramclient.cli.both_vehicles import may_have_several, resolve_both
 from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import are_extended, diff_extended, is_extended_source
+from paramclient.cli.extended import is_extended_source
+from paramclient.cli.extended_sources import diff_extended
 from paramclient.cli.file_output import described, value_text
 from paramclient.cli.json_setup import DiffJson
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Coloured, print_json, print_table, printable, say
-from paramclient.cli.sources import is_file, read_rules, resolve_all
+from paramclient.cli.sources import is_file, names_vehicle, read_rules, resolve_all
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.comparison import ChangedSide, Comparison, Difference, DifferenceStatus, compare
@@ -44,7 +44,7 @@ async def diff(
     /,
     *,
     base: str | None = None,
-    only: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
+    only: tuple[str, ...] = (),
     partial: bool = False,
     everything: Annotated[bool, Parameter(name="--all")] = False,
     renames: str | None = None,
@@ -57,10 +57,9 @@ async def diff(
     Exit code 0: both have the same names with the same values. Exit code 1: they differ.
 
     Args:
-        left: A parameter file; a vehicle in the cache, as 4, px4 or ardupilot, its hardware id
-            (in full, or uid: and at least 6 digits), its key, or cache:VEHICLE; or a link.
-        right: A file, a vehicle in the cache, or a link, like LEFT. With one link as LEFT and RIGHT, the two
-            vehicles on it are compared.
+        left: A parameter file; a vehicle in the cache, as 4, px4 or ardupilot, its hardware id (in full, or
+            uid: and at least 6 digits), its key, or cache:VEHICLE; or a link.
+        right: A file, a vehicle in the cache, or a link, like LEFT.
         base: A third source, or "defaults" for the firmware's defaults, to see which side differs from it.
         only: Compare only this name or pattern, such as "MC_*". May be given several times.
         partial: Leave out parameters that only the right side has; if the right side is a file and the left
@@ -69,21 +68,21 @@ async def diff(
         renames: A JSON file of names that firmware versions have changed. A parameter that only one side has
             is compared with the parameter of its other name.
         metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
-        extended: Use extended parameters (PARAM_EXT_*), such as those of a camera.
+        extended: Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them.
     """
-    is_extended = extended or is_extended_source(left) or is_extended_source(right)
-    if is_extended or (base is None and not only and await are_extended((left, right), options)):
+    if extended or is_extended_source(left) or is_extended_source(right):
         if base is not None or only or renames is not None or metadata is not None:
             raise UsageError("--base, --only, --renames and --metadata are for plain parameters")
         return await diff_extended(left, right, options, partial=partial, everything=everything)
     chosen = from_file(metadata, offline=True)
     rules = read_rules(renames)
     third_source = [] if base is None or base == DEFAULTS else [base]
-    if left == right and may_have_several(left, options):
-        first, second = await resolve_both(left, options)
-        third = await resolve_all(third_source, options)
-    else:
-        first, second, *third = await resolve_all([left, right, *third_source], options)
+    if left == right and not is_file(left) and not names_vehicle(left):
+        raise UsageError(
+            f"both sides are the vehicle on {left}. Two vehicles of one link are compared in the cache: "
+            f"`paramclient fetch {left} --vehicle all`, then `paramclient diff 1 2`"
+        )
+    first, second, *third = await resolve_all([left, right, *third_source], options)
     is_right_partial = partial and is_file(right) and not is_file(left)
     if is_right_partial:
         named = second if rules is None else rules.apply_to(second, first)

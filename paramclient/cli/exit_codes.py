@@ -45,8 +45,9 @@ def code_of(error: ParamClientError) -> ExitCode:
 
 def text_of(error: ParamClientError) -> str:
     """Return the message of an error for the command line, with options in place of Python arguments."""
-    if isinstance(error, AmbiguousVehicle) and error.choose_by in ("system", "component", "peer"):
-        return f"{error.summary} Choose one with --{error.choose_by}."
+    if isinstance(error, AmbiguousVehicle) and error.choose_by:
+        address = error.vehicles[0].partition(" ")[0] if error.vehicles else "1/1"
+        return f"{error.summary} Choose one with --vehicle, as in --vehicle {address}."
     return str(error)
 
 

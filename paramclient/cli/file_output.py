@@ -24,7 +24,6 @@ __all__ = ["described", "show_file", "value_text"]
 
 def show_file(
     file: ParamFile,
-    component: int | None,
     known: Callable[[Sequence[ParamSet]], Sequence[Metadata | None]],
     *,
     changed: bool,
@@ -34,12 +33,11 @@ def show_file(
 
     Args:
         file: the file.
-        component: the only component to print; None for all.
         known: returns the metadata of each set; called with `changed` only.
         changed: print only the parameters that differ from the firmware's defaults.
         json: print JSON.
     """
-    sets = file.sets if component is None else [file.choose(component)]
+    sets = file.sets
     shown = [*sets]
     defaults: list[dict[str, Default]] = [{} for _ in sets]
     if changed:

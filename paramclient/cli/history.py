@@ -11,12 +11,12 @@ from cyclopts.validators import Number
 
 from paramclient.cache import HistoryEntry, ParamCache, SnapshotSummary
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import history_extended
+from paramclient.cli.extended_sources import history_extended
 from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson
-from paramclient.cli.options import CacheOptions, Id
+from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import local_time, print_json, print_table, say
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
-from paramclient.cli.sources import VehicleChoice, chosen_vehicle, tables_in
+from paramclient.cli.sources import component_of, tables_in
 from paramclient.cli.time_arguments import parse_time
 from paramclient.errors import NotInCache, UsageError
 from paramclient.model.notation import hash_text
@@ -29,11 +29,9 @@ _DEFAULTS: Final = CacheOptions()
 
 
 def history(
-    vehicle: str | None = None,
+    vehicle: str,
     /,
     *names: str,
-    cached: VehicleChoice = None,
-    component: Id = None,
     since: str | None = None,
     limit: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
     snapshots: bool = False,
@@ -42,24 +40,18 @@ def history(
 ) -> ExitCode:
     """Print the changes of a vehicle's values: time, old and new value, author. The newest change is last.
 
-    An apply or restore that was interrupted by the end of the service has a line of its own. With
-    --snapshots, print the snapshots of the vehicle's tables instead, each with its number.
+    With --snapshots, print the snapshots of the vehicle's tables instead, each with its number.
 
     Args:
-        vehicle: A vehicle in the cache: 4 or 4/1, px4 or ardupilot, its hardware id (in full, or
-            uid: and at least 6 digits), or its key.
+        vehicle: A vehicle in the cache: 4 or 4/1, px4 or ardupilot, its hardware id (in full, or uid: and at
+            least 6 digits), or its key.
         names: Print only these parameters: names in upper or lower case, or patterns such as "MC_*".
-        cached: The vehicle, instead of the first argument; then all arguments are names.
-        component: Print only this component.
         since: Print only changes from this time on: 2h ago, yesterday, '2026-11-20 14:00'. A time without a
             time zone is in the time zone of this computer, like the printed times.
         limit: Print at most this number of changes, the newest ones.
         snapshots: Print the snapshots instead of the changes.
-        extended: Use extended parameters (PARAM_EXT_*), such as those of a camera.
+        extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
-    vehicle, names = chosen_vehicle(cached, vehicle, names)
-    if vehicle is None:
-        raise UsageError("VEHICLE is missing: a vehicle in the cache, by system id, hardware id or key")
     begin = None if since is None else parse_time(since, time.time())
     if begin is not None and not options.json:
         say(f"since {local_time(begin)}")
@@ -67,11 +59,11 @@ def history(
     if snapshots and name_patterns:
         raise UsageError("--snapshots lists whole tables and takes no parameter name")
     if extended and not snapshots:
-        return history_extended(vehicle, name_patterns, component, options, limit=limit, since=begin)
+        return history_extended(vehicle, name_patterns, options, limit=limit, since=begin)
     with ParamCache(options.cache) as cache:
-        key = tables_in(cache, vehicle, None)[0].key
+        key, component = tables_in(cache, vehicle)[0].key, component_of(vehicle)
         if snapshots:
-            found = cache.ext_snapshots(key, component) if extended else cache.snapshots(key, component)
+            found = cache.snapshots(key, component, extended=extended)
             kept = [each for each in found if begin is None or each.at >= begin]
             _print_snapshots(kept[-limit:] if limit else kept, options)
         else:

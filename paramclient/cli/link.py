@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import suppress
+from dataclasses import asdict
 from typing import Final
 
 import anyio
 
-from paramclient.cli.block_characters import Marks, Piece, marks_for
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.link_history import LOSS, ROUND_TRIP, LinkHistory, history_lines
 from paramclient.cli.options import Seconds, TrafficOptions
-from paramclient.cli.output import live_view, milliseconds, print_document, print_line, print_table
+from paramclient.cli.output import live_view, milliseconds, print_json, print_line, print_table
 from paramclient.cli.session import Deadline, listen, received_in_words
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.client.traffic import ComponentTraffic, TrafficReport
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.identity import autopilot_name
+from paramclient.model.notation import rounded
 from paramclient.wire.frames import enum_word
 from paramclient.wire.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS
+from paramclient.wire.signing import SigningReport
 
 __all__ = ["link"]
 
@@ -37,11 +37,6 @@ MEASURE_DELAY: Final = 2.0
 MEASURE_INTERVAL: Final = 4.0
 """Seconds between two reads that measure the round trip: request and response together take less of the link
 than the heartbeats of this client."""
-ROUND_TRIP_VALIDITY: Final = MEASURE_INTERVAL + 1.0
-"""Seconds for which a measured round trip is drawn: until the next measurement, and the second in which that
-arrives."""
-SCALES: Final = {LOSS: lambda share: f"{share:.1%}", ROUND_TRIP: milliseconds}
-"""The quantities of the history as text."""
 _DEFAULTS: Final = TrafficOptions()
 NO_AUTOPILOT: Final = ("unknown", autopilot_name(MAV_AUTOPILOT_INVALID))
 """Autopilot names of components that have no parameters to read."""
@@ -57,9 +52,8 @@ async def link(
 ) -> int:
     """Print the components on a link, their message rates and the packet loss.
 
-    On a terminal the table is live until Ctrl-C, with packet loss and round trip over the last minute.
-    Otherwise, and with --json, it is printed once, after --seconds (default 5). Packet loss is computed from
-    the gaps in the frames' sequence numbers.
+    On a terminal the table is live until Ctrl-C. Otherwise, and with --json, it is printed once, after
+    --seconds (default 5). Packet loss is computed from the gaps in the frames' sequence numbers.
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
@@ -76,10 +70,7 @@ async def link(
                 f"a MAVLink frame on {client.link.name}", attempts=0, waited=report.seconds, hint=hint
             )
     if options.json:
-        from paramclient.documents.traffic import TrafficDoc  # only here: loads pydantic
-
-        trips = {(each.system, each.component): _round_trip(client, each) for each in report.components}
-        print_document(TrafficDoc.of(client.link.name, report, client.signing_report(), trips))
+        print_json(_json(client, report))
     elif not is_live:
         print_table(_COLUMNS, _rows(client, report), right=" ".join(_COLUMNS[2:]))
         for line in _lines(client, report):
@@ -115,32 +106,18 @@ async def _listen(client: ParamClient, seconds: float | None) -> TrafficReport:
 
 
 async def _show(client: ParamClient, seconds: float | None) -> TrafficReport:
-    marks = marks_for(sys.stdout)  # the live view replaces the stream
     with live_view() as draw:
         deadline = Deadline(seconds)  # starts after rich is loaded
-        history = LinkHistory(anyio.current_time(), validity=ROUND_TRIP_VALIDITY)
         while True:
             report = client.traffic_report()
             if report.frames:
-                trips = {
-                    address: component.core.machine.round_trip
-                    for address, component in client.components.items()
-                }
-                history.take(report, trips, anyio.current_time())
-                draw(_COLUMNS, _rows(client, report), [*_lines(client, report), *_drawn(history, marks)])
+                draw(_COLUMNS, _rows(client, report), _lines(client, report))
             else:
                 draw(_COLUMNS, (), ["", f"nothing received yet: {_pace(client, report)}"])
             left = deadline.left(REFRESH_INTERVAL)
             if not left:
                 return report
             await anyio.sleep(left)
-
-
-def _drawn(history: LinkHistory, marks: Marks) -> list[str | Sequence[Piece]]:
-    """Return the lines of the history, after an empty one; none before the first second."""
-    width = shutil.get_terminal_size().columns
-    lines = history_lines(history.rows(), SCALES, marks, width)
-    return ["", *lines] if lines else []
 
 
 async def _measure_round_trips(client: ParamClient) -> None:
@@ -240,3 +217,69 @@ def _state(number: int) -> str:
 def _round_trip(client: ParamClient, each: ComponentTraffic) -> float | None:
     component = client.components.get((each.system, each.component))
     return None if component is None else component.round_trip
+
+
+# JSON
+
+
+def _json(client: ParamClient, report: TrafficReport) -> dict[str, object]:
+    signing = client.signing_report()
+    return {
+        "link": client.link.name,
+        "seconds": round(report.seconds, 3),
+        "bytes_received": report.bytes_received,
+        "bytes_sent": report.bytes_sent,
+        "received_per_s": round(report.received_rate, 1),
+        "sent_per_s": round(report.sent_rate, 1),
+        "frames": report.frames,
+        "unknown": report.unknown,
+        "damaged": report.damaged,
+        "other_bytes": report.other_bytes,
+        "signing": None if signing is None else _signing_json(signing),
+        "components": [_component_json(each, _round_trip(client, each)) for each in report.components],
+    }
+
+
+def _signing_json(signing: SigningReport) -> dict[str, object]:
+    return {
+        "fingerprint": signing.fingerprint,
+        "policy": signing.policy,
+        "link_id": signing.link_id,
+        "signed": signing.signed,
+        "unsigned": signing.unsigned,
+        "unproven": {str(why): count for why, count in signing.unproven.items()},
+        "refused": {str(why): count for why, count in signing.refused.items()},
+    }
+
+
+def _component_json(each: ComponentTraffic, round_trip: float | None) -> dict[str, object]:
+    beat = each.heartbeat
+    return {
+        "system": each.system,
+        "component": each.component,
+        "mavlink": each.version,
+        "autopilot": None if beat is None else autopilot_name(beat.autopilot),
+        "type": None if beat is None else _type(beat.type),
+        "state": None if beat is None else _state(beat.system_status),
+        "heartbeat_age_s": rounded(each.heartbeat_age),
+        "age_s": round(each.age, 4),
+        "frames": each.frames,
+        "bytes": each.bytes,
+        "frames_per_s": round(each.frame_rate, 2),
+        "bytes_per_s": round(each.byte_rate, 1),
+        "lost": each.lost,
+        "loss": rounded(each.loss),
+        "repeated": each.repeated,
+        "late": each.late,
+        "signed": each.signed,
+        "round_trip_s": rounded(round_trip),
+        "messages": {
+            message.name: {
+                "id": message.message_id,
+                "count": message.count,
+                "per_s": round(message.rate, 2),
+            }
+            for message in each.messages
+        },
+        "radio": None if each.radio is None else asdict(each.radio),
+    }

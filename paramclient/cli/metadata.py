@@ -39,7 +39,6 @@ __all__ = [
     "DESCRIBED_COLUMNS",
     "VEHICLE",
     "MetadataChoice",
-    "check_no_option",
     "described_cells",
     "files_of",
     "from_file",
@@ -55,6 +54,7 @@ __all__ = [
     "problems",
     "request_from_vehicle",
     "resolved",
+    "text_pairs",
     "units_of",
 ]
 
@@ -198,7 +198,7 @@ def how_to_describe(tables: Sequence[CachedComponent], name: str) -> str:
             continue
         link = "LINK" if table.identity.link.startswith(f"{LinkKind.REPLAY}:") else table.identity.link
         shown = name if name in table.params else next(iter(table.params), name)
-        words = ["paramclient", "get", link, shown, "--system", str(table.system), "--metadata", VEHICLE]
+        words = ["paramclient", "get", link, shown, "--vehicle", str(table.system), "--metadata", VEHICLE]
         requests.append(f"`{shlex.join(words)}` loads it from {table.system}/{table.component}.")
     return f"no metadata is stored for the firmware of {' and '.join(sorted(firsts))}. {' '.join(requests)}"
 
@@ -222,7 +222,7 @@ def parse_pairs(words: Sequence[str]) -> list[tuple[str, int | float | str]]:
     pairs: list[tuple[str, int | float | str]] = []
     left = iter(words)
     for word in left:
-        check_no_option(word)
+        _check_no_option(word)
         name, equals, text = word.partition("=")
         if not equals:
             value = next(left, None)
@@ -241,7 +241,27 @@ def parse_pairs(words: Sequence[str]) -> list[tuple[str, int | float | str]]:
     raise UsageError(f"set takes pairs of NAME and VALUE, or NAME=VALUE{end}")
 
 
-def check_no_option(word: str) -> None:
+def text_pairs(words: Sequence[str]) -> list[tuple[str, str]]:
+    """Parse the arguments of `set`, as `NAME VALUE` or `NAME=VALUE`, without reading the values.
+
+    Raises:
+        UsageError: a name has no value, or is invalid.
+    """
+    pairs: list[tuple[str, str]] = []
+    left = iter(words)
+    for word in left:
+        _check_no_option(word)
+        name, equals, text = word.partition("=")
+        value = text if equals else next(left, None)
+        if value is None:
+            raise UsageError(f"{name}: there is no value")
+        pairs.append((check_name(name), value))
+    if not pairs:
+        raise UsageError("set takes pairs of NAME and VALUE, or NAME=VALUE")
+    return pairs
+
+
+def _check_no_option(word: str) -> None:
     """Check that an argument in the place of a name is not an unknown option.
 
     The arguments of `set` may begin with a hyphen, because values may be negative. An unknown option would be

@@ -1,4 +1,4 @@
-"""The subcommands show and cache (list, path, remove, copy), which need no link."""
+"""The subcommands show and cache (list, path, remove), which need no link."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Final
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
 from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import is_extended_source, show_extended
+from paramclient.cli.extended import is_extended_source
+from paramclient.cli.extended_sources import show_extended
 from paramclient.cli.file_output import show_file
 from paramclient.cli.json_cache import SummaryJson, TableJson
 from paramclient.cli.json_output import ParamJson
@@ -22,7 +23,7 @@ from paramclient.cli.metadata import (
     known_of_table,
     print_descriptions,
 )
-from paramclient.cli.options import CacheOptions, Id
+from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import (
     by_index,
     default_text,
@@ -34,7 +35,7 @@ from paramclient.cli.output import (
     say,
 )
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
-from paramclient.cli.sources import VehicleChoice, chosen_vehicle, is_file, open_file, tables_in
+from paramclient.cli.sources import component_of, is_file, open_file, tables_in
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.metadata import Metadata, MetadataStore
 from paramclient.model.defaults import add_default, default_of
@@ -60,8 +61,6 @@ def show(
     vehicle: str | None = None,
     /,
     *names: str,
-    cached: VehicleChoice = None,
-    component: Id = None,
     changed: bool = False,
     metadata: MetadataChoice = None,
     extended: bool = False,
@@ -72,24 +71,21 @@ def show(
     With --changed, exit code 1: the firmware's defaults are not known.
 
     Args:
-        vehicle: A parameter file; a vehicle in the cache: 4 or 4/1, px4 or ardupilot, its
-            hardware id (in full, or uid: and at least 6 digits) or its key, also with the prefix cache:; or
-            replay:FILE, a telemetry log.
-        cached: The vehicle in the cache, instead of the first argument; then all arguments are names.
-        component: Print only this component.
+        vehicle: A parameter file; a vehicle in the cache: 4 or 4/1, px4 or ardupilot, its hardware id (in
+            full, or uid: and at least 6 digits) or its key, also with the prefix cache:; or replay:FILE, a
+            telemetry log.
         changed: Print only parameters that differ from the firmware's defaults: those of the vehicle, else
             those of its metadata.
         names: Print only these parameters of a vehicle, with their metadata: names in upper or lower case, or
             patterns such as "MC_*".
         metadata: A file that describes parameters. Default: the stored metadata of the vehicle's firmware.
             With a parameter file only for --changed.
-        extended: Use extended parameters (PARAM_EXT_*), such as those of a camera.
+        extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
-    vehicle, names = chosen_vehicle(cached, vehicle, names)
     if extended or (vehicle is not None and is_extended_source(vehicle)):
         if changed or metadata is not None:
             raise UsageError("--changed and --metadata are for plain parameters")
-        return show_extended(vehicle, names, component, options)
+        return show_extended(vehicle, names, options)
     if vehicle is not None and is_file(vehicle):
         if names or (metadata is not None and not changed):
             raise UsageError(
@@ -102,12 +98,12 @@ def show(
             store = MetadataStore.beside(ParamCache(options.cache).path)
             return store.known_of_sets(sets) if given is None else [given] * len(sets)
 
-        return show_file(open_file(vehicle), component, known, changed=changed, json=options.json)
+        return show_file(open_file(vehicle), known, changed=changed, json=options.json)
     name_patterns = tuple(check_given(names))
     described = from_file(metadata, offline=True)
     is_log = vehicle is not None and vehicle.lower().startswith("replay:")
     with _open(options) if not is_log or vehicle is None else cache_of_log(vehicle) as cache:
-        summaries = _tables_to_show(cache, None if is_log else vehicle, component)
+        summaries = _tables_to_show(cache, None if is_log else vehicle)
         extended_sizes = cache.ext_sizes()
         is_list = vehicle is None and len(summaries) > 1 and not options.json
         tables = [] if is_list else _load(cache, summaries)
@@ -156,17 +152,16 @@ def cache_path(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     return ExitCode.DONE
 
 
-def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions = _DEFAULTS) -> ExitCode:
+def cache_remove(vehicle: str, /, *, options: CacheOptions = _DEFAULTS) -> ExitCode:
     """Remove a vehicle from the cache: its tables and their history.
 
     Args:
-        vehicle: A vehicle in the cache: 4 or 4/1, px4 or ardupilot, its hardware id (in full, or
-            uid: and at least 6 digits), or its key.
-        component: Remove only the table of this component.
+        vehicle: A vehicle in the cache: 4, px4 or ardupilot, its hardware id (in full, or uid: and at least 6
+            digits), or its key; or 4/1, to remove only the table of this component.
     """
     with _open(options) as cache:
-        key = tables_in(cache, vehicle, component)[0].key
-        removed = cache.remove(key, component)
+        key = tables_in(cache, vehicle)[0].key
+        removed = cache.remove(key, component_of(vehicle))
     if options.json:
         print_json({"key": key, "removed": removed})
     else:
@@ -174,18 +169,18 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
     return ExitCode.DONE
 
 
-def tables_of(options: CacheOptions, vehicle: str, component: int | None) -> list[CachedComponent]:
+def tables_of(cache: str | None, vehicle: str, component: int | None) -> list[CachedComponent]:
     """Return the cached tables of a vehicle, or that of one of its components.
 
     Raises:
         UnknownVehicle, AmbiguousVehicle: as `tables_in`.
         CacheError: the cache cannot be read.
     """
-    with _open(options) as cache:
-        return _load(cache, tables_in(cache, vehicle, component))
+    with ParamCache(cache) as opened:
+        return _load(opened, tables_in(opened, vehicle, component))
 
 
-def _tables_to_show(cache: ParamCache, vehicle: str | None, component: int | None) -> list[CachedSummary]:
+def _tables_to_show(cache: ParamCache, vehicle: str | None) -> list[CachedSummary]:
     """Return the tables that the arguments of show name, as `tables_in` does.
 
     Raises:
@@ -193,7 +188,7 @@ def _tables_to_show(cache: ParamCache, vehicle: str | None, component: int | Non
         UnknownVehicle, AmbiguousVehicle: as `tables_in`.
     """
     try:
-        return tables_in(cache, vehicle, component)
+        return tables_in(cache, vehicle)
     except UnknownVehicle:
         if vehicle is None or vehicle.upper() not in map(str.upper, cached_names(cache)):
             raise

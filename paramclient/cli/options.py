@@ -1,6 +1,8 @@
-"""Options that several subcommands share. The texts below the fields are their help."""
+"""Options that several subcommands share. The texts below the fields are their help.
 
-from __future__ import annotations
+The annotations are evaluated at once: cyclopts would look up the names of inherited ones in the module of the
+subclass.
+"""
 
 import getpass
 import math
@@ -9,18 +11,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Final, TypeAlias, TypedDict
 
-from cyclopts import Parameter
+from cyclopts import Group, Parameter
 from cyclopts.validators import Number
 
-from paramclient.cli.vehicle_name import VehicleName
 from paramclient.client.signing import Signing, key_from_environment, read_key
 from paramclient.errors import UsageError
 from paramclient.model.values import Encoding
 from paramclient.wire.signing import SigningKey, SigningPolicy
 
 __all__ = [
+    "CONNECTION",
     "CacheOptions",
-    "Count",
     "Id",
     "KeyOptions",
     "LinkOptions",
@@ -34,10 +35,11 @@ SOURCE_SYSTEM: Final = 255
 SOURCE_COMPONENT: Final = 190
 """MAV_COMP_ID_MISSIONPLANNER, the usual component id of ground stations, and the default of `ParamClient`."""
 
+CONNECTION: Final = Parameter(group=Group("Connection", sort_key=9))
+"""Options of the link, which stand at the end of the help."""
+
 Id: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=255))]
 """A system or component id."""
-Count: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=255))]
-"""A number of vehicles, at most as many as there are system ids."""
 
 
 class SourceIds(TypedDict):
@@ -73,17 +75,17 @@ class CacheOptions:
 class KeyOptions:
     """The signing key and this computer's own ids, of subcommands that open a link."""
 
-    signing_key: Path | None = None
-    """A file with the key for signed messages. Default: the key that the environment names, if any."""
+    signing_key: Annotated[Path | None, CONNECTION] = None
+    """A file with the key. Default: that of the environment."""
 
-    signing_passphrase: bool = False
+    signing_passphrase: Annotated[bool, CONNECTION] = False
     """Ask for a passphrase, and derive the key from it."""
 
-    source_system: Id = None
-    """System id of this computer on the link, 1 to 255. Default: 255."""
+    source_system: Annotated[Id, CONNECTION] = None
+    """System id of this computer. Default: 255."""
 
-    source_component: Id = None
-    """Component id of this computer on the link, 1 to 255. Default: 190."""
+    source_component: Annotated[Id, CONNECTION] = None
+    """Component id of this computer. Default: 190."""
 
     _typed: ClassVar[SigningKey | None] = None  # a class variable, because each field would be an option
 
@@ -118,7 +120,7 @@ class KeyOptions:
 class SigningOptions(KeyOptions):
     """Options of subcommands that sign sent frames and check received ones."""
 
-    signing_policy: SigningPolicy = SigningPolicy.UNSIGNED_RADIOS
+    signing_policy: Annotated[SigningPolicy, CONNECTION] = SigningPolicy.UNSIGNED_RADIOS
     """With a key: which received frames are accepted."""
 
     @property
@@ -143,8 +145,8 @@ class TrafficOptions(SigningOptions):
     verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False
     """Log each step on stderr."""
 
-    tlog: Path | None = None
-    """Record all frames of the link, received and sent, in this new telemetry log."""
+    tlog: Annotated[Path | None, CONNECTION] = None
+    """Record the link in this new telemetry log."""
 
 
 @Parameter(name="*")
@@ -153,26 +155,10 @@ class LinkOptions(TrafficOptions):
     """Options of subcommands that communicate with a vehicle."""
 
     vehicle: str | None = None
-    """The vehicle: 4 or 4/1 (system and component id), px4 or ardupilot if only one vehicle has that
-    autopilot, or a hardware id or key of the cache. Instead of --system."""
-
-    system: Id = None
-    """System id of the vehicle, 1 to 255. Default: the first one received; for writes, the only one."""
-
-    component: Id = None
-    """Component id, 1 to 255. Default: the autopilot."""
-
-    peer: str | None = None
-    """The peer of the vehicle, HOST or HOST:PORT, if several have equal ids. Needs --split-peers."""
-
-    split_peers: bool = False
-    """Treat components with equal ids as different ones if their messages come from different peers."""
+    """4, 4/1 (system/component), uid:ID or all. Default: the first one heard, and for writes the only one."""
 
     timeout: Seconds = None
-    """Timeout for the whole command in seconds. Default: 10 for the first heartbeat, then no limit."""
-
-    encoding: Encoding | None = None
-    """Encoding of values in messages, if the component reports a wrong one."""
+    """Seconds for the whole command. Default: 10 for the first heartbeat."""
 
     cache: str | None = None
     """The cache file, or the postgresql:// URL of a shared cache. Default: the user's own cache."""
@@ -180,23 +166,14 @@ class LinkOptions(TrafficOptions):
     no_cache: bool = False
     """Neither read nor write a cache."""
 
-    listen_only: bool = False
-    """Send nothing; receive the parameters that other stations on the link request."""
+    encoding: Annotated[Encoding | None, CONNECTION] = None
+    """Encoding of values, if the component reports a wrong one."""
 
-    forward: str | None = None
-    """Share the vehicle's link with one other program over this link, such as udpout:127.0.0.1:14551."""
+    listen_only: Annotated[bool, CONNECTION] = False
+    """Send nothing; receive what other stations on the link request."""
 
-    named: ClassVar[VehicleName] = VehicleName()  # a class variable, because each field would be an option
-
-    def __post_init__(self) -> None:
-        KeyOptions.__post_init__(self)  # a class with slots has no super() without arguments
-        if self.vehicle is not None:
-            named = VehicleName.chosen(
-                self.vehicle, self.system, self.component, cache=self.cache, uses_cache=not self.no_cache
-            )
-            object.__setattr__(self, "named", named)
-            object.__setattr__(self, "system", named.system)
-            object.__setattr__(self, "component", named.component)
+    forward: Annotated[str | None, CONNECTION] = None
+    """Share the link with another program over this link."""
 
     @property
     def place(self) -> str | bool:

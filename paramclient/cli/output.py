@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Final, TextIO, TypeAlias
 
 import anyio
 
-from paramclient.cli.block_characters import Piece
 from paramclient.cli.json_output import as_json
 from paramclient.model.values import Param, format_value
 from paramclient.protocol.fetch import Progress
@@ -27,8 +26,6 @@ from paramclient.protocol.fetch import Progress
 if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
-
-    from paramclient.documents.document import Document
 
 __all__ = [
     "Coloured",
@@ -40,7 +37,6 @@ __all__ = [
     "live_view",
     "local_time",
     "milliseconds",
-    "print_document",
     "print_json",
     "print_line",
     "print_table",
@@ -51,10 +47,8 @@ __all__ = [
     "wrapped",
 ]
 
-Draw: TypeAlias = Callable[
-    [Sequence[str], Iterable[Sequence[object]], Iterable["str | Sequence[Piece]"]], None
-]
-"""Draws columns, rows and lines. Text lines are made printable; pieces are shown as they are."""
+Draw: TypeAlias = Callable[[Sequence[str], Iterable[Sequence[object]], Iterable[str]], None]
+"""Draws columns, rows and lines."""
 
 WIDTH_UNLIMITED: Final = 10_000
 """Width in columns of an output that is not a terminal, so that nothing is wrapped or cut."""
@@ -137,11 +131,6 @@ def by_index(params: Iterable[Param]) -> list[Param]:
 # JSON
 
 
-def print_document(document: Document) -> None:
-    """Print a document of `paramclient.documents` on one line, and flush."""
-    print(json.dumps(document.as_json(), allow_nan=False), flush=True)
-
-
 def print_json(item: object) -> None:
     """Print an object of `paramclient.cli.json_output`, or a mapping or list of them, on one line; flush."""
     print(json.dumps(as_json(item), allow_nan=False), flush=True)
@@ -193,16 +182,9 @@ def live_view() -> Iterator[Draw]:
     console = Console()
     with Live(console=console, auto_refresh=False) as live:
 
-        def draw(
-            columns: Sequence[str], rows: Iterable[Sequence[object]], lines: Iterable[str | Sequence[Piece]]
-        ) -> None:
+        def draw(columns: Sequence[str], rows: Iterable[Sequence[object]], lines: Iterable[str]) -> None:
             table = _fitting(columns, list(rows), columns[2:], console.width)
-            below: list[Text] = []
-            for line in lines:
-                if isinstance(line, str):
-                    below += map(Text, wrapped(printable(line), console.width))
-                else:
-                    below.append(Text.assemble(*line))
+            below = (Text(part) for line in lines for part in wrapped(printable(line), console.width))
             live.update(Group(table, *below), refresh=True)
 
         yield draw

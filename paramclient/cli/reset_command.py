@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -14,11 +13,10 @@ from cyclopts.validators import Number
 from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.default_sources import say_sources
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.json_output import VehicleJson, WriteJson
+from paramclient.cli.json_output import VehicleJson
 from paramclient.cli.metadata import (
     MetadataChoice,
     from_file,
-    info_of,
     known_of_session,
     request_from_vehicle,
 )
@@ -29,19 +27,19 @@ from paramclient.cli.output import (
     print_json,
     print_table,
     printable,
-    progress_bar,
     report,
     say,
 )
 from paramclient.cli.param_names import ChosenNames, check_given, suggest
-from paramclient.cli.session import CommandSession, connect
+from paramclient.cli.read_commands import fetch_table
+from paramclient.cli.session import CommandSession, announce_write, connect
 from paramclient.cli.write_outcomes import (
     outcome_cells,
     outcomes_code,
     report_outcomes,
     summary,
-    type_of,
     write_all,
+    writes_json,
 )
 from paramclient.client.arguments import SETTLE_MAX
 from paramclient.client.reset import ResetChoice, read_unconfirmed
@@ -53,14 +51,11 @@ from paramclient.model.notation import typed, value_json
 from paramclient.model.patterns import is_pattern
 from paramclient.model.values import Param, format_value
 from paramclient.model.wording import counted, first_of
-from paramclient.protocol.fetch import FetchResult
 from paramclient.protocol.set_results import SetOutcome
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
 
 __all__ = ["reset"]
 
-REFRESH_TIMEOUT: Final = 10.0
-"""Seconds to wait for the values that the vehicle's hash does not cover, without --timeout."""
 RESET_NAMES_MAX: Final = 10
 """Parameters that a line names, so that it stays short; it gives the number of further ones."""
 
@@ -85,7 +80,7 @@ async def reset(
     Fetches the table first. ArduPilot, and PX4 from 1.18 on, give the defaults in the parameter file over
     MAVFTP; defaults that the vehicle does not give are taken from its metadata. Parameters without a known
     default are listed and not written. On a terminal, the changes are shown and must be confirmed. If several
-    vehicles are heard, --system must choose one.
+    vehicles are heard, --vehicle must choose one.
 
     Exit code 1: a value was refused, a name is unknown, a default is not known, or the changes were not
     confirmed.
@@ -107,8 +102,8 @@ async def reset(
         raise UsageError("reset takes names, or --all, or --changed")
     name_patterns = check_given(names)
     described = from_file(metadata)
-    async with connect(url, options, only=True) as session:
-        fetched = await _fetch(session)
+    async with connect(url, options, writes=True) as session:
+        fetched = await fetch_table(session)
         chosen, read_only = (await _chosen(session, name_patterns), ()) if names else _all_names(session)
         if chosen is None:
             return ExitCode.INCOMPLETE
@@ -124,7 +119,6 @@ async def reset(
         plan = _ResetPlan.of(session, params, described, read_only, lists_unknown=not changed)
         if plan.choice.without_default:
             code = ExitCode.INCOMPLETE
-        await session.report_unheard()
         if dry_run:
             plan.print_planned()
             return code
@@ -136,7 +130,7 @@ async def reset(
         began = anyio.current_time()
         if plan.choice.values:
             await session.check_only()
-            await session.announce_write()
+            await announce_write([session])
             outcomes = await write_all(
                 session,
                 [*plan.choice.values.items()],
@@ -154,16 +148,6 @@ async def reset(
     report_outcomes(outcomes, described)
     plan.report_unwritten()
     return max(code, outcomes_code(outcomes))
-
-
-async def _fetch(session: CommandSession) -> FetchResult:
-    """Fetch the table, with the values that the vehicle's hash does not cover."""
-    component, deadline = session.component, session.deadline
-    with progress_bar(f"fetching {session.label}") as progress:
-        result = await component.fetch_all(timeout=deadline.left(), progress=progress)
-    with suppress(NoReply):
-        await component.refreshed(timeout=deadline.left(REFRESH_TIMEOUT))
-    return result
 
 
 def _all_names(session: CommandSession) -> tuple[list[str], tuple[str, ...]]:
@@ -300,10 +284,7 @@ class _ResetPlan:
     def print_outcomes(self, outcomes: Sequence[SetOutcome]) -> None:
         """Print the outcomes as a table or as JSON."""
         if self.session.options.json:
-            results = [
-                WriteJson.of(each, type_of(self.session, each), info_of(self.described, each.name))
-                for each in outcomes
-            ]
+            results = writes_json(self.session, outcomes, self.described)
             print_json({"vehicle": self._vehicle, "results": results, **self._unwritten})
             return
         rows: list[tuple[object, ...]] = []

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Final, Literal, TypeAlias
 
-import anyio
 import anyio.to_thread
 from cyclopts import Parameter
 
@@ -20,15 +19,22 @@ from paramclient.cli.default_sources import (
     say_sources,
 )
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import is_extended_link, is_extended_source, save_extended
+from paramclient.cli.extended import is_extended_source
+from paramclient.cli.extended_sources import save_extended
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets
 from paramclient.cli.offline import tables_of
-from paramclient.cli.options import CacheOptions, LinkOptions
-from paramclient.cli.output import print_json, printable, progress_bar, report, say
-from paramclient.cli.session import CommandSession, connect
-from paramclient.cli.sources import check_link, choose, collect_confirmed, is_file, names_vehicle, open_file
-from paramclient.cli.targets import find_vehicles
-from paramclient.client.component import Component
+from paramclient.cli.options import LinkOptions
+from paramclient.cli.output import print_json, printable, report, say
+from paramclient.cli.session import ChosenVehicle, CommandSession, report_others, run_on_all, sessions
+from paramclient.cli.sources import (
+    check_link,
+    choose,
+    is_file,
+    is_pattern_name,
+    names_vehicle,
+    open_file,
+    whole_table,
+)
 from paramclient.errors import UsageError
 from paramclient.files import FileFormat, write_file
 from paramclient.files.formats import format_of_name
@@ -38,13 +44,12 @@ from paramclient.model.defaults import default_of
 from paramclient.model.paramset import ParamSet
 from paramclient.model.patterns import NameChoice
 from paramclient.model.wording import counted
-from paramclient.protocol.fetch import FetchResult
 from paramclient.provision.vehicle_params import NO_DEFAULTS, cached_param_set, select_non_defaults
 
 __all__ = ["save"]
 
 SaveFormat: TypeAlias = Literal["qgc", "parm", "mission-planner", "pck", "json"]
-"""The file formats that can be written: all but PX4's start scripts."""
+"""The file formats that can be written."""
 
 _DEFAULTS: Final = LinkOptions()
 
@@ -56,8 +61,7 @@ async def save(
     *,
     file_format: Annotated[SaveFormat | None, Parameter(name="--format")] = None,
     changed: bool = False,
-    only: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
-    all_: Annotated[bool, Parameter(name="--all")] = False,
+    only: tuple[str, ...] = (),
     refresh: bool = False,
     metadata: MetadataChoice = None,
     extended: bool = False,
@@ -67,7 +71,8 @@ async def save(
 
     An existing file is replaced once the new one is completely on the disk. An incomplete table is not
     written. Exit code 1: the table is incomplete, or with --changed, no parameter differs or the defaults are
-    not known.
+    not known. With --vehicle all, a file with {system} or {uid} in its name becomes a file for each vehicle;
+    otherwise the file format must be able to hold several components.
 
     Args:
         where: The link, such as udpin:0.0.0.0:14550 or sim:px4; an on-board log (.bin, .ulg), for the values
@@ -78,184 +83,132 @@ async def save(
         changed: Write only parameters that differ from the firmware's defaults: those of the vehicle, else
             those of its metadata.
         only: Write only this name or pattern, such as "MC_*". May be given several times.
-        all_: Write all components of every vehicle heard within 3 s, or of the one with --system.
-            A file with {system} or {uid} in its name becomes a file for each vehicle; otherwise the file
-            format must be able to hold several components.
         refresh: Download all parameters even if the cache is up to date.
         metadata: With --changed, a file with the firmware's defaults; or vehicle, to download the vehicle's
             own metadata. Default: the stored metadata of the firmware; else that of the vehicle if it can be
             downloaded in 2 s.
-        extended: Use extended parameters (PARAM_EXT_*), such as those of a camera.
+        extended: Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them.
     """
-    extended = extended or is_extended_source(where)
-    if extended or (not (changed or all_ or refresh or only) and await is_extended_link(where, options)):
-        if changed or all_ or only:
-            raise UsageError("--changed, --only and --all are for plain parameters")
+    if extended or is_extended_source(where):
+        if changed or only:
+            raise UsageError("--changed and --only are for plain parameters")
         return await save_extended(
             where, file, None if file_format is None else FileFormat(file_format), options
         )
     if metadata is not None and not changed:
         raise UsageError("--metadata gives the defaults for --changed")
     written = format_of_name(str(file)) if file_format is None else FileFormat(file_format)
-    if all_ and options.component is not None:
-        raise UsageError("--all and --component exclude each other")
-    if is_file(where):
-        if refresh:
-            raise UsageError(f"--refresh needs a link; {where!r} is a file")
-        chosen = _Changed(changed, metadata, from_file(metadata, offline=True), STORED_DEFAULTS_HINT)
-        sets, faults = _from_file(where, options, chosen, all_=all_)
-    elif names_vehicle(where, options.cache):
-        if refresh:
-            raise UsageError(f"--refresh needs a link; {where!r} is a vehicle in the cache")
-        chosen = _Changed(changed, metadata, from_file(metadata, offline=True), STORED_DEFAULTS_HINT)
-        sets, faults = _from_cache(where, options, chosen, all_=all_)
+    is_offline = is_file(where) or names_vehicle(where)
+    if is_offline and refresh:
+        raise UsageError(f"--refresh needs a link; {where!r} is a file or a vehicle in the cache")
+    selection = _Selection(changed, STORED_DEFAULTS_HINT if is_offline else DEFAULTS_HINT)
+    given = from_file(metadata, offline=is_offline)
+    if is_offline:
+        _add_offline(selection, where, given, options)
     else:
         check_link(where)
-        chosen = _Changed(changed, metadata, from_file(metadata), DEFAULTS_HINT)
-        sets, faults = await _from_link(where, options, chosen, all_=all_, refresh=refresh)
-    for fault in faults:
+        await _add_link(selection, where, metadata, given, options, refresh=refresh)
+    for fault in selection.faults:
         report(fault)
-    sets = _chosen(sets, only) if only else sets
-    files = _by_file(str(file), sets) if all_ else {file: sets}
+    sets = _chosen(selection.sets, only) if only else selection.sets
+    files = _by_file(str(file), sets) if is_pattern_name(str(file)) else {file: sets}
     if sets:
         for path, each in files.items():
             await anyio.to_thread.run_sync(partial(write_file, path, each, file_format=written))
         _show(files, written, as_json=options.json)
     else:
         report(f"nothing was written to {file}")
-    return ExitCode.INCOMPLETE if faults or not sets else ExitCode.DONE
+    return ExitCode.INCOMPLETE if selection.faults or not sets else ExitCode.DONE
 
 
-@dataclass(frozen=True, slots=True)
-class _Changed:
-    """Whether only parameters that differ from the firmware's defaults are written.
+class _Selection:
+    """The sets to write, or their parameters that differ from the defaults, and sentences on failures.
 
-    Attributes:
-        is_chosen: whether they are.
-        choice: the value of --metadata.
-        given: the metadata of the file that it names, or None.
+    Args:
+        is_changed: whether only parameters that differ from the firmware's defaults are written.
         hint: what to do if no defaults are known.
     """
 
-    is_chosen: bool
-    choice: str | None
-    given: Metadata | None
-    hint: str
+    def __init__(self, is_changed: bool, hint: str) -> None:
+        self.is_changed = is_changed
+        self.sets: list[ParamSet] = []
+        self.faults: list[str] = []
+        self._hint = hint
 
-    def known_of(self, sets: Sequence[ParamSet], options: LinkOptions) -> list[Metadata | None]:
-        """Return the metadata of each set, without a link."""
-        if not self.is_chosen or self.given is not None:
-            return [self.given] * len(sets)
-        return known_of_sets(sets, options)
-
-    def add(
-        self, sets: list[ParamSet], whole: ParamSet, described: Mapping[str, int | float]
-    ) -> Sequence[str]:
-        """Add a set, or its non-default parameters if chosen; return the sentences on a failure."""
+    def add(self, whole: ParamSet, described: Mapping[str, int | float]) -> None:
+        """Add a set; `described` has defaults of the metadata by name."""
+        if not self.is_changed:
+            self.sets.append(whole)
+            return
         try:
-            sets.append(select_non_defaults(whole, described) if self.is_chosen else whole)
+            differing = select_non_defaults(whole, described)
         except UsageError as error:
-            hint = f"; {self.hint}" if str(error) == NO_DEFAULTS else ""
-            return [f"{address(whole)}: {error}{hint}"]
-        if self.is_chosen:
-            written = sets[-1].values()
-            say_sources(address(whole), [default_of(each, described.get(each.name)) for each in written])
-        return []
+            hint = f"; {self._hint}" if str(error) == NO_DEFAULTS else ""
+            self.faults.append(f"{address(whole)}: {error}{hint}")
+            return
+        self.sets.append(differing)
+        known = [default_of(each, described.get(each.name)) for each in differing.values()]
+        say_sources(address(whole), known)
 
 
-async def _from_link(
-    url: str, options: LinkOptions, changed: _Changed, *, all_: bool, refresh: bool
-) -> tuple[list[ParamSet], list[str]]:
-    """Return the parameters received or confirmed in this session, and sentences on incomplete tables."""
-    sets: list[ParamSet] = []
-    faults: list[str] = []
-    async with connect(url, options) as session:
-        fetched, silent = await _fetch(session, all_=all_, refresh=refresh)
-        faults += silent
-        for component, result in fetched:
-            found = await collect_confirmed(component, result, session.client.link.name, session.deadline)
-            if found.missing:
-                faults.append(
-                    f"{component.system}/{component.component} is incomplete: {len(found.missing)} of "
-                    f"{result.count} parameters were not received"
+async def _add_link(
+    selection: _Selection,
+    url: str,
+    choice: str | None,
+    given: Metadata | None,
+    options: LinkOptions,
+    *,
+    refresh: bool,
+) -> None:
+    """Add the parameters of the vehicles on a link that were received or confirmed in this session."""
+    async with sessions(url, options) as found:
+        draws = not found[0].choice.is_all
+
+        async def fetch(session: CommandSession) -> ParamSet:
+            return await whole_table(session, draws=draws, refresh=refresh)
+
+        for done in await run_on_all(found, fetch):
+            if done.result is None:
+                selection.faults.append(f"{done.session.address}: {done.error}")
+                continue
+            described: Mapping[str, int | float] = {}
+            if selection.is_changed:
+                table = done.session.component.params
+                params = [table[name] for name in done.result if name in table]
+                described = await find_defaults(done.session, choice, given, params)
+            selection.add(done.result, described)
+        await report_others(found)
+
+
+def _add_offline(selection: _Selection, where: str, given: Metadata | None, options: LinkOptions) -> None:
+    """Add the parameters of a file, of an on-board log, or of a vehicle in the cache."""
+    choice = ChosenVehicle.parse(options.vehicle)
+    if is_file(where):
+        file = open_file(where)
+        sets = list(file.sets) if choice.is_all else [choose(file, choice.component, choice.system)]
+    else:
+        if options.place is False:
+            raise UsageError(f"{where!r} is a vehicle in the cache, which --no-cache excludes")
+        tables = tables_of(options.cache, where, choice.component)
+        if not choice.is_all and len(tables) > 1:
+            pilots = [table for table in tables if table.component == AUTOPILOT]
+            if not pilots:
+                known = ", ".join(f"{table.system}/{table.component}" for table in tables)
+                raise UsageError(f"no autopilot is among {known}; name one of them, or use --vehicle all")
+            tables = pilots
+        for table in tables:
+            if not table.complete:
+                of = "" if table.count is None else f" of {table.count}"
+                selection.faults.append(
+                    f"{table.system}/{table.component} is incomplete: {table.size}{of} parameters are in the "
+                    "cache"
                 )
-            else:
-                described: Mapping[str, int | float] = {}
-                if changed.is_chosen:
-                    params = [component.params[name] for name in found.set if name in component.params]
-                    one = replace(session, component=component)
-                    described = await find_defaults(one, changed.choice, changed.given, params)
-                faults += changed.add(sets, found.set, described)
-        if not all_:
-            await session.report_others(has_all=True)
-    return sets, faults
-
-
-async def _fetch(
-    session: CommandSession, *, all_: bool, refresh: bool
-) -> tuple[list[tuple[Component, FetchResult]], list[str]]:
-    """Return the components to save with the results of their fetches, and sentences on silent ones."""
-    deadline = session.deadline
-    if all_ and session.options.split_peers:
-        raise UsageError("--all and --split-peers exclude each other: a file has each component once")
-    if not all_:
-        with progress_bar(f"fetching {session.label}") as progress:
-            result = await session.component.fetch_all(
-                refresh=refresh, timeout=deadline.left(), progress=progress
-            )
-        return [(session.component, result)], []
-    client, system = session.client, session.options.system
-    if system is None:
-        await find_vehicles(client, None, None, deadline)
-    everything = await client.fetch_all(system, refresh=refresh, timeout=deadline.left())
-    fetched = [(client.components[each], everything.results[each]) for each in sorted(everything.results)]
-    silent = [f"{each[0]}/{each[1]}: {everything.silent[each]}" for each in sorted(everything.silent)]
-    return fetched, silent
-
-
-def _from_file(
-    path: str, options: LinkOptions, changed: _Changed, *, all_: bool
-) -> tuple[list[ParamSet], list[str]]:
-    """Return the parameters of a file or an on-board log, and sentences on sets without changes."""
-    file = open_file(path)
-    chosen = file.sets if all_ else [choose(file, options.component, options.system)]
-    sets: list[ParamSet] = []
-    faults: list[str] = []
-    for each, known in zip(chosen, changed.known_of(chosen, options), strict=True):
-        faults += changed.add(sets, each, defaults_in(known, each))
-    return sets, faults
-
-
-def _from_cache(
-    vehicle: str, options: LinkOptions, changed: _Changed, *, all_: bool
-) -> tuple[list[ParamSet], list[str]]:
-    """Return the cached parameters of a vehicle, and sentences on incomplete tables."""
-    if options.no_cache or options.system is not None or options.encoding or options.timeout is not None:
-        raise UsageError(
-            "--no-cache, --system, --encoding and --timeout need a link; "
-            f"{vehicle!r} is a vehicle in the cache"
-        )
-    tables = tables_of(CacheOptions(cache=options.cache), vehicle, options.component)
-    if not all_ and len(tables) > 1:
-        pilots = [table for table in tables if table.component == AUTOPILOT]
-        if not pilots:
-            known = ", ".join(f"{table.system}/{table.component}" for table in tables)
-            raise UsageError(f"no autopilot is among {known}; choose one with --component, or use --all")
-        tables = pilots
-    sets: list[ParamSet] = []
-    faults: list[str] = []
-    for table in tables:
-        if not table.complete:
-            of = "" if table.count is None else f" of {table.count}"
-            faults.append(
-                f"{table.system}/{table.component} is incomplete: "
-                f"{table.size}{of} parameters are in the cache"
-            )
-            continue
-        whole = cached_param_set(table)
-        (metadata,) = changed.known_of([whole], options)
-        faults += changed.add(sets, whole, defaults_in(metadata, whole))
-    return sets, faults
+        sets = [cached_param_set(table) for table in tables if table.complete]
+    metadata = [given] * len(sets)
+    if selection.is_changed and given is None:
+        metadata = known_of_sets(sets, options)
+    for each, known_of_set in zip(sets, metadata, strict=True):
+        selection.add(each, defaults_in(known_of_set, each))
 
 
 def _chosen(sets: Sequence[ParamSet], only: Sequence[str]) -> list[ParamSet]:

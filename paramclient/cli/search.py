@@ -58,8 +58,7 @@ def search(
     Args:
         word: A word or a part of one, or several words in quotes.
         words: Further words.
-        vehicle: Search only this vehicle in the cache: 4, px4 or ardupilot, its hardware id, or
-            its key.
+        vehicle: Search only this vehicle in the cache: 4, px4 or ardupilot, its hardware id, or its key.
         limit: Print at most this number of parameters.
         metadata: A file that describes parameters. Default: the stored metadata of each vehicle's firmware.
     """
@@ -103,8 +102,7 @@ def info(
 
     Args:
         name: The parameter, in upper or lower case.
-        vehicle: Only of this vehicle in the cache: 4, px4 or ardupilot, its hardware id, or its
-            key.
+        vehicle: Only of this vehicle in the cache: 4, px4 or ardupilot, its hardware id, or its key.
         metadata: A file that describes parameters. Default: the stored metadata of each vehicle's firmware.
     """
     check_name(name)

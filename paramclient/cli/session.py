@@ -1,27 +1,27 @@
-"""An open link with its vehicle, and the deadline of a command."""
+"""Open links with their vehicles: the sessions on which a subcommand works, and its deadline."""
 
 from __future__ import annotations
 
 import re
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, Generic, TypeVar
 
 import anyio
 import anyio.to_thread
 
 from paramclient.cache import CachedSummary
+from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import LinkOptions, TrafficOptions
 from paramclient.cli.output import local_time, printable, report, say
-from paramclient.cli.vehicle_name import check_kind, check_uid, wait_for_kind
 from paramclient.cli.waiting import while_waiting
 from paramclient.client.arguments import address_in_words
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
-from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, UsageError
+from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, ParamClientError, UsageError
 from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.model.identity import version_text
 from paramclient.model.wording import counted, first_of
@@ -31,14 +31,21 @@ from paramclient.protocol.selection import LOOK_TIME, hint_of_link
 from paramclient.wire.messages import MAV_AUTOPILOT_INVALID
 
 __all__ = [
-    "Deadline",
     "CommandSession",
+    "Deadline",
+    "Done",
+    "ChosenVehicle",
+    "announce_write",
     "check_link_argument",
     "connect",
+    "failed_json",
     "listen",
     "received_in_words",
     "receiver_in_words",
-    "unheard_in_words",
+    "report_failures",
+    "report_others",
+    "run_on_all",
+    "sessions",
     "vehicle_in_words",
     "wait_for_firmware",
     "wait_for_vehicle",
@@ -63,9 +70,15 @@ FIRMWARE_TIMEOUT: Final = 0.5
 """Seconds to wait for the firmware version of the vehicle, to name it to the user or to find its metadata."""
 FIRMWARE_POLL_INTERVAL: Final = 0.01
 """Seconds between two checks whether the firmware version is known."""
+UID_POLL_INTERVAL: Final = 0.05
+"""Seconds between two checks whether a vehicle with a hardware id was heard."""
+
+T = TypeVar("T")
 
 _PARAMETER: Final = re.compile(r"[A-Z][A-Z0-9]*_[A-Z0-9_]*(=.*)?", re.IGNORECASE)
 """A text that is probably the name of a parameter, or NAME=VALUE: it has an underscore."""
+_ADDRESS: Final = re.compile(r"([0-9]{1,3})(?:/([0-9]{1,3}))?")
+_UID: Final = re.compile(r"uid:([0-9a-f]{6,})", re.IGNORECASE)
 
 
 class Deadline:
@@ -87,13 +100,58 @@ class Deadline:
 
 
 @dataclass(frozen=True, slots=True)
+class ChosenVehicle:
+    """The vehicle that --vehicle names; without any part, the first one heard or the only one.
+
+    Attributes:
+        system, component: its ids, or None.
+        uid: the beginning of its hardware id, or None.
+        is_all: whether all vehicles of the link are chosen.
+    """
+
+    system: int | None = None
+    component: int | None = None
+    uid: str | None = None
+    is_all: bool = False
+
+    @classmethod
+    def parse(cls, text: str | None) -> ChosenVehicle:
+        """Parse the value of --vehicle.
+
+        Raises:
+            UsageError: it names no vehicle of a link.
+        """
+        if text is None:
+            return cls()
+        if text.lower() == "all":
+            return cls(is_all=True)
+        if found := _UID.fullmatch(text):
+            return cls(uid=found[1].lower())
+        if (found := _ADDRESS.fullmatch(text)) is None:
+            raise UsageError(
+                f"--vehicle {text}: a vehicle is written as 4, as 4/1 (system and component id), as uid: and "
+                "at least 6 digits of its hardware id, or as all"
+            )
+        ids = [int(each) for each in found.groups() if each is not None]
+        if not all(1 <= each <= 255 for each in ids):
+            raise UsageError(f"--vehicle {text}: system and component ids are 1 to 255")
+        return cls(system=ids[0], component=ids[1] if len(ids) > 1 else None)
+
+    @property
+    def is_named(self) -> bool:
+        """Whether the user has chosen the vehicle."""
+        return self != ChosenVehicle()
+
+
+@dataclass(frozen=True, slots=True)
 class CommandSession:
-    """An open client, and the component that the command works on."""
+    """An open client, and a component that the command works on."""
 
     client: ParamClient
     component: Component
     deadline: Deadline
     options: LinkOptions
+    choice: ChosenVehicle
 
     @property
     def now(self) -> float:
@@ -103,61 +161,27 @@ class CommandSession:
         return time.time() if at is None else at
 
     @property
+    def address(self) -> str:
+        """System and component id: `1/1`."""
+        return f"{self.component.system}/{self.component.component}"
+
+    @property
     def label(self) -> str:
         """The component in words: `1/1 px4`."""
-        component = self.component
-        return f"{component.system}/{component.component} {component.autopilot}"
+        return f"{self.address} {self.component.autopilot}"
+
+    @property
+    def prefix(self) -> str:
+        """The beginning of a line about the component: its label with --vehicle all, else ""."""
+        return f"{self.label}: " if self.choice.is_all else ""
 
     @property
     def receiver(self) -> str:
-        """The component with its kind and firmware, for a subcommand that writes; see `receiver_in_words`."""
+        """The component with its kind and firmware; see `receiver_in_words`."""
         return receiver_in_words(self.component)
 
-    @property
-    def is_named(self) -> bool:
-        """Whether an option chose the vehicle, instead of the first one heard."""
-        options = self.options
-        return options.system is not None or options.vehicle is not None or options.peer is not None
-
-    async def report_others(self, *, has_all: bool = False) -> None:
-        """Report other vehicles of the link, if no option chose the one that was used.
-
-        For subcommands that only read: they use the first vehicle heard, which may be another one next
-        time. A short command may end before the heartbeat of another vehicle; the cache knows those of
-        earlier commands.
-
-        Args:
-            has_all: whether the subcommand has --all for every vehicle.
-        """
-        if self.is_named:
-            return
-        others = [each for each in self.client.autopilots if each.system != self.component.system]
-        sentences = [f"{self.label} was used, the first vehicle heard."]
-        if others:
-            listed = first_of([vehicle_in_words(each) for each in others], OTHERS_SHOWN_MAX)
-            sentences.append(f"Also on this link: {listed}.")
-        sentences += await unheard_in_words(self)
-        if len(sentences) > 1:
-            all_of_them = ", --all reads all of them" if has_all else ""
-            report(f"{' '.join(sentences)} --system chooses one{all_of_them}")
-
-    async def announce_write(self) -> None:
-        """Print a line on stderr that says to which vehicle the subcommand writes, unless it prints JSON."""
-        if not self.options.json:
-            await wait_for_firmware([self.component], self.deadline)
-            say(printable(f"writing to {self.receiver} on {self.client.link.name}"))
-
-    async def report_unheard(self) -> None:
-        """Report vehicles of the link that the cache knows and that were not heard, if no option chose one.
-
-        For subcommands that write, before the first write.
-        """
-        if not self.is_named:
-            for sentence in await unheard_in_words(self):
-                report(f"{sentence} --system chooses one")
-
     async def check_only(self) -> None:
-        """Check that the component is still the only one that matches the options.
+        """Check that the component is still the only one that --vehicle fits.
 
         For subcommands that write, directly before the first write: other vehicles may have appeared.
 
@@ -166,27 +190,180 @@ class CommandSession:
             NoReply: no vehicle is heard.
             LinkError: the link failed.
         """
-        options, component = self.options, self.component
-        kind = options.named.kind
-        if kind is not None and check_kind(self.client, kind) in (None, component):
-            await self.client.only_component(
-                component.system, component.component, timeout=self.deadline.left(RECHECK_TIMEOUT)
-            )
+        choice, own = self.choice, self.component
+        if choice.is_all:
             return
-        found = await self.client.only_component(
-            options.system,
-            options.component,
-            peer=options.peer,
-            timeout=self.deadline.left(RECHECK_TIMEOUT),
-        )
-        if found is not component:
-            other_vehicle = f"{found.system}/{found.component} {found.autopilot}"
+        system, component = choice.system, choice.component
+        if choice.uid is not None:
+            system, component = own.system, own.component
+        timeout = self.deadline.left(RECHECK_TIMEOUT)
+        found = await self.client.only_component(system, component, timeout=timeout)
+        if found is not own:
+            other = f"{found.system}/{found.component} {found.autopilot}"
             raise AmbiguousVehicle(
-                f"{self.label} was chosen and is no longer heard; {other_vehicle} is heard instead. "
-                "Nothing was written.",
-                vehicles=(self.label, other_vehicle),
-                choose_by=_difference(found, component),
+                f"{self.label} was chosen and is no longer heard; {other} is heard instead. Nothing was "
+                "written.",
+                vehicles=(self.label, other),
+                choose_by="system" if found.system != own.system else "component",
             )
+
+
+@asynccontextmanager
+async def sessions(
+    url: str,
+    options: LinkOptions,
+    *,
+    writes: bool = False,
+    policy: Policy = Policy.AUTO,
+    is_live: bool = False,
+) -> AsyncIterator[list[CommandSession]]:
+    """Open a link, and yield a session for each vehicle that --vehicle names.
+
+    Args:
+        url: the link.
+        options: the vehicle, and the options of the link.
+        writes: whether several vehicles are an error, unless --vehicle names one or all.
+        policy: as in `ParamClient`.
+        is_live: read a log in real time; otherwise it is read at full speed, unless its name gives a speed.
+
+    Raises:
+        UsageError: no such link, or options that exclude each other.
+        AmbiguousVehicle: with `writes`, several vehicles were heard.
+        NoReply: the vehicle was not heard.
+        LinkError: the link cannot be opened, or failed.
+    """
+    check_link_argument(url)
+    choice, deadline = ChosenVehicle.parse(options.vehicle), Deadline(options.timeout)
+    async with ParamClient(
+        url if is_live else _at_full_speed(url),
+        cache=None if options.place is True else options.place,
+        encoding=options.encoding,
+        policy=policy,
+        listen_only=options.listen_only,
+        forward=options.forward,
+        tlog=options.tlog,
+        signing=options.signing,
+        **options.source,
+    ) as client:
+        timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
+        found = await _find(client, choice, timeout=timeout, only=writes)
+        if writes:
+            await wait_for_firmware(found, deadline)
+        yield [CommandSession(client, each, deadline, options, choice) for each in found]
+
+
+@asynccontextmanager
+async def connect(
+    url: str, options: LinkOptions, *, writes: bool = False, is_live: bool = False
+) -> AsyncIterator[CommandSession]:
+    """Open a link, and yield the session of one vehicle; arguments and errors as in `sessions`.
+
+    Raises:
+        UsageError: also for --vehicle all.
+    """
+    if ChosenVehicle.parse(options.vehicle).is_all:
+        raise UsageError("--vehicle all is not possible here; name one vehicle")
+    async with sessions(url, options, writes=writes, is_live=is_live) as found:
+        yield found[0]
+
+
+async def announce_write(found: Sequence[CommandSession]) -> None:
+    """Print a line on stderr for each vehicle to which the subcommand writes, unless it prints JSON.
+
+    Also reports vehicles of the link in the cache that were not heard, if --vehicle names none.
+    """
+    first = found[0]
+    if not first.options.json:
+        for each in found:
+            say(printable(f"writing to {each.receiver} on {each.client.link.name}"))
+    if not first.choice.is_named:
+        for sentence in await _unheard_in_words(first):
+            report(f"{sentence} --vehicle chooses one")
+
+
+async def report_others(found: Sequence[CommandSession]) -> None:
+    """Report other vehicles of the link, if --vehicle did not choose the one that was used.
+
+    For subcommands that only read: they use the first vehicle heard, which may be another one next time. A
+    short command may end before the heartbeat of another vehicle; the cache knows those of earlier commands.
+    """
+    first = found[0]
+    if first.choice.is_all:
+        for sentence in await _unheard_in_words(first):
+            report(sentence)
+    if first.choice.is_named:
+        return
+    others = [each for each in first.client.autopilots if each.system != first.component.system]
+    sentences = []
+    if others:
+        listed = first_of([vehicle_in_words(each) for each in others], OTHERS_SHOWN_MAX)
+        sentences.append(f"Also on this link: {listed}.")
+    sentences += await _unheard_in_words(first)
+    if sentences:
+        used = f"{first.label} was used, the first vehicle heard."
+        report(f"{' '.join([used, *sentences])} --vehicle chooses one")
+
+
+# Work on every session
+
+
+@dataclass(frozen=True, slots=True)
+class Done(Generic[T]):
+    """The outcome of the work on one vehicle: its result, or the error that ended it."""
+
+    session: CommandSession
+    result: T | None = None
+    error: ParamClientError | None = None
+
+
+async def run_on_all(
+    found: Sequence[CommandSession], work: Callable[[CommandSession], Awaitable[T]]
+) -> list[Done[T]]:
+    """Work on all vehicles concurrently; return the outcomes. A failure of one does not stop the others.
+
+    Raises:
+        ParamClientError: the error of the vehicle, without --vehicle all.
+    """
+    if not found[0].choice.is_all:
+        return [Done(found[0], await work(found[0]))]
+    done: dict[int, Done[T]] = {}
+
+    async def run(place: int, session: CommandSession) -> None:
+        try:
+            done[place] = Done(session, result=await work(session))
+        except ParamClientError as error:
+            done[place] = Done(session, error=error)
+
+    async with anyio.create_task_group() as tasks:
+        for place, session in enumerate(found):
+            tasks.start_soon(run, place, session)
+    return [done[place] for place in sorted(done)]
+
+
+def report_failures(done: Sequence[Done[T]]) -> int:
+    """Print the errors of vehicles on which the work failed; return the exit code for them."""
+    worst: int = ExitCode.DONE
+    for each in done:
+        if each.error is not None:
+            report(f"{each.session.label}: {each.error}")
+            worst = max(worst, code_of(each.error))
+    return worst
+
+
+def failed_json(done: Sequence[Done[T]]) -> list[dict[str, object]]:
+    """Return the JSON of the vehicles on which the work failed."""
+    return [
+        {
+            "system": each.session.component.system,
+            "component": each.session.component.component,
+            "error": str(each.error),
+        }
+        for each in done
+        if each.error is not None
+    ]
+
+
+# Vehicles
 
 
 def check_link_argument(text: str) -> None:
@@ -209,7 +386,7 @@ def check_link_argument(text: str) -> None:
             ) from None
 
 
-async def unheard_in_words(session: CommandSession) -> list[str]:
+async def _unheard_in_words(session: CommandSession) -> list[str]:
     """Return a sentence about vehicles of the link in the cache that were not heard; none without any.
 
     Vehicles that were heard last more than `UNHEARD_AGE_MAX` ago are left out, and so are those with the
@@ -260,115 +437,94 @@ def vehicle_in_words(component: Component) -> str:
     return f"{component.system}/{component.component} {kind}".rstrip()
 
 
-@asynccontextmanager
-async def connect(
-    url: str,
-    options: LinkOptions,
-    *,
-    policy: Policy = Policy.AUTO,
-    is_live: bool = False,
-    only: bool = False,
-) -> AsyncIterator[CommandSession]:
-    """Open a link and wait for the component that the options name.
+async def _find(
+    client: ParamClient, choice: ChosenVehicle, *, timeout: float | None, only: bool
+) -> list[Component]:
+    """Return the vehicles that a choice names; see `sessions`."""
+    if not choice.is_all:
+        return [await wait_for_vehicle(client, choice, timeout=timeout, only=only)]
 
-    Args:
-        url: the link.
-        options: the component, and the options of the link.
-        policy: as in `ParamClient`.
-        is_live: read a log in real time; otherwise it is read at full speed, unless its name gives a speed.
-        only: whether several vehicles are an error, unless the options name one: for subcommands that write.
+    async def look(_: Callable[[], None]) -> list[Component]:
+        return await client.find_autopilots(timeout=timeout)
 
-    Raises:
-        UsageError: no such link, or options that exclude each other.
-        AmbiguousVehicle: with `only`, several vehicles were heard.
-        NoReply: the component was not heard.
-        LinkError: the link cannot be opened, or failed.
-    """
-    check_link_argument(url)
-    if options.peer is not None and not options.split_peers:
-        raise UsageError("--peer needs --split-peers")
-    deadline = Deadline(options.timeout)
-    async with ParamClient(
-        url if is_live else _at_full_speed(url),
-        cache=None if options.place is True else options.place,
-        encoding=options.encoding,
-        policy=policy,
-        listen_only=options.listen_only,
-        forward=options.forward,
-        tlog=options.tlog,
-        signing=options.signing,
-        split_peers=options.split_peers,
-        **options.source,
-    ) as client:
-        timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
-        component = await wait_for_vehicle(
-            client,
-            options.system,
-            options.component,
-            kind=options.named.kind,
-            peer=options.peer,
-            timeout=timeout,
-            only=only,
-        )
-        await check_uid(client, component, options.named.uid)
-        yield CommandSession(client, component, deadline, options)
+    return await while_waiting(look, f"vehicles on {client.link.name}", lambda: received_in_words(client))
 
 
 async def wait_for_vehicle(
-    client: ParamClient,
-    system: int | None,
-    component: int | None,
-    *,
-    kind: str | None = None,
-    peer: str | None = None,
-    timeout: float | None,
-    only: bool = False,
+    client: ParamClient, choice: ChosenVehicle, *, timeout: float | None, only: bool = False
 ) -> Component:
-    """Wait for a component; meanwhile, show on a terminal the awaited component and those that were heard.
+    """Wait for one vehicle; meanwhile, show on a terminal the awaited one and those that were heard.
 
     Args:
         client: an open client.
-        system, component, peer, timeout: as in `ParamClient.component`.
-        kind: wait for the only vehicle with this autopilot instead.
-        only: as in `connect`.
+        choice: the vehicle.
+        timeout: seconds; None waits without limit.
+        only: as `writes` in `sessions`.
 
     Raises:
         ParamClientError: as from `ParamClient.component` and `ParamClient.only_component`.
     """
-    awaited = (
-        address_in_words(system, component, peer) if kind is None else f"a vehicle with autopilot {kind}"
-    )
+    if choice.uid is None:
+        awaited = address_in_words(choice.system, choice.component, None)
+    else:
+        awaited = f"a vehicle with hardware id {choice.uid}"
 
     async def look(_: Callable[[], None]) -> Component:
-        if kind is None and not only:
-            return await client.component(system, component, peer=peer, timeout=timeout)
-        if kind is None:
-            return await _find_only(client, system, component, peer=peer, timeout=timeout)
-        began = anyio.current_time()
-        found = await wait_for_kind(client, kind, timeout)
-        if found is None:
-            waited = anyio.current_time() - began
-            raise NoReply(awaited, attempts=0, waited=waited, hint=received_in_words(client))
-        return found
+        if choice.uid is not None:
+            return await _find_by_uid(client, choice.uid, awaited, timeout, only=only)
+        if only:
+            return await _find_only(client, choice, timeout)
+        return await client.component(choice.system, choice.component, timeout=timeout)
 
     return await while_waiting(look, f"{awaited} on {client.link.name}", lambda: received_in_words(client))
 
 
-async def _find_only(
-    client: ParamClient, system: int | None, component: int | None, *, peer: str | None, timeout: float | None
+async def _find_by_uid(
+    client: ParamClient, uid: str, awaited: str, timeout: float | None, *, only: bool
 ) -> Component:
+    """Wait for the autopilot with a hardware id; with `only`, also for another one that begins like it.
+
+    Raises:
+        AmbiguousVehicle: several have this beginning.
+        NoReply: none has it.
+    """
+    began, has_looked = anyio.current_time(), False
+    with anyio.move_on_after(timeout):
+        while True:
+            found = [each for each in client.autopilots if (each.identity.uid or "").startswith(uid)]
+            if len(found) > 1:
+                words = [vehicle_in_words(each) for each in found]
+                raise AmbiguousVehicle(
+                    f"{len(found)} vehicles on this link have hardware ids that begin with {uid}: "
+                    f"{', '.join(words)}.",
+                    vehicles=words,
+                    choose_by="system",
+                )
+            if found and (has_looked or not only or found[0].identity.uid == uid):
+                return found[0]
+            if found:
+                has_looked = True
+                await anyio.sleep(LOOK_TIME)
+                continue
+            client.core.check_open()
+            await anyio.sleep(UID_POLL_INTERVAL)
+    waited = anyio.current_time() - began
+    raise NoReply(awaited, attempts=0, waited=waited, hint=received_in_words(client))
+
+
+async def _find_only(client: ParamClient, choice: ChosenVehicle, timeout: float | None) -> Component:
     """Wait for the only component, as `ParamClient.only_component` does; the error lists all vehicles.
 
     That call ends with the second vehicle that is heard. The user chooses one of all: the others are
     waited for as long as an autopilot takes for a heartbeat.
     """
-    deadline = Deadline(timeout)
+    deadline, address = Deadline(timeout), (choice.system, choice.component)
     try:
-        return await client.only_component(system, component, peer=peer, timeout=timeout)
+        return await client.only_component(*address, timeout=timeout)
     except AmbiguousVehicle:
         await anyio.sleep(deadline.left(LOOK_TIME) or 0.0)
         with suppress(NoReply):
-            await client.only_component(system, component, peer=peer, timeout=RECHECK_TIMEOUT)
+            await client.only_component(*address, timeout=RECHECK_TIMEOUT)
         raise
 
 
@@ -392,13 +548,6 @@ def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> P
 def received_in_words(client: ParamClient) -> str:
     """Return what was received so far on the link."""
     return hint_of_link(client.core.station, client.link.name)
-
-
-def _difference(found: Component, chosen: Component) -> str:
-    """Return the name of the argument that distinguishes two components."""
-    if found.system != chosen.system:
-        return "system"
-    return "component" if found.component != chosen.component else "peer"
 
 
 def _at_full_speed(url: str) -> str:

@@ -12,22 +12,9 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from paramclient.cli.confirmation import can_ask, confirm
-from paramclient.cli.every_vehicle import (
-    address_text,
-    check_all,
-    check_expected,
-    every_vehicle,
-    run_on_all,
-)
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import (
-    check_choice,
-    is_extended_session,
-    may_be_extended,
-    set_extended,
-    text_pairs,
-)
-from paramclient.cli.json_output import VehicleJson, WriteJson
+from paramclient.cli.extended import set_extended
+from paramclient.cli.json_output import VehicleJson
 from paramclient.cli.metadata import (
     MetadataChoice,
     from_file,
@@ -36,11 +23,20 @@ from paramclient.cli.metadata import (
     parse_pairs,
     problems,
     resolved,
+    text_pairs,
 )
-from paramclient.cli.options import Count, LinkOptions
+from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_json, print_table, printable, report, say
 from paramclient.cli.param_names import spelling
-from paramclient.cli.session import CommandSession, check_link_argument, connect, wait_for_firmware
+from paramclient.cli.session import (
+    CommandSession,
+    announce_write,
+    check_link_argument,
+    connect,
+    run_on_all,
+    sessions,
+    wait_for_firmware,
+)
 from paramclient.cli.write_outcomes import (
     OUTCOME_COLUMNS,
     counted_outcomes,
@@ -48,8 +44,8 @@ from paramclient.cli.write_outcomes import (
     outcomes_code,
     report_outcomes,
     summary,
-    type_of,
     write_all,
+    writes_json,
 )
 from paramclient.client.arguments import SETTLE_MAX
 from paramclient.errors import ParamClientError, UsageError
@@ -71,20 +67,16 @@ async def set_(
     durable: bool = False,
     metadata: MetadataChoice = None,
     extended: bool = False,
-    plain: bool = False,
-    all_: Annotated[bool, Parameter(name="--all")] = False,
-    expect: Count = None,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Write parameters in the order given, and verify each by the value that the vehicle reports.
 
     A value is a decimal or hexadecimal number (0x1F), nan or inf; of an extended parameter also text, or
     bytes as hex:00FF. As NAME=VALUE, it may also be the name of a value, or names of bits separated by |, if
-    metadata describes the parameter: it is downloaded from the vehicle unless --metadata names a file. Many
-    writes are in flight at a time; values of one name, and switches such as *_ENABLE, are written one after
-    the other. A refused value does not stop the others. If several vehicles are heard, --system must
-    choose one, or --all must choose all. A value outside the range in the metadata, or a fraction for an
-    integer parameter, is written only after confirmation on a terminal, or with --force.
+    metadata describes the parameter: it is downloaded from the vehicle unless --metadata names a file. A
+    refused value does not stop the others. If several vehicles are heard, --vehicle must choose one, or all.
+    A value outside the range in the metadata, or a fraction for an integer parameter, is written only after
+    confirmation on a terminal, or with --force.
 
     Args:
         url: The link.
@@ -96,58 +88,57 @@ async def set_(
             ArduPilot.
         durable: End only when all values and their history are on the disk and survive a power loss.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
-        extended: Use the extended parameters (PARAM_EXT_*) of the component, such as a camera. Without this
-            option, they are used if a camera or other payload answers a request for the first one.
-        plain: Use the plain parameters, even if the component has extended ones.
-        all_: Write to every vehicle heard within 3 s.
-        expect: With --all: wait up to 10 s for this number of vehicles, and write to none if there are fewer.
+        extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
     check_link_argument(url)
-    check_expected(expect, all_=all_)
-    if all_:
-        check_all(options, extended=extended)
-        plain = True
-    check_choice(extended=extended, plain=plain)
-    described = from_file(metadata)
-    wanted: list[tuple[str, int | float | str]] = []
-    texts: list[tuple[str, str]] = []
-    if may_be_extended(options, extended=extended, plain=plain):
+    if extended:
+        if settle or force or metadata is not None:
+            raise UsageError("--settle, --force and --metadata are for plain parameters")
         texts = text_pairs(pairs)
-    else:
-        wanted = parse_pairs(pairs)
-        if described is not None:
-            wanted = [*resolved(wanted, described)]
-    if all_:
-        async with every_vehicle(url, options, expect=expect) as sessions:
-            jobs = [await _prepare(each, wanted, described, metadata) for each in sessions]
-            await _check_values(jobs, force=force)
-            for each in sessions:
-                await each.announce_write()
-            done = await run_on_all(
-                jobs, lambda job: _write(job, settle=settle, force=force, durable=durable, draws=False)
+        async with connect(url, options, writes=True) as session:
+            return await set_extended(session, texts, durable=durable)
+    described = from_file(metadata)
+    wanted = parse_pairs(pairs)
+    if described is not None:
+        wanted = [*resolved(wanted, described)]
+    async with sessions(url, options, writes=True) as found:
+        jobs = {each.address: await _prepare(each, wanted, described, metadata) for each in found}
+        await _check_values([*jobs.values()], force=force)
+        for each in found:
+            await each.check_only()
+        await announce_write(found)
+
+        async def work(session: CommandSession) -> Sequence[SetOutcome]:
+            job = jobs[session.address]
+            return await write_all(
+                session,
+                job.writes,
+                lambda so_far: _print([job], [so_far]),
+                verb="setting",
+                settle=settle,
+                force=force,
+                durable=durable,
             )
-        return _show_fleet(jobs, [each.result or () for each in done], options)
-    async with connect(url, options, only=True) as session:
-        if texts:
-            if await is_extended_session(session, extended=extended, plain=plain):
-                if settle or force or metadata is not None:
-                    raise UsageError("--settle, --force and --metadata are for plain parameters")
-                return await set_extended(session, texts, durable=durable)
-            wanted = parse_pairs(pairs)
-        job = await _prepare(session, wanted, described, metadata)
-        described = job.described
-        await _check_values([job], force=force)
-        await session.check_only()
-        await session.announce_write()
-        await session.report_unheard()
+
         began = anyio.current_time()
-        outcomes = await _write(job, settle=settle, force=force, durable=durable)
-        line = summary(session, outcomes, anyio.current_time() - began)
-    _print(session, outcomes, described)
+        done = [each.result or () for each in await run_on_all(found, work)]
+        elapsed = anyio.current_time() - began
+        is_all = found[0].choice.is_all
+        lines = [
+            printable(f"{counted_outcomes(outcomes)} on {session.receiver}")
+            if is_all
+            else summary(session, outcomes, elapsed)
+            for session, outcomes in zip(found, done, strict=True)
+        ]
+    _print([*jobs.values()], done)
     if not options.json:
-        say(line)
-    report_outcomes(outcomes, described)
-    return outcomes_code(outcomes)
+        for line in lines:
+            say(line)
+    code: int = ExitCode.DONE
+    for job, outcomes in zip(jobs.values(), done, strict=True):
+        report_outcomes(outcomes, job.described, vehicle=job.session.prefix)
+        code = max(code, outcomes_code(outcomes))
+    return code
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,65 +208,31 @@ async def _fractions(job: _Job) -> list[str]:
     return found
 
 
-async def _write(
-    job: _Job, *, settle: float, force: bool, durable: bool, draws: bool = True
-) -> Sequence[SetOutcome]:
-    """Write the values; return one outcome for each, also if nothing could be written."""
-    return await write_all(
-        job.session,
-        job.writes,
-        lambda so_far: _print(job.session, so_far, job.described),
-        verb="setting",
-        settle=settle,
-        force=force,
-        durable=durable,
-        draws=draws,
-    )
-
-
-def _print(session: CommandSession, outcomes: Sequence[SetOutcome], described: Metadata | None) -> None:
-    """Print the outcomes as a table or as JSON."""
-    if session.options.json:
-        print_json(_json(session, outcomes, described))
-        return
-    print_table(
-        OUTCOME_COLUMNS,
-        (outcome_cells(session, outcome, described) for outcome in outcomes),
-        right="requested actual",
-    )
-
-
-def _json(
-    session: CommandSession, outcomes: Sequence[SetOutcome], described: Metadata | None
-) -> dict[str, object]:
-    results = [WriteJson.of(each, type_of(session, each), info_of(described, each.name)) for each in outcomes]
-    return {"vehicle": VehicleJson.of(session.component), "results": results}
-
-
-def _show_fleet(jobs: Sequence[_Job], done: Sequence[Sequence[SetOutcome]], options: LinkOptions) -> int:
-    """Print the outcomes of several vehicles; return the exit code."""
+def _print(jobs: Sequence[_Job], done: Sequence[Sequence[SetOutcome]]) -> None:
+    """Print the outcomes of the vehicles as a table or as JSON."""
+    first = jobs[0].session
     pairs = list(zip(jobs, done, strict=True))
-    if options.json:
-        vehicles = [
+    if first.options.json:
+        objects = [
             {
-                "system": job.session.component.system,
-                "component": job.session.component.component,
-                **_json(job.session, outcomes, job.described),
+                "vehicle": VehicleJson.of(job.session.component),
+                "results": writes_json(job.session, outcomes, job.described),
             }
             for job, outcomes in pairs
         ]
-        print_json({"vehicles": vehicles})
-    else:
-        rows = (
-            (address_text(job.session), *outcome_cells(job.session, outcome, job.described))
-            for job, outcomes in pairs
-            for outcome in outcomes
+        vehicles = [
+            {"system": job.session.component.system, "component": job.session.component.component, **each}
+            for job, each in zip(jobs, objects, strict=True)
+        ]
+        print_json({"vehicles": vehicles} if first.choice.is_all else objects[0])
+        return
+    rows = (
+        (
+            *([job.session.address] if first.choice.is_all else []),
+            *outcome_cells(job.session, outcome, job.described),
         )
-        print_table(["vehicle", *OUTCOME_COLUMNS], rows, right="requested actual")
-        for job, outcomes in pairs:
-            say(printable(f"{counted_outcomes(outcomes)} on {job.session.receiver}"))
-    code: int = ExitCode.DONE
-    for job, outcomes in pairs:
-        report_outcomes(outcomes, job.described, vehicle=f"{job.session.label}: ")
-        code = max(code, outcomes_code(outcomes))
-    return code
+        for job, outcomes in pairs
+        for outcome in outcomes
+    )
+    columns = [*(["vehicle"] if first.choice.is_all else []), *OUTCOME_COLUMNS]
+    print_table(columns, rows, right="requested actual")

@@ -12,10 +12,9 @@ from typing import Annotated, Final
 from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.options import Id, KeyOptions, Seconds
+from paramclient.cli.options import CONNECTION, KeyOptions, Seconds
 from paramclient.cli.output import print_json, print_line, printable
-from paramclient.cli.session import VEHICLE_TIMEOUT, Deadline, wait_for_vehicle
-from paramclient.cli.vehicle_name import VehicleName, check_uid
+from paramclient.cli.session import VEHICLE_TIMEOUT, ChosenVehicle, Deadline, wait_for_vehicle
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.client.signing import Signing, read_key
@@ -34,18 +33,11 @@ PROOF_TIMEOUT: Final = 10.0
 class SigningTarget(KeyOptions):
     """The vehicle, and the safety of the link. The texts below the fields are their help."""
 
-    link_is_safe: bool = False
+    link_is_safe: Annotated[bool, CONNECTION] = False
     """Confirm that no other person or program can read this link: a USB cable, a wire. Default: ask."""
 
     vehicle: str | None = None
-    """The vehicle: 4 or 4/1, px4 or ardupilot, or a hardware id or key of the cache. Instead of
-    --system."""
-
-    system: Id = None
-    """System id of the vehicle, 1 to 255. Default: the only one received."""
-
-    component: Id = None
-    """Component id of the vehicle, 1 to 255. Default: the autopilot."""
+    """The vehicle: 4 or 4/1 (system and component id), or uid:HARDWARE-ID. Default: the only one heard."""
 
     timeout: Seconds = None
     """Timeout for the whole command in seconds. Default: 10 for the first heartbeat, and 10 for the
@@ -155,11 +147,10 @@ async def _send(
     signing = None if present is None else Signing(present, SigningPolicy.ACCEPT_ALL)
     async with ParamClient(link, cache=False, signing=signing, **options.source) as client:
         timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
-        named = VehicleName.chosen(options.vehicle, options.system, options.component)
-        vehicle = await wait_for_vehicle(
-            client, named.system, named.component, kind=named.kind, timeout=timeout, only=True
-        )
-        await check_uid(client, vehicle, named.uid)
+        choice = ChosenVehicle.parse(options.vehicle)
+        if choice.is_all:
+            raise UsageError("a signing key is set on one vehicle at a time")
+        vehicle = await wait_for_vehicle(client, choice, timeout=timeout, only=True)
         await vehicle.setup_signing(key, link_is_safe=True)
         return vehicle.system, vehicle.component
 

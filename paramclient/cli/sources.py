@@ -1,10 +1,7 @@
 """Sources of parameters that an argument can name: a file, a vehicle in the cache, or a link.
 
-The kind of source follows from the text, and from whether a file of that name exists:
-
-1. a file that exists, independent of its name;
-2. `cache:VEHICLE`, or a text that can only name a vehicle in the cache (see `paramclient.cache.lookup`): a
-   number is a system id, `uid:` and at least six digits are the beginning of a hardware id;
+1. A file that exists, independent of its name;
+2. `cache:VEHICLE`, or a text that can only name a vehicle in the cache (see `paramclient.cache.lookup`);
 3. any other text: a link.
 
 If both exist, `./1` is the file and `cache:1` the vehicle.
@@ -16,18 +13,16 @@ import difflib
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path, PurePath
-from typing import Annotated, Final, TypeAlias
+from typing import Final
 
 import anyio
-from cyclopts import Parameter
 
 from paramclient.cache import CachedSummary, ParamCache
 from paramclient.cache.lookup import address_of, is_vehicle_name
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import progress_bar, report
-from paramclient.cli.session import CommandSession, Deadline, connect
-from paramclient.client.component import Component
-from paramclient.errors import UnknownVehicle, UsageError
+from paramclient.cli.session import ChosenVehicle, CommandSession, report_others, sessions
+from paramclient.errors import FileError, UnknownVehicle, UsageError
 from paramclient.files import ParamFile, read_file, read_renames
 from paramclient.files.formats import ENDINGS
 from paramclient.files.param_file import AUTOPILOT
@@ -35,16 +30,18 @@ from paramclient.links import FORMS, parse_link
 from paramclient.logs.onboard import is_onboard_log, read_onboard_log
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
-from paramclient.protocol.fetch import FetchResult
-from paramclient.provision.vehicle_params import FetchedSet, collect_set, incomplete_error, load_cached_set
+from paramclient.provision.inspection import wait_for_identity
+from paramclient.provision.vehicle_params import collect_set, incomplete_error, load_cached_set
 
 __all__ = [
-    "VehicleChoice",
     "check_link",
+    "check_new",
+    "check_pattern",
     "choose",
-    "chosen_vehicle",
-    "collect_confirmed",
+    "component_of",
+    "fill_pattern",
     "is_file",
+    "is_pattern_name",
     "names_vehicle",
     "open_file",
     "read_rules",
@@ -56,60 +53,53 @@ __all__ = [
 
 SOURCES: Final = f"""\
   FILE                a parameter file, or an on-board log (.bin, .ulg), that exists
-  cache:VEHICLE       the cached table of a vehicle: 4 or 4/1, px4 or ardupilot, its hardware id
-                      (in full, or uid: and at least 6 digits), or its key; cache: may be left out
+  cache:VEHICLE       the cached table of a vehicle: 4 or 4/1, px4 or ardupilot, its hardware id (in full,
+                      or uid: and at least 6 digits), or its key; cache: may be left out
 {FORMS}"""
 """The accepted sources, for messages."""
 
-VehicleChoice: TypeAlias = Annotated[str | None, Parameter(name="--vehicle")]
-"""The vehicle in the cache, of a subcommand that also takes it as its first argument."""
-
+PLACEHOLDERS: Final = ("{uid}", "{system}")
+"""Placeholders in file names, which are replaced by the ids of the vehicle."""
 _ENDINGS: Final = frozenset({*ENDINGS, ".bin", ".ulg", ".txt", ".csv"})
 """Extensions of files with parameters, also of formats that are not readable: a text with one of them is
 meant as a file, and no link name has one."""
-
 _CACHED: Final = "cache:"
 """The prefix of a vehicle in the cache."""
 
 
-async def resolve(text: str, options: LinkOptions, *, only: bool = False) -> ParamSet:
+async def resolve(text: str, options: LinkOptions, *, writes: bool = False) -> ParamSet:
     """Return the parameters of the source that an argument names: a file, a vehicle in the cache, or a link.
 
     Opens a link and fetches the whole table, from the cache if the vehicle's hash matches.
 
     Args:
         text: the argument; see the docstring of this module.
-        only: whether several vehicles on the link are an error, unless the options name one: for values that
-            will be written.
-        options: `component` selects in all three (default: the autopilot, or the only component); `system`,
-            `timeout` and `encoding` are for links.
+        options: --vehicle selects the vehicle of a link, and the component of a file or of the cache.
+        writes: whether the values will be written; see `sessions`.
 
     Raises:
-        UsageError: the text names none of the three; a file cannot be read (FileError); options exclude each
-            other.
-        UnknownVehicle: the cache has no such vehicle or component.
-        AmbiguousVehicle: several vehicles in the cache have this name; with `only`, several are on the link.
-        CacheError: the cached table is incomplete.
+        UsageError: the text names none of the three; a file cannot be read (FileError).
+        UnknownVehicle, AmbiguousVehicle, CacheError: as `tables_in`, and the cached table is incomplete.
         VehicleError: some parameters were not received; the message names them.
-        NoReply: no vehicle was heard, or it did not answer.
-        LinkError: the link cannot be opened, or failed.
+        NoReply, LinkError: as `sessions`.
     """
-    (params,) = await resolve_all([text], options, only=only)
+    (params,) = await resolve_all([text], options, writes=writes)
     return params
 
 
-async def resolve_all(texts: Sequence[str], options: LinkOptions, *, only: bool = False) -> list[ParamSet]:
+async def resolve_all(texts: Sequence[str], options: LinkOptions, *, writes: bool = False) -> list[ParamSet]:
     """Resolve several sources, as `resolve` does: files and cached vehicles first, then links concurrently.
 
     A text that is given twice is resolved once. The first error ends all.
     """
+    choice = ChosenVehicle.parse(options.vehicle)
     found: dict[str, ParamSet] = {}
     links: list[str] = []
     for text in dict.fromkeys(texts):
         if is_file(text):
-            found[text] = _from_file(text, options)
-        elif names_vehicle(text, options.cache):
-            found[text] = _from_cache(text, options)
+            found[text] = choose(open_file(text), choice.component, choice.system)
+        elif names_vehicle(text):
+            found[text] = _from_cache(text, options, choice.component)
         else:
             check_link(text)
             links.append(text)
@@ -117,7 +107,10 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions, *, only: bool 
 
     async def fetch(url: str) -> None:
         try:
-            found[url] = await _from_link(url, options, is_alone=len(links) == 1, only=only)
+            async with sessions(url, options, writes=writes) as opened:
+                found[url] = await whole_table(opened[0], draws=len(links) == 1)
+                if not writes:
+                    await report_others(opened)
         except Exception as error:  # raised here, the task group would wrap it in a group
             errors.append(error)
             tasks.cancel_scope.cancel()
@@ -130,6 +123,29 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions, *, only: bool 
     return [found[text] for text in texts]
 
 
+async def whole_table(session: CommandSession, *, draws: bool, refresh: bool = False) -> ParamSet:
+    """Fetch the table of a session's component; return the values received or confirmed in this session.
+
+    Args:
+        session: the session.
+        draws: whether the progress is drawn; two bars at a time would mix.
+        refresh: as in `Component.fetch_all`.
+
+    Raises:
+        VehicleError: some parameters were not received; the message names them.
+        NoReply, LinkError: as from `Component.fetch_all`.
+    """
+    component, deadline, link = session.component, session.deadline, session.client.link.name
+    with progress_bar(f"fetching {session.label}") if draws else nullcontext() as progress:
+        result = await component.fetch_all(refresh=refresh, timeout=deadline.left(), progress=progress)
+    for note in result.notes:
+        report(f"{session.label} on {link}: {note}")
+    found = await collect_set(component, result, source=f"link {link}", timeout=deadline.left())
+    if found.missing:
+        raise incomplete_error(component, found.missing)
+    return found.set
+
+
 def is_file(text: str) -> bool:
     """Return whether an argument names an existing file. A device is not a file: it may be a link."""
     with suppress(OSError, ValueError):  # a text that is too long or has a NUL is not a file name
@@ -138,13 +154,8 @@ def is_file(text: str) -> bool:
     return False
 
 
-def names_vehicle(text: str, cache: str | None = None) -> bool:
-    """Return whether an argument has the form of a name of a vehicle in the cache.
-
-    Args:
-        text: the argument.
-        cache: the option --cache.
-    """
+def names_vehicle(text: str) -> bool:
+    """Return whether an argument has the form of a name of a vehicle in the cache."""
     return text.startswith(_CACHED) or is_vehicle_name(text)
 
 
@@ -177,19 +188,6 @@ def _nearest_file(text: str) -> str:
         return ""
     similar = difflib.get_close_matches(Path(text).name, names, n=1)
     return f" (did you mean {folder / similar[0]}?)" if similar else ""
-
-
-async def collect_confirmed(
-    component: Component, result: FetchResult, link: str, deadline: Deadline
-) -> FetchedSet:
-    """Return the parameters received or confirmed in this session; see `collect_set`. Reports the notes.
-
-    Raises:
-        LinkError: the link failed.
-    """
-    for note in result.notes:
-        report(f"{component.system}/{component.component} {component.autopilot} on {link}: {note}")
-    return await collect_set(component, result, source=f"link {link}", timeout=deadline.left())
 
 
 def open_file(path: str) -> ParamFile:
@@ -228,13 +226,13 @@ def choose(file: ParamFile, component: int | None, system: int | None) -> ParamS
     return file.choose(component, system=system if is_of_several else None)
 
 
-def tables_in(cache: ParamCache, vehicle: str | None, component: int | None) -> list[CachedSummary]:
+def tables_in(cache: ParamCache, vehicle: str | None, component: int | None = None) -> list[CachedSummary]:
     """Return the tables in the cache that an argument names. All subcommands use this function.
 
     Args:
         cache: the cache.
         vehicle: the name of the vehicle, also with the prefix `cache:`; None for all vehicles.
-        component: return only the table of this component.
+        component: return only the table of this component, unless the name has one.
 
     Raises:
         UsageError: the name is empty, such as an unset variable of a script.
@@ -246,8 +244,6 @@ def tables_in(cache: ParamCache, vehicle: str | None, component: int | None) -> 
         raise UsageError("a vehicle in the cache needs a name: its system id, its hardware id, or its key")
     known = cache.components(name)
     address = None if name is None else address_of(name)
-    if address is not None and component not in (None, address[1]):
-        raise UsageError(f"{name} names component {address[1]}, and --component names {component}")
     component = component if address is None else address[1]
     chosen = [each for each in known if component in (None, each.component)]
     if not chosen and (known or vehicle is not None):
@@ -259,62 +255,68 @@ def tables_in(cache: ParamCache, vehicle: str | None, component: int | None) -> 
     return chosen
 
 
-def chosen_vehicle(
-    option: str | None, vehicle: str | None, names: tuple[str, ...]
-) -> tuple[str | None, tuple[str, ...]]:
-    """Return the vehicle in the cache and the names, where --vehicle may name it instead of an argument.
-
-    Args:
-        option: the value of --vehicle, or None.
-        vehicle: the first argument: the vehicle, or with --vehicle a name; or None.
-        names: the further arguments.
-    """
-    if option is None:
-        return vehicle, names
-    return f"{_CACHED}{option.removeprefix(_CACHED)}", names if vehicle is None else (vehicle, *names)
+def component_of(vehicle: str) -> int | None:
+    """Return the component id in the name of a vehicle in the cache, such as `4/1`; None without one."""
+    address = address_of(vehicle.removeprefix(_CACHED))
+    return None if address is None else address[1]
 
 
-def _from_file(path: str, options: LinkOptions) -> ParamSet:
-    return choose(open_file(path), options.component, options.system)
-
-
-def _from_cache(vehicle: str, options: LinkOptions) -> ParamSet:
+def _from_cache(vehicle: str, options: LinkOptions, component: int | None) -> ParamSet:
     if options.place is False:
         raise UsageError(f"{vehicle!r} is a vehicle in the cache, which --no-cache excludes")
     with ParamCache(options.cache) as cache:
-        tables = tables_in(cache, vehicle, options.component)
+        tables = tables_in(cache, vehicle, component)
         table = next((each for each in tables if each.component == AUTOPILOT), tables[0])
-        if options.component is None and len(tables) > 1 and table.component != AUTOPILOT:
+        if len(tables) > 1 and table.component != AUTOPILOT:
             known = ", ".join(f"{each.system}/{each.component}" for each in tables)
-            raise UsageError(f"no autopilot is among {known}; choose one with --component")
+            raise UsageError(f"no autopilot is among {known}; name one of them instead of {vehicle}")
         return load_cached_set(cache, table.key, table.component, note=report)
 
 
-async def _from_link(url: str, options: LinkOptions, *, is_alone: bool, only: bool) -> ParamSet:
-    """Return the whole table of a component. Draws the progress only if `is_alone`: two bars would mix."""
-    async with connect(url, options, only=only) as session:
-        found = await whole_table(session, draws=is_alone)
-        if not only:
-            await session.report_others()
-        return found
+# File names for several vehicles
 
 
-async def whole_table(session: CommandSession, *, draws: bool) -> ParamSet:
-    """Fetch the table of a session's component; return it with the values confirmed in this session.
+def is_pattern_name(name: str) -> bool:
+    """Return whether a file name has a placeholder for the ids of the vehicle."""
+    return any(place in name for place in PLACEHOLDERS)
 
-    Args:
-        session: the session.
-        draws: whether the progress is drawn; two bars at a time would mix.
+
+def check_pattern(what: str, pattern: str | None, options: LinkOptions) -> None:
+    """Check that a file name has a placeholder if there may be several vehicles.
 
     Raises:
-        VehicleError: some parameters were not received; the message names them.
-        NoReply, LinkError: as from `Component.fetch_all`.
+        UsageError: it has none.
     """
-    component, deadline = session.component, session.deadline
-    link = session.client.link.name
-    with progress_bar(f"fetching {session.label}") if draws else nullcontext() as progress:
-        result = await component.fetch_all(timeout=deadline.left(), progress=progress)
-    found = await collect_confirmed(component, result, link, deadline)
-    if found.missing:
-        raise incomplete_error(component, found.missing)
-    return found.set
+    is_all = ChosenVehicle.parse(options.vehicle).is_all
+    if pattern is not None and is_all and not is_pattern_name(pattern):
+        raise UsageError(
+            f"with --vehicle all, {what} needs {' or '.join(PLACEHOLDERS)} in its name: {pattern}"
+        )
+
+
+async def fill_pattern(pattern: str, session: CommandSession) -> str:
+    """Return a file name with the placeholders replaced by the vehicle's ids.
+
+    Raises:
+        UsageError: the name has `{uid}`, and the vehicle reports no hardware id.
+    """
+    if "{uid}" in pattern:
+        await wait_for_identity(session.component)
+        uid = session.component.identity.uid
+        if uid is None:
+            raise UsageError(f"{session.label} does not report a hardware id, which {pattern} needs")
+        pattern = pattern.replace("{uid}", uid)
+    return pattern.replace("{system}", str(session.component.system))
+
+
+def check_new(path: str) -> Path:
+    """Return the path of a new file. An existing file may be the only copy of an earlier state.
+
+    Raises:
+        FileError: the file exists.
+    """
+    if Path(path).exists():
+        raise FileError(
+            "exists already, and may be the backup of an earlier run; choose another name", source=path
+        )
+    return Path(path)

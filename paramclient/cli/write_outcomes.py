@@ -11,7 +11,8 @@ from typing import Final
 import anyio
 
 from paramclient.cli.exit_codes import ExitCode, code_of
-from paramclient.cli.metadata import meaning_of, needs_reboot
+from paramclient.cli.json_output import WriteJson
+from paramclient.cli.metadata import info_of, meaning_of, needs_reboot
 from paramclient.cli.output import Coloured, printable, progress_bar, report, say
 from paramclient.cli.param_names import suggest
 from paramclient.cli.session import CommandSession
@@ -31,8 +32,8 @@ __all__ = [
     "report_outcomes",
     "status_in_words",
     "summary",
-    "type_of",
     "write_all",
+    "writes_json",
 ]
 
 OUTCOME_COLUMNS: Final = ("name", "requested", "actual", "status")
@@ -54,7 +55,6 @@ async def write_all(
     settle: float,
     force: bool,
     durable: bool,
-    draws: bool = True,
 ) -> Sequence[SetOutcome]:
     """Write values; return one outcome for each, also if nothing could be written.
 
@@ -64,9 +64,9 @@ async def write_all(
         show: prints outcomes as the subcommand does; called on cancellation with the outcomes so far.
         verb: the action for the progress bar, `setting`.
         settle, force, durable: as in `Component.set_many`.
-        draws: whether to draw the progress; several bars at once are not possible.
     """
-    with _progress_until_interrupted(session, writes, show, verb if draws else None) as progress:
+    drawn = None if session.choice.is_all else verb  # two bars at once are not possible
+    with _progress_until_interrupted(session, writes, show, drawn) as progress:
 
         async def write(erase: Callable[[], None]) -> SetManyResult:
             def report(outcome: SetOutcome) -> None:
@@ -173,6 +173,13 @@ def status_in_words(status: SetStatus, error: Exception | None) -> str:
 
 def _text(value: WireValue | None, kind: ParamType | int) -> str | None:
     return None if value is None else format_value(value, kind)
+
+
+def writes_json(
+    session: CommandSession, outcomes: Sequence[SetOutcome], described: Metadata | None
+) -> list[WriteJson]:
+    """Return the JSON of outcomes."""
+    return [WriteJson.of(each, type_of(session, each), info_of(described, each.name)) for each in outcomes]
 
 
 def type_of(session: CommandSession, outcome: SetOutcome) -> ParamType | int:

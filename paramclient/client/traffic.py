@@ -191,11 +191,6 @@ class Traffic:
         """Frames of all components received twice."""
         return sum(source.repeated for source in self._sources.values())
 
-    @property
-    def has_radio(self) -> bool:
-        """Whether a telemetry radio has sent its status."""
-        return any(source.is_radio for source in self._sources.values())
-
     def report(self, now: float) -> TrafficReport:
         """Return the present counts."""
         began = now if self._began is None else self._began

@@ -5,8 +5,7 @@ All links implement `Link`; a program can provide its own implementation.
 
 - `link`, `names`: the interface of links, and their names.
 - `udp`, `tcp`, `serial`, `sim`, `replay`: one module for each kind of link.
-- `own_thread`: blocking calls of a link in a thread of their own.
-- `refusals`, `port_users`: the reason why a link cannot be opened, and the program that uses its port.
+- `refusals`: the reason why a link cannot be opened.
 - `ports`, `serial_transport`, `tlog`, `clock_offset`: serial ports, serialx on Windows, logs, arrival times.
 """
 

@@ -12,15 +12,13 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
 from contextlib import suppress
-from functools import partial
 from typing import Any, Final, NoReturn, Protocol, TypeAlias, runtime_checkable
 
 import anyio
 
 from paramclient.errors import LinkError
 from paramclient.links.names import LinkSpec
-from paramclient.links.own_thread import run_in_own_thread
-from paramclient.links.refusals import host_refusal, is_port_in_use, port_in_use, socket_refusal
+from paramclient.links.refusals import host_refusal, socket_refusal
 
 __all__ = ["Address", "Link", "Peer", "SocketLink", "claim", "close_socket"]
 
@@ -117,19 +115,15 @@ class SocketLink(ABC):
             if opening == self._openings:
                 self._discard()
             if isinstance(error, OSError) and not isinstance(error, LinkError):
-                raise self._error(await self._refusal(error)) from error
+                problem = socket_refusal(
+                    error, self._host, self._port, self._target, is_stream=self.is_stream
+                )
+                raise self._error(problem) from error
             raise
 
     async def close(self) -> None:
         """See `Link.close`."""
         self._discard()
-
-    async def _refusal(self, error: OSError) -> str:
-        """Return why the link cannot be opened."""
-        if is_port_in_use(error):
-            find = partial(port_in_use, self._port, is_tcp=self.is_stream)
-            return await run_in_own_thread(find)
-        return socket_refusal(error, self._host, self._port, self._target)
 
     @abstractmethod
     async def _open(self, opening: int) -> None:

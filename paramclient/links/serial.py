@@ -18,18 +18,17 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import threading
 from contextlib import suppress
-from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn, Protocol, TypeVar
 
 import anyio
-import anyio.from_thread
 import anyio.lowlevel
+import anyio.to_thread
 
 from paramclient.errors import LinkError, UsageError
 from paramclient.links.link import OPEN_TIMEOUT, Peer
 from paramclient.links.names import LinkSpec
-from paramclient.links.own_thread import run_in_own_thread
 from paramclient.links.ports import need_serialx
 from paramclient.links.refusals import device_refusal, reason
 
@@ -114,18 +113,16 @@ class SerialLink:
                 port = await _open_port(self.device, self.baud)
         except OSError as error:
             self._check(opening)
-            raise self._error(await self._refusal(error)) from error
+            if isinstance(error, TimeoutError):
+                problem = f"{self.device} did not open within {OPEN_TIMEOUT:g} s"
+            else:
+                problem = device_refusal(self.device, self.baud, error)
+            raise self._error(problem) from error
         if opening != self._openings:
             await port.close()
         self._check(opening)
         self._port = port
         self._peer = self._peer._replace(number=self._peer.number + 1)
-
-    async def _refusal(self, error: OSError) -> str:
-        """Return why the port cannot be opened."""
-        if isinstance(error, TimeoutError):
-            return f"{self.device} did not open within {OPEN_TIMEOUT:g} s"
-        return await run_in_own_thread(partial(device_refusal, self.device, self.baud, error))
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`: one chunk of up to `READ_SIZE` bytes."""
@@ -224,9 +221,28 @@ if sys.platform != "win32":
         @classmethod
         async def opened(cls, device: str, baud: int) -> _Descriptor:
             """Open a port in a thread. A port that opens after cancellation is closed again."""
-            return await run_in_own_thread(
-                lambda: cls._open(device, baud), undo=cls._release, grace=CLOSE_TIMEOUT
-            )
+            lock = threading.Lock()
+            opened: list[_Descriptor] = []
+            is_wanted = True
+
+            def work() -> _Descriptor:
+                port = cls._open(device, baud)
+                with lock:
+                    opened.append(port)
+                    if is_wanted:
+                        return port
+                port._release()
+                return port
+
+            try:
+                return await anyio.to_thread.run_sync(work, abandon_on_cancel=True)
+            except BaseException:
+                with lock:
+                    is_wanted = False
+                    found = list(opened)
+                for port in found:
+                    port._release()
+                raise
 
         async def read(self) -> bytes:
             with suppress(anyio.ClosedResourceError):
@@ -248,7 +264,7 @@ if sys.platform != "win32":
         async def close(self) -> None:
             anyio.notify_closing(self._file)
             with anyio.move_on_after(CLOSE_TIMEOUT, shield=True):
-                await run_in_own_thread(self._release)
+                await anyio.to_thread.run_sync(self._release, abandon_on_cancel=True)
 
         @classmethod
         def _open(cls, device: str, baud: int) -> _Descriptor:

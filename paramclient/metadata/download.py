@@ -76,7 +76,7 @@ async def metadata_of(
         return None
     uri, crc = next((place for place in places if place[0].startswith(_SCHEME)), places[0])
     content = await files.get(uri, crc)
-    read = await _in_thread(_read_parameters, content, f"{uri} of {files.label}")
+    read = await _in_thread(read_content, content, source=f"{uri} of {files.label}")
     now = component.identity
     if kept is not None and crc is not None and before.uid in (None, now.uid):
         await _in_thread(kept.remember, now, component.component, crc)
@@ -190,10 +190,6 @@ def _places_of_parameters(general: bytes, source: str) -> list[tuple[str, int | 
         for uri, crc in ((file.uri, file.crc), (file.fallback_uri, file.fallback_crc))
         if uri
     ]
-
-
-def _read_parameters(content: bytes, source: str) -> Metadata:
-    return read_content(content, source=source)
 
 
 async def _in_thread(work: Callable[P, Result], *args: P.args, **kwargs: P.kwargs) -> Result:

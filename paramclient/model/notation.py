@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import struct
 from datetime import UTC, datetime
-from typing import Final, TypeAlias
+from typing import TypeAlias
 
 from paramclient.errors import UsageError
 from paramclient.model.paramset import WrittenParam
@@ -16,8 +15,6 @@ __all__ = [
     "bits_text",
     "bits_written",
     "hash_text",
-    "parse_number",
-    "parse_value",
     "rounded",
     "time_or_none",
     "time_text",
@@ -28,8 +25,6 @@ __all__ = [
 
 Scalar: TypeAlias = int | float | str
 """A value in strict JSON."""
-_WORDS: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
-_FLOAT32: Final = struct.Struct("<f")
 
 
 def value_json(value: WireValue, number: ParamType | int) -> Scalar:
@@ -44,33 +39,6 @@ def value_json(value: WireValue, number: ParamType | int) -> Scalar:
     if math.isfinite(value):
         return shortest_float(value) if number == ParamType.REAL32 else value
     return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
-
-
-def parse_number(given: object) -> WireValue:
-    """Return the value of a JSON number; NaN and infinities are text, raw bytes text of the form `0x…`.
-
-    Raises:
-        TypeError, ValueError: this is not a value.
-    """
-    if isinstance(given, str):
-        return _WORDS[given] if given in _WORDS else int(given.removeprefix("0x"), 16).to_bytes(4, "little")
-    if isinstance(given, bool) or not isinstance(given, int | float):
-        raise TypeError(f"a value cannot be of type {type(given).__name__}")
-    return given
-
-
-def parse_value(given: object, number: ParamType | int) -> WireValue:
-    """Return the value of a result of `value_json`, which may also be 2 for 2.0.
-
-    Raises:
-        TypeError, ValueError: this is not a value.
-        OverflowError: it does not fit a REAL32.
-    """
-    value = parse_number(given)
-    if number == ParamType.REAL32 and not isinstance(value, bytes):
-        rounded_value: float = _FLOAT32.unpack(_FLOAT32.pack(value))[0]
-        return rounded_value
-    return float(value) if number == ParamType.REAL64 and isinstance(value, int) else value
 
 
 def value_written(value: WireValue, param: WrittenParam) -> Scalar:

@@ -45,7 +45,6 @@ __all__ = [
     "same_bits",
     "shortest_float",
     "type_name",
-    "type_of_name",
 ]
 
 Value: TypeAlias = int | float | str | bytes
@@ -264,16 +263,6 @@ _TYPES: tuple[ParamType | int, ...] = (0, *TYPES_BY_NAME.values())
 def type_name(number: ParamType | int) -> str:
     """Return the name of a type, `INT32`, `REAL32`, …, or `TYPE_77` for an unknown type."""
     return ParamType(number).name if 1 <= number <= ParamType.CUSTOM else f"TYPE_{number}"
-
-
-def type_of_name(name: str) -> ParamType | int:
-    """Return the type with a name of `type_name`.
-
-    Raises:
-        ValueError: no type has this name.
-    """
-    known = TYPES_BY_NAME.get(name)
-    return int(name.removeprefix("TYPE_")) if known is None else known
 
 
 def check_name(name: str) -> str:

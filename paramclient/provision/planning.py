@@ -38,7 +38,6 @@ __all__ = [
     "Plan",
     "PlanRow",
     "PlanStatus",
-    "RowComparison",
     "Stage",
     "Step",
     "overlay",
@@ -96,19 +95,6 @@ class PlanStatus(StrEnum):
     """The value is invalid; `PlanRow.reason` gives the reason."""
 
 
-class RowComparison(StrEnum):
-    """The comparison of a vehicle's parameter with the wanted one."""
-
-    SAME = "same"
-    """The vehicle has the wanted value."""
-    DIFFERENT = "different"
-    """The vehicle has another value, or the wanted value is invalid."""
-    MISSING = "missing"
-    """The vehicle does not have the parameter."""
-    LEFT_OUT = "left out"
-    """The parameter is left out, and may differ."""
-
-
 @dataclass(frozen=True, slots=True)
 class PlanRow:
     """The planned action for one wanted parameter, with the value that the vehicle has.
@@ -159,18 +145,9 @@ class PlanRow:
         return self.before is None or not _is_same(self.target.settable, self.before, self.type)
 
     @property
-    def comparison(self) -> RowComparison:
-        """How the vehicle's parameter compares with the wanted one."""
-        if self.category == MISSING:
-            return RowComparison.MISSING
-        if self.status is PlanStatus.SKIPPED:
-            return RowComparison.LEFT_OUT
-        return RowComparison.SAME if self.status is PlanStatus.UNCHANGED else RowComparison.DIFFERENT
-
-    @property
     def is_met(self) -> bool:
         """Whether the vehicle has the wanted value, or the parameter is left out."""
-        return self.comparison in (RowComparison.SAME, RowComparison.LEFT_OUT)
+        return self.category != MISSING and self.status in (PlanStatus.UNCHANGED, PlanStatus.SKIPPED)
 
     def __str__(self) -> str:
         kind = ParamType.REAL32 if self.type is None else self.type

@@ -18,8 +18,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from paramclient.service.problems import ServiceError, problem_of, problem_response
 from paramclient.service.tokens import TokenHolder, Tokens
 
-__all__ = ["AccessMiddleware", "author_of", "holder_of", "require_read", "require_write"]
+__all__ = ["AccessMiddleware", "author_of", "holder_of", "require_write"]
 
+PROTECTED: Final = ("/api/", "/metrics")
+"""Begin of the paths that require a token. The others are the page, its description, and `/health`."""
 SAFE_METHODS: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 LOCAL: Final = TokenHolder("local", "write")
 """The holder of all requests to a service without tokens."""
@@ -34,7 +36,8 @@ _PAGE_NAME: Final = re.compile(r"[A-Za-z0-9._ -]{1,64}")
 
 
 class AccessMiddleware:
-    """Finds the holder of the token of a request, and rejects wrong tokens and writes of other sites.
+    """Finds the holder of the token of a request. Rejects requests without a valid one, and writes of other
+    sites, before their body is received.
 
     Args:
         app: the application.
@@ -63,8 +66,11 @@ class AccessMiddleware:
         try:
             if scope["method"] not in SAFE_METHODS:
                 self._check_origin(headers)
-            state = scope.setdefault("state", {})
-            state["holder"] = self._holder(headers)
+            holder = self._holder(headers)
+            if holder is None and scope["path"].startswith(PROTECTED):
+                detail = "This service requires a token in the header Authorization: Bearer TOKEN."
+                raise ServiceError(401, "unauthorized", detail)
+            scope.setdefault("state", {})["holder"] = holder
         except ServiceError as error:
             challenge = {"www-authenticate": "Bearer"} if error.status == 401 else None
             await problem_response(problem_of(error), challenge)(scope, receive, send_with_headers)
@@ -95,8 +101,10 @@ class AccessMiddleware:
             ServiceError: 403, it is.
         """
         origin = headers.get("origin")
-        own = headers.get("host", "")
-        if origin is None or origin in self._origins or origin.partition("://")[2] == own:
+        if origin is None or origin in self._origins:
+            return
+        own = headers.get("host")
+        if own and origin.partition("://")[2] == own:
             return
         raise ServiceError(403, "other-origin", f"Pages of {origin[:200]} may not change anything here.")
 
@@ -115,24 +123,12 @@ def author_of(request: Request) -> str:
     return f"{name} ({page})" if _PAGE_NAME.fullmatch(page) else name
 
 
-async def require_read(request: Request) -> None:
-    """Reject a request without a token.
-
-    Raises:
-        ServiceError: 401, the token is missing.
-    """
-    if holder_of(request) is None:
-        detail = "This service requires a token in the header Authorization: Bearer TOKEN."
-        raise ServiceError(401, "unauthorized", detail)
-
-
 async def require_write(request: Request) -> None:
     """Reject a request without a token that may write.
 
     Raises:
-        ServiceError: 401 or 403.
+        ServiceError: 403, it has none.
     """
-    await require_read(request)
     holder = holder_of(request)
     if holder is None or not holder.may_write:
         raise ServiceError(403, "forbidden", "This request requires a token that may write.")

@@ -37,33 +37,6 @@ if TYPE_CHECKING:
     from paramclient.provision import ApplyResult, ExtApplyResult, ExtPlan, Plan
     from paramclient.service.targets import Target
 
-__all__ = [
-    "apply_result",
-    "cached_vehicles",
-    "change",
-    "ext_apply_result",
-    "ext_change",
-    "ext_fetch_result",
-    "ext_history",
-    "ext_param",
-    "ext_plan",
-    "ext_writes",
-    "ext_written",
-    "fetch_result",
-    "history",
-    "param",
-    "param_file",
-    "param_set",
-    "params",
-    "plan",
-    "progress",
-    "snapshots",
-    "vehicle",
-    "vehicle_state",
-    "write",
-    "writes",
-]
-
 CHANGING_MEMBERS: Final = frozenset({"silence_s", "round_trip_s", "params", "fetch"})
 """Members of a vehicle that change all the time: they cause no event."""
 
@@ -210,8 +183,7 @@ def write(outcome: SetOutcome, target: Target) -> dict[str, Any]:
     known = target.component.params.get(outcome.name)
     info = None if target.metadata is None else target.metadata.find(outcome.name)
     kind = ParamType.REAL64 if known is None else known.type_number
-    found: dict[str, Any] = as_json(WriteJson.of(outcome, kind, info))
-    return found
+    return dict(as_json(WriteJson.of(outcome, kind, info)))
 
 
 def writes(result: SetManyResult, target: Target) -> dict[str, Any]:
@@ -226,24 +198,22 @@ def writes(result: SetManyResult, target: Target) -> dict[str, Any]:
 def plan(found: Plan, target: Target) -> dict[str, Any]:
     """Return a plan."""
     component = target.component
-    members: dict[str, Any] = as_json(
-        PlanJson.of(found, system=component.system, component=component.component)
-    )
-    return members
+    return dict(as_json(PlanJson.of(found, system=component.system, component=component.component)))
 
 
 def apply_result(result: ApplyResult, target: Target) -> dict[str, Any]:
     """Return the result of an apply or restore."""
     component = target.component
-    members: dict[str, Any] = as_json(
-        ApplyJson.of(
-            result,
-            system=component.system,
-            component=component.component,
-            vehicle=VehicleJson.of(component),
+    return dict(
+        as_json(
+            ApplyJson.of(
+                result,
+                system=component.system,
+                component=component.component,
+                vehicle=VehicleJson.of(component),
+            )
         )
     )
-    return members
 
 
 # The past
@@ -264,8 +234,7 @@ def snapshots(kept: Iterable[SnapshotSummary]) -> dict[str, Any]:
 
 def ext_param(known: Param) -> dict[str, Any]:
     """Return an extended parameter of a table."""
-    found: dict[str, Any] = as_json(ExtParamJson.of_table(known))
-    return found
+    return dict(as_json(ExtParamJson.of_table(known)))
 
 
 def ext_written(known: WrittenParam) -> dict[str, Any]:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any, Final
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict
+from pydantic_core import to_json
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
@@ -93,9 +93,11 @@ def problem_of(error: Exception) -> dict[str, Any]:
     if isinstance(error, ParamClientError):
         status = next(status for kind, status in _STATUSES.items() if isinstance(error, kind))
         name = type(error).__name__
-        members = {key: _json(value) for key, value in vars(error).items() if not key.startswith("_")}
+        public = {key: value for key, value in vars(error).items() if not key.startswith("_")}
+        text = to_json(public, inf_nan_mode="strings", bytes_mode="hex", fallback=str)
+        members = {**json.loads(text), "error": name}
         kind = re.sub("(?<=[a-z])([A-Z])", r"-\1", name).lower()
-        return _problem(status, kind, str(error), {**members, "error": name})
+        return _problem(status, kind, str(error), members)
     return _problem(500, "internal", "Internal error of the service. Its log has the details.", {})
 
 
@@ -140,25 +142,6 @@ async def _failed(request: Request, error: Exception) -> Response:
 def _problem(status: int, kind: str, detail: str, members: Mapping[str, Any]) -> dict[str, Any]:
     title = kind.replace("-", " ").capitalize()
     return {**members, "type": f"urn:paramclient:{kind}", "title": title, "status": status, "detail": detail}
-
-
-def _json(value: Any) -> Any:
-    """Return an attribute of an exception as JSON: numbers and texts unchanged, types by name."""
-    match value:
-        case None | bool() | str():
-            return value
-        case bytes():
-            return value.hex()
-        case int():
-            return int(value)
-        case float():
-            return value if math.isfinite(value) else str(value)
-        case Mapping():
-            return {str(key): _json(each) for key, each in value.items()}
-        case Iterable():
-            return [_json(each) for each in value]
-        case _:
-            return str(value)
 
 
 _STATUSES: Final[dict[type[ParamClientError], int]] = {

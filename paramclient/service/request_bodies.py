@@ -32,6 +32,7 @@ __all__ = [
     "UploadedFile",
     "Value",
     "WriteManyRequest",
+    "WriteOptions",
     "WriteRequest",
     "range_faults",
     "resolve_value",
@@ -102,37 +103,37 @@ Force = Annotated[
 Durable = Annotated[bool, Field(description="Respond after value and history are on the disk.")]
 
 
-class WriteRequest(Body):
+class WriteOptions(Body):
+    """Options of writes; see `Component.set`."""
+
+    settle_s: Annotated[float, Field(ge=0, le=60)] = 0.0
+    force: Force = False
+    durable: Durable = False
+    timeout_s: Seconds = None
+
+
+class WriteRequest(WriteOptions):
     """One value."""
 
     value: Value
-    settle_s: Annotated[float, Field(ge=0, le=60)] = 0.0
-    force: Force = False
-    durable: Durable = False
-    timeout_s: Seconds = None
 
 
-class WriteManyRequest(Body):
+class WriteManyRequest(WriteOptions):
     """Several values, by name; written in this order, many at a time."""
 
     values: Values
-    settle_s: Annotated[float, Field(ge=0, le=60)] = 0.0
-    force: Force = False
-    durable: Durable = False
-    timeout_s: Seconds = None
-
-
-class FetchRequest(Body):
-    """Options of a fetch; see `Component.fetch_all`."""
-
-    refresh: bool = False
-    timeout_s: Seconds = None
 
 
 class MetadataRequest(Body):
     """Timeout of the vehicle's responses."""
 
     timeout_s: Seconds = None
+
+
+class FetchRequest(MetadataRequest):
+    """Options of a fetch; see `Component.fetch_all`."""
+
+    refresh: bool = False
 
 
 class UploadedFile(Body):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import dataclass
 from typing import Annotated, Any, Final, TypeVar
 
 import anyio
@@ -16,15 +17,14 @@ from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import JSONResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from paramclient.cache import CachedComponent
 from paramclient.errors import NotInCache, UnknownParameter
 from paramclient.metadata import Metadata
 from paramclient.model.patterns import NameChoice
 from paramclient.model.similar_names import did_you_mean, nearest_names
-from paramclient.model.values import Param
+from paramclient.model.values import Param, WireValue
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.service import documents, extended
-from paramclient.service.access import author_of, holder_of, require_read, require_write
+from paramclient.service.access import author_of, holder_of, require_write
 from paramclient.service.hub import Hub
 from paramclient.service.metrics import METRICS_MEDIA_TYPE, metrics_text
 from paramclient.service.problems import ServiceError
@@ -34,6 +34,7 @@ from paramclient.service.request_bodies import (
     SnapshotNumber,
     Timestamp,
     WriteManyRequest,
+    WriteOptions,
     WriteRequest,
     range_faults,
     resolve_value,
@@ -45,11 +46,10 @@ __all__ = [
     "ROUTERS",
     "Ext",
     "HubArgument",
-    "Key",
-    "LinkName",
+    "Snapshot",
+    "SourceArgument",
     "TargetArgument",
     "VEHICLE",
-    "cached_table",
     "run_until_disconnect",
 ]
 
@@ -59,10 +59,9 @@ SEND_TIMEOUT: Final = 30.0
 
 Result = TypeVar("Result")
 
-open_to_all = APIRouter(tags=["service"])
-reading = APIRouter(dependencies=[Depends(require_read)], tags=["parameters"])
-writing = APIRouter(dependencies=[Depends(require_write)], tags=["parameters"])
-ROUTERS: Final = (open_to_all, reading, writing)
+reading = APIRouter(tags=["vehicles and parameters"])
+writing = APIRouter(tags=["vehicles and parameters"], dependencies=[Depends(require_write)])
+ROUTERS: Final = (reading, writing)
 
 
 async def _hub_of(request: Request) -> Hub:
@@ -76,6 +75,7 @@ ComponentId = Annotated[int, Path(ge=0, le=255)]
 LinkName = Annotated[
     str | None, Query(max_length=200, description="Name of the link, if several have the ids.")
 ]
+Snapshot = Annotated[SnapshotNumber | None, Query(description="The parameters of this snapshot.")]
 Names = Annotated[list[str] | None, Query(max_length=64, description="Names, or patterns such as MC_*.")]
 Key = Annotated[str | None, Query(max_length=400, description="Key of a vehicle in the cache.")]
 Ext = Annotated[bool, Query(description="The extended parameters (PARAM_EXT_*).")]
@@ -90,10 +90,48 @@ async def _target_of(
 TargetArgument = Annotated[Target, Depends(_target_of)]
 
 
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A connected vehicle, or one in the cache.
+
+    Attributes:
+        key: the key of its table in the cache.
+        component: its component id.
+        target: the connected component, or None.
+    """
+
+    key: str
+    component: int
+    target: Target | None
+
+    @property
+    def connected(self) -> Target:
+        """The connected component.
+
+        Raises:
+            ServiceError: 422, a vehicle in the cache is requested.
+        """
+        if self.target is None:
+            raise ServiceError(422, "not-connected", "This is served for connected vehicles only.")
+        return self.target
+
+
+async def _source_of(
+    hub: HubArgument, system: System, component: ComponentId, link: LinkName = None, key: Key = None
+) -> Source:
+    if key is not None:
+        return Source(key, component, None)
+    target = hub.target(system, component, link)
+    return Source(target.component.identity.key, component, target)
+
+
+SourceArgument = Annotated[Source, Depends(_source_of)]
+
+
 # the service
 
 
-@open_to_all.get("/health")
+@reading.get("/health")
 async def health(request: Request, hub: HubArgument) -> dict[str, Any]:
     """Return that the service responds; with a valid token also its role, and the links."""
     holder = holder_of(request)
@@ -163,13 +201,10 @@ async def load_metadata(
 @reading.get(f"{VEHICLE}/params")
 async def params(
     hub: HubArgument,
-    system: System,
-    component: ComponentId,
-    link: LinkName = None,
-    key: Key = None,
+    source: SourceArgument,
     names: Names = None,
     metadata: Annotated[bool, Query(description="Include the whole metadata of the parameters.")] = False,
-    snapshot: Annotated[SnapshotNumber | None, Query(description="The parameters of this snapshot.")] = None,
+    snapshot: Snapshot = None,
     at: Annotated[Timestamp | None, Query(description="The parameters at this time.")] = None,
     ext: Ext = False,
 ) -> Response:
@@ -177,34 +212,37 @@ async def params(
     position = hub.feed.position
     when = at if snapshot is None else snapshot
     if ext:
-        target = hub.target(system, component, link)
+        target = source.connected
         found = extended.params(target) if when is None else await extended.state(target, when)
         return JSONResponse({**position, "params": _chosen(found, names)})
     if when is not None:
-        owner = hub.target(system, component, link).component.identity.key if key is None else key
-        state = await hub.read_cache(lambda cache: cache.state_at(owner, component, when))
+        state = await hub.read_cache(lambda cache: cache.state_at(source.key, source.component, when))
         return JSONResponse({**position, "params": _chosen(documents.param_set(state), names)})
-    known, source = await _known_params(hub, system, component, link, key)
-    chosen = _chosen(source, names).values()
+    described, known = await _known_params(hub, source)
+    chosen = _chosen(known, names).values()
 
     def encode() -> Response:
-        return JSONResponse({**position, "params": documents.params(chosen, known, whole=metadata)})
+        return JSONResponse({**position, "params": documents.params(chosen, described, whole=metadata)})
 
     return await anyio.to_thread.run_sync(encode)
 
 
-async def _known_params(
-    hub: Hub, system: int, component: int, link: str | None, key: str | None
-) -> tuple[Metadata | None, dict[str, Param]]:
-    """Return the metadata and the parameters of a connected vehicle, or of one in the cache."""
-    if key is None:
-        target = hub.target(system, component, link)
-        return target.metadata, dict(target.component.params)
-    table, store = await cached_table(hub, key, component), hub.metadata_store
-    known = None
+async def _known_params(hub: Hub, source: Source) -> tuple[Metadata | None, dict[str, Param]]:
+    """Return the metadata and the parameters of a vehicle.
+
+    Raises:
+        NotInCache: the cache has no such table.
+    """
+    if source.target is not None:
+        return source.target.metadata, dict(source.target.component.params)
+    key, component, store = source.key, source.component, hub.metadata_store
+    table = await hub.read_cache(lambda cache: cache.load(key, component))
+    if table is None:
+        raise NotInCache(f"The cache has no table of component {component} of vehicle {key!r}.")
+    described = None
     if store is not None:
-        known = await anyio.to_thread.run_sync(store.known, table.identity, component)
-    return known, dict(table.params)
+        described = await anyio.to_thread.run_sync(store.known, table.identity, component)
+    return described, dict(table.params)
 
 
 @reading.get(f"{VEHICLE}/params/{{name:path}}")
@@ -242,20 +280,8 @@ async def set_param(
             request, lambda: extended.set_one(target, name, body, author=author)
         )
     value = resolve_value(target, name, body.value)
-    if not body.force:
-        _check_range(range_faults(target, {name: value}))
-    result = await run_until_disconnect(
-        request,
-        lambda: target.component.set(
-            name,
-            value,
-            settle=body.settle_s,
-            force=body.force,
-            durable=body.durable,
-            timeout=body.timeout_s,
-            author=author,
-        ),
-    )
+    options = _write_options(target, {name: value}, body, author)
+    result = await run_until_disconnect(request, lambda: target.component.set(name, value, **options))
     return documents.write(SetOutcome(name, value, SetStatus(result.status), result), target)
 
 
@@ -272,32 +298,9 @@ async def set_params(
     if ext:
         return await run_until_disconnect(request, lambda: extended.set_many(target, body, author=author))
     values = {name: resolve_value(target, name, given) for name, given in body.values.items()}
-    if not body.force:
-        _check_range(range_faults(target, values))
-    result = await run_until_disconnect(
-        request,
-        lambda: target.component.set_many(
-            values,
-            settle=body.settle_s,
-            force=body.force,
-            durable=body.durable,
-            timeout=body.timeout_s,
-            author=author,
-        ),
-    )
+    options = _write_options(target, values, body, author)
+    result = await run_until_disconnect(request, lambda: target.component.set_many(values, **options))
     return documents.writes(result, target)
-
-
-async def cached_table(hub: Hub, key: str, component: int) -> CachedComponent:
-    """Return a table in the cache.
-
-    Raises:
-        NotInCache: there is none.
-    """
-    table = await hub.read_cache(lambda cache: cache.load(key, component))
-    if table is None:
-        raise NotInCache(f"The cache has no table of component {component} of vehicle {key!r}.")
-    return table
 
 
 async def run_until_disconnect(request: Request, work: Callable[[], Awaitable[Result]]) -> Result:
@@ -329,10 +332,25 @@ def _chosen(known: dict[str, Result], names: list[str] | None) -> dict[str, Resu
     return {name: each for name, each in known.items() if choice.has(name)}
 
 
-def _check_range(faults: dict[str, str]) -> None:
+def _write_options(
+    target: Target, values: dict[str, WireValue], body: WriteOptions, author: str
+) -> dict[str, Any]:
+    """Return the arguments that `set` and `set_many` have in common.
+
+    Raises:
+        ServiceError: 422, values are out of range.
+    """
+    faults = {} if body.force else range_faults(target, values)
     if faults:
         detail = f"{'; '.join(list(faults.values())[:5])}. Nothing was written; `force` writes it anyway."
         raise ServiceError(422, "out-of-range", detail, names=list(faults))
+    return {
+        "settle": body.settle_s,
+        "force": body.force,
+        "durable": body.durable,
+        "timeout": body.timeout_s,
+        "author": author,
+    }
 
 
 class _EventStream(Response):

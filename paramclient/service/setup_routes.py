@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from typing import Annotated, Any, Final
 
 import anyio
@@ -24,14 +25,13 @@ from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.restore_point import load_state_before_apply
 from paramclient.provision.vehicle_params import fetch_set, load_cached_set, select_non_defaults, set_maker
 from paramclient.service import documents, extended
-from paramclient.service.access import author_of, require_read, require_write
+from paramclient.service.access import author_of, require_write
 from paramclient.service.hub import Hub
 from paramclient.service.problems import ServiceError
 from paramclient.service.request_bodies import (
     ApplyRequest,
     PlanRequest,
     RestoreRequest,
-    SnapshotNumber,
     SnapshotRequest,
     Timestamp,
     UploadedFile,
@@ -41,8 +41,8 @@ from paramclient.service.routes import (
     VEHICLE,
     Ext,
     HubArgument,
-    Key,
-    LinkName,
+    Snapshot,
+    SourceArgument,
     TargetArgument,
     run_until_disconnect,
 )
@@ -55,8 +55,8 @@ HISTORY_ENTRIES: Final = 100
 PROGRESS_INTERVAL: Final = 0.25
 """Seconds between two progress events of an apply or restore."""
 
-reading = APIRouter(dependencies=[Depends(require_read)], tags=["set-ups and history"])
-writing = APIRouter(dependencies=[Depends(require_write)], tags=["set-ups and history"])
+reading = APIRouter(tags=["set-ups and history"])
+writing = APIRouter(tags=["set-ups and history"], dependencies=[Depends(require_write)])
 ROUTERS: Final = (reading, writing)
 
 
@@ -73,28 +73,21 @@ async def read_file(body: UploadedFile) -> Response:
 async def file(
     request: Request,
     hub: HubArgument,
-    system: int,
-    component: int,
-    link: LinkName = None,
-    key: Key = None,
+    source: SourceArgument,
     file_format: Annotated[FileFormat, Query(alias="format")] = FileFormat.QGC,
     changed: Annotated[bool, Query(description="Only parameters that differ from the defaults.")] = False,
-    snapshot: Annotated[SnapshotNumber | None, Query(description="The parameters of this snapshot.")] = None,
+    snapshot: Snapshot = None,
 ) -> Response:
     """Return the parameters as a file. Those of a connected vehicle are fetched first, unless in sync."""
-    target = None if key is not None else hub.target(system, component, link)
-    owner = target.component.identity.key if target is not None else key or ""
+    key, component, target = source.key, source.component, source.target
     described: dict[str, int | float] = {}
     if snapshot is not None:
-        found = await hub.read_cache(lambda cache: cache.state_at(owner, component, snapshot))
+        found = await hub.read_cache(lambda cache: cache.state_at(key, component, snapshot))
     elif target is None:
-        found = await hub.read_cache(lambda cache: load_cached_set(cache, owner, component))
+        found = await hub.read_cache(lambda cache: load_cached_set(cache, key, component))
     else:
-        live = target  # fetched below
-        fetched = await run_until_disconnect(
-            request, lambda: fetch_set(live.component, source=f"link {live.link.name}")
-        )
-        found = fetched.set
+        fetch = partial(fetch_set, target.component, source=f"link {target.link.name}")
+        found = (await run_until_disconnect(request, fetch)).set
         described = {} if target.metadata is None else target.metadata.defaults_of(found)
     if changed:
         found = select_non_defaults(found, described)
@@ -116,13 +109,7 @@ async def plan(
     if ext:
         return await run_until_disconnect(request, lambda: extended.plan(target, body))
     wanted = await _wanted(hub, target, body)
-    found = await run_until_disconnect(
-        request,
-        lambda: prepare(
-            target.component, wanted, include=body.include, info=target.metadata, force=body.force
-        ),
-    )
-    return documents.plan(found, target)
+    return await run_until_disconnect(request, lambda: _plan(target, wanted, body.include, force=body.force))
 
 
 @writing.post(f"{VEHICLE}/apply")
@@ -134,28 +121,18 @@ async def apply_(
     The progress is in the events. If the client disconnects, the apply ends; written values stay.
     """
     author = author_of(request)
-    async with _only_setup(target, author):
+
+    async def work() -> dict[str, Any]:
         if ext:
-            return await run_until_disconnect(request, lambda: extended.apply(target, body, author=author))
-        wanted = await _wanted(hub, target, body)
-        result = await run_until_disconnect(
-            request,
-            lambda: apply(
-                target.component,
-                wanted,
-                include=body.include,
-                info=target.metadata,
-                reboot=body.reboot,
-                allow_armed=body.allow_armed,
-                skip_invalid=body.skip_invalid,
-                force=body.force,
-                durable=body.durable,
-                timeout=body.timeout_s,
-                author=author,
-                progress=_Publisher(hub, target),
-            ),
+            return await extended.apply(target, body, author=author)
+        wanted, options = await _wanted(hub, target, body), _options(hub, target, body, author)
+        result = await apply(
+            target.component, wanted, skip_invalid=body.skip_invalid, durable=body.durable, **options
         )
-    return documents.apply_result(result, target)
+        return documents.apply_result(result, target)
+
+    with _only_setup(target, author):
+        return await run_until_disconnect(request, work)
 
 
 @writing.post(f"{VEHICLE}/restore")
@@ -164,57 +141,50 @@ async def restore_(
 ) -> dict[str, Any]:
     """Restore an earlier state, with the vehicle's own identity and calibration; `dry_run` writes nothing."""
     author = author_of(request)
-    async with _only_setup(target, author):
+
+    async def work() -> dict[str, Any]:
         if ext:
-            return await run_until_disconnect(request, lambda: extended.restore(target, body, author=author))
+            return await extended.restore(target, body, author=author)
         state = await _earlier_state(hub, target, body.when)
         if body.dry_run:
             include = (*await restore_categories(target.component, state), *body.include)
-            found = await run_until_disconnect(
-                request,
-                lambda: prepare(
-                    target.component, state, include=include, info=target.metadata, force=body.force
-                ),
-            )
-            return documents.plan(found, target)
-        result = await run_until_disconnect(
-            request,
-            lambda: restore(
-                target.component,
-                state,
-                include=body.include,
-                info=target.metadata,
-                reboot=body.reboot,
-                allow_armed=body.allow_armed,
-                force=body.force,
-                timeout=body.timeout_s,
-                author=author,
-                progress=_Publisher(hub, target),
-            ),
-        )
-    return documents.apply_result(result, target)
+            return await _plan(target, state, include, force=body.force)
+        result = await restore(target.component, state, **_options(hub, target, body, author))
+        return documents.apply_result(result, target)
+
+    with _only_setup(target, author):
+        return await run_until_disconnect(request, work)
+
+
+async def _plan(target: Target, wanted: ParamSet, include: Iterable[str], *, force: bool) -> dict[str, Any]:
+    found = await prepare(target.component, wanted, include=include, info=target.metadata, force=force)
+    return documents.plan(found, target)
+
+
+def _options(hub: Hub, target: Target, body: ApplyRequest | RestoreRequest, author: str) -> dict[str, Any]:
+    """Return the arguments that `apply` and `restore` have in common."""
+    return {
+        "include": body.include,
+        "info": target.metadata,
+        "reboot": body.reboot,
+        "allow_armed": body.allow_armed,
+        "force": body.force,
+        "timeout": body.timeout_s,
+        "author": author,
+        "progress": _Publisher(hub, target),
+    }
 
 
 # the past
 
 
 @reading.get(f"{VEHICLE}/snapshots")
-async def snapshots(
-    hub: HubArgument,
-    system: int,
-    component: int,
-    link: LinkName = None,
-    key: Key = None,
-    ext: Ext = False,
-) -> dict[str, Any]:
+async def snapshots(hub: HubArgument, source: SourceArgument, ext: Ext = False) -> dict[str, Any]:
     """Return the snapshots, the newest last."""
-    if key is None:
-        target = hub.target(system, component, link)
-        key = target.component.identity.key
-    owner = key
-    return documents.snapshots(
-        await hub.read_cache(lambda cache: cache.snapshots(owner, component, extended=ext))
-    )
+    if ext:
+        return documents.snapshots(await source.connected.component.ext.snapshots())
+    kept = await hub.read_cache(lambda cache: cache.snapshots(source.key, source.component))
+    return documents.snapshots(kept)
 
 
 @writing.post(f"{VEHICLE}/snapshots", status_code=201)
@@ -240,27 +210,25 @@ async def create_snapshot(
             extended=ext,
         )
     )
-    return {"id": kept}
+    return {"id": kept.id}
 
 
 @reading.get(f"{VEHICLE}/history")
 async def history(
     hub: HubArgument,
-    system: int,
-    component: int,
-    link: LinkName = None,
-    key: Key = None,
+    source: SourceArgument,
     name: Annotated[str | None, Query(max_length=16)] = None,
     limit: Annotated[int, Query(ge=1, le=1_000)] = HISTORY_ENTRIES,
     since: Annotated[Timestamp | None, Query(description="Only from this time on.")] = None,
     ext: Ext = False,
 ) -> Response:
     """Return the newest changes of values, the newest last."""
-    owner = hub.target(system, component, link).component.identity.key if key is None else key
-    entries = await hub.read_cache(
-        lambda cache: cache.history(owner, component, name, limit, since, extended=ext)
-    )
-    return JSONResponse(documents.ext_history(entries) if ext else documents.history(entries))
+    which = source.key, source.component, name, limit, since
+    if ext:
+        return JSONResponse(
+            documents.ext_history(await hub.read_cache(lambda cache: cache.ext_history(*which)))
+        )
+    return JSONResponse(documents.history(await hub.read_cache(lambda cache: cache.history(*which))))
 
 
 async def _wanted(hub: Hub, target: Target, body: PlanRequest) -> ParamSet:
@@ -284,8 +252,8 @@ async def _earlier_state(hub: Hub, target: Target, when: float | None) -> ParamS
     return await hub.read_cache(lambda cache: cache.state_at(key, component, when))
 
 
-@asynccontextmanager
-async def _only_setup(target: Target, author: str) -> AsyncIterator[None]:
+@contextmanager
+def _only_setup(target: Target, author: str) -> Iterator[None]:
     """Run one apply or restore of a component at a time: two would undo each other's changes.
 
     Raises:

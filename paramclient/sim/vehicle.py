@@ -31,7 +31,6 @@ class VehicleOptions(DeviceOptions, total=False):
     dead: Iterable[int | str]
     list_stops_at: int | None
     list_stops: float
-    repeated_names: bool
 
 
 class Vehicle(Device):
@@ -60,9 +59,6 @@ class Vehicle(Device):
         list_stops_at: number of values after which a list stops; None for never. The list has then ended: a
             new request starts at the beginning.
         list_stops: the number of lists that stop; `math.inf` for all.
-        repeated_names: whether the table may contain a name more than once, as with names truncated to 16
-            bytes. Each has its index; requests by name get the first.
-        high_latency, armed: see the attributes.
         reboot_ack: whether a reboot command is acknowledged before the reboot.
         reboot_down: seconds for which the vehicle is off during a reboot.
         signing_key: the key that signs sent frames; only frames signed with it, and RADIO_STATUS, are then
@@ -97,11 +93,10 @@ class Vehicle(Device):
         dead: Iterable[int | str] = (),
         list_stops_at: int | None = None,
         list_stops: float = 1,
-        repeated_names: bool = False,
         **options: Unpack[DeviceOptions],
     ) -> None:
         rows = tuple(table)
-        if not repeated_names and len({row.name for row in rows}) < len(rows):
+        if len({row.name for row in rows}) < len(rows):
             raise UsageError("the table contains a parameter name twice")
         if len(rows) > _TABLE_SIZE_MAX:
             raise UsageError(f"a table holds at most {_TABLE_SIZE_MAX} parameters, not {len(rows)}")

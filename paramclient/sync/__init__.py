@@ -7,8 +7,8 @@ all other classes are those of `paramclient`::
         vehicle = client.component()
         print(vehicle.get("MC_ROLL_P"))
 
-The functions have the arguments and the results of those in `paramclient.provision`, `paramclient.metadata`
-and `paramclient.diagnosis`.
+The functions have the arguments and the results of those in `paramclient.provision` and
+`paramclient.metadata`.
 
 - `proxy`: the one class behind all of them.
 
@@ -17,15 +17,8 @@ and `paramclient.diagnosis`.
 
 from __future__ import annotations
 
-from paramclient import diagnosis, metadata, provision
-from paramclient.client.events import (
-    Discovered,
-    Event,
-    Found,
-    Lost,
-    Rebooted,
-    Resynced,
-)
+from paramclient import metadata, provision
+from paramclient.client.events import Discovered, Event, Found, Lost, Rebooted, Resynced
 from paramclient.provision.fleet import Wanted
 from paramclient.sync.proxy import (
     Changes,
@@ -52,7 +45,6 @@ __all__ = [
     "apply",
     "apply_all",
     "apply_extended",
-    "check_vehicle",
     "load_extended_state",
     "metadata_of",
     "prepare",
@@ -76,4 +68,3 @@ verify_extended = blocking(provision.verify_extended)
 restore_extended = blocking(provision.restore_extended)
 load_extended_state = blocking(provision.load_extended_state)
 metadata_of = blocking(metadata.metadata_of)
-check_vehicle = blocking(diagnosis.check_vehicle)

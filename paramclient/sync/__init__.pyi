@@ -12,7 +12,6 @@ from paramclient.client.fetch_all import FetchedAll
 from paramclient.client.reset import ResetResult
 from paramclient.client.signing import Signing
 from paramclient.client.stats import ClientStats
-from paramclient.diagnosis.report import VehicleReport
 from paramclient.links import Link
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.metadata_cache import MetadataStore
@@ -62,7 +61,6 @@ __all__ = [
     "apply",
     "apply_all",
     "apply_extended",
-    "check_vehicle",
     "load_extended_state",
     "metadata_of",
     "prepare",
@@ -551,12 +549,3 @@ def metadata_of(
     progress: Callable[[int, int | None], None] | None = None,
 ) -> Metadata | None:
     """Return the parameter metadata of a component, or None if the component has none."""
-
-def check_vehicle(
-    client: ParamClient,
-    component: Component,
-    *,
-    timeout: float = 60.0,
-    progress: Callable[[str], None] | None = None,
-) -> VehicleReport:
-    """Measure which services a vehicle offers, and how fast they are."""

@@ -109,11 +109,11 @@ def test_the_state_of_extended_parameters(cache: ParamCache) -> None:
     save(0, b"tea")
     save(10, b"milk")
     assert cache.ext_state_at("1", 100, NOW + 5).params["A"].value == "tea"
-    made = cache.store_ext_snapshot(
+    made = cache.store_snapshot(
         PX4, 100, ExtParamSet({"A": ExtParam.of("A", b"rum", ExtParamType.CUSTOM, 0)}), reason="by hand"
     )
     assert cache.ext_state_at("1", 100, made.id).params["A"].value == "rum"
-    assert cache.ext_snapshots("1") == [made]
+    assert cache.snapshots("1", extended=True) == [made]
     assert cache.snapshots("1") == []
 
 
@@ -145,28 +145,28 @@ def test_a_snapshot_keeps_types_defaults_and_firmware(cache: ParamCache, open_ca
 def test_a_snapshot_of_the_cached_table(cache: ParamCache) -> None:
     default = Param("A", 1, ParamType.INT32, 0, 1, default=3)
     cache.save(update(StoredParam.of(default, NOW), table=TableState(5, 1, complete=True)))
-    made = cache.snapshot("1", 1, reason="test")
+    made = cache.store_snapshot("1", 1, reason="test")
     change(cache, 2, 1, "A")
     assert (made.hash, made.complete, made.size) == (5, True, 1)
     assert cache.state_at("1", 1, made.id)["A"] == WrittenParam("A", 1, ParamType.INT32, 3)
     with pytest.raises(UnknownVehicle):
-        cache.snapshot("2", 1, reason="test")
+        cache.store_snapshot("2", 1, reason="test")
 
 
 def test_the_newest_snapshots_are_kept_and_numbers_are_never_used_again(cache: ParamCache) -> None:
     cache.save(whole_table(1))
-    made = [cache.snapshot("1", 1, reason=str(number)).id for number in range(SNAPSHOTS + 2)]
+    made = [cache.store_snapshot("1", 1, reason=str(number)).id for number in range(SNAPSHOTS + 2)]
     assert [each.id for each in cache.snapshots("1")] == made[2:]
     with pytest.raises(CacheError, match=rf"there is no snapshot {made[0]} of .* those kept are {made[2]}, "):
         cache.state_at("1", 1, made[0])
     cache.remove("1")
     cache.save(whole_table(1))
-    assert cache.snapshot("1", 1, reason="new").id > made[-1]
+    assert cache.store_snapshot("1", 1, reason="new").id > made[-1]
 
 
 def test_an_interrupted_apply_is_told_from_one_that_has_ended(cache: ParamCache) -> None:
     cache.save(whole_table(1))
-    params = cache.state_at("1", 1, cache.snapshot("1", 1, reason="by hand").id)
+    params = cache.state_at("1", 1, cache.store_snapshot("1", 1, reason="by hand").id)
     made = [
         cache.store_snapshot(PX4, 1, params, reason="before apply", is_of_operation=True) for _ in range(2)
     ]

@@ -10,7 +10,7 @@ import pytest
 
 from paramclient.files import read_file
 from paramclient.model.values import ParamType
-from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.wire import messages
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import Tap
@@ -61,20 +61,6 @@ def test_fetch_compares_with_the_metadata_of_the_vehicle(command: Command, put: 
     assert "1/1 px4: 1 of 1 default from the metadata of the firmware" in done.err
 
 
-def test_it_is_remembered_for_the_firmware(command: Command, put: Put) -> None:
-    assert command("fetch", put(quad()), "--changed", "--metadata", "vehicle").code == 0
-    tap = Tap(quad())
-    done = command("fetch", put(tap), "--changed", "--json")
-    assert list(done.json["params"]) == ["MC_ROLL_P"]
-    param = done.json["params"]["MC_ROLL_P"]
-    assert (param["default"], param["default_source"]) == (4, "metadata")
-    assert not tap.messages(messages.FileTransfer)
-    everything = command("fetch", put(quad()), "--json").json["params"]
-    assert {name: each["default_source"] for name, each in everything.items()} == dict.fromkeys(
-        TABLE, "metadata"
-    )
-
-
 def test_without_changed_nothing_is_requested_for_defaults(command: Command, put: Put) -> None:
     tap = Tap(quad())
     done = command("fetch", put(tap), "--json")
@@ -101,26 +87,11 @@ def test_unknown_defaults_are_an_error_that_says_what_to_do(command: Command, pu
     assert "--metadata vehicle requests it from a vehicle that serves it" in done.err
 
 
-def test_metadata_vehicle_takes_the_time_that_it_needs(command: Command, put: Put) -> None:
-    vehicle = PX4Vehicle(metadata=True, ftp_rate=2_000.0)
-    vehicle.set_param("MC_ROLL_P", 6.5)
-    done = command("fetch", put(vehicle), "--changed", "--metadata", "vehicle")
-    assert done.code == 0
-    assert "MC_ROLL_P" in [row[0] for row in done.rows]
-
-
-def test_the_default_of_a_file_counts_without_a_link_to_more(
-    command: Command, put: Put, tmp_path: Path
-) -> None:
-    vehicle = GenericVehicle(table={"A": 5.0, "B": 6.0})
-    done = command("fetch", put(vehicle), "--changed", "--metadata", a_file(tmp_path, A=2.5))
-    assert done.code == 0
-    assert [row[0] for row in done.rows[1:]] == ["A"]
-
-
 def test_each_of_several_vehicles_has_its_own_defaults(command: Command, put: Put) -> None:
     other = PX4Vehicle(system=2, table=TABLE, metadata=True)
-    done = command("fetch", put(Air([quad(), other])), "--changed", "--all", "--metadata", "vehicle")
+    done = command(
+        "fetch", put(Air([quad(), other])), "--changed", "--vehicle", "all", "--metadata", "vehicle"
+    )
     assert done.code == 0, done.err
     assert [row[:2] for row in done.rows[1:]] == [["1/1", "MC_ROLL_P"]]
 

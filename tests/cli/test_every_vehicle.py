@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from paramclient import read_file
-from paramclient.cli import session, set_command
+from paramclient.cli import set_command
 from paramclient.metadata import Metadata, ParamInfo
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.commands import Command, Put, behind, in_process, leaping
@@ -41,11 +41,11 @@ def test_get_reads_from_every_vehicle(
     command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle]
 ) -> None:
     url = put(Air(vehicles))
-    read = command("get", url, "GAIN", "--all")
+    read = command("get", url, "GAIN", "--vehicle", "all")
     assert (read.code, read.err) == (0, "")
     assert read.words[0] == ["vehicle", "name", "value", "type", "index"]
     assert [line[:3] for line in read.words[1:]] == [["1/1", "GAIN", "4.0"], ["2/1", "GAIN", "4.0"]]
-    read = command("get", url, "OF_*", "--all", "--json")
+    read = command("get", url, "OF_*", "--vehicle", "all", "--json")
     assert read.code == 1
     first, second = read.json["vehicles"]
     assert (first["system"], first["component"]) == (1, 1)
@@ -60,13 +60,13 @@ def test_fetch_prints_the_tables_of_every_vehicle(
     command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle]
 ) -> None:
     url = put(Air(vehicles))
-    fetched = command("fetch", url, "--all", "--json")
+    fetched = command("fetch", url, "--vehicle", "all", "--json")
     assert fetched.code == 0
     tables = {each["system"]: each for each in fetched.json["vehicles"]}
     assert tables[1]["params"].keys() == vehicles[0].params.keys()
     assert tables[2]["params"].keys() == vehicles[1].params.keys()
     assert tables[2]["autopilot"] == "ardupilot"
-    shown = command("fetch", url, "--all", "--only", "GAIN")
+    shown = command("fetch", url, "--vehicle", "all", "--only", "GAIN")
     assert [line[:3] for line in shown.words[1:]] == [["1/1", "GAIN", "4.0"], ["2/1", "GAIN", "4.0"]]
     assert "parameters of 2/1 ardupilot from" in shown.err
     assert len(re.findall(r" bytes received, [0-9,]+ sent on the whole link", shown.err)) == 2
@@ -78,7 +78,7 @@ def test_one_vehicle_that_fails_stops_no_other(
     command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle]
 ) -> None:
     mute = PX4Vehicle(system=3, table=SHARED, dead=range(100), list_stops_at=0, list_stops=1e9)
-    read = command("get", put(Air([vehicles[0], mute])), "GAIN", "--all", "--timeout", "20")
+    read = command("get", put(Air([vehicles[0], mute])), "GAIN", "--vehicle", "all", "--timeout", "20")
     assert read.code == 3
     assert [line[:2] for line in read.words[1:]] == [["1/1", "GAIN"]]
     assert "3/1 px4: " in read.err
@@ -88,11 +88,11 @@ def test_set_writes_to_every_vehicle(
     command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle]
 ) -> None:
     url = put(Air(vehicles))
-    written = command("set", url, "GAIN", "6.5", "--all")
+    written = command("set", url, "GAIN", "6.5", "--vehicle", "all")
     assert written.code == 0
     assert [line[0] for line in written.words[1:]] == ["1/1", "2/1"]
     assert [each.values["GAIN"] for each in vehicles] == [6.5, 6.5]
-    written = command("set", url, "GAIN", "7", "OF_PX4", "2", "--all", "--json")
+    written = command("set", url, "GAIN", "7", "OF_PX4", "2", "--vehicle", "all", "--json")
     assert written.code == 1
     first, second = written.json["vehicles"]
     assert [each["vehicle"]["kind"] for each in (first, second)] == ["PX4 quadrotor", "ArduPilot quadrotor"]
@@ -105,26 +105,15 @@ def test_save_writes_every_vehicle_into_one_file_or_into_one_each(
     command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle], tmp_path: Path
 ) -> None:
     url = put(Air(vehicles))
-    assert command("save", url, tmp_path / "fleet.json", "--all").code == 0
+    assert command("save", url, tmp_path / "fleet.json", "--vehicle", "all").code == 0
     assert [each.system for each in read_file(tmp_path / "fleet.json").sets] == [1, 2]
-    saved = command("save", url, tmp_path / "quad-{system}.param", "--all", "--json")
+    saved = command("save", url, tmp_path / "quad-{system}.param", "--vehicle", "all", "--json")
     assert saved.code == 0
     assert [each["path"] for each in saved.json["files"]] == [
         str(tmp_path / f"quad-{system}.param") for system in (1, 2)
     ]
     assert "OF_PX4" in read_file(tmp_path / "quad-1.param").choose()
     assert "OF_PX4" not in read_file(tmp_path / "quad-2.param").choose()
-    alone = command("save", url, tmp_path / "one.json", "--all", "--system", "2")
-    assert alone.code == 0
-    assert [each.system for each in read_file(tmp_path / "one.json").sets] == [2]
-
-
-@pytest.mark.parametrize("option", [["--system", "1"], ["--split-peers"], ["--extended"]])
-@pytest.mark.parametrize("words", [["fetch"], ["get", "GAIN"], ["set", "GAIN", "1"]], ids=lambda w: w[0])
-def test_all_excludes_options_that_choose(command: Command, option: list[str], words: list[str]) -> None:
-    refused = command(words[0], "udpin:127.0.0.1:0", *words[1:], "--all", *option)
-    assert refused.code == 2
-    assert "--all" in refused.err
 
 
 def test_own_ids(command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle]) -> None:
@@ -202,14 +191,14 @@ def test_a_read_names_the_other_vehicles_on_the_link(
     assert read.code == 0
     assert re.search(
         r"[12]/1 \w+ was used, the first vehicle heard\. Also on this link: [12]/1 \w+ quadrotor.*\. "
-        r"--system chooses one, --all reads all of them\n",
+        r"--vehicle chooses one\n",
         read.err,
     )
-    for choice in (["--system", 1], ["--vehicle", "2/1"], ["--all"]):
+    for choice in (["--vehicle", 1], ["--vehicle", "2/1"], ["--vehicle", "all"]):
         assert "Also on this link" not in command("fetch", url, *choice).err
 
 
-@pytest.mark.parametrize("words", [("get", "GAIN"), ("fetch",), ("set", "GAIN", 5), ("reset", "GAIN")])
+@pytest.mark.parametrize("words", [("get", "GAIN"), ("fetch",), ("set", "GAIN", 5)])
 def test_vehicles_of_the_link_that_only_the_cache_knows_are_named(
     command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle], words: tuple[str, ...]
 ) -> None:
@@ -218,68 +207,12 @@ def test_vehicles_of_the_link_that_only_the_cache_knows_are_named(
     alone = command(name, put(Air(vehicles[1:])), *rest)
     assert "not heard" not in alone.err
     url = put(Air(vehicles))
-    assert "not heard" not in command("fetch", url, "--all").err
+    assert "not heard" not in command("fetch", url, "--vehicle", "all").err
     put(Air(vehicles[1:]))
     vehicles[1].set_param("GAIN", 7.0)
     done = command(name, url, *rest)
     assert done.code == alone.code
     change_silently = r"1 vehicle of this link in the cache was not heard: 1/1 PX4 quadrotor \(last 2\S+\)\. "
-    assert re.search(change_silently + "--system chooses one", done.err)
-    if name != "reset":
-        assert re.search(change_silently + "--expect waits longer", command(name, url, *rest, "--all").err)
-    for choice in (["--system", 2], ["--vehicle", "2/1"]):
+    assert re.search(change_silently + "--vehicle chooses one", done.err)
+    for choice in (["--vehicle", 2], ["--vehicle", "2/1"]):
         assert "not heard" not in command(name, url, *rest, *choice).err
-
-
-def test_vehicles_of_another_day_or_link_are_not_named(
-    command: Command,
-    put: Put,
-    vehicles: tuple[PX4Vehicle, ArduPilotVehicle],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    url = put(Air(vehicles))
-    assert command("fetch", url, "--all").code == 0
-    put(Air([ArduPilotVehicle(system=number, live=(), table=SHARED) for number in (1, 2)]))
-    assert "not heard" not in command("get", url, "GAIN", "--all").err  # another vehicle with a known id
-    put(Air(vehicles[1:]))
-    assert "not heard" in command("get", url, "GAIN").err
-    monkeypatch.setattr(session, "UNHEARD_AGE_MAX", -1.0)
-    assert "not heard" not in command("get", url, "GAIN").err
-
-
-@pytest.mark.parametrize("words", [("get", "GAIN"), ("fetch",), ("set", "GAIN", 5)])
-def test_fewer_vehicles_than_expected_are_an_error(
-    command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle], words: tuple[str, ...]
-) -> None:
-    url, (name, *rest) = put(Air(vehicles)), words
-    assert command(name, url, *rest, "--all", "--expect", 2).code == 0
-    before = vehicles[0].requests.copy()
-    done = command(name, url, *rest, "--all", "--expect", 3)
-    assert (done.code, done.out) == (3, "")
-    assert "no reply: 3 vehicles (heard: 1/1 px4, 2/1 ardupilot) in 10.0 s" in done.err
-    assert vehicles[0].requests["PARAM_SET"] == before["PARAM_SET"]
-    assert command(name, url, *rest, "--expect", 2).code == 2
-
-
-def test_diff_of_one_link_compares_the_two_vehicles_on_it(
-    command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle]
-) -> None:
-    vehicles[1].set_param("GAIN", 5.0)
-    url = put(Air(vehicles))
-    found = command("diff", url, url, "--json")
-    assert found.code == 1
-    assert (found.json["left"]["system"], found.json["right"]["system"]) == (1, 2)
-    assert found.json["params"]["GAIN"]["left"]["value"] == 4.0
-    assert found.json["params"]["GAIN"]["right"]["value"] == 5.0
-    alone = command("diff", url, url, "--system", 2, "--json")
-    assert (alone.code, alone.json["right"]["system"]) == (0, 2)
-
-
-def test_diff_of_one_link_with_three_vehicles_says_how_to_compare_two(command: Command, put: Put) -> None:
-    url = put(Air([PX4Vehicle(system=number, table=SHARED) for number in (1, 2, 3)]))
-    refused = command("diff", url, url)
-    assert (refused.code, refused.out) == (2, "")
-    assert "3 vehicles on this link: 1/1 PX4 quadrotor" in refused.err
-    assert f"`paramclient fetch {url} --all` stores them all; then `paramclient diff 1 2`" in refused.err
-    assert command("fetch", url, "--all").code == 0
-    assert command("diff", 1, 2).code == 0

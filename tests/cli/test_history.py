@@ -125,8 +125,8 @@ def known(path: Path) -> None:
             cache.save(update(*(stored(*item, at=at, by=BY_US) for item in items), table=DONE, at=at))
         at = HOUR_AGO + 1300
         cache.save(update(stored("C", 1, at=at), stored("C", 2, at=at), component=154, at=at))
-        cache.snapshot(PX4.key, 1, reason="before apply \x1b[31m.parm", at=HOUR_AGO + 1500)
-        cache.snapshot(PX4.key, 154, reason="by hand", at=HOUR_AGO + 1900)
+        cache.store_snapshot(PX4.key, 1, reason="before apply \x1b[31m.parm", at=HOUR_AGO + 1500)
+        cache.store_snapshot(PX4.key, 154, reason="by hand", at=HOUR_AGO + 1900)
 
 
 @pytest.mark.usefixtures("known")
@@ -143,7 +143,7 @@ def test_history_prints_the_cached_changes_since_a_time(command: Command) -> Non
         [first, "1", "A", "1", "2", "us"],
     ]
     second = time_text(HOUR_AGO + 900)
-    since = command("history", "1", "--since", second, "--component", 1, "--json").json["history"]
+    since = command("history", "1/1", "--since", second, "--json").json["history"]
     assert [each["name"] for each in since] == ["B"]
     since = command("history", "1", "--since", first, "--limit", 3, "--json").json["history"]
     assert [each["name"] for each in since] == ["A", "B", "C"]
@@ -168,8 +168,8 @@ def test_snapshots_are_listed_with_their_numbers(command: Command) -> None:
         ["1", first, "1", "2", "before", "apply", "\\x1b[31m.parm"],
         ["2", second, "154", "1", "by", "hand", "(not", "complete)"],
     ]
-    for narrowed in (["--component", 154], ["--limit", 1], ["--since", time_text(HOUR_AGO + 1700)]):
-        found = command("history", "1", "--snapshots", *narrowed, "--json").json["snapshots"]
+    for narrowed in (["1/154"], ["1", "--limit", 1], ["1", "--since", time_text(HOUR_AGO + 1700)]):
+        found = command("history", *narrowed, "--snapshots", "--json").json["snapshots"]
         assert [each["id"] for each in found] == [2]
 
 

@@ -22,6 +22,7 @@ from paramclient.sim import Air, ArduPilotVehicle, Camera, Endpoint, GenericVehi
 from tests.commands import Command, Put, behind, in_process, leaping, strict
 
 DATA: Final = Path(__file__).parents[1] / "data"
+RECORDS: Final = "PARAMCLIENT_RECORD_JSON" in os.environ
 MASK: Final = "..."
 MASKED: Final = frozenset(
     {
@@ -86,23 +87,25 @@ def both() -> Air:
 
 
 FETCH: Final = "fetch URL"
-FETCH_EXTENDED: Final = "fetch URL --component 100"
+FETCH_EXTENDED: Final = "fetch URL --vehicle 1/100 --extended"
 CASES: Final = {
     "fetch_px4": Case(quad, (FETCH + " --json", FETCH + " --only MC_* --json")),
     "fetch_ardupilot": Case(copter, (FETCH + " --json", FETCH + " --changed --json")),
     "fetch_odd_values": Case(odd, (FETCH + " --json",)),
-    "fetch_all": Case(both, (FETCH + " --all --json",)),
+    "fetch_all": Case(both, (FETCH + " --vehicle all --json",)),
     "fetch_extended": Case(camera, (FETCH_EXTENDED + " --json",)),
     "get": Case(quad, ("get URL MC_ROLL_P MC_P* --json", "get URL MC_ROLL_PP SYS_AUTOSTART --json")),
     "get_described": Case(copter, ("get URL RTL_ALT --metadata DATA/apm.pdef.xml --json",)),
-    "get_all": Case(both, ("get URL RTL_ALT --all --json",)),
-    "get_extended": Case(camera, ("get URL CAM_NAME CAM_KEY --component 100 --json",)),
+    "get_all": Case(both, ("get URL RTL_ALT --vehicle all --json",)),
+    "get_extended": Case(camera, ("get URL CAM_NAME CAM_KEY --vehicle 1/100 --extended --json",)),
     "set": Case(
         quad, ("set URL MC_ROLL_P 7 SYS_AUTOSTART 4002 --json", "set URL NO_SUCH 7 MC_ROLL_P 8 --json")
     ),
     "set_described": Case(copter, ("set URL RTL_ALT=100 --metadata DATA/apm.pdef.xml --json",)),
-    "set_all": Case(both, ("set URL WPNAV_SPEED 400 --all --json",)),
-    "set_extended": Case(camera, ("set URL CAM_NAME Rear CAM_KEY hex:00 NO_SUCH 1 --component 100 --json",)),
+    "set_all": Case(both, ("set URL WPNAV_SPEED 400 --vehicle all --json",)),
+    "set_extended": Case(
+        camera, ("set URL CAM_NAME Rear CAM_KEY hex:00 NO_SUCH 1 --vehicle 1/100 --extended --json",)
+    ),
     "reset": Case(
         lambda: ArduPilotVehicle(live=()),
         (
@@ -145,9 +148,9 @@ CASES: Final = {
     "diff_extended": Case(
         camera,
         (
-            "save URL TMP/before.json --component 100 --extended",
-            "set URL CAM_NAME Rear --component 100",
-            "diff URL TMP/before.json --component 100 --extended --json",
+            "save URL TMP/before.json --vehicle 1/100 --extended",
+            "set URL CAM_NAME Rear --vehicle 1/100 --extended",
+            "diff URL TMP/before.json --vehicle 1/100 --extended --json",
         ),
     ),
     "search": Case(
@@ -175,11 +178,11 @@ CASES: Final = {
     ),
     "history_extended": Case(
         camera,
-        (FETCH_EXTENDED, "set URL CAM_NAME Rear --component 100", "history 1 --extended --json"),
+        (FETCH_EXTENDED, "set URL CAM_NAME Rear --vehicle 1/100 --extended", "history 1 --extended --json"),
     ),
     "save": Case(quad, ("save URL TMP/quad.params --json", "save 1 TMP/quad.param --only MC_* --json")),
-    "save_all": Case(both, ("save URL TMP/{system}.params --all --json",)),
-    "save_extended": Case(camera, ("save URL TMP/camera.json --component 100 --json",)),
+    "save_all": Case(both, ("save URL TMP/{system}.params --vehicle all --json",)),
+    "save_extended": Case(camera, ("save URL TMP/camera.json --vehicle 1/100 --extended --json",)),
     "apply": Case(
         copter,
         (
@@ -188,14 +191,14 @@ CASES: Final = {
             "apply URL DATA/json/copter.param --full --json",
         ),
     ),
-    "apply_all": Case(both, ("apply URL DATA/json/copter.param --all --json",)),
+    "apply_all": Case(both, ("apply URL DATA/json/copter.param --vehicle all --json",)),
     "apply_extended": Case(
         camera,
         (
-            "save URL TMP/before.json --component 100 --extended",
-            "set URL CAM_NAME Rear --component 100",
-            "apply URL TMP/before.json --component 100 --dry-run --json",
-            "apply URL TMP/before.json --component 100 --json",
+            "save URL TMP/before.json --vehicle 1/100 --extended",
+            "set URL CAM_NAME Rear --vehicle 1/100 --extended",
+            "apply URL TMP/before.json --vehicle 1/100 --extended --dry-run --json",
+            "apply URL TMP/before.json --vehicle 1/100 --extended --json",
         ),
     ),
     "restore": Case(
@@ -210,10 +213,10 @@ CASES: Final = {
     "restore_extended": Case(
         camera,
         (
-            "save URL TMP/before.json --component 100 --extended",
-            "set URL CAM_NAME Rear --component 100",
-            "apply URL TMP/before.json --component 100 --json",
-            "restore URL --component 100 --json",
+            "save URL TMP/before.json --vehicle 1/100 --extended",
+            "set URL CAM_NAME Rear --vehicle 1/100 --extended",
+            "apply URL TMP/before.json --vehicle 1/100 --extended --json",
+            "restore URL --vehicle 1/100 --extended --json",
         ),
     ),
     "import": Case(
@@ -293,7 +296,7 @@ def test_json_is_as_recorded(
     monkeypatch.setattr(ports_command, "list_ports", lambda: [port])
     found = outputs(CASES[name], command, put, tmp_path)
     path = DATA / "json" / f"{name}.json"
-    if "PARAMCLIENT_RECORD_JSON" in os.environ:
+    if RECORDS:
         path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     assert found == json.loads(path.read_text(encoding="utf-8"))
     assert json.dumps(found) == json.dumps(json.loads(path.read_text(encoding="utf-8")))  # also the order

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import pytest
 from paramclient.metadata import MetadataStore
 from paramclient.model.values import ParamType
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
-from paramclient.sim.metadata import METADATA_FILE
 from tests.commands import Command, Put, behind, in_process, leaping
 
 DATA = Path(__file__).parents[1] / "data"
@@ -82,13 +80,6 @@ def test_set_accepts_value_names_of_a_file(command: Command, put: Any) -> None:
     assert vehicle.requests["COMMAND_LONG"] <= 1  # its metadata was not requested
 
 
-def test_numbers_may_follow_an_equals_sign(command: Command, put: Any) -> None:
-    vehicle = quad(metadata=False)
-    done = command("set", put(vehicle), "COM_FLTMODE1=3", "MC_ROLL_P", 4.25, "MAV_SYS_ID=0x7", "--no-cache")
-    assert done.code == 0
-    assert vehicle.values == {"COM_FLTMODE1": 3, "EKF2_GPS_CTRL": 7, "MAV_SYS_ID": 7, "MC_ROLL_P": 4.25}
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -129,14 +120,6 @@ def test_value_names_need_metadata(command: Command, put: Any) -> None:
     assert not vehicle.requests["PARAM_SET"]
 
 
-def test_an_unknown_value_name_is_not_sent(command: Command, put: Any) -> None:
-    vehicle = quad()
-    done = command("set", put(vehicle), "MC_ROLL_P", 3, "COM_FLTMODE1=Retrun", "--no-cache")
-    assert (done.code, done.out) == (2, "")
-    assert "COM_FLTMODE1: 'Retrun' is not a number, nor one of its values: Unassigned (-1)" in done.err
-    assert not vehicle.requests["PARAM_SET"]
-
-
 def test_a_value_outside_of_the_range_is_sent_with_force(command: Command, put: Any) -> None:
     """The range of the metadata is advice; the vehicle decides."""
     vehicle = quad()
@@ -172,34 +155,6 @@ def test_get_prints_meaning_and_units(command: Command, put: Any) -> None:
         ["MC_ROLL_P", "6.5", "REAL32", "3", "1/s"],
         ["COM_FLTMODE1", "-1", "INT32", "0", "Unassigned"],
     ]
-
-
-def test_get_has_more_members_in_json_with_metadata(command: Command, put: Any) -> None:
-    url = put(quad())
-    plain = command("get", url, "MC_ROLL_P", "--json", "--no-cache").json["params"]["MC_ROLL_P"]
-    assert set(plain) == {"value", "type", "index", "bits"}
-    done = command("get", url, "MC_ROLL_P", "COM_FLTMODE1", "--json", "--metadata", "vehicle", "--no-cache")
-    params = done.json["params"]
-    assert params["MC_ROLL_P"] == plain | {
-        "default": 6.5,
-        "default_source": "metadata",
-        "units": "1/s",
-        "metadata": {
-            "short_description": "Gain from the error of the roll angle to the roll rate",
-            "long_description": "The rate per unit of error. Higher reacts quicker and swings sooner.",
-            "units": "1/s",
-            "minimum": 0,
-            "maximum": 12,
-            "increment": 0.1,
-            "decimals": 2,
-            "default": 6.5,
-            "category": "Standard",
-            "group": "MC",
-        },
-    }
-    mode = params["COM_FLTMODE1"]
-    assert mode["text"] == "Unassigned"
-    assert mode["metadata"]["values"]["5"] == "Return"
 
 
 def test_downloaded_metadata_is_stored(command: Command, put: Any, tmp_path: Path) -> None:
@@ -256,43 +211,6 @@ def test_diff_prints_meaning_and_units(command: Command, tmp_path: Path) -> None
     assert "units" not in plain.out
 
 
-def test_diff_uses_stored_metadata_of_each_side(command: Command, put: Any, tmp_path: Path) -> None:
-    cache = ("--cache", tmp_path / "cache.sqlite3")
-    assert command("get", put(quad()), "MC_ROLL_P", "--metadata", "vehicle", *cache).code == 0
-    file = tmp_path / "wanted.param"
-    file.write_text("COM_FLTMODE1,5\nMC_ROLL_P,7\n")
-    put(quad())
-    done = command("diff", "sim:px4", file, "--only", "COM_FLTMODE1", "--only", "MC_ROLL_P", *cache)
-    assert "-1 (Unassigned)" in done.out
-    assert "5 (Return)" in done.out
-    assert "1/s" in done.out
-
-
-def test_metadata_of_diff_is_a_file_and_not_a_vehicle(command: Command) -> None:
-    done = command("diff", "a.param", "b.param", "--metadata", "vehicle")
-    assert done.code == 2
-    assert "here --metadata takes a file" in done.err
-
-
-def test_without_stored_metadata_there_is_no_wait(
-    command: Command, put: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def forbidden(*_: object) -> None:
-        raise AssertionError
-
-    monkeypatch.setattr(MetadataStore, "known", forbidden)
-    assert command("get", put(quad()), "MC_ROLL_P", "--cache", tmp_path / "cache.sqlite3").code == 0
-    assert command("get", put(quad()), "MC_ROLL_P", "--no-cache").code == 0
-
-
-def test_a_vehicle_whose_metadata_file_is_missing(command: Command, put: Any) -> None:
-    vehicle = quad()
-    del vehicle.files[METADATA_FILE]
-    done = command("get", put(vehicle), "MC_ROLL_P", "--metadata", "vehicle", "--no-cache")
-    assert done.code == 1
-    assert "file not found" in done.err
-
-
 @pytest.mark.parametrize("words", [["get", "sim:px4", "A"], ["set", "sim:px4", "A=1"], ["show"]])
 def test_an_invalid_metadata_file_is_exit_code_2(command: Command, tmp_path: Path, words: list[str]) -> None:
     cache = ("--cache", tmp_path / "cache.sqlite3")
@@ -338,60 +256,10 @@ def test_show_prints_the_metadata_of_a_parameter(command: Command, shown: tuple[
     ]
 
 
-def test_show_prints_single_parameters_without_metadata(command: Command, shown: tuple[object, ...]) -> None:
-    done = command("show", "1", "TST_LOG", *shown)
-    assert done.code == 0
-    assert [line.split()[:2] for line in done.out.splitlines()] == [["name", "value"], ["TST_LOG", "1"]]
-    done = command("show", "1", "TST_LOG", "--json", *shown)
-    assert list(done.json["components"][0]["params"]) == ["TST_LOG"]
-    done = command("show", "1", "NONE", "TST_LOG", *shown)
-    assert (done.code, done.out) == (5, "")
-    assert "not among the cached parameters: NONE" in done.err
-
-
-def test_show_of_a_whole_table_prints_meanings(command: Command, shown: tuple[object, ...]) -> None:
-    done = command("show", "--metadata", XML, *shown)
-    assert "Stabilize" in done.out
-    assert "lowest" not in done.out
-    params = command("show", "--metadata", XML, "--json", *shown).json["components"][0]["params"]
-    assert params["TST_ALT"]["units"] == "cm"
-    assert params["TST_LOG"]["text"] == "IMU"
-    assert "metadata" not in params["TST_LOG"]
-
-
-def test_show_of_a_parameter_file_has_no_names(command: Command, tmp_path: Path) -> None:
-    file = tmp_path / "quad.param"
-    file.write_text("FLTMODE1,5\n")
-    assert command("show", file).code == 0
-    for words in (["FLTMODE1"], ["--metadata", XML]):
-        done = command("show", file, *words)
-        assert (done.code, done.out) == (2, "")
-        assert "go with a vehicle in the cache" in done.err
-
-
 def test_show_refuses_metadata_of_the_vehicle(command: Command, shown: tuple[object, ...]) -> None:
     done = command("show", "--metadata", "vehicle", *shown)
     assert (done.code, done.out) == (2, "")
     assert "needs a link" in done.err
-
-
-def test_text_of_a_metadata_file_is_escaped(
-    command: Command, shown: tuple[object, ...], tmp_path: Path
-) -> None:
-    nasty = {
-        "name": "TST_LOG",
-        "shortDesc": "\x1b[2Jgone",
-        "longDesc": "a\r\x1b]0;title\x07\nb\u202e",
-        "units": "\x9b31m",
-        "values": [{"value": 1, "description": "\x1b[31mred"}],
-    }
-    path = tmp_path / "nasty.json"
-    path.write_text(json.dumps({"version": 1, "parameters": [nasty]}))
-    for words in (["show", "1", "TST_LOG"], ["show", "1", "TST_LOG", "--json"], ["show", "1"]):
-        done = command(*words, "--metadata", path, *shown)
-        assert done.code == 0
-        assert (done.out + done.err).replace("\n", "").isprintable()
-        assert (done.out + done.err).isascii()
 
 
 def test_a_simulated_vehicle_describes_its_parameters(command: Command) -> None:

@@ -79,7 +79,7 @@ def test_the_error_of_several_vehicles_lists_all_that_send_a_heartbeat(
     assert (outcome.code, outcome.out) == (2, "")
     assert outcome.err == (
         "paramclient: 4 vehicles on this link: 1/1 PX4 quadrotor, 2/1 PX4 quadrotor, 3/1 PX4 quadrotor, "
-        "4/1 PX4 quadrotor. Choose one with --system.\n"
+        "4/1 PX4 quadrotor. Choose one with --vehicle, as in --vehicle 1/1.\n"
     )
 
 
@@ -100,53 +100,3 @@ def test_an_excerpt_of_a_wrong_file_has_no_escapes(command: Command) -> None:
     assert outcome.code == 2
     assert "...'" in outcome.err
     assert "\\u2026" not in outcome.err
-
-
-def test_a_bit_mask_with_many_names_does_not_widen_the_comparison(command: Command) -> None:
-    bits = ",".join(f"{bit}:Sensor number {bit}" for bit in range(20))
-    Path("apm.pdef.xml").write_text(
-        '<paramfile><vehicles><parameters name="ArduCopter"><param name="ArduCopter:MASK" '
-        f'humanName="Mask"><field name="Bitmask">{bits}</field></param></parameters></vehicles></paramfile>',
-        encoding="utf-8",
-    )
-    Path("left.parm").write_text("MASK 1048575\n", encoding="utf-8")
-    Path("right.parm").write_text("MASK 3\n", encoding="utf-8")
-    outcome = command("diff", "left.parm", "right.parm", "--metadata", "apm.pdef.xml")
-    assert outcome.rows[1][1:3] == [
-        "1048575 (Sensor number 0|Sensor number 1|Sensor n...)",
-        "3 (Sensor number 0|Sensor number 1)",
-    ]
-    assert all(len(line) < 150 for line in outcome.out.splitlines())
-
-
-def test_show_names_what_it_does_not_print(command: Command) -> None:
-    assert command("fetch", "sim:camera", "--component", 100).code == 0
-    assert command("show", "1/100").err.endswith("\n16 extended parameters: --extended prints them\n")
-    assert command("fetch", "sim:px4").code == 0
-    listed = command("show").rows
-    assert listed[0][3] == "extended"
-    assert [row[3] for row in listed[1:] if row[1] == "no autopilot"] == ["16"]
-    wrong = command("show", "mc_roll_p")
-    assert (wrong.code, wrong.out) == (2, "")
-    assert wrong.err == (
-        "paramclient: mc_roll_p is the name of a parameter: the first argument of show is the vehicle, as in "
-        "`paramclient show 1 mc_roll_p`; `paramclient info mc_roll_p` prints it for every vehicle\n"
-    )
-    assert "is not in the cache" in command("show", "NO_SUCH_PARAMETER").err
-
-
-def test_a_vehicle_without_snapshots_has_no_table_of_them(command: Command) -> None:
-    assert command("fetch", "sim:px4").code == 0
-    listed = command("history", 1, "--snapshots")
-    assert (listed.code, listed.out) == (0, "")
-    assert listed.err == "no snapshots: apply and restore store one before they write\n"
-
-
-def test_set_prints_the_name_of_the_reported_value(command: Command) -> None:
-    url = "sim:px4?metadata=1"
-    done = command("set", url, "COM_FLTMODE1=Return", "MC_ROLL_P", 6.5)
-    assert done.rows[1:] == [
-        ["COM_FLTMODE1", "5", "5 (Return)", "accepted"],
-        ["MC_ROLL_P", "6.5", "6.5", "accepted"],
-    ]
-    assert command("set", url, "COM_FLTMODE1=Return", "--json").json["results"][0]["actual"] == 5

@@ -108,31 +108,9 @@ def test_a_terminal_shows_what_is_awaited(
     assert written[0] == "waiting for 1/1 px4 to acknowledge PARAM_SET (0 s)."
 
 
-@pytest.mark.parametrize(
-    ("columns", "line"),
-    [
-        (40, "waiting for an ... on sim:custom (3 s)."),
-        (14, "wa...m (3 s)."),
-    ],
-)
-def test_a_narrow_terminal_keeps_the_seconds(
-    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch, columns: int, line: str
-) -> None:
-    use_terminal(monkeypatch)
-    monkeypatch.setenv("COLUMNS", str(columns))
-    done = command("get", put(Air([])), "A", "--timeout", 3.2)
-    assert drawn(done.err)[-2] == line
-
-
 def test_a_quick_response_leaves_the_terminal_alone(
     command: Command, put: Put, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     use_terminal(monkeypatch)
     done = command("get", put(GenericVehicle({"A": 1})), "A")
     assert (done.code, done.err) == (0, "")
-
-
-def test_without_a_terminal_only_the_error_is_printed(command: Command, put: Put) -> None:
-    done = command("get", put(Deaf(table={"A": 1})), "A")
-    assert done.err.count("\n") == 1
-    assert "\x1b" not in done.err

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
@@ -57,20 +56,6 @@ def test_show_prints_the_values_at_the_end_of_a_log(command: Command, copter: Pa
     assert shown.err == f"2 parameters of 7/1 ardupilot from {copter}\n"
 
 
-def test_show_prints_types_and_the_format_as_json(command: Command, quad: Path) -> None:
-    document = json.loads(command("show", quad, "--json").out)
-    assert document["format"] == "ulog"
-    params = document["components"][0]["params"]
-    assert (params["MC_ROLL_P"]["value"], params["MC_ROLL_P"]["default"]) == (7.5, 6.5)
-    assert params["SYS_AUTOSTART"]["type"] == "INT32"
-
-
-def test_show_changed_prints_what_differs_from_the_defaults(command: Command, quad: Path) -> None:
-    shown = command("show", quad, "--changed")
-    assert shown.code == 0
-    assert [line.split()[0] for line in shown.out.splitlines()[1:]] == ["MC_ROLL_P"]
-
-
 def test_diff_compares_logs_of_both_formats(command: Command, copter: Path, quad: Path) -> None:
     compared = command("diff", copter, quad, "--json")
     assert compared.code == 1
@@ -83,22 +68,6 @@ def test_save_writes_a_log_as_a_parameter_file(command: Command, copter: Path, t
     saved = command("save", copter, path)
     assert (saved.code, saved.err) == (0, f"2 parameters of 7/1 written to {path} (mission-planner)\n")
     assert read_file(path).choose()["ATC_RAT_RLL_P"].value == 0.2
-
-
-def test_save_changed_writes_what_differs_from_the_defaults(
-    command: Command, quad: Path, tmp_path: Path
-) -> None:
-    path = tmp_path / "quad.params"
-    assert command("save", quad, path, "--changed").code == 0
-    assert list(read_file(path).choose()) == ["MC_ROLL_P"]
-
-
-def test_save_converts_a_parameter_file(command: Command, tmp_path: Path) -> None:
-    (tmp_path / "a.parm").write_text("MC_ROLL_P 6.5\n")
-    assert command("save", tmp_path / "a.parm", tmp_path / "b.json").code == 0
-    assert read_file(tmp_path / "b.json").choose()["MC_ROLL_P"].value == 6.5
-    refreshed = command("save", tmp_path / "a.parm", tmp_path / "b.json", "--refresh")
-    assert (refreshed.code, "--refresh needs a link" in refreshed.err) == (2, True)
 
 
 def test_a_damaged_log_is_an_error_without_a_traceback(command: Command, tmp_path: Path) -> None:

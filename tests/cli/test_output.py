@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from paramclient.cli.output import in_local_time, local_time, print_line, print_table, say
+from paramclient.cli.output import local_time, print_line, print_table, say
 from paramclient.cli.time_arguments import parse_time
 from paramclient.sim import PX4Vehicle
 from tests.commands import Command, Put, behind, in_process, leaping
@@ -136,18 +136,6 @@ def test_messages_of_the_cache_have_local_times(
     assert failed.code == 5
     assert "at 2026-01-02T03:00:00+05:30 is not known: the history begins at" in failed.err
     assert re.search(r"begins at [0-9-]{10}T[0-9:]{8}\+05:30", failed.err)
-
-
-@pytest.mark.usefixtures("in_zone")
-def test_names_that_look_like_times_stay_as_they_are() -> None:
-    for text in ("2026-01-02T03:00:00Z.json", "/tmp/2026-01-02T03:00:00Z", "2026-99-02T03:00:00Z of it"):
-        assert in_local_time(text) == text
-    assert in_local_time("at 2026-01-01T21:30:00.250Z; later") == "at 2026-01-02T03:00:00.250+05:30; later"
-
-
-def test_without_an_offset_the_zone_is_z() -> None:
-    assert local_time(0.0) in ("1970-01-01T00:00:00.000Z", local_time(0.0))
-    assert "+00:00" not in local_time(0.0)
 
 
 # closed outputs

@@ -77,17 +77,6 @@ def test_get_and_set_suggest_names_of_the_vehicle(command: Command, put: Put, pa
         assert outcome.err.rstrip().endswith(". Did you mean MC_ROLL_P?")
 
 
-@pytest.mark.parametrize("is_fetched", [True, False])
-@pytest.mark.parametrize("words", [["mc_yaw_p", "5"], ["Mc_Yaw_P=5"]])
-def test_set_takes_any_case(command: Command, put: Put, words: list[str], is_fetched: bool) -> None:
-    vehicle = px4()
-    if is_fetched:
-        assert command("fetch", put(vehicle)).code == 0
-    done = command("set", put(vehicle), *words, "--json")
-    assert (done.code, vehicle.values["MC_YAW_P"]) == (0, 5.0)
-    assert done.json["results"][0]["name"] == "MC_YAW_P"
-
-
 def test_a_name_that_fits_two_parameters_in_other_cases_is_not_written(command: Command, put: Put) -> None:
     vehicle = GenericVehicle({"Gain": 1.0, "gain": 2.0}, param_error=True)
     assert command("fetch", put(vehicle)).code == 0
@@ -218,12 +207,6 @@ def test_watch_follows_groups_that_appear(
     }
     found = [line for line in lines(watched.out) if not line.startswith("1/1 resynced")]
     assert sorted(found) == [changes[name] for name in printed]
-
-
-def test_watch_of_a_pattern_without_a_match_is_an_error(command: Command, put: Put) -> None:
-    watched = command("watch", put(growing()), "GRP_*", "NOT_*", "--timeout", 30)
-    assert (watched.code, watched.out) == (1, "")
-    assert watched.err.endswith("no parameter that matches NOT_*\n")
 
 
 def growing() -> Growing:

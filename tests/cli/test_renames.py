@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -74,14 +73,6 @@ def test_apply_writes_under_the_name_of_the_vehicle(command: Command, put: Calla
     assert vehicle.values["WP_SPD"] == 7.5
 
 
-def test_apply_prints_the_name_of_the_vehicle_as_json(
-    command: Command, put: Callable[[Endpoint], str]
-) -> None:
-    reported = command("apply", put(copter()), file(), "--renames", "names.json", "--json").json
-    row = reported["params"]["WPNAV_SPEED"]
-    assert (row["vehicle_name"], row["wanted"], row["actual"], row["status"]) == ("WP_SPD", 7.5, 7.5, "set")
-
-
 def test_a_dry_run_shows_the_steps_under_both_names(command: Command, put: Callable[[Endpoint], str]) -> None:
     vehicle = copter()
     outcome = command("apply", put(vehicle), file(), "--renames", "names.json", "--dry-run")
@@ -124,22 +115,6 @@ def test_a_bad_file_of_names_is_an_error_with_its_line(
     assert "bad.json:2: the factor of C is 0" in outcome.err
 
 
-@pytest.mark.parametrize("words", [("apply", "--dry-run")])
-def test_firmware_versions_that_differ_are_named_first(
-    command: Command, put: Callable[[Endpoint], str], words: tuple[str, ...]
-) -> None:
-    subcommand, *options = words
-    wanted = older_file(OTHER=2.0)
-    outcome = command(subcommand, put(copter()), wanted, *options)
-    first = "1/1 ardupilot: the file is of ArduPilot 4.5.7, the vehicle has 4.6.0-dev\n"
-    assert outcome.err.startswith(first)
-    reported = command(subcommand, put(copter()), wanted, *options, "--json").json
-    assert reported["firmware"] == {"file": "4.5.7", "vehicle": "4.6.0-dev"}
-    same = replace(Identity(1, "udp", autopilot=3), firmware=67502080)
-    write_file("same.json", ParamSet({"OTHER": WrittenParam("OTHER", 2.0)}, identity=same))
-    assert "firmware" not in command(subcommand, put(copter()), "same.json", *options, "--json").json
-
-
 def test_diff_compares_parameters_under_their_other_names(command: Command) -> None:
     old = file("WPNAV_SPEED,750\nRTL_ALT,1500\nOTHER,1\n", "old.param")
     new = file("WP_SPD,7.0\nRTL_ALT_M,15\nOTHER,1\nMORE,2\n", "new.param")
@@ -160,24 +135,3 @@ def test_diff_compares_parameters_under_their_other_names(command: Command) -> N
     ]
     outcome = command("diff", old, new, "--renames", "names.json", "--partial", "--only", "RTL_ALT_M")
     assert outcome.code == 0
-
-
-def test_diff_prints_both_names_as_json(command: Command) -> None:
-    old, new = file("WPNAV_SPEED,750\n", "old.param"), file("WP_SPD,7.0\n", "new.param")
-    reported = command("diff", old, new, "--renames", "names.json", "--json").json
-    (row,) = reported["params"].values()
-    assert (row["is"], row["right_name"], row["renamed"]["value"]) == ("different", "WP_SPD", 7.5)
-    assert (row["left"]["value"], row["right"]["value"]) == (750, 7.0)
-
-
-def test_diff_knows_the_defaults_of_renamed_parameters(command: Command) -> None:
-    def side(name: str, value: float, default: float) -> str:
-        param = WrittenParam(name, value, ParamType.REAL32, default)
-        write_file(f"{name}.json", ParamSet({name: param}))
-        return f"{name}.json"
-
-    left, right = side("WPNAV_SPEED", 750.0, 1000.0), side("WP_SPD", 10.0, 10.0)
-    outcome = command("diff", left, right, "--renames", "names.json", "--base", "defaults")
-    (row,) = outcome.rows[1:]
-    assert row[0] == "WPNAV_SPEED"
-    assert row[-1] == "left"

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from paramclient import ParamType
-from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
+from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
 from paramclient.wire import messages
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import Tap
@@ -77,21 +77,6 @@ def test_a_switch_that_hides_others_is_reset_last(command: Command, put: Put) ->
     tap = Tap(copter())
     assert command("reset", put(tap), "MC_ENABLE", "MC_ROLL_P", "COUNT").code == 0
     assert written(tap) == ["MC_ROLL_P", "COUNT", "MC_ENABLE"]
-
-
-@pytest.mark.parametrize("choice", ["--all", "--changed"])
-def test_a_refused_default_does_not_stop_the_others(command: Command, put: Put, choice: str) -> None:
-    vehicle = copter()
-    done = command("reset", put(vehicle), choice, "--json")
-    assert done.code == 1
-    document = done.json
-    assert {each["name"]: each["status"] for each in document["results"]} == {
-        **dict.fromkeys(CHANGED, "accepted"),
-        "FIXED": "refused",
-    }
-    assert (document["unchanged"], document["without_default"]) == (["MC_PITCH_P"], [])
-    assert "FIXED: " in done.err
-    assert values(vehicle, *CHANGED) == CHANGED
 
 
 def test_a_parameter_without_a_known_default_is_listed_and_not_written(command: Command, put: Put) -> None:
@@ -235,17 +220,6 @@ def test_the_user_of_a_terminal_confirms(
         for words in (["COUNT", "--yes"], ["COUNT", "--json"], ["MC_PITCH_P"]):
             done = command("reset", put(again), *words)
             assert (done.code, "go on?" in done.err) == (0, False)
-
-
-def test_with_two_vehicles_nothing_is_written(command: Command, put: Put) -> None:
-    one, two = copter(), copter(system=2)
-    tap = Tap(Air([one, two]))
-    url = put(tap)
-    done = command("reset", url, "COUNT")
-    assert (done.code, written(tap)) == (2, [])
-    assert "Choose one with --system." in done.err
-    assert command("reset", url, "COUNT", "--system", 2).code == 0
-    assert (one.values["COUNT"], two.values["COUNT"]) == (300, 12)
 
 
 def test_a_vehicle_that_falls_silent_has_an_outcome_for_each_value(command: Command, put: Put) -> None:

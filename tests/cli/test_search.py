@@ -81,7 +81,7 @@ def test_a_camera_needs_no_metadata(
 ) -> None:
     leaping(monkeypatch)
     run = in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
-    assert run("fetch", "sim:camera", "--component", 100).code == 0
+    assert run("fetch", "sim:camera", "--vehicle", "1/100", "--extended").code == 0
     assert run("get", "sim:px4?metadata=1", "MC_ROLL_P", "--metadata", "vehicle").code == 0
     found = run("search", "roll")
     assert (found.code, found.err) == (0, "")

@@ -198,21 +198,17 @@ def put(monkeypatch: pytest.MonkeyPatch) -> Put:
 LINK = "udpin:127.0.0.1:1"
 COMMANDS = [
     ["show", "NAME"],
-    ["show", "NAME", "MC_ROLL_P"],
     ["show", "NAME", "--json"],
     ["history", "NAME"],
     ["history", "NAME", "--snapshots"],
     ["cache", "remove", "NAME"],
-    ["cache", "remove", "NAME", "--component", "1"],
     ["save", "NAME", "FILE"],
-    ["save", "NAME", "FILE", "--all"],
-    ["diff", "NAME", "3"],
+    ["save", "NAME", "FILE", "--vehicle", "all"],
     ["diff", "3", "NAME"],
     ["diff", "3", "3", "--base", "NAME"],
     ["diff", LINK, "NAME"],
     ["apply", LINK, "NAME", "--yes"],
-    ["apply", LINK, "NAME", "--dry-run"],
-    ["apply", LINK, "NAME", "--all", "--yes"],
+    ["apply", LINK, "NAME", "--vehicle", "all", "--yes"],
 ]
 """With NAME for the vehicle, and FILE for a file that is not there."""
 

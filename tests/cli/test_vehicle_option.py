@@ -1,4 +1,4 @@
-"""--vehicle: a vehicle by address, kind or hardware id, on links and in the cache."""
+"""--vehicle: a vehicle of a link by address or hardware id, all of them, and vehicles of the cache."""
 
 from __future__ import annotations
 
@@ -7,22 +7,18 @@ from typing import Any
 
 import pytest
 
-from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from tests.commands import Command, Put, behind, in_process, leaping
 
 TABLE: dict[str, Any] = {"A": 1.0, "B": 2.0}
+UID = "0a" * 18
 
 
 @pytest.fixture
-def cache(tmp_path: Path) -> Path:
-    return tmp_path / "cache.sqlite3"
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], cache: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
+def command(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
     """Run the command line in this process, on simulated time, with a new cache."""
     leaping(monkeypatch)
-    return in_process(capsys, "--cache", str(cache))
+    return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
 
 
 @pytest.fixture
@@ -39,42 +35,64 @@ def copter(system: int = 4, **options: Any) -> ArduPilotVehicle:
     return ArduPilotVehicle(system=system, live=(), **{"table": TABLE} | options)
 
 
-@pytest.mark.parametrize("name", ["4", "4/1", "ardupilot", "ArduPilot"])
+@pytest.mark.parametrize("name", ["4", "4/1", f"uid:{UID}", "UID:0A0A0A"])
 def test_one_of_two_vehicles_is_written_to(command: Command, put: Put, name: str) -> None:
-    one, two = px4(), copter()
-    far_end: Endpoint = Air([one, two])
-    url = put(far_end)
-    done = command("set", url, "A", 7, "--vehicle", name)
+    one, two = px4(), copter(uid2=bytes.fromhex(UID))
+    done = command("set", put(Air([one, two])), "A", 7, "--vehicle", name)
     assert done.code == 0, done.err
     assert (one.values["A"], two.values["A"]) == (1.0, 7.0)
 
 
-def test_a_component_of_a_vehicle(command: Command, put: Put) -> None:
-    camera = GenericVehicle({"A": 5}, system=4, component=100)
-    url = put(Air([px4(), copter(), camera]))
-    for words in (["4/100"], ["4", "--component", "100"]):
-        done = command("get", url, "A", "--plain", "--json", "--vehicle", *words)
-        assert done.json["params"]["A"]["value"] == 5
+def test_another_vehicle_under_the_system_id_is_not_written_to(command: Command, put: Put) -> None:
+    other = copter(uid2=bytes.fromhex("0b" * 18))
+    done = command("set", put(other), "A", 7, "--vehicle", f"uid:{UID}", "--timeout", 5)
+    assert (done.code, done.out, other.requests["PARAM_SET"]) == (3, "", 0)
+    assert f"a vehicle with hardware id {UID}" in done.err
+    assert "Heard on sim:custom so far: 4/1 ArduPilot quadrotor." in done.err
 
 
-@pytest.mark.parametrize("words", [["get"], ["set"]])
-def test_a_kind_of_several_vehicles_lists_them(command: Command, put: Put, words: list[str]) -> None:
-    one, two = px4(), px4(2)
-    done = command(
-        words[0], put(Air([one, two, copter()])), "A", *["9"] * (words == ["set"]), "--vehicle", "px4"
-    )
+def test_two_vehicles_with_the_same_beginning_of_the_hardware_id(command: Command, put: Put) -> None:
+    one, two = (copter(number, uid2=bytes.fromhex("0a" * 17 + end)) for number, end in ((4, "01"), (5, "02")))
+    done = command("set", put(Air([one, two])), "A", 7, "--vehicle", "uid:0a0a0a")
     assert (done.code, done.out) == (2, "")
-    assert done.err == (
-        "paramclient: 2 vehicles on this link are px4: 1/1 px4, 2/1 px4. Choose one with --system.\n"
-    )
+    assert "2 vehicles on this link have hardware ids that begin with 0a0a0a: 4/1 " in done.err
     assert (one.requests["PARAM_SET"], two.requests["PARAM_SET"]) == (0, 0)
 
 
-def test_a_kind_that_is_not_there(command: Command, put: Put) -> None:
-    done = command("get", put(copter()), "A", "--vehicle", "px4", "--timeout", 3)
-    assert (done.code, done.out) == (3, "")
-    assert "a vehicle with autopilot px4" in done.err
-    assert "Heard on sim:custom so far: 4/1 ArduPilot quadrotor." in done.err
+def test_a_component_of_a_vehicle(command: Command, put: Put) -> None:
+    camera = GenericVehicle({"A": 5}, system=4, component=100)
+    done = command("get", put(Air([px4(), copter(), camera])), "A", "--json", "--vehicle", "4/100")
+    assert done.json["params"]["A"]["value"] == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("4/300", "system and component ids are 1 to 255"),
+        ("0", "system and component ids are 1 to 255"),
+        ("tractor", "a vehicle is written as 4, as 4/1"),
+        ("px4", "a vehicle is written as 4, as 4/1"),
+        ("uid:0a0a", "a vehicle is written as 4, as 4/1"),
+        ("", "a vehicle is written as 4, as 4/1"),
+    ],
+)
+def test_names_that_name_nothing(command: Command, put: Put, name: str, reason: str) -> None:
+    tried = command("get", put(copter()), "A", "--vehicle", name)
+    assert (tried.code, tried.out) == (2, "")
+    assert reason in tried.err
+
+
+def test_subcommands_for_one_vehicle_refuse_all(command: Command, put: Put, tmp_path: Path) -> None:
+    vehicle = px4()
+    url = put(vehicle)
+    for words in (["reset", url, "A"], ["watch", url], ["check", url], ["set", url, "A", "1", "--extended"]):
+        done = in_words(command, *words, "--vehicle", "all")
+        assert (done, vehicle.requests["PARAM_SET"]) == (2, 0)
+
+
+def in_words(command: Command, *words: str) -> int:
+    """Return the exit code of a command; check takes no cache."""
+    return command(*words, *(["--no-cache"] if words[0] != "check" else [])).code
 
 
 def test_kinds_and_addresses_in_the_cache(command: Command, put: Put) -> None:
@@ -88,30 +106,3 @@ def test_kinds_and_addresses_in_the_cache(command: Command, put: Put) -> None:
     missing = command("show", "4/9")
     assert missing.code == 2
     assert "no vehicle has system id 4 and a table of component 9" in missing.err
-    both = command("show", "4/1", "--component", "2")
-    assert (both.code, both.out) == (2, "")
-    assert "4/1 names component 1, and --component names 2" in both.err
-
-
-@pytest.mark.parametrize(
-    ("words", "reason"),
-    [
-        (["--vehicle", "4", "--system", "4"], "--vehicle and --system exclude each other"),
-        (["--vehicle", "4/1", "--component", "2"], "--vehicle 4/1 and --component 2 exclude each other"),
-        (["--vehicle", "px4", "--component", "1"], "--vehicle px4 and --component 1 exclude each other"),
-        (["--vehicle", "4/300"], "system and component ids are 1 to 255"),
-        (["--vehicle", "0"], "system and component ids are 1 to 255"),
-        (["--vehicle", "tractor"], "vehicle tractor is not in the cache"),
-        (["--vehicle", "tractor", "--no-cache"], "hardware ids are looked up in the cache"),
-    ],
-)
-def test_names_that_name_nothing(command: Command, put: Put, words: list[str], reason: str) -> None:
-    tried = command("get", put(copter()), "A", *words)
-    assert (tried.code, tried.out) == (2, "")
-    assert reason in tried.err
-
-
-def test_history_needs_a_vehicle(command: Command) -> None:
-    failed = command("history")
-    assert (failed.code, failed.out) == (2, "")
-    assert "VEHICLE is missing: a vehicle in the cache" in failed.err

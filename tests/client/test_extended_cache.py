@@ -14,6 +14,7 @@ from paramclient.cache.sqlite import SqliteStore
 from paramclient.errors import CacheError
 from paramclient.logs.telemetry import import_log
 from paramclient.sim import Air, Camera, PX4Vehicle
+from tests.caches import extended
 from tests.shell import in_simulated_time
 
 TABLE: dict[str, int | float | str | bytes] = {"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_ISO": 100}
@@ -21,7 +22,7 @@ TABLE: dict[str, int | float | str | bytes] = {"CAM_MODE": 1, "CAM_NAME": "Front
 
 def kept(path: Path) -> CachedExtTable:
     with ParamCache(path) as cache:
-        return cache.extended()
+        return extended(cache)
 
 
 def history(path: Path) -> list[tuple[str, object, object, str]]:
@@ -110,7 +111,7 @@ async def test_plain_and_extended_tables_of_one_system_are_kept_apart(tmp_path: 
     with ParamCache(tmp_path / "cache") as cache:
         plain = cache.component(component=100)
         assert {name: param.value for name, param in plain.params.items()} == {"CAM_MODE": 0.5}
-        assert cache.extended().params["CAM_MODE"].value == 1
+        assert extended(cache).params["CAM_MODE"].value == 1
         assert set(cache.component().params) == {"A", "B"}
         [vehicle] = cache.vehicles()
         assert vehicle.components == (1, 100)
@@ -163,8 +164,8 @@ async def test_another_vehicle_gets_a_table_of_its_own(tmp_path: Path) -> None:
         assert not component.ext.params
         await component.ext.fetch_all()
     with ParamCache(path) as cache:
-        assert list(cache.extended(system=1).params) == list(TABLE)
-        assert list(cache.extended(system=2).params) == ["OTHER"]
+        assert list(extended(cache, cache.components("1")[0].key).params) == list(TABLE)
+        assert list(extended(cache, cache.components("2")[0].key).params) == ["OTHER"]
 
 
 @pytest.mark.asyncio

@@ -31,6 +31,7 @@ from paramclient import (
 )
 from paramclient.sim import Air, Camera, PX4Vehicle
 from tests import shell
+from tests.caches import extended
 from tests.shell import a_client, in_simulated_time, settled
 
 MANY = {f"PARAM_{number:03}": number for number in range(120)}
@@ -287,12 +288,12 @@ async def test_a_durable_set_is_on_the_disk_with_its_line_when_it_returns(tmp_pa
         for number, value in enumerate((5, 6, 6)):  # at once, with the component hardly known
             assert (await ext.set("A", value, durable=True)).actual == value
             with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as other:
-                lines = other.execute("SELECT count(*) FROM ext_history").fetchone()
+                lines = other.execute("SELECT count(*) FROM history").fetchone()
                 assert lines == (min(number + 1, 2),)
         result = await ext.set_many([("A", 7), ("B", b"\xff")], durable=True)
         assert result.is_complete
         with ParamCache(path) as cache:
-            assert {name: each.value for name, each in cache.extended().params.items()} == {
+            assert {name: each.value for name, each in extended(cache).params.items()} == {
                 "A": 7,
                 "B": b"\xff",
             }
@@ -311,7 +312,7 @@ async def test_without_a_disk_nothing_is_sent_or_it_is_said_what_the_component_h
         async with a_client(camera, cache=cache) as client:
             ext = (await client.component(1, 100)).ext
             await ext.fetch_all()
-            with mock.patch.object(cache, "sync", side_effect=CacheError("no room")):
+            with mock.patch.object(cache, "save", side_effect=CacheError("no room")):
                 with pytest.raises(NotDurable, match="1/100 has accepted A, but it is not on the disk"):
                     await ext.set("A", 5, durable=True)
                 assert camera.ext_values["A"] == ext.params["A"].value == 5
@@ -322,4 +323,4 @@ async def test_without_a_disk_nothing_is_sent_or_it_is_said_what_the_component_h
             assert isinstance(result.error, NotDurable)
             assert "has accepted 2 values, but they are not on the disk" in str(result.error)
             await ext.set("A", 7, durable=True)
-            assert cache.extended().params["A"].value == 7
+            assert extended(cache).params["A"].value == 7

@@ -75,34 +75,6 @@ def test_a_change_that_is_received_again_keeps_the_moment_of_the_change() -> Non
     assert (param.value, by, moment) == (2, "station 254/190", 2.0)
 
 
-def test_restored_unwritten_values_keep_their_observation_times() -> None:
-    table = Table()
-    receive(table, 1, "vehicle", 1.0)
-    table.take_dirty()
-    receive(table, 2, "vehicle", 2.0)
-    for again in (2.5, 3.0, 3.5):
-        changed, params = table.changed, table.params.copy()
-        unwritten = (table.take_dirty(), table.take_overwritten(), table.take_removed_at(), changed, params)
-        table.restore_unwritten(*unwritten)
-        assert table.dirty == {"A": "vehicle"}
-        receive(table, 2, "vehicle", again)
-    assert [(each.param.value, each.moment) for each in table.take_overwritten()] == [(2, 2.0)]
-
-
-@pytest.mark.parametrize("by", ["vehicle", "us"])
-def test_a_value_replaced_during_a_failed_write_is_kept(by: str) -> None:
-    table = Table()
-    receive(table, 1, "vehicle", 1.0)
-    table.take_dirty()
-    receive(table, 2, "vehicle", 2.0)
-    changed, params = table.changed, table.params.copy()
-    unwritten = (table.take_dirty(), table.take_overwritten(), table.take_removed_at(), changed, params)
-    receive(table, 3, by, 3.0)
-    table.restore_unwritten(*unwritten)
-    assert [(each.param.value, each.moment) for each in table.take_overwritten()] == [(2, 2.0)]
-    assert table.take_dirty() == {"A": by}
-
-
 def test_a_removed_name_has_the_time_of_the_last_value_of_the_download() -> None:
     table = Table()
     receive(table, 1, "vehicle", 1.0)
@@ -128,8 +100,6 @@ def test_cached_values_keep_their_observation_times() -> None:
     param = Param("A", 1, ParamType.INT32, 0, 1)
     table.fill({"A": param}, moments={"A": -500.0})
     assert table.params.moments == {"A": -500.0}
-    table.renew({"A": Param("A", 2, ParamType.INT32, 0, 2)}, {"A": -400.0})
-    assert table.params.moments == {"A": -400.0}
 
 
 def test_sleep_that_the_clock_leaves_out_makes_everything_older() -> None:

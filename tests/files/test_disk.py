@@ -161,33 +161,11 @@ def test_errors_of_opening_a_file_have_the_reason(tmp_path: Path) -> None:
     assert "cannot be written: not a regular file" in str(refused(lambda: write_file(folder, PARAMS)))
 
 
-def test_opening_a_pipe_does_not_block(tmp_path: Path) -> None:
-    pipe = tmp_path / "pipe.param"
-    os.mkfifo(pipe)
-    assert str(refused(lambda: read_file(pipe))) == f"{pipe}: cannot be read: not a regular file"
-    assert str(refused(lambda: write_file(pipe, PARAMS))) == f"{pipe}: cannot be written: not a regular file"
-    assert stat.S_ISFIFO(pipe.stat().st_mode)
-
-
 def test_a_too_large_file_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "huge.param"
     with path.open("wb") as file:
         file.truncate(LARGEST_FILE + 1)
     assert f"a parameter file has at most {LARGEST_FILE} bytes" in str(refused(lambda: read_file(path)))
-
-
-def test_a_list_has_a_header_that_names_the_vehicle(tmp_path: Path) -> None:
-    from paramclient import Identity
-
-    who = Identity(3, "udp", "00ff", 12, firmware=0x01110000, git_hash="abc")
-    path = tmp_path / "quad.param"
-    write_file(path, ParamSet(PARAMS.params, 1, 3, who, 1_700_000_000.0, "link udpin:0.0.0.0:14550"))
-    assert read_file(path).header == (
-        "2 parameters of system/component 3/1, px4",
-        "of the vehicle uid:00ff, firmware 1.17.0-dev, commit abc",
-        "as of 2023-11-14T22:13:20Z",
-        "from link udpin:0.0.0.0:14550",
-    )
 
 
 def test_bytes_without_a_name() -> None:

@@ -15,7 +15,7 @@ import anyio.lowlevel
 import pytest
 
 from paramclient.errors import LinkError
-from paramclient.links import Link, Peer, create_link, serve_endpoint, udp
+from paramclient.links import Link, create_link, serve_endpoint, udp
 from paramclient.wire import messages
 from tests.cable import TIMEOUT
 from tests.shell import a_client, bits, generic
@@ -195,63 +195,12 @@ async def test_udpout_resolves_a_silent_name_again(
 # Ports used by other programs
 
 
-@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
-@pytest.mark.parametrize("ours", ["127.0.0.1", "0.0.0.0"])
-@pytest.mark.asyncio
-async def test_a_port_that_others_would_share_is_in_use(kind: str, ours: str) -> None:
-    transport = socket.SOCK_STREAM if kind == "tcpin" else socket.SOCK_DGRAM
-    with socket.socket(socket.AF_INET, transport) as other:
-        for option in (socket.SO_REUSEADDR, socket.SO_REUSEPORT):
-            other.setsockopt(socket.SOL_SOCKET, option, 1)
-        other.bind(("127.0.0.1", 0))
-        if kind == "tcpin":
-            other.listen()
-        port = other.getsockname()[1]
-        with pytest.raises(LinkError, match=f"port {port} is in use by this program itself"):
-            await create_link(f"{kind}:{ours}:{port}").open()
-
-
 # Selectors without a file descriptor, as on Windows
 
 
 @pytest.fixture
 def without_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(selectors, "DefaultSelector", selectors.SelectSelector)
-
-
-@pytest.mark.usefixtures("without_a_file")
-@pytest.mark.asyncio
-async def test_tcpin_receives_from_all_connections_without_a_selector_file() -> None:
-    link: Any = create_link("tcpin:127.0.0.1:0")
-    await link.open()
-    clients = [socket.create_connection(link.address, timeout=TIMEOUT) for _ in range(3)]
-    got: dict[Peer, bytes] = {}
-    with anyio.fail_after(TIMEOUT):
-        for number, client in enumerate(clients):
-            client.send(bytes([number]))
-            got.update(await link.receive())
-        assert sorted(got.values()) == [b"\0", b"\1", b"\2"]
-        clients[1].close()
-        assert [data for _, data in await link.receive()] == [b""]
-        for _ in range(3):
-            with anyio.move_on_after(0.001):
-                await link.receive()
-        clients[2].send(b"after")
-        assert [data for _, data in await link.receive()] == [b"after"]
-        await link.send(b"to all", None)
-        assert [clients[number].recv(10) for number in (0, 2)] == [b"to all", b"to all"]
-    async with anyio.create_task_group() as tasks:
-        errors: list[LinkError] = []
-
-        async def wait() -> None:
-            errors.append(await failure(link))
-
-        tasks.start_soon(wait)
-        await anyio.wait_all_tasks_blocked()
-        await link.close()
-    assert "closed" in str(errors[0])
-    for client in clients:
-        client.close()
 
 
 # Event loops without socket readiness, as on Windows

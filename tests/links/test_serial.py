@@ -22,7 +22,7 @@ import serialx
 
 from paramclient.client import reconnect_delays
 from paramclient.errors import LinkError, UsageError
-from paramclient.links import Link, Peer, create_link, refusals, serial
+from paramclient.links import Link, Peer, create_link, serial
 from paramclient.links.serial_transport import UNREAD_BYTES_MAX, Transport
 from paramclient.wire import messages
 from tests.cable import TIMEOUT, Cable
@@ -30,7 +30,6 @@ from tests.shell import a_client, bits, generic, small_px4, until
 
 HEARTBEAT = messages.encode(messages.Heartbeat(6, 8), system=255, component=190, sequence=0)
 RATE = 40_000.0
-NO_PORTS = "This computer has no serial ports: is the device plugged in and switched on?"
 """Bytes per second in each direction. With 57600 baud (5,760 bytes per second), tests would take seconds."""
 
 TIOCGEXCL = 0x80045440  # Linux, asm-generic/ioctls.h; termios has no name for it
@@ -125,7 +124,6 @@ async def test_unplugged_permanently(cable: Cable, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(reconnect_delays, "LINK_TIMEOUT", 0.2)
     monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.05)
     monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MAX", 0.1)
-    monkeypatch.setattr(refusals, "list_ports", list)
     vehicle = generic(stream=True)
     async with (
         asyncio.timeout(TIMEOUT),
@@ -135,9 +133,7 @@ async def test_unplugged_permanently(cable: Cable, monkeypatch: pytest.MonkeyPat
         tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))
         component = await client.component()
         cable.pull_out()
-        with pytest.raises(
-            LinkError, match=f"{cable.device} does not exist. This computer has no serial ports"
-        ) as caught:
+        with pytest.raises(LinkError, match=f"{cable.device} does not exist") as caught:
             await component.get("PARAM_01")
         assert isinstance(caught.value.__cause__, FileNotFoundError)
         cable.plug_in()
@@ -224,7 +220,7 @@ async def test_an_open_port_is_exclusive_and_closing_frees_it(cable: Cable) -> N
     async with opened(cable) as link:
         assert is_exclusive()
         error = await refusal(create_link(cable.link))
-        assert str(error) == f"{cable.link}: {cable.device} is in use by this program itself, on another link"
+        assert f"{cable.link}: {cable.device} is in use by another link or program" in str(error)
         await link.send(HEARTBEAT, None)
         assert cable.recv(100) == HEARTBEAT
     assert not is_exclusive()
@@ -233,38 +229,12 @@ async def test_an_open_port_is_exclusive_and_closing_frees_it(cable: Cable) -> N
 
 
 @pytest.mark.asyncio
-@pytest.mark.parametrize(
-    ("code", "text"),
-    [
-        (errno.ENOENT, f"/dev/ttyACM0 does not exist. {NO_PORTS}"),
-        (errno.ENODEV, f"/dev/ttyACM0 does not exist. {NO_PORTS}"),
-        (errno.EBUSY, "/dev/ttyACM0 is in use by another program. Close that program"),
-        (errno.EPERM, "no permission to open /dev/ttyACM0"),
-        (errno.ENOTTY, f"/dev/ttyACM0 is not a serial port. {NO_PORTS}"),
-        (errno.EINVAL, "/dev/ttyACM0 cannot be set to 57600 baud"),
-        (errno.EIO, "cannot open /dev/ttyACM0: Input/output error"),
-    ],
-)
-async def test_errors_of_opening_a_port(code: int, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_: object) -> None:
-        raise OSError(code, os.strerror(code))
-
-    monkeypatch.setattr(serialx.Serial, "open", refuse)
-    monkeypatch.setattr(refusals, "_group_hint", lambda _: "")
-    monkeypatch.setattr(refusals, "list_ports", list)
-    error = await refusal(create_link("/dev/ttyACM0"))
-    assert str(error) == f"serial:/dev/ttyACM0:57600: {text}"
-    assert isinstance(error.__cause__, OSError)
-
-
-@pytest.mark.asyncio
 @pytest.mark.parametrize("name", ["", "file", "missing"])
-async def test_files_that_are_not_ports(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(refusals, "list_ports", list)
+async def test_files_that_are_not_ports(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").touch()
     path = tmp_path / name
     expected = f"{path} does not exist." if name == "missing" else f"{path} is not a serial port."
-    assert f"{expected} {NO_PORTS}" in str(await refusal(create_link(f"serial:{path}")))
+    assert expected in str(await refusal(create_link(f"serial:{path}")))
 
 
 @pytest.mark.asyncio

@@ -21,7 +21,6 @@ from paramclient import (
 from paramclient.cache import BY_US, StoredParam, TableUpdate
 from paramclient.links import LinkKind, ReplayLink, create_link, parse_link
 from paramclient.links.replay import PAUSE_MAX
-from paramclient.links.tlog import FIRST_FRAME_OFFSET_MAX
 from paramclient.logs.imported_table import ImportedTable
 from paramclient.logs.telemetry import import_log
 from paramclient.model.identity import Identity
@@ -79,23 +78,6 @@ async def test_a_file_that_is_not_a_log(tmp_path: Path) -> None:
         with pytest.raises(LinkError, match="is not a regular file"):
             async with a_replay(endless):
                 raise AssertionError("it was opened")
-
-
-@pytest.mark.parametrize("before", [FIRST_FRAME_OFFSET_MAX - 100, FIRST_FRAME_OFFSET_MAX])
-@in_simulated_time
-async def test_the_first_frame_must_be_near_the_start(before: int, tmp_path: Path) -> None:
-    """For all bytes before the first frame; a file without a frame there may be a disk image."""
-    path = tmp_path / "flight.tlog"
-    path.write_bytes(bytes(before) + whole(A=1).data)
-    if before < FIRST_FRAME_OFFSET_MAX:
-        async with a_replay(path) as client:
-            assert (await (await client.component()).fetch_all()).complete
-        return
-    with path.open("r+b") as file:
-        file.truncate(1 << 40)
-    with pytest.raises(LinkError, match="is not a telemetry log"):
-        async with a_replay(path):
-            raise AssertionError("it was opened")
 
 
 # As a link

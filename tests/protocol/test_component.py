@@ -7,25 +7,7 @@ import struct
 from collections.abc import Callable
 
 import pytest
-
-from paramclient.errors import (
-    LinkError,
-    NoReply,
-    ParamErrorCode,
-    Refused,
-    UnknownParameter,
-    UsageError,
-)
-from paramclient.model.px4_hash import hash_params
-from paramclient.model.values import Encoding, Param, ParamType, Trust, WireValue
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import (
-    ComponentIdentified,
-    Event,
-    EventMaker,
-    Fetched,
-    ParamChanged,
-)
 from paramclient.protocol.params import table as table_room
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import DOUBT_TIME, FOREIGN_SET_MEMORY
@@ -45,6 +27,24 @@ from paramclient.protocol.wire import (
     ParamSetMessage,
     ParamValue,
     StatusText,
+)
+
+from paramclient.errors import (
+    LinkError,
+    NoReply,
+    ParamErrorCode,
+    Refused,
+    UnknownParameter,
+    UsageError,
+)
+from paramclient.model.px4_hash import hash_params
+from paramclient.model.values import Encoding, Param, ParamType, Trust, WireValue
+from paramclient.protocol.events import (
+    ComponentIdentified,
+    Event,
+    EventMaker,
+    Fetched,
+    ParamChanged,
 )
 from paramclient.sim import GenericVehicle, PX4Vehicle, Vehicle
 from tests.simulation import Simulation, is_so, known, listed, param_value

@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-
-from paramclient.protocol import wire
 from paramclient.protocol.no_reply_hint import LISTED_MAX, hint_of_component, hint_of_link
 from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.station import SENDERS_MAX, Station
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_INVALID,
     MAV_AUTOPILOT_PX4,
@@ -19,6 +16,9 @@ from paramclient.protocol.wire import (
     Message,
     StatusText,
 )
+
+from paramclient.protocol import wire
+from paramclient.protocol.station import SENDERS_MAX, Station
 
 LINK = "udpin:0.0.0.0:14550"
 ASKS = "Is the vehicle sending to this port?"

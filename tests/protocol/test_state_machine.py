@@ -10,10 +10,6 @@ from typing import Any, ClassVar, TypedDict, Unpack
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
-
-from paramclient.errors import NoReply, ParamClientError
-from paramclient.model.values import Encoding, Param, ParamType, encode_value
-from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult, Policy
@@ -24,8 +20,12 @@ from paramclient.protocol.params.write_batch import SetOutcome, SetStatus, Write
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.write_window import WRITES_IN_FLIGHT_MAX
-from paramclient.protocol.station import Station
 from paramclient.protocol.wire import HASH_CHECK
+
+from paramclient.errors import NoReply, ParamClientError
+from paramclient.model.values import Encoding, Param, ParamType, encode_value
+from paramclient.protocol import wire
+from paramclient.protocol.station import Station
 from paramclient.sim import (
     Air,
     ArduPilotVehicle,

@@ -5,14 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-
-from paramclient.errors import LinkError
-from paramclient.model.values import Encoding, ParamType
-from paramclient.protocol import station as room
-from paramclient.protocol import wire
-from paramclient.protocol.events import ComponentDiscovered
 from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.station import Station
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_INVALID,
     MAV_AUTOPILOT_PX4,
@@ -27,6 +20,13 @@ from paramclient.protocol.wire import (
     ParamSetMessage,
     StatusText,
 )
+
+from paramclient.errors import LinkError
+from paramclient.model.values import Encoding, ParamType
+from paramclient.protocol import station as room
+from paramclient.protocol import wire
+from paramclient.protocol.events import ComponentDiscovered
+from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
 from tests.simulation import Simulation, param_value
 

@@ -6,11 +6,7 @@ import math
 from collections.abc import Callable
 
 import pytest
-
-from paramclient.errors import AmbiguousVehicle
-from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle_selection import LOOK_TIME, VehicleChoice, vehicle_in_words
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
@@ -21,6 +17,10 @@ from paramclient.protocol.wire import (
     Heartbeat,
     Message,
 )
+
+from paramclient.errors import AmbiguousVehicle
+from paramclient.protocol import wire
+from paramclient.protocol.station import Station
 
 PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4)
 ROVER = Heartbeat(10, MAV_AUTOPILOT_ARDUPILOTMEGA)

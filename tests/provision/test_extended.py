@@ -14,9 +14,9 @@ from paramclient import (
     ParamCache,
     ParamSet,
     SetOutcome,
-    Value,
     SetStatus,
     UsageError,
+    Value,
 )
 from paramclient.files.disk import read_extended_file
 from paramclient.provision import (

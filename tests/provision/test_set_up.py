@@ -88,23 +88,6 @@ class ClampingVehicle(ArduPilotVehicle):
         super()._write(entry, bits)
 
 
-class RevertingVehicle(PX4Vehicle):
-    """A PX4 whose TUNE_19 reverts TUNE_01.
-
-    Attributes:
-        quarrels: whether TUNE_01 also takes back TUNE_19.
-    """
-
-    quarrels = False
-
-    def _write(self, entry: Entry, bits: int) -> None:
-        super()._write(entry, bits)
-        if entry.name == "TUNE_19":
-            super()._write(self._entry("TUNE_01"), bits_of(0.25, ParamType.REAL32))
-        if entry.name == "TUNE_01" and self.quarrels:
-            super()._write(self._entry("TUNE_19"), bits_of(4.75, ParamType.REAL32))
-
-
 CLAMPED: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "MPC_TILTMAX_AIR": 45.0,
     "MPC_TILTMAX_LND": 12.0,

@@ -20,7 +20,7 @@ from paramclient.sim import ArduPilotVehicle, Camera, PX4Vehicle
 from tests.recordings import DATA
 from tests.service.asgi import a_browser
 from tests.service.hub import V, problem, service, synced, until, value
-from tests.shell import VALUES, FlakyLink, Tap, generic, in_simulated_time, small_px4
+from tests.shell import VALUES, FlakyLink, PeersLink, Tap, generic, in_simulated_time, small_px4
 
 CAMERA = "/api/vehicles/1/100"
 EXT = {"ext": "true"}
@@ -214,6 +214,17 @@ async def test_a_vehicle_that_is_lost_answers_no_request_with_a_problem() -> Non
         assert value(await browser.get(f"{V}/params/PARAM_04")) == VALUES["PARAM_04"]
         tap.is_mute = tap.is_deaf = False
         await synced(browser)
+
+
+@in_simulated_time
+async def test_two_vehicles_under_one_address_are_reported_and_not_written() -> None:
+    px4, copter = PX4Vehicle(), ArduPilotVehicle(ftp=False)
+    link = PeersLink({("10.0.0.1", 14550): px4, ("10.0.0.2", 14550): copter})
+    async with service(link) as (_, browser):
+        found = await until(browser, V, lambda found: found["contest"] is not None)
+        assert found["state"] == "contested"
+        answer = await browser.put(f"{V}/params/MC_ROLL_P", json={"value": 5})
+        problem(answer, 409, "contested-address")
 
 
 @in_simulated_time

@@ -6,14 +6,15 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from paramclient.model.ext_params import ExtParam, ExtValue
-from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import ExtParamChanged
 from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.ext.fetch import ExtFetchResult
 from paramclient.protocol.ext.writes import ExtSetResult
-from paramclient.protocol.station import Station
 from paramclient.protocol.wire import Message
+
+from paramclient.protocol import wire
+from paramclient.protocol.events import ExtParamChanged
+from paramclient.protocol.station import Station
 from paramclient.sim import Air, Camera, Endpoint
 from tests.simulation import Simulation
 

@@ -10,8 +10,6 @@ from typing import Any
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
-
-from paramclient.errors import NoReply, SetFailed, ValueNotApplied, ValueUnsupported
 from paramclient.model.ext_params import ExtParamType, ExtValue
 from paramclient.protocol.ext.fetch import ExtFetch
 from paramclient.protocol.ext.write_batch import ExtWriteBatch
@@ -19,6 +17,8 @@ from paramclient.protocol.ext.writes import ExtWrite
 from paramclient.protocol.params.reads import ValueRead
 from paramclient.protocol.params.write_batch import SetStatus
 from paramclient.protocol.requests.operation import Operation
+
+from paramclient.errors import NoReply, SetFailed, ValueNotApplied, ValueUnsupported
 from paramclient.sim import Air, Camera, FaultyLink
 from tests.protocol.ext.camera import CameraSession
 

@@ -6,20 +6,20 @@ import math
 from typing import Any
 
 import pytest
-
-from paramclient.errors import LinkError, NoReply, UnknownParameter, UsageError
 from paramclient.model.ext_params import ExtParamType
-from paramclient.model.values import ParamType, Trust
-from paramclient.protocol import wire
 from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.station import Station
 from paramclient.protocol.wire import (
     Message,
     ParamExtRequestList,
     ParamExtRequestRead,
     ParamExtValue,
 )
+
+from paramclient.errors import LinkError, NoReply, UnknownParameter, UsageError
+from paramclient.model.values import ParamType, Trust
+from paramclient.protocol import wire
+from paramclient.protocol.station import Station
 from paramclient.sim import Camera, camera_table
 from tests.protocol.ext.camera import CameraSession, lossy
 

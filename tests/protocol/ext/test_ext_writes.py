@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from paramclient.model.ext_params import ExtParam, ExtValue
+from paramclient.protocol.ext.writes import LATE_ACK_TIME
+from paramclient.protocol.requests.retry import EXT_PROGRESS_TIMEOUT
+from paramclient.protocol.wire import ParamExtAck, ParamExtRequestRead, ParamExtSet
 
 from paramclient.errors import (
     ExtAckResult,
@@ -14,11 +18,7 @@ from paramclient.errors import (
     ValueNotApplied,
     ValueUnsupported,
 )
-from paramclient.model.ext_params import ExtParam, ExtValue
 from paramclient.protocol import wire
-from paramclient.protocol.ext.writes import LATE_ACK_TIME
-from paramclient.protocol.requests.retry import EXT_PROGRESS_TIMEOUT
-from paramclient.protocol.wire import ParamExtAck, ParamExtRequestRead, ParamExtSet
 from paramclient.sim import Camera
 from tests.protocol.ext.camera import CameraSession, lossy
 

@@ -11,9 +11,6 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-
-from paramclient.errors import PackError, UsageError
-from paramclient.model.values import ParamType
 from paramclient.protocol.ftp.param_pck import (
     PACK_SIZE_MAX,
     Pack,
@@ -21,6 +18,9 @@ from paramclient.protocol.ftp.param_pck import (
     decode,
     encode,
 )
+
+from paramclient.errors import PackError, UsageError
+from paramclient.model.values import ParamType
 from paramclient.sim import ardupilot_table
 from tests.recordings import DATA
 

@@ -9,12 +9,6 @@ from typing import Any, TypeVar
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-
-from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoReply, UsageError
-from paramclient.model.px4_hash import crc32_px4
-from paramclient.model.values import ParamType
-from paramclient.protocol import wire
-from paramclient.protocol.ftp import DirectoryEntry, FileRead, FileTransfers, FileWrite, param_pck
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
@@ -30,6 +24,12 @@ from paramclient.protocol.requests.retry import (
     RetryPolicy,
 )
 from paramclient.protocol.wire import FileTransfer, Message
+
+from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoReply, UsageError
+from paramclient.model.px4_hash import crc32_px4
+from paramclient.model.values import ParamType
+from paramclient.protocol import wire
+from paramclient.protocol.ftp import DirectoryEntry, FileRead, FileTransfers, FileWrite, param_pck
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.sim.ftp import IDLE_LIMIT
 from tests.recordings import DATA

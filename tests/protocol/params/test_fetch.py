@@ -6,14 +6,14 @@ import math
 from collections.abc import Iterable
 
 import pytest
+from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.fetch_result import FetchResult
+from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSetMessage
 
 from paramclient.errors import LinkError, NoReply
 from paramclient.model.values import TYPES_BY_NAME, ParamType, Trust, WireValue
 from paramclient.protocol import wire
 from paramclient.protocol.events import Fetched, ParamChanged
-from paramclient.protocol.params.change import Change
-from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSetMessage
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
 from tests.simulation import Memory, Simulation, is_so, known, listing_ardupilot
 

@@ -6,8 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-
-from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_notes import FILE_IN_USE
@@ -24,6 +22,8 @@ from paramclient.protocol.wire import (
     ParamRequestList,
     ParamRequestRead,
 )
+
+from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle
 from tests.shell import Tap, bits
 from tests.simulation import Simulation

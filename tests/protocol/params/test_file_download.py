@@ -8,16 +8,16 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from paramclient.protocol.ftp.packets import Opcode, Packet
+from paramclient.protocol.params.fetch import Fetch
+from paramclient.protocol.params.file_download import PARAMETER_FILE, WITH_DEFAULTS
+from paramclient.protocol.params.sync import SyncSettings
 
 from paramclient import FetchResult, NoReply, Trust
 from paramclient.errors import LinkError
 from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.protocol.events import ParamChanged, TableResynced
-from paramclient.protocol.ftp.packets import Opcode, Packet
-from paramclient.protocol.params.fetch import Fetch
-from paramclient.protocol.params.file_download import PARAMETER_FILE, WITH_DEFAULTS
-from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, GenericVehicle, PX4Vehicle
 from tests.shell import Tap, bits

@@ -6,8 +6,6 @@ import math
 from collections.abc import Callable, Iterable
 
 import pytest
-
-from paramclient.errors import LinkError, NoReply
 from paramclient.protocol.params.list_download import (
     ListDownload,
 )
@@ -31,6 +29,8 @@ from paramclient.protocol.wire import (
     ParamRequestList,
     ParamRequestRead,
 )
+
+from paramclient.errors import LinkError, NoReply
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.simulation import Simulation, is_so, listing_ardupilot, param_value
 

@@ -6,15 +6,6 @@ from __future__ import annotations
 import math
 
 import pytest
-
-from paramclient.errors import (
-    LinkError,
-    NoReply,
-    ParamErrorCode,
-    Refused,
-    TypeMismatch,
-    UnknownParameter,
-)
 from paramclient.protocol.params.reads import CONTROL_INDEX, Key, Read, Reads
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.pacing import BURST_MIN, FIRST_RATE
@@ -26,6 +17,15 @@ from paramclient.protocol.requests.retry import (
     RetryPolicy,
 )
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamValue
+
+from paramclient.errors import (
+    LinkError,
+    NoReply,
+    ParamErrorCode,
+    Refused,
+    TypeMismatch,
+    UnknownParameter,
+)
 from paramclient.sim import Air, ArduPilotVehicle
 from tests.simulation import Simulation, param_value
 

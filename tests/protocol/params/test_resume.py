@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-from paramclient import ParamCache, ParamClient, Trust
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.protocol.wire import ParamRequestList, ParamRequestRead
+
+from paramclient import ParamCache, ParamClient, Trust
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from tests.caches import kill_when, params_on_disk
 from tests.shell import bits, in_simulated_time

@@ -7,26 +7,12 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import pytest
-
-from paramclient.errors import CacheError, NoReply, UsageError
-from paramclient.model.values import ParamType, Trust
-from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import (
-    ComponentFound,
-    ComponentLost,
-    ComponentRebooted,
-    Event,
-    Fetched,
-    ParamChanged,
-    TableResynced,
-)
 from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.params.reads import Read
 from paramclient.protocol.params.sync import GAP_CHECK_INTERVAL, WATCH_INTERVAL, SyncSettings, SyncState
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.retry import FETCH_RESTARTS_MAX
-from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle.presence import LOST_AFTER
 from paramclient.protocol.wire import (
     HASH_CHECK,
@@ -36,6 +22,20 @@ from paramclient.protocol.wire import (
     ParamRequestRead,
     ParamSetMessage,
 )
+
+from paramclient.errors import CacheError, NoReply, UsageError
+from paramclient.model.values import ParamType, Trust
+from paramclient.protocol import wire
+from paramclient.protocol.events import (
+    ComponentFound,
+    ComponentLost,
+    ComponentRebooted,
+    Event,
+    Fetched,
+    ParamChanged,
+    TableResynced,
+)
+from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam
 from tests.shell import Tap
 from tests.simulation import Memory, Simulation, is_so, listed

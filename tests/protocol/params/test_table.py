@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import pytest
-
-from paramclient.model.px4_hash import hash_params
-from paramclient.model.values import Encoding, Param, ParamType, Trust, as_reported
 from paramclient.protocol.params import table as room
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.wire import ParamValue
+
+from paramclient.model.px4_hash import hash_params
+from paramclient.model.values import Encoding, Param, ParamType, Trust, as_reported
 from tests.simulation import known, listed, param_value
 
 

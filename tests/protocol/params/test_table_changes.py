@@ -4,12 +4,12 @@ how soon."""
 from __future__ import annotations
 
 import pytest
-
-from paramclient.model.values import ParamType
-from paramclient.protocol.events import ParamChanged
 from paramclient.protocol.params.change import Added, Change, Changed, FirstValue, Removed
 from paramclient.protocol.params.sync import DOWNLOAD_PAUSE_MIN, SyncSettings, SyncState
 from paramclient.protocol.wire import FileTransfer, ParamRequestList
+
+from paramclient.model.values import ParamType
+from paramclient.protocol.events import ParamChanged
 from paramclient.sim import Air, ArduPilotVehicle
 from tests.protocol.params.test_sync import INTERVAL, World, state
 

@@ -6,17 +6,13 @@ from collections.abc import Sequence
 from functools import partial
 
 import pytest
-
-from paramclient.model.values import ParamType
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import Event, EventMaker, ParamChanged
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.reads import Read
 from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.params.value_check import AMBIGUITY_WINDOW
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.retry import BATCH_INTERVAL
-from paramclient.protocol.station import Station
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_PX4,
@@ -26,6 +22,10 @@ from paramclient.protocol.wire import (
     ParamRequestRead,
     ParamSetMessage,
 )
+
+from paramclient.model.values import ParamType
+from paramclient.protocol.events import Event, EventMaker, ParamChanged
+from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.simulation import Simulation, is_so, param_value
 

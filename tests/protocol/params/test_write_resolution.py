@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import pytest
+from paramclient.protocol.params.small_changes import CHANGE_MIN, note_on_small_change
 
 from paramclient.model.values import Param, ParamType, WireValue, bits_of
-from paramclient.protocol.params.small_changes import CHANGE_MIN, note_on_small_change
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle
 from tests.simulation import Simulation
 

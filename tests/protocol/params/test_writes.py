@@ -7,6 +7,12 @@ import struct
 from functools import partial
 
 import pytest
+from paramclient.protocol.params.reads import Reads
+from paramclient.protocol.params.table import Table
+from paramclient.protocol.params.writes import Write, Writes
+from paramclient.protocol.requests.context import Context
+from paramclient.protocol.requests.retry import INITIAL_TIMEOUT, RetryPolicy
+from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamSetMessage, ParamValue
 
 from paramclient.errors import (
     LinkError,
@@ -19,12 +25,6 @@ from paramclient.errors import (
     ValueNotApplied,
 )
 from paramclient.model.values import Encoding, ParamType, Trust, WireValue, decode_value
-from paramclient.protocol.params.reads import Reads
-from paramclient.protocol.params.table import Table
-from paramclient.protocol.params.writes import Write, Writes
-from paramclient.protocol.requests.context import Context
-from paramclient.protocol.requests.retry import INITIAL_TIMEOUT, RetryPolicy
-from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamSetMessage, ParamValue
 from tests.simulation import is_so, known, param_value
 
 INT32 = ParamType.INT32

@@ -8,10 +8,6 @@ from collections.abc import Iterable
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from paramclient import LinkError, ParamClient, TrafficReport
-from paramclient.protocol import wire
-from paramclient.protocol.station import Station
 from paramclient.protocol.stats import traffic as room
 from paramclient.protocol.stats.packet_loss import (
     CERTAIN_GAP,
@@ -22,6 +18,10 @@ from paramclient.protocol.stats.packet_loss import (
 from paramclient.protocol.stats.sniffer import SeenFrame, Sniffer
 from paramclient.protocol.stats.traffic import ComponentTraffic, Traffic
 from paramclient.protocol.wire import Framer, Heartbeat
+
+from paramclient import LinkError, ParamClient, TrafficReport
+from paramclient.protocol import wire
+from paramclient.protocol.station import Station
 from paramclient.sim import Air, FaultyLink, PX4Vehicle
 from tests.simulation import Simulation
 

@@ -5,14 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 
 import pytest
-
-from paramclient.errors import ContestedAddress, NoReply
-from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import ComponentContested, ComponentReplaced, ComponentUncontested, Event
 from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.requests.retry import PEER_REQUESTS
-from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle import address_contest as room
 from paramclient.protocol.vehicle.presence import LOST_AFTER
 from paramclient.protocol.wire import (
@@ -30,6 +25,11 @@ from paramclient.protocol.wire import (
     ParamValue,
     SystemTime,
 )
+
+from paramclient.errors import ContestedAddress, NoReply
+from paramclient.protocol import wire
+from paramclient.protocol.events import ComponentContested, ComponentReplaced, ComponentUncontested, Event
+from paramclient.protocol.station import Station
 from paramclient.sim import ArduPilotVehicle, Endpoint, PX4Vehicle
 from tests.simulation import param_value
 

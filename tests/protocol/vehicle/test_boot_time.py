@@ -5,13 +5,8 @@ from __future__ import annotations
 import struct
 
 import pytest
-
-from paramclient.model.values import ParamType
-from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import ComponentRebooted, Event, EventMaker
 from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.station import Station
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_PX4,
@@ -27,6 +22,11 @@ from paramclient.protocol.wire import (
     StatusText,
     SystemTime,
 )
+
+from paramclient.model.values import ParamType
+from paramclient.protocol import wire
+from paramclient.protocol.events import ComponentRebooted, Event, EventMaker
+from paramclient.protocol.station import Station
 
 OWN = (255, 190)
 COPTER = Heartbeat(2, MAV_AUTOPILOT_ARDUPILOTMEGA, system_status=3)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import pytest
-
-from paramclient import CommandRefused, CommandResult, LinkError, NoReply, Refused
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.retry import RetryPolicy
 from paramclient.protocol.vehicle.commands import Command, Commands
 from paramclient.protocol.wire import CommandAck, CommandLong, Message
+
+from paramclient import CommandRefused, CommandResult, LinkError, NoReply, Refused
 from tests.simulation import is_so
 
 OWN = (255, 190)

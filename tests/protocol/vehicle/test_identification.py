@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 
 import pytest
-
-from paramclient.model.values import Encoding
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.retry import (
     RetryPolicy,
@@ -32,6 +30,8 @@ from paramclient.protocol.wire import (
     Heartbeat,
     Message,
 )
+
+from paramclient.model.values import Encoding
 from tests.simulation import is_so
 
 OWN = (255, 190)

@@ -21,6 +21,7 @@ from paramclient.protocol.wire import (
     Heartbeat,
     SystemTime,
 )
+
 from tests.simulation import is_so
 
 ACTIVE = Heartbeat(2, MAV_AUTOPILOT_PX4, system_status=MAV_STATE_ACTIVE)

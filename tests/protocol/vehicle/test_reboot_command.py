@@ -10,6 +10,9 @@ from typing import Any, TypeAlias
 
 import anyio
 import pytest
+from paramclient.protocol.requests.retry import REBOOT_COMMANDS_MAX
+from paramclient.protocol.system_id_change import OLD_ID_SILENCE_MIN
+from paramclient.protocol.vehicle.reboot_command import SAVING_TIME, UNOBSERVED_TIMEOUT
 
 from paramclient import (
     AnotherVehicle,
@@ -23,9 +26,6 @@ from paramclient import (
 )
 from paramclient.client.component import REBOOT_TIMEOUT
 from paramclient.protocol import wire
-from paramclient.protocol.requests.retry import REBOOT_COMMANDS_MAX
-from paramclient.protocol.system_id_change import OLD_ID_SILENCE_MIN
-from paramclient.protocol.vehicle.reboot_command import SAVING_TIME, UNOBSERVED_TIMEOUT
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, Vehicle
 from tests.shell import FlakyLink, Tap, a_client, generic, in_simulated_time, outcome, residue, tasks_beside
 from tests.simulation import is_so

@@ -12,11 +12,6 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pymavlink.dialects.v20 import all as dialect
-
-from paramclient.errors import UsageError
-from paramclient.protocol import wire
-from paramclient.protocol.station import Station
 from paramclient.protocol.wire import (
     Framer,
     Message,
@@ -39,6 +34,11 @@ from paramclient.protocol.wire.signing import (
     TIMESTAMP_LAG_MAX,
     UNITS_PER_SECOND,
 )
+from pymavlink.dialects.v20 import all as dialect
+
+from paramclient.errors import UsageError
+from paramclient.protocol import wire
+from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from tests.shell import VALUES, small_px4
 from tests.simulation import PEER, Simulation

@@ -16,10 +16,6 @@ import pytest
 from fastcrc.crc16 import mcrf4xx
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pymavlink.dialects.v20 import all as dialect
-from pymavlink.generator.mavcrc import x25crc_slow
-
-from paramclient.protocol import wire
 from paramclient.protocol.wire import (
     BOOT_CLOCK_OFFSETS,
     AutopilotVersion,
@@ -51,6 +47,10 @@ from paramclient.protocol.wire import (
     encode,
     frames,
 )
+from pymavlink.dialects.v20 import all as dialect
+from pymavlink.generator.mavcrc import x25crc_slow
+
+from paramclient.protocol import wire
 
 DATA = Path(__file__).parents[2] / "data"
 RECORDINGS = {

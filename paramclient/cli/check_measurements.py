@@ -1,0 +1,375 @@
+"""The measurements of check: round trips, reads, list and file downloads, hash. They only read."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from statistics import median
+from typing import Any, Final, TypeVar
+
+import anyio
+
+from paramclient.cli.json_output import IdentityJson, Json, as_json
+from paramclient.cli.session import Deadline
+from paramclient.client.client import ParamClient
+from paramclient.client.component import Component
+from paramclient.errors import (
+    CommandRefused,
+    FileTransferError,
+    LinkError,
+    NoReply,
+    PackError,
+    ParamClientError,
+    VehicleError,
+)
+from paramclient.model.notation import hash_text, rounded
+from paramclient.protocol import param_pck
+from paramclient.protocol.fetch import Progress
+from paramclient.protocol.file_download import PARAM_FILE, WITH_DEFAULTS
+from paramclient.wire.frames import enum_word
+from paramclient.wire.messages import (
+    HASH_CHECK,
+    MAV_AUTOPILOT_ARDUPILOTMEGA,
+    MAV_AUTOPILOT_INVALID,
+    MAV_CMD_REQUEST_MESSAGE,
+    MAV_TYPE_GCS,
+    AutopilotVersion,
+    message_id,
+)
+
+__all__ = ["HashMeasurement", "ListCheck", "Measurements", "Report"]
+
+CHECK_LISTENING_TIME: Final = 2.2
+"""Seconds in which every component is heard twice, as each sends a heartbeat once a second."""
+VERSION_TIMEOUT: Final = 3.0
+"""Seconds for AUTOPILOT_VERSION: four attempts at the initial timeout."""
+MEASURE_TIMEOUT: Final = 3.0
+"""Seconds for one small request: longer than any measured round trip with repeats."""
+ROUND_TRIP_COUNT: Final = 10
+"""Number of round trips that are measured: enough for a median and a maximum."""
+SINGLE_READ_COUNT: Final = 5
+"""Number of sequential reads that are measured: enough for a median."""
+CONCURRENT_READ_COUNT: Final = 30
+"""Number of concurrent reads: ArduPilot serves five in 100 ms, so 30 show its rate within 0.6 s."""
+STEADY_SHARE: Final = 0.9
+"""Share of the list up to which its rate is measured: after it come the repeats of lost values."""
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True, slots=True)
+class RoundTrips(Json):
+    """Measured round-trip times in seconds, and their number."""
+
+    count: int
+    min_s: float
+    median_s: float
+    max_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class LinkCheck(Json):
+    """The link since it was opened, `loss` and `lost` of the vehicle's frames."""
+
+    name: str
+    seconds: float
+    round_trip: RoundTrips | None
+    loss: float | None
+    lost: int
+    autopilots: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class ReadCheck(Json):
+    """Reads of single parameters: one after the other, and `in_flight` at once."""
+
+    single_s: float | None = None
+    per_s: float | None = None
+    in_flight: int = 0
+    answered: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ListCheck(Json):
+    """The list download."""
+
+    count: int | None
+    received: int
+    elapsed_s: float
+    per_s: float | None
+    lost: int
+    missing: int
+    is_cut_short: bool
+    error: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class FileCheck(Json):
+    """MAVFTP and the packed parameter file; `defaults` is the number of its defaults."""
+
+    is_serving: bool
+    size: int | None
+    elapsed_s: float | None
+    parameters: int | None
+    defaults: int | None
+    error: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class HashMeasurement(Json):
+    """The vehicle's hash `before` the downloads, or why there is none."""
+
+    before: str | None
+    error: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Report(Json):
+    """All measurements of one vehicle. A part for which no time was left is None."""
+
+    system: int
+    component: int
+    autopilot: str
+    vehicle_type: str | None
+    identity: IdentityJson
+    has_version: bool
+    encoding: str
+    encoding_reason: str
+    is_armed: bool | None
+    link: LinkCheck
+    reads: ReadCheck | None
+    list_: ListCheck | None
+    files: FileCheck | None
+    hash: HashMeasurement | None
+    elapsed_s: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the report as objects that `json.dumps` accepts."""
+        written: dict[str, Any] = as_json(self)
+        return written
+
+
+class Measurements:
+    """The measurements of one vehicle.
+
+    Sends no PARAM_SET, no command except MAV_CMD_REQUEST_MESSAGE, and writes no file.
+
+    Args:
+        client: an open client that counts traffic, without a cache.
+        component: the vehicle.
+        deadline: a measurement after it is left out, and a list download that takes longer is cut short.
+        progress: called with the name of the next measurement; or None.
+    """
+
+    def __init__(
+        self,
+        client: ParamClient,
+        component: Component,
+        deadline: Deadline,
+        progress: Callable[[str], None] | None,
+    ) -> None:
+        self._client = client
+        self._component = component
+        self._deadline = deadline
+        self._progress = progress
+        self._began = anyio.current_time()
+        self._core = component.core
+
+    async def take(self) -> Report:
+        """Take all measurements.
+
+        Raises:
+            LinkError: the link failed.
+        """
+        component, machine = self._component, self._core.machine
+        self._client.traffic_report()
+        listened = anyio.current_time() - self._core.client.opened_at
+        await self._step("listening", lambda: anyio.sleep(max(0.0, CHECK_LISTENING_TIME - listened)))
+        await self._step("identification", self._wait_for_identity)
+        trips = await self._step("round trip", self._measure_round_trips)
+        found = await self._step("hash", self._read_hash)
+        reads = await self._step("single reads", self._measure_reads)
+        listed = await self._step("list download", self._measure_list)
+        files = await self._step("MAVFTP", self._check_files)
+        kind = machine.identification.vehicle_type
+        return Report(
+            system=component.system,
+            component=component.component,
+            autopilot=component.autopilot,
+            vehicle_type=None if kind is None else enum_word("MAV_TYPE", kind),
+            identity=IdentityJson.of(component.identity),
+            has_version=machine.identification.firmware is not None,
+            encoding=component.encoding.value,
+            encoding_reason=component.encoding_reason,
+            is_armed=component.is_armed,
+            link=self._link(trips),
+            reads=reads,
+            list_=listed,
+            files=files,
+            hash=found,
+            elapsed_s=round(anyio.current_time() - self._began, 3),
+        )
+
+    def _left(self) -> float:
+        """Return the timeout of one request in seconds."""
+        return self._deadline.left(MEASURE_TIMEOUT) or 0.0
+
+    async def _step(self, name: str, measure: Callable[[], Awaitable[Result]]) -> Result | None:
+        """Return the result of a measurement; None if no time is left for it."""
+        if not self._left():
+            return None
+        if self._progress is not None:
+            self._progress(name)
+        return await measure()
+
+    async def _wait_for_identity(self) -> None:
+        """Wait until AUTOPILOT_VERSION was received or finally refused, at most `VERSION_TIMEOUT`."""
+        with anyio.move_on_after(self._deadline.left(VERSION_TIMEOUT)):
+            while not self._core.machine.identification.settled:
+                await self._core.client.link_task.activity.wait()
+
+    async def _measure_round_trips(self) -> RoundTrips | None:
+        """Measure the time from command to acknowledgement, of commands that were sent once."""
+        machine = self._core.machine
+        what = f"COMMAND_ACK of {self._component.system}/{self._component.component}"
+        found: list[float] = []
+        for _ in range(ROUND_TRIP_COUNT):
+            began = anyio.current_time()
+            command = machine.commands.begin(
+                MAV_CMD_REQUEST_MESSAGE, (float(message_id(AutopilotVersion)),), began
+            )
+            try:
+                await self._core.wait(command, self._left(), lambda: (what, 0))
+            except CommandRefused:
+                pass  # a refusal is an acknowledgement too
+            except NoReply:
+                if not found:
+                    break  # the vehicle acknowledges no commands
+                continue
+            finally:
+                machine.commands.cancel(command, anyio.current_time())
+            if command.attempts == 1:
+                found.append(anyio.current_time() - began)
+        if not found:
+            return None
+        return RoundTrips(len(found), round(min(found), 4), round(median(found), 4), round(max(found), 4))
+
+    async def _read_hash(self) -> HashMeasurement:
+        if self._core.machine.identification.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
+            return HashMeasurement(None, "ArduPilot has no parameter hash")
+        try:
+            param = await self._component.get(HASH_CHECK, timeout=self._left())
+        except (NoReply, VehicleError) as error:
+            return HashMeasurement(None, str(error))
+        return HashMeasurement(hash_text(param.bits), None)
+
+    async def _measure_reads(self) -> ReadCheck:
+        single = []
+        for index in range(SINGLE_READ_COUNT):
+            began = anyio.current_time()
+            if await self._is_answered(index):
+                single.append(anyio.current_time() - began)
+            elif not single:
+                return ReadCheck()
+        count = self._component.count or 0
+        # indices spread over the table, without those that were just read
+        step = max((count - SINGLE_READ_COUNT) // CONCURRENT_READ_COUNT, 1)
+        indices = range(SINGLE_READ_COUNT, count, step)[:CONCURRENT_READ_COUNT]
+        began = anyio.current_time()
+        answered_at: list[float] = []
+
+        async def read(index: int) -> None:
+            if await self._is_answered(index):
+                answered_at.append(anyio.current_time())
+
+        async with anyio.create_task_group() as tasks:
+            for index in indices:
+                tasks.start_soon(read, index)
+        rate = len(answered_at) / (max(answered_at) - began) if answered_at else None
+        return ReadCheck(rounded(median(single)), rounded(rate), len(indices), len(answered_at))
+
+    async def _is_answered(self, index: int) -> bool:
+        try:
+            await self._component.get(index, timeout=self._left())
+        except (NoReply, VehicleError):
+            return False
+        return True
+
+    async def _measure_list(self) -> ListCheck:
+        """Measure one list download, also if a file download would be faster."""
+        machine = self._core.machine
+        began = anyio.current_time()
+        arrivals: list[tuple[float, int]] = []
+
+        def progress(state: Progress) -> None:
+            if state.received and (not arrivals or state.received > arrivals[-1][1]):
+                arrivals.append((anyio.current_time(), state.received))
+
+        # the vehicle sends the whole list even if later measurements have begun
+        deadline = began + max(0.0, (self._deadline.left() or 0.0) - MEASURE_TIMEOUT)
+        try:
+            fetch = machine.begin_fetch(began, refresh=True, by_list=True)
+            try:
+                result = await self._core.wait_for_fetch(fetch, deadline, progress)
+            finally:
+                machine.end_fetch(fetch, anyio.current_time())
+                self._core.client.wake()
+        except LinkError:
+            raise
+        except ParamClientError as error:
+            elapsed = round(anyio.current_time() - began, 4)
+            return ListCheck(None, 0, elapsed, None, 0, 0, is_cut_short=False, error=str(error))
+        now = anyio.current_time()
+        first, steady = fetch.first_value_at, STEADY_SHARE * result.received
+        rates = (
+            number / (at - first)
+            for at, number in [*arrivals, (now, result.received)]
+            if number >= steady and at > first
+        )
+        return ListCheck(
+            count=result.count,
+            received=result.received,
+            elapsed_s=round(now - began, 4),
+            per_s=rounded(next(rates, None)),
+            lost=result.lost,
+            missing=len(result.missing),
+            is_cut_short=not fetch.done,
+            error=None,
+        )
+
+    async def _check_files(self) -> FileCheck:
+        began = anyio.current_time()
+        try:
+            ftp = self._client.ftp(self._component)
+            data = await ftp.read(PARAM_FILE + WITH_DEFAULTS, timeout=self._deadline.left())
+            elapsed = rounded(anyio.current_time() - began)
+            content = param_pck.decode(data)
+        except (FileTransferError, NoReply, PackError) as error:
+            return FileCheck(not isinstance(error, NoReply), None, None, None, None, str(error))
+        parameters = len(content.entries)
+        defaults = parameters if content.with_defaults else 0
+        return FileCheck(True, len(data), elapsed, parameters, defaults, None)
+
+    def _link(self, trips: RoundTrips | None) -> LinkCheck:
+        client, component = self._client, self._component
+        report = client.traffic_report()
+        address = (component.system, component.component)
+        mine = next((each for each in report.components if (each.system, each.component) == address), None)
+        lost = 0 if mine is None else max(mine.lost, 0)
+        sent = 0 if mine is None else mine.frames - mine.repeated + lost
+        others = [
+            f"{each.system}/{each.component}"
+            for each in report.components
+            if each.heartbeat is not None
+            and (each.system, each.component) != address
+            and each.heartbeat.type != MAV_TYPE_GCS
+            and each.heartbeat.autopilot != MAV_AUTOPILOT_INVALID
+        ]
+        return LinkCheck(
+            name=client.link.name,
+            seconds=round(report.seconds, 3),
+            round_trip=trips,
+            loss=rounded(lost / sent) if sent else None,
+            lost=lost,
+            autopilots=others,
+        )

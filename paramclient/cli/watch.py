@@ -1,0 +1,237 @@
+"""The subcommand watch: changes of parameters and events of the component, as text or JSON."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncGenerator, Callable, Sequence
+from contextlib import aclosing, suppress
+from typing import Final, TypeAlias
+
+import anyio
+
+from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.extended import ext_text, read_extended
+from paramclient.cli.json_output import ExtParamJson
+from paramclient.cli.options import LinkOptions
+from paramclient.cli.output import local_time, print_json, print_line, printable, say
+from paramclient.cli.param_names import ChosenNames, check_given, may_appear
+from paramclient.cli.read_commands import fetch_table, get_chosen, report_all
+from paramclient.cli.session import CommandSession, connect, report_others
+from paramclient.client.events import (
+    Discovered,
+    Event,
+    Found,
+    Lost,
+    Rebooted,
+    Resynced,
+)
+from paramclient.client.streams import Changes, Events
+from paramclient.errors import CacheError, ParamClientError
+from paramclient.model.notation import hash_text, time_text, value_json
+from paramclient.model.patterns import NameChoice, is_pattern
+from paramclient.model.values import Param, format_value
+from paramclient.model.wording import counted
+from paramclient.protocol.events import Change
+
+__all__ = ["watch"]
+
+_DEFAULTS: Final = LinkOptions()
+
+_ComponentEvent: TypeAlias = Lost | Found | Rebooted | Resynced
+
+
+async def watch(url: str, /, *names: str, extended: bool = False, options: LinkOptions = _DEFAULTS) -> int:
+    """Print changes of values by any source, as they happen, until Ctrl-C or --timeout.
+
+    Updates the table first, and also prints values that have changed since the cache was written. Also prints
+    when the vehicle is lost, found or rebooted, and when its table is in sync again. Parameters that appear
+    later, such as after a change of an *_ENABLE parameter, are watched too if a name or pattern matches.
+
+    Args:
+        url: The link.
+        names: The parameters to watch, or patterns such as "MC_*". Default: all.
+        extended: Extended parameters (PARAM_EXT_*), such as a camera's.
+    """
+    given = check_given(names)
+    async with connect(url, options, is_live=True) as session:
+        feed = session.component.ext.changes() if extended else session.component.changes()
+        events = session.client.events()
+        known: set[str] | None = None
+        if not session.client.listens_only:
+            code = await (_begin_extended if extended else _begin)(session, given)
+            if code:
+                return code
+            known = set(session.component.ext.params if extended else session.component.params)
+        count = len(session.component.ext.params if extended else session.component.params)
+        everything = counted(count, "extended parameter" if extended else "parameter")
+        say(printable(f"watching {', '.join(given) or everything} of {session.label}"))
+        await report_others([session])
+        failure: Exception | None = None
+        async with anyio.create_task_group() as tasks:
+            if given and not extended and not any(map(is_pattern, given)) and known is not None:
+                tasks.start_soon(_follow_groups, session)
+            with anyio.move_on_after(session.deadline.left()):
+                try:
+                    choice = NameChoice(given) if given else None
+                    await _print_changes_and_events(session, feed, events, known, choice, extended=extended)
+                except Exception as error:  # raised here, the task group would wrap it in a group
+                    failure = error
+            tasks.cancel_scope.cancel()
+        if failure is not None:
+            raise failure
+    return ExitCode.DONE
+
+
+async def _begin(session: CommandSession, given: Sequence[str]) -> int:
+    """Update the table, and report the names that the vehicle does not have; return the exit code.
+
+    A name or pattern of a group that the vehicle currently hides may appear later, and is no error.
+    """
+    patterns = [text for text in given if is_pattern(text)]
+    if patterns or not given:
+        with suppress(CacheError):  # with an empty cache, all received parameters are new
+            await fetch_table(session)
+    if not given:
+        return ExitCode.DONE
+    _, errors = await get_chosen(session, [text for text in given if not is_pattern(text)])
+    errors |= ChosenNames.of(session.component, patterns).errors
+    hidden = [name for name in errors if may_appear(name, session.component)]
+    if hidden:
+        say(printable(f"not there at present: {', '.join(hidden)}"))
+    return report_all(error for name, error in errors.items() if name not in hidden)
+
+
+async def _begin_extended(session: CommandSession, given: Sequence[str]) -> int:
+    """Update the extended parameters, and report unknown names; return the exit code."""
+    if not given or any(map(is_pattern, given)):
+        with suppress(CacheError):
+            await session.component.ext.fetch_all(timeout=session.deadline.left())
+    _, errors = await read_extended(session, [name for name in given if not is_pattern(name)])
+    return report_all(errors)
+
+
+async def _follow_groups(session: CommandSession) -> None:
+    """Fetch the table, so that added and removed parameters are noticed. Values were read already."""
+    with suppress(ParamClientError):  # the events and the end of the changes report it
+        await session.component.fetch_all()
+
+
+async def _print_changes_and_events(
+    session: CommandSession,
+    changes: Changes,
+    events: Events,
+    known: set[str] | None,
+    choice: NameChoice | None,
+    *,
+    extended: bool,
+) -> None:
+    """Print changes and events of the component until cancelled.
+
+    Args:
+        session: the session.
+        changes: the changes of the component, or of its extended parameters.
+        events: the events of the client.
+        known: names of the table at the start. The first value of any other parameter is not a change. None:
+            the first value of every parameter is not a change.
+        choice: the names to watch; None for all.
+        extended: whether the changes are those of extended parameters.
+    """
+    async with aclosing(_merged(changes, events)) as merged:
+        async for each in merged:
+            if isinstance(each, Change):
+                if each.kind == "first" and (known is None or each.name in known):
+                    known = known and known - {each.name}
+                    continue
+                if choice is not None and not choice.has(each.name):
+                    continue
+                text = _change_text(each, ext_text if extended else _plain_text)
+            elif isinstance(each, Discovered) or each.component is not session.component:
+                continue
+            else:
+                text = _event_text(each)
+            at = session.now
+            if session.options.json:
+                print_json(_line(each, at, ExtParamJson.of if extended else _plain_json))
+            else:
+                print_line(f"{local_time(at)}  {text}")
+
+
+async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | Event]:
+    """Yield changes and events in the order of their arrival."""
+    waiting: dict[asyncio.Future[Change | Event], Changes | Events] = {}
+
+    def wait(feed: Changes | Events) -> None:
+        waiting[asyncio.ensure_future(anext(feed))] = feed
+
+    try:
+        wait(changes)
+        wait(events)
+        while waiting:
+            done, _ = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+            for each in [each for each in waiting if each in done]:
+                feed = waiting.pop(each)
+                if not isinstance(each.exception(), StopAsyncIteration):  # else a log has ended
+                    wait(feed)
+                    yield each.result()
+    finally:
+        for each in waiting:
+            if not each.cancel():
+                each.exception()  # both end with the link; one error is reported
+
+
+def _line(item: Change | _ComponentEvent, at: float, shown: Callable[[Param], object]) -> dict[str, object]:
+    """Return the JSON of a change or an event."""
+    if isinstance(item, Change):
+        old, new = (None if param is None else shown(param) for param in (item.old, item.new))
+        return {
+            "time": time_text(at),
+            "name": item.name,
+            "old": old,
+            "new": new,
+            "by": item.by,
+            "kind": item.kind,
+        }
+    event: dict[str, object] = {
+        "time": time_text(at),
+        "event": type(item).__name__.lower(),
+        "system": item.component.system,
+        "component": item.component.component,
+    }
+    if isinstance(item, Lost | Found):
+        event["silence_s"] = round(item.silence, 4)
+    if isinstance(item, Resynced):
+        event |= {"changed": list(item.changed), "hash": hash_text(item.hash)}
+    return event
+
+
+def _plain_json(param: Param) -> object:
+    return value_json(param.settable, param.type_number)
+
+
+def _plain_text(param: Param) -> str:
+    return format_value(param.settable, param.type_number)
+
+
+def _change_text(change: Change, shown: Callable[[Param], str | None]) -> str:
+    old, new = (
+        "none" if param is None else printable(shown(param) or "") for param in (change.old, change.new)
+    )
+    if change.kind == "added":
+        return f"{change.name}  added: {new}  ({change.by})"
+    if change.kind == "removed":
+        return f"{change.name}  removed, was {old}  ({change.by})"
+    return f"{change.name}  {old} -> {new}  ({change.by})"
+
+
+def _event_text(event: _ComponentEvent) -> str:
+    match event:
+        case Lost():
+            text = f"lost: nothing received for {event.silence:.1f} s"
+        case Found():
+            text = f"found after {event.silence:.1f} s"
+        case Rebooted():
+            text = "rebooted"
+        case Resynced():
+            count = len(event.changed)
+            text = f"resynced: {count or 'no'} {'value' if count == 1 else 'values'} had changed"
+    return f"{event.component.system}/{event.component.component} {text}"

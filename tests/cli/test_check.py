@@ -1,0 +1,88 @@
+"""check: what a vehicle serves, how fast, and what is slow or unusual."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
+from paramclient.sim.param_table import Entry
+from tests.commands import Command, Put, behind, in_process, leaping
+from tests.shell import Tap
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Run the command line in this process, on simulated time."""
+    leaping(monkeypatch)
+    return in_process(capsys)
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    return behind(monkeypatch, "udpin:0.0.0.0:14550")
+
+
+def texts(document: dict[str, Any]) -> str:
+    return " ".join(each["text"] for each in document["findings"])
+
+
+def test_a_vehicle_on_a_good_link_has_no_findings(command: Command, put: Put) -> None:
+    for vehicle in (PX4Vehicle(), ArduPilotVehicle()):
+        done = command("check", put(vehicle), "--json")
+        assert (done.code, done.json["findings"]) == (0, [])
+        assert done.json["list"]["received"] == done.json["list"]["count"]
+        assert 0 <= done.json["link"]["round_trip"]["median_s"] < 0.1
+    assert (done.json["files"]["parameters"], done.json["files"]["is_serving"]) == (1382, True)
+    assert 45 < done.json["reads"]["per_s"] < 55
+
+
+def test_nothing_is_changed(command: Command, put: Put) -> None:
+    vehicle = Tap(PX4Vehicle())
+    assert command("check", put(vehicle)).code == 0
+    names = {type(message).__name__ for _, _, message in vehicle.received}
+    assert not names & {"ParamSet", "ParamSetMessage"}
+
+
+def test_the_output_is_a_table(command: Command, put: Put) -> None:
+    done = command("check", put(Air([PX4Vehicle(), ArduPilotVehicle(system=2)])), "--vehicle", "1")
+    rows = dict(row for row in done.rows if len(row) == 2)
+    assert rows["vehicle"] == "1/1 px4 quadrotor, disarmed"
+    assert rows["list"].startswith("903 of 903 in ")
+    assert rows["other autopilots"] == "2/1"
+    assert done.out.endswith("Nothing slow or unusual.\n")
+
+
+def test_a_lossy_link_is_a_finding(command: Command, put: Put) -> None:
+    air = Air.symmetric([ArduPilotVehicle(ftp=False)], loss=0.2, delay=0.3, seed=1)
+    found = command("check", put(air), "--json").json
+    assert found["link"]["loss"] > 0.1
+    assert "of the vehicle's frames were lost" in texts(found)
+    assert "The packed parameter file cannot be read" in texts(found)
+
+
+class Silent(GenericVehicle):
+    """A vehicle that never sends one of its parameters, and acknowledges no command."""
+
+    def _send_value(self, entry: Entry, **where: Any) -> None:
+        if entry.name != "B":
+            super()._send_value(entry, **where)
+
+
+def test_missing_parameters_are_a_problem(command: Command, put: Put) -> None:
+    done = command("check", put(Silent({"A": 1, "B": 2, "C": 3})), "--json")
+    assert (done.code, done.json["list"]["missing"]) == (1, 1)
+    assert "1 of 3 parameters stayed missing" in texts(done.json)
+
+
+def test_without_time_a_list_is_cut_short(command: Command, put: Put) -> None:
+    done = command("check", put(PX4Vehicle(burst=1, period=0.05)), "--json", "--timeout", 15)
+    assert (done.code, done.json["list"]["is_cut_short"]) == (1, True)
+    assert "The list is received at 20 values per second" in texts(done.json)
+
+
+def test_only_a_link_to_a_vehicle_can_be_measured(command: Command, put: Put) -> None:
+    log = command("check", "replay:tests/data/px4_get_set.tlog")
+    assert (log.code, "is a log: check needs a link to a vehicle" in log.err) == (2, True)
+    assert command("check", put(PX4Vehicle()), "--vehicle", "9", "--timeout", 3).code == 3
