@@ -6,7 +6,7 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Final, TypeVar
@@ -91,12 +91,19 @@ class CacheWriter:
             summaries = await self._try(self.cache.components) or ()
             self._known = {(each.system, each.component) for each in summaries}
 
-    async def close(self) -> None:
-        """Write all new values, warn of lost ones, and close the cache if it is owned."""
+    async def close(self, nodes: Iterable[Node]) -> None:
+        """Write all new values, warn of lost ones, and close the cache if it is owned.
+
+        Args:
+            nodes: the components. The complete table of one that was not identified yet is written too.
+        """
         if self.cache is None:
             return
         is_written = False
         with anyio.move_on_after(CLOSE_WAIT_MAX, shield=True):
+            for node in nodes:
+                if node not in self._identities and any(each.table.is_complete for each in node.sessions):
+                    await self.load(node)
             is_written = await self.flush()
         if not is_written:
             logger.warning("the last values could not be written to the cache: %s", self.failure or "timeout")

@@ -51,8 +51,8 @@ if TYPE_CHECKING:
 __all__ = ["ParamClient"]
 
 VEHICLES_LISTENING_TIME: Final = 3.0
-"""Seconds after the first autopilot in which further ones are looked for: three heartbeats, of which two may be
-lost."""
+"""Seconds after the first autopilot in which further ones are looked for: three heartbeats, two of which may
+be lost."""
 LISTENING_TIME: Final = 1.2
 """Seconds after the client was opened in which components are waited for, by a fetch of all."""
 
@@ -77,8 +77,8 @@ class ParamClient:
             close it), or False for none. A replayed log neither reads nor writes a cache.
         system, component: MAVLink ids of this client, 1 to 255.
         encoding: parameter encoding of all components; None detects it for each component.
-        watch_interval: seconds between two checks of each fetched table against the vehicle, at least 1. None:
-            every 30 s for a vehicle with a hash, and for others if a download takes no more than 1.5 s. 0
+        watch_interval: seconds between two checks of each fetched table against the vehicle, at least 1.
+            None: every 30 s for a vehicle with a hash, and for others if a download takes no more than 1.5 s. 0
             disables the checks. See `Component.sync_state`.
         policy: which requests may update tables, see `Policy`: "auto", "hash-only" or "cache-only". Any value
             but "auto" also disables the checks of `watch_interval`.
@@ -201,7 +201,7 @@ class ParamClient:
         """
         if self._is_entered:
             raise UsageError(
-                "the client was opened by `async with`, which closes it: leave its body instead of calling aclose"
+                "the client was opened by `async with`, which closes it at its end; do not call aclose"
             )
         if self._task is not None:
             await self._task.close()

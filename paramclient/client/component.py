@@ -52,8 +52,8 @@ __all__ = ["Component", "ComponentState"]
 CACHE_TIMEOUT: Final = 1.5
 """Seconds to wait for the identity of a component, without which its cached table cannot be loaded."""
 REBOOT_TIMEOUT: Final = 60.0
-"""Seconds for a vehicle to reboot and report its identity, by default: small autopilot boards take up to 30 s,
-and boards that calibrate sensors first a little longer."""
+"""Seconds for a vehicle to reboot and report its identity, by default: small autopilot boards take up to 30
+seconds, and boards that calibrate sensors first a little longer."""
 PASSIVE_TIMEOUT: Final = 20.0
 """Seconds of a fetch where nothing is sent, by default: another station may never request a list."""
 SETUP_SIGNING_COUNT: Final = 3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import anyio
@@ -149,7 +150,8 @@ class ClientCore:
 
     async def _release(self) -> None:
         with anyio.CancelScope(shield=True):
-            for close in (self.cache_writer.close, self.taps.close, self.link.close):
+            cache_close = partial(self.cache_writer.close, self.station.nodes.values())
+            for close in (cache_close, self.taps.close, self.link.close):
                 try:
                     await close()
                 except ParamClientError as error:

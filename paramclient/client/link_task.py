@@ -18,8 +18,8 @@ from paramclient.protocol.station import Peer, Station
 __all__ = ["LinkTask", "Tap"]
 
 READ_PAUSE: Final = 0.02
-"""Seconds for which the reader pauses while no conversation waits, so that telemetry accumulates: 20 datagrams
-in one read take a fifth of the CPU time of 20 reads. A change in a pause is reported that much later."""
+"""Seconds for which the reader pauses while no conversation waits, so that telemetry accumulates: 20
+datagrams in one read take a fifth of the CPU time of 20 reads. A change in a pause is reported that much later."""
 PAUSE_DATAGRAMS_MAX: Final = 64
 """Datagrams in one pause at the rate of the last read, at most: an eighth of Linux' default socket buffer."""
 CHUNKS_PER_TURN: Final = 64
@@ -55,8 +55,8 @@ class Tap(Protocol):
 class LinkTask:
     """Passes received data from a link to the station, and its frames to the link.
 
-    `read` and `send` run concurrently while the client is open. A dropped link that can reconnect is reopened;
-    requests wait meanwhile, and fail after `LINK_TIMEOUT`.
+    `read` and `send` run concurrently while the client is open. A dropped link that can reconnect is
+    reopened; requests wait meanwhile, and fail after `LINK_TIMEOUT`.
 
     Args:
         link: an open link.

@@ -18,8 +18,8 @@ from paramclient.protocol.events import Change
 __all__ = ["Changes", "Events", "Stream", "Subscribers"]
 
 CHANGES_MAX: Final = 100_000
-"""Queued changes for a consumer, one for each name, at most: more than a table holds. Above it, the oldest are
-dropped."""
+"""Queued changes for a consumer, one for each name, at most: more than a table holds. Above it, the oldest
+are dropped."""
 EVENTS_MAX: Final = 1_000
 """Queued events for a consumer, at most. Above it, the oldest are dropped."""
 

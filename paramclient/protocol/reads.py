@@ -119,8 +119,9 @@ def _unknown(session: Session, which: str | int) -> UnknownParameter:
     system, component = session.channel.target
     name, index = (which, None) if isinstance(which, str) else (None, which)
     nearest = () if name is None else nearest_names(name, session.table.params)
+    what = f"{'' if name else 'parameter with index '}{which}"
     return UnknownParameter(
-        f"{system}/{component} has no {'' if name else 'parameter with index '}{which}.{did_you_mean(nearest)}",
+        f"{system}/{component} has no {what}.{did_you_mean(nearest)}",
         system=system,
         component=component,
         name=name,

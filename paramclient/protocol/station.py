@@ -236,7 +236,7 @@ class Station:
         node.receive(message, now, frame.version)
 
     def _moves(self, node: Node, peer: Peer, message: Message, now: float) -> bool:
-        """Return whether a component is at another peer now: its own one is silent, or it is the same link."""
+        """Return whether a component is at another peer now: its own is silent, or it is the same link."""
         if now - node.presence.received_at > RIVAL_TIME or node.is_same_vehicle(message):
             node.peer = peer
             node.rival = None
