@@ -18,8 +18,8 @@ from paramclient.protocol.station import Peer, Station
 __all__ = ["LinkTask", "Tap"]
 
 READ_PAUSE: Final = 0.02
-"""Seconds for which the reader pauses while no conversation waits, so that telemetry accumulates: 20
-datagrams in one read take a fifth of the CPU time of 20 reads. A change in a pause is reported that much later."""
+"""Seconds for which the reader pauses while no conversation waits, so that telemetry accumulates: one read of
+20 datagrams takes a fifth of the CPU time of 20 reads. A change in a pause is reported that much later."""
 PAUSE_DATAGRAMS_MAX: Final = 64
 """Datagrams in one pause at the rate of the last read, at most: an eighth of Linux' default socket buffer."""
 CHUNKS_PER_TURN: Final = 64
