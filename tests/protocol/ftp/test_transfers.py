@@ -195,36 +195,6 @@ class TestReading:
         desk.closed()
         assert read.result == b"a" * 100 + b"b" * 100 + b"c" * 100
 
-    def test_an_end_that_is_lost_is_requested(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened(size=480)
-        desk.now += 0.1
-        desk.answer(burst, b"a" * 239)
-        desk.now += 0.01
-        desk.answer(burst, b"b" * 239, offset=239, nth=2)
-        assert desk.take() == []
-        desk.pass_time(0.2)
-        requested = desk.take()
-        assert [packet.opcode for packet in requested] == [Opcode.READ_FILE] * len(requested)
-        assert requested[0].offset == 478
-        desk.answer(requested[0], code=FileErrorCode.EOF)
-        desk.closed()
-        assert read.result == b"a" * 239 + b"b" * 239
-
-    def test_a_burst_that_ends_early_is_followed_by_another(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened(size=5000)
-        desk.answer(burst, b"a" * 239, complete=True)
-        second = desk.next(Opcode.BURST_READ_FILE)
-        assert second.offset == 239
-        desk.answer(burst, b"a" * 239, complete=True)
-        desk.answer(burst, code=FileErrorCode.FAIL, nth=2)
-        assert desk.take() == []
-        desk.answer(second, b"b" * 239, offset=239)
-        desk.answer(second, code=FileErrorCode.EOF, offset=478, nth=2)
-        desk.closed()
-        assert read.result == b"a" * 239 + b"b" * 239
-
     def test_a_burst_that_falls_silent_in_the_middle_is_requested_again(self) -> None:
         desk = Desk()
         read, burst = desk.opened(size=50_000)
@@ -281,17 +251,6 @@ class TestWhatIsNotForUs:
         desk.closed()
         assert read.result == b"new" * 50
 
-    def test_every_file_has_a_session_of_its_own(self) -> None:
-        desk = Desk()
-        sessions = set()
-        for _ in range(300):
-            read = desk.transfers.read("a", desk.now)
-            request = desk.first(Opcode.OPEN_FILE_RO)
-            sessions.add(request.session)
-            desk.answer(request, code=FileErrorCode.FILE_NOT_FOUND)
-            assert read.done
-        assert sessions == set(range(1, 256))
-
 
 class TestRefusals:
     @pytest.mark.parametrize(
@@ -313,14 +272,6 @@ class TestRefusals:
         assert error.is_not_found == (code in (10, 2))
         assert desk.take() == []
         assert desk.transfers.is_idle
-
-    def test_a_refused_read_closes_the_session(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened()
-        desk.answer(burst, b"x" * 239, offset=239)
-        desk.answer(desk.next(Opcode.READ_FILE), b"\x16", code=FileErrorCode.FAIL_ERRNO)
-        desk.closed()
-        assert error_of(read).errno == 22
 
     def test_a_session_that_is_lost_on_board_is_opened_again(self) -> None:
         desk = Desk()
@@ -391,21 +342,6 @@ class TestSilence:
             Opcode.TERMINATE_SESSION,
             Opcode.TERMINATE_SESSION,
         ]
-
-    def test_a_close_without_an_answer_does_not_hold_up_the_next_for_ever(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened()
-        desk.answer(burst, b"abc")
-        desk.answer(burst, code=FileErrorCode.EOF, offset=3, nth=2)
-        desk.transfers.read("b", desk.now)
-        began = desk.now
-        while not read.done:
-            assert not [packet for packet in desk.take() if packet.opcode == Opcode.OPEN_FILE_RO]
-            desk.now = desk.transfers.next_deadline()
-            desk.transfers.tick(desk.now)
-        assert read.result == b"abc"
-        assert desk.now - began <= 5.0
-        assert b"b" in [packet.data for packet in desk.take()]
 
     def test_the_end_of_a_link_ends_everything(self) -> None:
         desk = Desk()
@@ -483,20 +419,6 @@ class TestTurns:
         desk.closed(session=3)
         assert not read.done
 
-    def test_one_whose_open_is_never_answered_is_closed_blindly(self) -> None:
-        desk = Desk()
-        read = desk.transfers.read("a", desk.now)
-        request = desk.opening()
-        desk.transfers.release(read, desk.now)
-        desk.take()
-        desk.pass_time()
-        *opens, last, copy = desk.take()
-        assert {packet.opcode for packet in opens} == {Opcode.OPEN_FILE_RO}
-        assert last == copy
-        assert (last.opcode, last.session) == (Opcode.TERMINATE_SESSION, request.session)
-        assert desk.transfers.is_idle
-        assert not read.done
-
 
 class TestHaste:
     def known_link(self) -> Desk:
@@ -528,26 +450,6 @@ class TestHaste:
         desk.answer(burst, code=FileErrorCode.EOF, offset=3, nth=2)
         desk.closed(first.session)
         assert read.result == b"abc"
-
-    def test_the_first_bytes_show_that_the_burst_was_of_another_file(self) -> None:
-        """The refusal of the open was lost: another station's session has its number."""
-        desk = self.known_link()
-        read = desk.transfers.read("a", desk.now, magics=(b"up",))
-        first, _, burst = desk.take()
-        desk.answer(burst, b"x" * 239)
-        desk.answer(burst, b"x" * 239, offset=239, nth=2)
-        assert desk.take() == []
-        desk.answer(burst, code=FileErrorCode.EOF, offset=478, nth=3)
-        *closes, again, _, burst = desk.take()
-        assert {packet.opcode for packet in closes} == {Opcode.TERMINATE_SESSION}
-        assert (again.opcode, again.data) == (Opcode.OPEN_FILE_RO, b"a")
-        assert again.sequence != first.sequence
-        assert read.result is None
-        desk.answer(again, bytes(4))
-        desk.answer(burst, b"up")
-        desk.answer(burst, code=FileErrorCode.EOF, offset=2, nth=2)
-        desk.closed(again.session)
-        assert read.result == b"up"
 
     def test_but_not_for_ever(self) -> None:
         desk = self.known_link()
@@ -581,24 +483,6 @@ class TestWriting:
         desk.closed()
         assert write.done
         assert write.error is None
-
-    def test_an_unanswered_request_is_repeated_with_its_sequence_number(self) -> None:
-        desk = Desk()
-        desk.transfers.write("a", b"abc", desk.now)
-        desk.answer(desk.next(Opcode.CREATE_FILE), session=9)
-        first = desk.next(Opcode.WRITE_FILE)
-        desk.pass_time(1.5)
-        again = desk.take()
-        assert again
-        assert set(again) == {first}
-
-    def test_a_piece_that_is_refused(self) -> None:
-        desk = Desk()
-        write = desk.transfers.write("a", b"abc", desk.now)
-        desk.answer(desk.next(Opcode.CREATE_FILE), session=9)
-        desk.answer(desk.next(Opcode.WRITE_FILE), b"\x1c", code=FileErrorCode.FAIL_ERRNO)
-        desk.closed()
-        assert str(error_of(write)) == "1/1 does not write a: fail errno 28"
 
     def test_a_file_that_is_refused_as_a_whole(self) -> None:
         desk = Desk()
@@ -829,23 +713,6 @@ class TestOnTheAir:
         assert ground.read("a") == content
         ground.settle()
 
-    def test_the_tail_of_a_large_file_is_read_by_bursts(self) -> None:
-        vehicle = PX4Vehicle()
-        vehicle.files["log/1.ulg"] = bytes(number * 7 % 251 for number in range(600_000))
-        ground = Ground(vehicle, delay=0.05)
-        assert ground.read("log/1.ulg") == vehicle.files["log/1.ulg"]
-        assert ground.now < 2.5  # 15 bursts; the last 90 kB alone took 9 s by single reads
-        assert ground.requests < 25
-
-    @pytest.mark.parametrize("loss", [0.02, 0.05, 0.1])
-    def test_a_file_from_px4_over_a_lossy_link_without_delay(self, loss: float) -> None:
-        for seed in range(6):
-            vehicle = PX4Vehicle()
-            vehicle.files["log/1.ulg"] = bytes(number * 7 % 251 for number in range(100_000))
-            ground = Ground(vehicle, loss=loss, seed=seed)
-            assert ground.read("log/1.ulg") == vehicle.files["log/1.ulg"]
-            assert ground.now < 2.0
-
     @pytest.mark.parametrize("job", ["list", "checksum"])
     def test_a_list_and_a_checksum_wait_for_the_session_of_another_station(self, job: str) -> None:
         vehicle = ardupilot()
@@ -874,13 +741,6 @@ class TestOnTheAir:
         assert (vehicle.open_files, read.done) == (["log/1.ulg"], False)
         assert ground.outcome(read) == b"b" * 1000
         assert 11.0 < ground.now < 16.0  # PX4 closes what is not used for 11 s
-
-    def test_a_file_of_several_bursts(self) -> None:
-        vehicle = PX4Vehicle()
-        vehicle.files["log"] = bytes(range(250)) * 400
-        ground = Ground(vehicle, loss=0.1, delay=0.05, seed=3)
-        assert ground.read("log") == vehicle.files["log"]
-        ground.settle()
 
     @thorough
     @given(faults, st.integers(0, 1500), st.booleans())
@@ -948,15 +808,6 @@ class TestOnTheAir:
         vehicle.reboot(ground.now, down=0.3)
         assert param_pck.decode(ground.outcome(read) or b"").total == 1382
         ground.settle()
-
-    def test_a_close_is_not_repeated_while_the_burst_still_arrives(self) -> None:
-        ground = Ground(ardupilot(ftp_rate=5760.0), delay=0.01)
-        read = ground.transfers.read(PARAMS, ground.now)
-        ground.run(1.0)
-        before = ground.requests
-        ground.transfers.release(read, ground.now)
-        ground.settle()
-        assert ground.requests - before == 1
 
     @pytest.mark.parametrize("after", [0.0, 0.06, 0.12, 0.3])
     def test_released_at_any_moment_it_leaves_nothing_open(self, after: float) -> None:
@@ -1044,9 +895,3 @@ class TestSpeed:
         beats = 2 * (ground.now - start + 1)  # HEARTBEAT and SYSTEM_TIME
         banner = 3
         assert ground.air.downlink.sent - sent <= 64 + 1 + banner + beats + 8
-
-    def test_a_slow_link_does_not_get_it_twice(self) -> None:
-        vehicle = ardupilot(ftp_rate=400.0)
-        ground = Ground(vehicle, round_trip=0.2, delay=0.075, rate=1200, queue=1024, loss=0.05, seed=2)
-        ground.read(PARAMS + "?withdefaults=1")
-        assert ground.air.downlink.sent < 64 * 1.5 + 2 * ground.now

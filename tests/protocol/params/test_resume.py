@@ -227,6 +227,7 @@ anyio.run(main)
 """
 
 
+@pytest.mark.slow  # it runs a process
 @pytest.mark.parametrize(
     ("make", "made", "after"),
     [

@@ -10,7 +10,6 @@ from paramclient.errors import ContestedAddress, NoReply
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentContested, ComponentReplaced, ComponentUncontested, Event
-from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.requests.retry import PEER_REQUESTS
 from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle import address_contest as room
@@ -19,7 +18,6 @@ from paramclient.protocol.wire import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_PX4,
     MAV_CMD_REQUEST_MESSAGE,
-    MAV_TYPE_GCS,
     AutopilotVersion,
     CommandLong,
     Framer,
@@ -203,19 +201,6 @@ def test_two_of_one_kind_are_distinguished_by_id_and_clock(other: dict[str, obje
     assert net.kinds() == ["Contested"], "reported once"
 
 
-def test_the_id_that_every_simulated_px4_has_shows_nothing() -> None:
-    uid = 0x4954414C44494E4F
-    net = Net(a=Speaker(uid=uid), b=Speaker(uid=uid, booted_at=-50.0, start=0.4))
-    net.run(3.0)
-    assert net.kinds() == ["Contested"]
-    net = Net(a=Speaker(uid=uid), b=Speaker(uid=uid, start=0.4))
-    net.run(10.0)
-    assert net.kinds() == []
-    net = Net(a=Speaker(uid=uid, booted_at=None), b=Speaker(uid=uid, booted_at=None, start=0.4))
-    net.run(10.0)
-    assert net.kinds() == ["Contested"]
-
-
 def test_requests_go_to_the_peer_that_gives_the_hardware_id() -> None:
     """Also if the forger was received first."""
     vehicle = Speaker(PX4, start=0.4)
@@ -281,16 +266,6 @@ def test_a_vehicle_that_starts_again_behind_two_paths_is_no_contest() -> None:
     assert net.kinds() == []
 
 
-def test_ground_stations_with_one_address_are_no_contest() -> None:
-    gcs = Heartbeat(MAV_TYPE_GCS, 8)
-    net = Net(
-        a=Speaker(gcs, uid=None, booted_at=None, system=254),
-        b=Speaker(gcs, uid=None, booted_at=None, start=0.3, system=254),
-    )
-    net.run(20.0)
-    assert net.kinds() == []
-
-
 def test_components_of_one_system_may_have_several_peers() -> None:
     net = Net(a=Speaker())
     net.run(2.0)
@@ -301,18 +276,6 @@ def test_components_of_one_system_may_have_several_peers() -> None:
     net.machine.read("P", net.now)
     targets = {peer for _, peer in net.station.data_to_send()}
     assert targets == {"a", "camera"}
-
-
-def test_a_heartbeat_from_a_forged_address_brings_that_seven_requests_and_no_more() -> None:
-    station = Station(link="udpin:test", is_stream=False, sync_settings=SyncSettings.chosen(None, "auto"))
-    station.receive(wire.encode(PX4, system=9, component=1, sequence=0), "victim", 0.0)
-    framer, sent = Framer(wire.DECODED_IDS, stream=False), []
-    for step in range(1200):
-        station.tick(step * STEP)
-        for data, peer in station.data_to_send():
-            if peer == "victim":
-                sent += [wire.decode(frame) for frame in framer.receive(data)]
-    assert len(sent) <= 7
 
 
 # A peer in place of another
@@ -463,25 +426,6 @@ def test_nothing_is_written_to_a_peer_without_an_id_while_another_may_be_the_veh
         assert not any(isinstance(each, ParamSetMessage) for each in peer.received)
 
 
-def test_a_vehicle_that_connects_anew_goes_on() -> None:
-    station = Station(link="tcpin:test", is_stream=True)
-    net = Net(a=Speaker(), station=station)
-    net.run(2.0)
-    hold(net, "P", "Q")
-    station.receive(b"", "a", net.now)
-    net.peers["a"].end = net.now
-    net.run(1.0)
-    assert not station.data_to_send() or all(peer is None for _, peer in station.data_to_send())
-    net.peers["b"] = Speaker(start=net.now)
-    net.run(1.0)
-    assert net.machine.peers.home == "b"
-    assert [*net.machine.table.params] == ["P", "Q"]
-    write = net.machine.write("P", 5.0, net.now)
-    net.run(0.5)
-    assert write.result is not None
-    assert not any(isinstance(each, ComponentReplaced) for each in net.events)
-
-
 def test_a_component_that_no_longer_identifies_itself_is_not_written_to() -> None:
     """At a serial port only the id shows whether it is the vehicle that was there before."""
     speaker = Speaker(end=3.0)
@@ -502,20 +446,6 @@ def test_a_component_that_no_longer_identifies_itself_is_not_written_to() -> Non
     net.run(2.0)
     assert again.result is not None
     assert len([each for each in speaker.received if isinstance(each, ParamSetMessage)]) == 1
-
-
-def test_a_restart_at_a_new_port_may_take_its_time_to_answer() -> None:
-    after = Speaker(uid=None, booted_at=None, start=4.0)
-    net = Net(a=silent_after(3.0), b=after)
-    net.run(2.0)
-    hold(net, "P", "Q")
-    net.machine.begin_reboot(net.now)
-    net.run(10.0)
-    after.uid, after.booted_at = 1, 3.5
-    net.run(6.0)
-    assert net.machine.peers.home == "b"
-    assert not any(isinstance(each, ComponentReplaced) for each in net.events)
-    assert [*net.machine.table.params] == ["P", "Q"]
 
 
 def camera(net: Net, peer: str, value: float) -> ComponentMachine:
