@@ -105,11 +105,6 @@ class CacheWriter:
         self._replacements = 0 if cache is None else cache.replacements
         self._ahead = -math.inf  # of unix time to the components' time, in seconds
 
-    @property
-    def failure(self) -> CacheError | None:
-        """Why the cache cannot be written; None while it can."""
-        return self._failure
-
     async def open(self) -> None:
         """Load the list of cached components."""
         if self._cache is not None:
