@@ -23,13 +23,13 @@ from typing import Any, Self
 import pytest
 
 import paramclient
-from paramclient import LinkError, ParamCache, ParamErrorCode, ParamType
+from paramclient import LinkError, ParamCache, ParamType
 from paramclient.cli import run
 from paramclient.cli import watch as watch_command
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import printable
-from paramclient.errors import ClientClosed, ParamClientError
+from paramclient.errors import ClientClosed, ParamClientError, ParamErrorCode
 from paramclient.links import Peer, SimLink
 from paramclient.protocol import wire
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table

@@ -26,7 +26,6 @@ from paramclient import (
     LinkError,
     NoReply,
     ParamClient,
-    ParamErrorCode,
     ParamType,
     Progress,
     Refused,
@@ -37,6 +36,7 @@ from paramclient import (
 )
 from paramclient.client import arguments, link_task, reconnect_delays
 from paramclient.client.component_core import IDENTITY_TIMEOUT
+from paramclient.errors import ParamErrorCode
 from paramclient.links import Peer, create_link, serve_endpoint
 from paramclient.protocol import wire
 from paramclient.protocol.station import Station

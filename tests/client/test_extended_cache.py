@@ -8,11 +8,12 @@ from pathlib import Path
 import anyio
 import pytest
 
-from paramclient import ExtChange, ParamCache, ParamClient, Policy, Trust
+from paramclient import ParamCache, ParamClient, Policy, Trust
 from paramclient.cache import CachedExtTable
 from paramclient.cache.sqlite import SqliteStore
 from paramclient.errors import CacheError
 from paramclient.logs.telemetry import import_log
+from paramclient.protocol.ext.change import ExtChange
 from paramclient.sim import Air, Camera, PX4Vehicle
 from tests.caches import extended
 from tests.shell import in_simulated_time

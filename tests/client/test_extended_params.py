@@ -13,22 +13,20 @@ import pytest
 
 from paramclient import (
     CacheError,
-    ExtChange,
-    ExtParamType,
-    ExtSetOutcome,
-    ExtSettable,
     LinkError,
     NoReply,
     NotDurable,
     ParamCache,
     Policy,
     Progress,
-    SetFailed,
     SetStatus,
     UnknownParameter,
     UsageError,
-    ValueUnsupported,
 )
+from paramclient.errors import SetFailed, ValueUnsupported
+from paramclient.model.ext_params import ExtParamType, ExtSettable
+from paramclient.protocol.ext.change import ExtChange
+from paramclient.protocol.ext.write_batch import ExtSetOutcome
 from paramclient.sim import Air, Camera, PX4Vehicle
 from tests import shell
 from tests.caches import extended

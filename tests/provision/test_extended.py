@@ -11,8 +11,6 @@ from paramclient import (
     Component,
     ExtParam,
     ExtParamSet,
-    ExtSetOutcome,
-    ExtValue,
     NoReply,
     NotInCache,
     ParamCache,
@@ -20,6 +18,8 @@ from paramclient import (
     UsageError,
 )
 from paramclient.files.disk import read_extended_file
+from paramclient.model.ext_params import ExtValue
+from paramclient.protocol.ext.write_batch import ExtSetOutcome
 from paramclient.provision import (
     apply_extended,
     load_extended_state,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from paramclient import LinkError, ParamClient, TrafficReport
+from paramclient import LinkError, ParamClient
 from paramclient.protocol import wire
 from paramclient.protocol.station import Station
 from paramclient.protocol.stats import traffic as room
@@ -20,7 +20,7 @@ from paramclient.protocol.stats.packet_loss import (
     SequenceCheck,
 )
 from paramclient.protocol.stats.sniffer import SeenFrame, Sniffer
-from paramclient.protocol.stats.traffic import ComponentTraffic, Traffic
+from paramclient.protocol.stats.traffic import ComponentTraffic, Traffic, TrafficReport
 from paramclient.protocol.wire import Framer, Heartbeat
 from paramclient.sim import Air, FaultyLink, PX4Vehicle
 from tests.simulation import Simulation

@@ -6,7 +6,8 @@ import math
 
 import pytest
 
-from paramclient import CommandRefused, CommandResult, LinkError, NoReply, Refused
+from paramclient import CommandRefused, LinkError, NoReply, Refused
+from paramclient.errors import CommandResult
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.retry import RetryPolicy
 from paramclient.protocol.vehicle.commands import Command, Commands

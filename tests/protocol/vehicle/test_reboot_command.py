@@ -14,13 +14,13 @@ import pytest
 from paramclient import (
     AnotherVehicle,
     CommandRefused,
-    CommandResult,
     Component,
     NoReply,
     ParamClient,
     Rebooted,
 )
 from paramclient.client.component import REBOOT_TIMEOUT
+from paramclient.errors import CommandResult
 from paramclient.protocol import wire
 from paramclient.protocol.requests.retry import REBOOT_COMMANDS_MAX
 from paramclient.protocol.vehicle.reboot_command import SAVING_TIME, UNOBSERVED_TIMEOUT
