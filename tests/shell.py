@@ -421,7 +421,7 @@ def _nothing() -> None:
 
 def extended(cache: ParamCache, system: int | None = None) -> CachedExtTable:
     """The only table of extended parameters in a cache, or the only one of this system."""
-    keys = {each.key for each in cache.vehicles() if system in (None, each.system)}
+    keys = {each.key for each in cache.vehicles() if system in (None, each.identity.system)}
     ((key, number),) = [each for each in cache.ext_sizes() if each[0] in keys]
     found = cache.load_ext(key, number)
     assert found is not None
