@@ -16,7 +16,6 @@ import anyio
 import anyio.to_thread
 
 from paramclient import Component, Param, ParamClient, ParamType
-from paramclient.cache import CachedExtTable, ParamCache
 from paramclient.client import cache_writer
 from paramclient.client.worker_thread import Worker
 from paramclient.errors import LinkError
@@ -417,12 +416,3 @@ def a_client(link: Any, **options: Any) -> ParamClient:
 
 def _nothing() -> None:
     return
-
-
-def extended(cache: ParamCache, system: int | None = None) -> CachedExtTable:
-    """The only table of extended parameters in a cache, or the only one of this system."""
-    keys = {each.key for each in cache.vehicles() if system in (None, each.identity.system)}
-    ((key, number),) = [each for each in cache.ext_sizes() if each[0] in keys]
-    found = cache.load_ext(key, number)
-    assert found is not None
-    return found
