@@ -15,6 +15,7 @@ from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.json_output import ExtParamJson, ext_value_json
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_json, print_table, printable, progress_bar, report, say
+from paramclient.cli.param_names import with_suggestion
 from paramclient.cli.session import ChosenVehicle, CommandSession, announce_write, connect
 from paramclient.cli.sources import check_link, check_new, is_file, names_vehicle, tables_in
 from paramclient.cli.write_outcomes import status_in_words
@@ -31,7 +32,6 @@ from paramclient.model.ext_params import (
 )
 from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.patterns import NameChoice, is_pattern
-from paramclient.model.similar_names import did_you_mean, nearest_names
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.ext.fetch import ExtFetchResult
 from paramclient.protocol.ext.write_batch import ExtSetOutcome
@@ -183,7 +183,7 @@ async def read_extended(
         try:
             found[name] = await session.component.ext.get(name, timeout=session.deadline.left())
         except UnknownParameter as error:
-            errors.append(_with_nearest(error, session.component.ext.params))
+            errors.append(with_suggestion(error, session.component.ext.params))
         except NoReply as error:
             errors.append(error)
 
@@ -191,20 +191,6 @@ async def read_extended(
         for name in names:
             tasks.start_soon(read, name)
     return found, errors
-
-
-def _with_nearest(error: UnknownParameter, known: Iterable[str]) -> UnknownParameter:
-    """Return the error with the most similar ones of these names, if it names none."""
-    nearest = () if error.nearest or error.name is None else nearest_names(error.name, known)
-    if not nearest:
-        return error
-    return UnknownParameter(
-        f"{error}.{did_you_mean(nearest)}",
-        system=error.system,
-        component=error.component,
-        name=error.name,
-        nearest=nearest,
-    )
 
 
 async def set_extended(

@@ -34,6 +34,12 @@ def small() -> Camera:
     return Camera({"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_KEY": b"\xff\0\xfe", "CAM_EV": 0.5})
 
 
+def test_without_the_option_a_camera_gets_a_hint(command: Command, put: Put) -> None:
+    done = command("get", put(small()), "A", "--vehicle", "1/100", "--timeout", 3)
+    assert done.code in (1, 3)
+    assert done.err.startswith("1/100 usually has extended parameters: --extended uses them\n")
+
+
 def test_fetch_finds_them(command: Command, put: Put) -> None:
     url = put(small())
     done = command("fetch", url, *CAMERA)
