@@ -14,7 +14,6 @@ import pytest
 from paramclient import ParamClient
 from paramclient.cli import run
 from paramclient.cli import session as cli_session
-from paramclient.client.worker_thread import Worker
 from paramclient.links import SimLink
 from paramclient.sim import Endpoint
 from tests.shell import PeersLink, SimulatedTimeLoop, simulated_time_loop
@@ -89,7 +88,7 @@ def behind(monkeypatch: pytest.MonkeyPatch, url: str) -> Put:
 
 def leaping(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run commands on an event loop with simulated time, on which waits take no time."""
-    in_worker, in_thread = Worker.run, anyio.to_thread.run_sync
+    in_thread = anyio.to_thread.run_sync
 
     def waits(call: Callable[..., Any]) -> Callable[..., Any]:
         async def counted(*arguments: Any, **options: Any) -> Any:
@@ -102,7 +101,6 @@ def leaping(monkeypatch: pytest.MonkeyPatch) -> None:
         return counted
 
     really_run = anyio.run
-    monkeypatch.setattr(Worker, "run", waits(in_worker))
     monkeypatch.setattr(anyio.to_thread, "run_sync", waits(in_thread))
     monkeypatch.setattr(
         anyio, "run", lambda *call: really_run(*call, backend_options={"loop_factory": SimulatedTimeLoop})

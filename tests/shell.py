@@ -17,7 +17,6 @@ import anyio.to_thread
 
 from paramclient import Component, Param, ParamClient, ParamType
 from paramclient.client import cache_writer
-from paramclient.client.worker_thread import Worker
 from paramclient.errors import LinkError
 from paramclient.links import Peer, SimLink
 from paramclient.sim import Endpoint, GenericVehicle, PX4Vehicle, SimParam
@@ -144,13 +143,12 @@ def in_simulated_time(test: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, 
 
             return run_in_thread
 
-        in_worker, in_thread = counted(Worker.run), counted(anyio.to_thread.run_sync)
+        in_thread = counted(anyio.to_thread.run_sync)
         with asyncio.Runner(loop_factory=SimulatedTimeLoop) as runner:
             loop = runner.get_loop()
             assert isinstance(loop, SimulatedTimeLoop)
             clock = SimpleNamespace(time=lambda: loop.now + loop.ahead)
             with (
-                mock.patch.object(Worker, "run", in_worker),
                 mock.patch.object(anyio.to_thread, "run_sync", in_thread),
                 mock.patch.object(cache_writer, "time", clock),
             ):

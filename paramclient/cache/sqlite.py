@@ -111,9 +111,9 @@ class SqliteStore:
                 except ParamClientError:
                     self._drop()
                     raise
-                except Exception:  # a value that was not written by this program
+                except Exception as error:  # a value that this program cannot have written, or cannot write
                     if self._is_sound():
-                        raise
+                        raise CacheError(f"the cache {self.place} cannot be used: {error!r}") from error
                     self._set_aside("damaged")
                 except BaseException:
                     self._drop()

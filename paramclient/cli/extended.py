@@ -15,6 +15,7 @@ from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.json_output import ExtParamJson, ext_value_json
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_json, print_table, printable, progress_bar, report, say
+from paramclient.cli.param_names import with_suggestion
 from paramclient.cli.session import ChosenVehicle, CommandSession, announce_write, connect
 from paramclient.cli.sources import check_link, check_new, is_file, names_vehicle, tables_in
 from paramclient.cli.write_outcomes import status_in_words
@@ -23,7 +24,6 @@ from paramclient.files.disk import is_extended_file, read_extended_file
 from paramclient.model.ext_values import check_ext_value, encode_ext_value, ext_bytes
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.patterns import NameChoice, is_pattern
-from paramclient.model.similar_names import did_you_mean, nearest_names
 from paramclient.model.values import Param, ParamType, WireValue, format_value, type_name
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.fetch import FetchResult
@@ -175,7 +175,7 @@ async def read_extended(
         try:
             found[name] = await session.component.ext.get(name, timeout=session.deadline.left())
         except UnknownParameter as error:
-            errors.append(_with_nearest(error, session.component.ext.params))
+            errors.append(with_suggestion(error, session.component.ext.params))
         except NoReply as error:
             errors.append(error)
 
@@ -183,20 +183,6 @@ async def read_extended(
         for name in names:
             tasks.start_soon(read, name)
     return found, errors
-
-
-def _with_nearest(error: UnknownParameter, known: Iterable[str]) -> UnknownParameter:
-    """Return the error with the most similar ones of these names, if it names none."""
-    nearest = () if error.nearest or error.name is None else nearest_names(error.name, known)
-    if not nearest:
-        return error
-    return UnknownParameter(
-        f"{error}.{did_you_mean(nearest)}",
-        system=error.system,
-        component=error.component,
-        name=error.name,
-        nearest=nearest,
-    )
 
 
 async def set_extended(

@@ -31,9 +31,8 @@ class TableJson(Json):
     @classmethod
     def of(cls, table: CachedComponent, params: Mapping[str, ParamJson]) -> TableJson:
         """Return a table with these parameters."""
-        return cls(
-            system=table.system,
-            component=table.component,
+        return cls.take(
+            table,
             autopilot=autopilot_name(table.autopilot),
             uid=table.identity.uid,
             hash=hash_text(table.hash),
@@ -62,15 +61,10 @@ class SummaryJson(Json):
     @classmethod
     def of(cls, summary: CachedSummary, extended: int | None = None) -> SummaryJson:
         """Return a summary, with the number of extended parameters or None."""
-        return cls(
-            key=summary.key,
-            system=summary.system,
-            component=summary.component,
+        return cls.take(
+            summary,
             autopilot=autopilot_name(summary.autopilot),
             uid=summary.identity.uid,
-            size=summary.size,
-            count=summary.count,
-            complete=summary.complete,
             hash=hash_text(summary.hash),
             synced_at=time_or_none(summary.synced_at),
             updated_at=time_or_none(summary.updated_at),
@@ -92,13 +86,11 @@ class HistoryLineJson(Json):
     @classmethod
     def of(cls, entry: HistoryEntry) -> HistoryLineJson:
         """Return a change."""
-        return cls(
+        return cls.take(
+            entry,
             time=time_text(entry.at),
-            component=entry.component,
-            name=entry.name,
             old=value_json(entry.old.settable, entry.old.type_number),
             new=None if entry.new is None else value_json(entry.new.settable, entry.new.type_number),
-            by=entry.by,
         )
 
 
@@ -117,12 +109,4 @@ class SnapshotJson(Json):
     @classmethod
     def of(cls, summary: SnapshotSummary) -> SnapshotJson:
         """Return a snapshot."""
-        return cls(
-            id=summary.id,
-            time=time_text(summary.at),
-            component=summary.component,
-            size=summary.size,
-            complete=summary.complete,
-            hash=hash_text(summary.hash),
-            reason=summary.reason,
-        )
+        return cls.take(summary, time=time_text(summary.at), hash=hash_text(summary.hash))

@@ -58,12 +58,19 @@ SHORT_TEXT_LENGTH_MAX: Final = 400
 """Characters of the members `text` and `units`, which thousands of rows may repeat."""
 
 
+@dataclass(frozen=True, slots=True)
 class Json:
     """An object with these members in this order.
 
     A member with the default None is left out if it is None; a member without a default is then null. The
     name in JSON has no trailing underscore: `is_` is `is`.
     """
+
+    @classmethod
+    def take(cls, source: object, **members: Any) -> Self:
+        """Return an object with these members, and with the attributes of `source` for the others."""
+        names = [each.name for each in fields(cls) if each.name not in members]
+        return cls(**{name: getattr(source, name) for name in names if hasattr(source, name)}, **members)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -131,22 +138,14 @@ class InfoJson(Json):
     @classmethod
     def of(cls, info: ParamInfo) -> InfoJson:
         """Return the metadata of a parameter, without empty members."""
-        return cls(
-            short_description=info.short_description or None,
-            long_description=info.long_description or None,
-            units=info.units or None,
-            minimum=_number(info.minimum),
-            maximum=_number(info.maximum),
-            increment=_number(info.increment),
-            decimals=info.decimals,
-            default=_number(info.default),
+        named = ("short_description", "long_description", "units", "category", "group")
+        flags = ("reboot_required", "is_read_only", "is_volatile")
+        return cls.take(
+            info,
+            **{name: getattr(info, name) or None for name in (*named, *flags)},
+            **{name: _number(getattr(info, name)) for name in ("minimum", "maximum", "increment", "default")},
             values={format_value(value): name for value, name in info.values.items()} or None,
             bits={str(bit): name for bit, name in info.bits.items()} or None,
-            reboot_required=info.reboot_required or None,
-            is_read_only=info.is_read_only or None,
-            is_volatile=info.is_volatile or None,
-            category=info.category or None,
-            group=info.group or None,
         )
 
 
@@ -355,7 +354,7 @@ class IdentityJson(Json):
     @classmethod
     def of(cls, identity: Identity) -> IdentityJson:
         """Return an identity."""
-        return cls(**{each.name: getattr(identity, each.name) for each in fields(cls)})
+        return cls.take(identity)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -374,10 +373,8 @@ class OriginJson(Json):
     def of(cls, params: ParamSet) -> Self:
         """Return the origin of a set."""
         identity = params.identity
-        return cls(
-            source=params.source,
-            system=params.system,
-            component=params.component,
+        return cls.take(
+            params,
             autopilot=None if identity is None else autopilot_name(identity.autopilot),
             uid=None if identity is None else identity.uid,
             at=time_or_none(params.at),
@@ -394,10 +391,8 @@ class SetJson(OriginJson):
     @classmethod
     def with_sources(cls, params: ParamSet, sources: Mapping[str, str]) -> SetJson:
         """Return a set, with the origins of its defaults by name where they are given."""
-        origin = OriginJson.of(params)
-        members = {each.name: getattr(origin, each.name) for each in fields(origin)}
         written = {name: WrittenJson.of(param, sources.get(name)) for name, param in params.items()}
-        return cls(**members, params=written)
+        return cls.take(OriginJson.of(params), params=written)
 
 
 # Fetches and writes
@@ -439,19 +434,16 @@ class FetchJson(Json):
         described: Mapping[str, int | float],
     ) -> FetchJson:
         """Return a fetch with these parameters; `described` has defaults of the metadata by name."""
-        return cls(
+        return cls.take(
+            result,
             system=component.system,
             component=component.component,
             autopilot=component.autopilot,
             uid=component.identity.uid,
-            count=result.count,
             received=result.count - len(missing),
-            source=result.source,
             hash=hash_text(result.hash),
             missing=missing,
             cached=cached,
-            lost=result.lost,
-            repeated=result.repeated,
             round_trip_s=rounded(result.round_trip),
             elapsed_s=round(result.elapsed, 4),
             bytes_received=bytes_received,

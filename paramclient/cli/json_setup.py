@@ -167,16 +167,15 @@ class StageJson(Json):
     def of(cls, stage: Stage) -> StageJson:
         """Return a stage of a plan."""
         steps = [
-            StepJson(
-                name=step.name,
+            StepJson.take(
+                step,
                 value=value_json(step.value, step.type),
                 type=type_name(step.type),
                 before=value_json(step.before, step.type),
-                needs_reboot=step.needs_reboot,
             )
             for step in stage.steps
         ]
-        return cls(purpose=stage.purpose, reboot_first=stage.reboot_first, steps=steps)
+        return cls.take(stage, steps=steps)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -102,7 +102,7 @@ def _kind_of(path: Path) -> str | None:
         return "an SQLite database, and no log"
     with suppress(ParamClientError):
         file_format = read_file(path).file_format
-        return f"a parameter file ({file_format}), and no log. `paramclient cache add VEHICLE {path}` adds it"
+        return f"a parameter file ({file_format}), and no log"
     with suppress(UnicodeDecodeError):
         begin.decode()
         return "a text file, and no log"

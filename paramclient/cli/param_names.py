@@ -26,6 +26,7 @@ __all__ = [
     "spelling",
     "suggest",
     "unmatched_text",
+    "with_suggestion",
 ]
 
 CACHED_TABLES_MAX: Final = 20
@@ -96,7 +97,7 @@ async def suggest(
     if cache is None or not any(map(_lacks_suggestion, errors.values())):
         return errors
     known = await anyio.to_thread.run_sync(cached_names, cache, session.component.autopilot)
-    return {name: _with_suggestion(error, known) for name, error in errors.items()}
+    return {name: with_suggestion(error, known) for name, error in errors.items()}
 
 
 def cached_names(cache: ParamCache, autopilot: str | None = None) -> frozenset[str]:
@@ -169,7 +170,8 @@ def _lacks_suggestion(error: ParamClientError) -> bool:
     return isinstance(error, UnknownParameter) and not error.nearest and not is_pattern(error.name or "*")
 
 
-def _with_suggestion(error: ParamClientError, known: Collection[str]) -> ParamClientError:
+def with_suggestion(error: ParamClientError, known: Collection[str]) -> ParamClientError:
+    """Return the error of an unknown name with similar ones of these names, if it has none yet."""
     if not _lacks_suggestion(error):
         return error
     assert isinstance(error, UnknownParameter)

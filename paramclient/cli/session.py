@@ -216,6 +216,7 @@ async def sessions(
     writes: bool = False,
     policy: Policy = Policy.AUTO,
     is_live: bool = False,
+    is_plain: bool = True,
 ) -> AsyncIterator[list[CommandSession]]:
     """Open a link, and yield a session for each vehicle that --vehicle names.
 
@@ -225,6 +226,7 @@ async def sessions(
         writes: whether several vehicles are an error, unless --vehicle names one or all.
         policy: as in `ParamClient`.
         is_live: read a log in real time; otherwise it is read at full speed, unless its name gives a speed.
+        is_plain: whether plain parameters are used, so that --extended is suggested for a camera.
 
     Raises:
         UsageError: no such link, or options that exclude each other.
@@ -249,6 +251,10 @@ async def sessions(
         found = await _find(client, choice, timeout=timeout, only=writes)
         if writes:
             await wait_for_firmware(found, deadline)
+        for each in found if is_plain else ():
+            if each.ext.is_expected:
+                label = f"{each.system}/{each.component}"
+                say(f"{label} usually has extended parameters: --extended uses them")
         yield [CommandSession(client, each, deadline, options, choice) for each in found]
 
 
@@ -263,7 +269,7 @@ async def connect(
     """
     if ChosenVehicle.parse(options.vehicle).is_all:
         raise UsageError("--vehicle all is not possible here; name one vehicle")
-    async with sessions(url, options, writes=writes, is_live=is_live) as found:
+    async with sessions(url, options, writes=writes, is_live=is_live, is_plain=False) as found:
         yield found[0]
 
 

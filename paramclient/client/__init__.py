@@ -28,5 +28,4 @@
 - `vehicle_search`: all vehicles on a link, or an expected number of them.
 - `suspend_detection`: detection of suspend and of a stopped process.
 - `taps`: the telemetry log and the forwarder of a client.
-- `worker_thread`: a thread for blocking calls.
 """

@@ -6,14 +6,13 @@ import logging
 import os
 import time
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import anyio
+import anyio.to_thread
 
 from paramclient.client.frame_cutter import FrameCutter
-from paramclient.client.worker_thread import Worker
 from paramclient.errors import UsageError
 from paramclient.links import Peer
 from paramclient.links.tlog import packed_time
@@ -62,7 +61,6 @@ class Capture:
     def __init__(self, path: str | os.PathLike[str], *, is_stream: bool) -> None:
         self._path = Path(path)
         self._cutter = FrameCutter(stream=is_stream)
-        self._worker = Worker("paramclient tlog")
         self._file: int | None = None
         self._unwritten: list[_Chunk] = []
         self._size = 0
@@ -75,7 +73,7 @@ class Capture:
         Raises:
             UsageError: the file exists, or cannot be created.
         """
-        await self._worker.run(self._create)
+        await anyio.to_thread.run_sync(self._create)
 
     def received(self, data: bytes, peer: Peer) -> None:
         """Queue received data; empty data marks the end of the peer's stream."""
@@ -98,12 +96,12 @@ class Capture:
             await self._flush()
 
     async def close(self) -> None:
-        """Write the queued frames, close the file and end the thread."""
+        """Write the queued frames and close the file."""
         try:
             self.pause()
             await self._flush()
         finally:
-            await self._worker.close(self._close)
+            await anyio.to_thread.run_sync(self._close)
 
     def _take(self, peer: Peer | None, data: bytes) -> None:
         if self._has_failed:
@@ -120,7 +118,8 @@ class Capture:
         if self._has_failed or self._file is None or not batch:
             return
         try:
-            await self._worker.run(partial(self._write, batch))
+            with anyio.CancelScope(shield=True):  # the batch is no longer queued
+                await anyio.to_thread.run_sync(self._write, batch)
         except OSError as error:
             self._fail(error.strerror or str(error))
 

@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import logging
 import os
-from functools import partial
 from pathlib import Path
 from typing import Final
 
 import anyio
+import anyio.to_thread
 import platformdirs
 
 from paramclient.client.signing import Signing, timestamp_now
-from paramclient.client.worker_thread import Worker
 from paramclient.errors import UsageError
 from paramclient.wire.signing import ADOPTED_TIMESTAMP_MAX, UNITS_PER_SECOND, Signer, SigningPolicy, Verifier
 
@@ -123,7 +122,6 @@ class TimestampKeeper:
         self._signing = signing
         self._folder = folder / "signing"
         self._file = TimestampFile(self._folder, signing.key.fingerprint, signing.link_id)
-        self._worker = Worker("paramclient signing")
         self._signer: Signer | None = None
         self._written = 0
         self._is_kept = False
@@ -136,7 +134,7 @@ class TimestampKeeper:
         """
         last = 0
         try:
-            last = await self._worker.run(self._file.claim)
+            last = await anyio.to_thread.run_sync(self._file.claim)
             self._is_kept = True
         except OSError as error:
             self._warn(error)
@@ -158,7 +156,7 @@ class TimestampKeeper:
         signer = self._signer
         if signer is not None and self._is_kept:
             await self._write(signer.timestamp)
-        await self._worker.close(self._file.release)
+        await anyio.to_thread.run_sync(self._file.release)
 
     async def _keep(self) -> None:
         signer = self._signer
@@ -168,7 +166,8 @@ class TimestampKeeper:
 
     async def _write(self, timestamp: int) -> None:
         try:
-            await self._worker.run(partial(self._file.write, timestamp))
+            with anyio.CancelScope(shield=True):
+                await anyio.to_thread.run_sync(self._file.write, timestamp)
         except OSError as error:
             self._warn(error)
             self._is_kept = False

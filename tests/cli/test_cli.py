@@ -18,18 +18,17 @@ from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import pytest
 
 import paramclient
-from paramclient import LinkError, ParamCache, ParamErrorCode, ParamType
+from paramclient import LinkError, ParamCache, ParamType
 from paramclient.cli import run
 from paramclient.cli import watch as watch_command
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import printable
-from paramclient.errors import ClientClosed, ParamClientError
+from paramclient.errors import ClientClosed, ParamClientError, ParamErrorCode
 from paramclient.links import Peer, SimLink
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.sim.param_table import Entry
@@ -241,14 +240,6 @@ def test_the_system_and_the_component_can_be_chosen(command: Command) -> None:
     assert absent.code == 3
 
 
-def test_the_encoding_can_be_chosen(command: Command) -> None:
-    reported = command(
-        "get", "sim:ardupilot", "RTL_ALT", "--encoding", "bytewise", "--json", "--no-cache"
-    ).json
-    cast = command("get", "sim:ardupilot", "RTL_ALT", "--json", "--no-cache").json
-    assert cast["params"]["RTL_ALT"]["value"] != reported["params"]["RTL_ALT"]["value"]
-
-
 # get
 
 
@@ -365,28 +356,6 @@ def test_a_failed_set_prints_its_reason(
     assert done.err == f"paramclient: {name}: {reason}\n"
 
 
-def test_a_change_too_small_for_px4_is_reported(command: Command, put: Callable[[Endpoint], str]) -> None:
-    link = put(PX4Vehicle(table={"A": 0.5}))
-    done = command("set", link, "A", 0.50000006, "--no-cache")
-    assert done.code == 0
-    note = "PX4 takes a change of at most 1.19e-07 for none: its next start may bring 0.5 back"
-    assert f"A: {note}\n" in done.err
-    [result] = command("set", link, "A", 0.5, "--json", "--no-cache").json["results"]
-    assert result["note"] == note.replace("0.5 back", "0.50000006 back")
-    assert "note" not in command("set", link, "A", 0.75, "--json", "--no-cache").json["results"][0]
-
-
-def test_all_sets_are_tried_for_the_highest_exit_code(
-    command: Command, put: Callable[[Endpoint], str]
-) -> None:
-    vehicle = GenericVehicle([SimParam("A", ParamType.UINT8, 1), SimParam("B", 6, 1)], param_error=True)
-    done = command("set", put(vehicle), "NOPE", 1, "A", 300, "B", 2, "--json", "--no-cache")
-    assert [result["status"] for result in done.json["results"]] == ["refused", "refused", "accepted"]
-    assert done.code == 2
-    assert vehicle.values == {"A": 1, "B": 2}
-    assert done.err.count("\n") == 2
-
-
 @pytest.mark.parametrize(
     ("name", "text", "held"),
     [
@@ -412,19 +381,6 @@ def test_numbers_are_parsed_exactly(
     done = command("set", put(vehicle), name, text, "--json", "--no-cache")
     assert (done.code, done.json["results"][0]["status"]) == (0, "accepted")
     assert vehicle.values[name] == held
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["true", "", " 1", "1_000", "0x", "--5", "nano", "1e999", "0b1", "\u0661", "1,5", "--jsno", "9" * 400],
-)
-def test_a_value_must_be_a_number(command: Command, put: Callable[[Endpoint], str], text: str) -> None:
-    vehicle = GenericVehicle({"A": 1})
-    done = command("set", put(vehicle), "A", text, "--no-cache")
-    assert (done.code, done.out) == (2, "")
-    assert done.err.startswith("paramclient: A: ")
-    assert done.err.count("\n") == 1
-    assert not vehicle.requests
 
 
 # fetch under a policy
@@ -486,17 +442,6 @@ def test_fetch_prints_parameters_that_differ_from_the_defaults(command: Command)
     )
 
 
-def test_changed_without_defaults_fails(command: Command, warm: Path) -> None:
-    for arguments in (("fetch", "sim:px4", "--changed"), ("show", "--changed")):
-        shown = command(*arguments, "--cache", warm)
-        assert (shown.code, shown.out) == (1, "")
-        assert "defaults are not known" in shown.err
-        found = command(*arguments, "--cache", warm, "--json")
-        assert found.code == 1
-        assert "defaults are not known" in found.err
-        assert (found.json["components"][0] if "show" in arguments else found.json)["params"] == {}
-
-
 # watch
 
 
@@ -539,26 +484,6 @@ def test_watch_without_names_fetches_the_table_first(live_command: Command, tmp_
     [kept] = live_command("show", "3", "--json", "--cache", cache).json["components"]
     assert kept["params"]["MC_ROLL_P"]["value"] == 6.1
     assert len(kept["params"]) == 903
-
-
-def test_watch_ends_after_its_timeout(command: Command) -> None:
-    watched = command("watch", "sim:px4", "MC_ROLL_P", "--timeout", 3, "--no-cache")
-    assert (watched.code, watched.out) == (0, "")
-    unknown = command("watch", "sim:px4?param_error=1", "NOPE", "--no-cache")
-    assert (unknown.code, unknown.out) == (1, "")
-
-
-def test_watch_prints_changes_since_the_cache_was_written(
-    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
-) -> None:
-    cache = tmp_path / "cache.sqlite3"
-    url = put(GenericVehicle({"A": 1, "B": 2}))
-    assert command("fetch", url, "--cache", cache).code == 0
-    put(GenericVehicle({"A": 1, "B": 3}))
-    watched = command("watch", url, "--json", "--cache", cache, "--timeout", 3)
-    assert watched.code == 0
-    change = watched.json
-    assert (change["name"], change["old"], change["new"]) == ("B", 2, 3)
 
 
 def test_watch_prints_added_and_removed_parameters(live_command: Command) -> None:
@@ -650,16 +575,6 @@ def test_a_link_that_fails_during_watch_is_reported_once(
 
 # link
 
-LINK_KEYS = [
-    *("link", "seconds", "bytes_received", "bytes_sent", "received_per_s", "sent_per_s"),
-    *("frames", "unknown", "damaged", "other_bytes", "signing", "components"),
-]
-HEARD_KEYS = [
-    *("system", "component", "mavlink", "autopilot", "type", "state", "heartbeat_age_s", "age_s"),
-    *("frames", "bytes", "frames_per_s", "bytes_per_s", "lost", "loss", "repeated", "late", "signed"),
-    *("round_trip_s", "messages", "radio"),
-]
-
 
 class Modem(PX4Vehicle):
     """A vehicle with a telemetry radio, and with a message that is in no dialect."""
@@ -735,11 +650,6 @@ def test_link_is_live_on_a_terminal() -> None:
     assert strict(one.out)["components"][0]["system"] == 1
 
 
-def screen(text: str) -> str:
-    """What was printed, without the sequences that move the cursor and set colours."""
-    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text).replace("\r", "")
-
-
 def test_a_live_link_ends_with_ctrl_c() -> None:
     ours, theirs = pty.openpty()
     try:
@@ -813,15 +723,6 @@ def test_an_ambiguous_name_chooses_no_vehicle(command: Command, warm: Path) -> N
     assert len(ParamCache(warm).vehicles()) == 2
 
 
-def test_a_vehicle_can_be_removed(command: Command, warm: Path) -> None:
-    key = key_of(warm)
-    assert command("cache", "remove", "1/9", "--cache", warm).code == 2
-    removed = command("cache", "remove", "1", "--json", "--cache", warm)
-    assert (removed.code, removed.json) == (0, {"key": key, "removed": 1})
-    assert command("cache", "list", "--json", "--cache", warm).json["components"] == []
-    assert command("cache", "remove", "1", "--cache", warm).code == 2
-
-
 # Exit codes and signals
 
 
@@ -859,13 +760,6 @@ def test_bad_arguments_are_exit_code_2(command: Command, arguments: list[str], t
     assert outcome.err.startswith("paramclient: ")
     assert outcome.err.count("\n") == 1
     assert text in outcome.err
-
-
-def test_a_bad_link_name_lists_the_accepted_forms(command: Command) -> None:
-    outcome = command("fetch", "carrier-pigeon", "--no-cache")
-    assert (outcome.code, outcome.out) == (2, "")
-    assert outcome.err.startswith("paramclient: link name 'carrier-pigeon': ")
-    assert "\n  udpin:HOST:PORT " in outcome.err
 
 
 def test_a_missing_vehicle_is_exit_code_3(live_command: Command) -> None:
@@ -968,35 +862,6 @@ def test_sim_ends_cleanly() -> None:
         assert ended(started) == Outcome(130, "", "")
 
 
-class RemoteEnd:
-    """Communicates with a simulated vehicle in another process: receives messages until one matches."""
-
-    def __init__(self, url: str) -> None:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.settimeout(TIMEOUT)
-        self._socket.connect(("127.0.0.1", int(url.rpartition(":")[2])))
-
-    def ask(self, *requests: messages.Message) -> None:
-        for request in requests:
-            self._socket.send(messages.encode(request, system=255, component=190, sequence=0))
-
-    def until(
-        self, is_last: Callable[[frames.Frame, messages.Message | None], bool]
-    ) -> list[messages.Message | None]:
-        messages: list[messages.Message | None] = []
-        while True:
-            [frame] = frames.Framer(stream=False).receive(self._socket.recv(300))
-            messages.append(messages.decode(frame))
-            if is_last(frame, messages[-1]):
-                return messages
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._socket.close()
-
-
 def test_a_closed_pipe_ends_the_command_silently(warm: Path) -> None:
     for arguments in (["fetch", "sim:px4"], ["fetch", "sim:px4", "--json"], ["show"], ["cache", "path"]):
         reading, writing = os.pipe()
@@ -1078,14 +943,6 @@ def test_help_has_examples(command: Command, arguments: Sequence[str]) -> None:
         assert command().out == helped.out
 
 
-@pytest.mark.parametrize("name", ["apply"])
-def test_the_help_names_the_arguments_as_in_the_usage(name: str, command: Command) -> None:
-    helped = command(name, "--help").out
-    assert helped.startswith(f"Usage: paramclient {name} [OPTIONS] URL FILE\n")
-    assert re.search(r"\bFILE +A parameter file;", helped)
-    assert "SOURCE" not in helped
-
-
 # Output
 
 
@@ -1139,11 +996,6 @@ def test_text_from_the_wire_is_escaped(
     assert fetched.out.isascii()
 
 
-def test_unprintable_text_is_escaped() -> None:
-    assert printable("A_1 [x]") == "A_1 [x]"
-    assert printable("\x00\u202e\U0001f4a9\n\t") == "\\x00\\u202e\\U0001f4a9\\x0a\\x09"
-
-
 def on_terminal(*arguments: object, **environment: str) -> Outcome:
     """Run the command line with stdout and stderr on one terminal."""
     ours, theirs = pty.openpty()
@@ -1174,14 +1026,6 @@ def test_progress_is_drawn_on_a_terminal(tmp_path: Path) -> None:
     plain = on_terminal("fetch", "sim:px4", "--no-cache", NO_COLOR="1")
     assert re.search(r"[0-9]+/903", plain.out)
     assert not re.search(r"\x1b\[(3|9)[0-9]m", plain.out)
-
-
-def test_a_pipe_gets_no_escape_codes(tmp_path: Path) -> None:
-    fetched = run_process("fetch", "sim:px4", "--cache", tmp_path / "cache.sqlite3")
-    assert fetched.code == 0
-    assert len(fetched.out.splitlines()) == 904
-    assert ESCAPE not in fetched.out + fetched.err
-    assert "\r" not in fetched.out + fetched.err
 
 
 # sim

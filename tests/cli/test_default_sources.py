@@ -10,7 +10,7 @@ import pytest
 
 from paramclient.files import read_file
 from paramclient.model.values import ParamType
-from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
+from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.wire import messages
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import Tap
@@ -48,7 +48,6 @@ def a_file(folder: Path, **defaults: float) -> Path:
 
 
 ROW = ["MC_ROLL_P", "6.25", "REAL32", "3", "live", "4.0"]
-SOURCES = "4 of 4 defaults from the metadata of the firmware, which does not have the defaults of an airframe"
 
 
 # fetch
@@ -85,15 +84,6 @@ def test_unknown_defaults_are_an_error_that_says_what_to_do(command: Command, pu
     assert (done.code, done.out) == (1, "")
     assert "defaults are not known" in done.err
     assert "--metadata vehicle requests it from a vehicle that serves it" in done.err
-
-
-def test_each_of_several_vehicles_has_its_own_defaults(command: Command, put: Put) -> None:
-    other = PX4Vehicle(system=2, table=TABLE, metadata=True)
-    done = command(
-        "fetch", put(Air([quad(), other])), "--changed", "--vehicle", "all", "--metadata", "vehicle"
-    )
-    assert done.code == 0, done.err
-    assert [row[:2] for row in done.rows[1:]] == [["1/1", "MC_ROLL_P"]]
 
 
 # without a link, and files

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +13,6 @@ import pytest
 
 from paramclient import ParamCache, ParamClient, ParamType
 from paramclient.cache import StoredParam, TableState
-from paramclient.cli import run
 from paramclient.cli import session as cli_session
 from paramclient.links import SimLink
 from paramclient.model.identity import Identity
@@ -146,23 +142,6 @@ def test_the_defaults_are_a_base(command: Command) -> None:
     }
 
 
-def test_unknown_defaults_are_no_base(command: Command, cache: Path) -> None:
-    keep(cache, {"A": (1, INT32)})
-    outcome = command("diff", 1, 1, "--base", "defaults")
-    assert (outcome.code, outcome.out) == (2, "")
-    assert "defaults are not known" in outcome.err
-
-
-def test_equal_sets_are_exit_code_0_without_a_table(command: Command, cache: Path) -> None:
-    keep(cache, {"A": (0.0, REAL32), "B": (1, INT32)})
-    keep(cache, {"B": (1, INT32), "A": (-0.0, REAL32)}, SECOND)
-    outcome = command("diff", 1, 2)
-    assert (outcome.code, outcome.out) == (0, "")
-    assert outcome.err.splitlines()[-1] == "2 same"
-    reported = command("diff", 1, 2, "--json")
-    assert (reported.code, reported.err, reported.json["same"], reported.json["params"]) == (0, "", True, {})
-
-
 @pytest.mark.usefixtures("two")
 def test_partial_leaves_out_only_parameters_of_the_right_side(command: Command) -> None:
     names = set(command("diff", 1, 2, "--partial", "--json").json["params"])
@@ -234,19 +213,6 @@ def test_an_unknown_source_is_an_error(command: Command, words: list[str], code:
     assert text in outcome.err
 
 
-@pytest.mark.usefixtures("two")
-def test_no_cache_excludes_cached_vehicles(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["diff", "1", "2", "--no-cache"]) == 2
-    assert "--no-cache excludes" in capsys.readouterr().err
-
-
-def test_an_incomplete_table_is_not_compared(command: Command, cache: Path) -> None:
-    keep(cache, {"A": (1, INT32)}, complete=False)
-    outcome = command("diff", 1, 1)
-    assert (outcome.code, outcome.out) == (5, "")
-    assert "the cache has 1 of 2 parameters of 1/1 (uid:aa00000000000001), not all" in outcome.err
-
-
 def test_the_autopilot_is_the_default_component(command: Command, cache: Path) -> None:
     keep(cache, {"CAM": (1, INT32)}, component=100)
     only = command("diff", 1, 1, "--all", "--json").json
@@ -256,17 +222,7 @@ def test_the_autopilot_is_the_default_component(command: Command, cache: Path) -
     assert command("diff", 1, 1, "--vehicle", "1/100", "--json").json["left"]["component"] == 100
 
 
-def test_an_empty_name_is_refused(command: Command, cache: Path) -> None:
-    """An empty name, as of an unset variable in a script, does not mean the only vehicle."""
-    keep(cache, BEFORE)
-    for words in (["show", ""], ["history", ""], ["cache", "remove", ""]):
-        assert command(*words).code == 2
-    assert len(ParamCache(cache).vehicles()) == 1
-
-
 # Files
-
-ROWS = ("A_SAME\t1\t6", "B_FLOAT\t0.100000001490116119\t9", "C_LEFT\t5\t6")
 
 
 @pytest.fixture
@@ -311,24 +267,6 @@ def test_show_prints_a_file(command: Command, write: Callable[..., str]) -> None
     shown = command("show", path)
     assert (shown.code, shown.rows[:2]) == (0, [["name", "value", "type"], ["A", "1", "INT32"]])
     assert shown.err == "1 parameter of 1/1 from both.params\n1 parameter of 1/100 from both.params\n"
-
-
-def test_show_prints_comments_and_changed_parameters_of_a_file(
-    command: Command, write: Callable[..., str]
-) -> None:
-    plain = write("quad.param", "A,1", "# why", "B,2")
-    assert command("show", plain).rows == [["name", "value", "comment"], ["A", "1"], ["B", "2", "why"]]
-    unknown = command("show", plain, "--changed")
-    assert (unknown.code, unknown.out) == (1, "")
-    assert "defaults are not known" in unknown.err
-    params = {"A": {"value": 1, "default": 0}, "B": {"value": -0.0, "default": 0}, "C": {"value": 1}}
-    full = write("quad.json", json.dumps({"paramclient": 1, "sets": [{"params": params}]}))
-    changed = command("show", full, "--changed")
-    assert (changed.code, changed.rows) == (0, [["name", "value", "default"], ["A", "1", "0"]])
-    assert changed.err == "1 parameter from quad.json, those that differ from their default\n"
-    [component] = command("show", full, "--changed", "--json").json["components"]
-    expected = {"value": 1, "type": None, "bits": None, "default": 0, "default_source": "vehicle"}
-    assert component["params"] == {"A": expected}
 
 
 # Links
@@ -389,11 +327,3 @@ PLAIN = {
     for name, value in os.environ.items()
     if name not in {"FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "COLUMNS", "PYTHONUNBUFFERED"}
 }
-
-
-def start(cache: Path, stdout: int, *more: str) -> subprocess.Popen[str]:
-    words = [sys.executable, "-m", "paramclient", "diff", "1", "2", *more, "--cache", str(cache)]
-    environment = {**PLAIN, "TERM": "xterm", "COLUMNS": "60"}
-    return subprocess.Popen(
-        words, cwd=ROOT, stdout=stdout, stderr=subprocess.PIPE, text=True, env=environment
-    )

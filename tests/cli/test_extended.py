@@ -34,6 +34,12 @@ def small() -> Camera:
     return Camera({"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_KEY": b"\xff\0\xfe", "CAM_EV": 0.5})
 
 
+def test_without_the_option_a_camera_gets_a_hint(command: Command, put: Put) -> None:
+    done = command("get", put(small()), "A", "--vehicle", "1/100", "--timeout", 3)
+    assert done.code in (1, 3)
+    assert done.err.startswith("1/100 usually has extended parameters: --extended uses them\n")
+
+
 def test_fetch_finds_them(command: Command, put: Put) -> None:
     url = put(small())
     done = command("fetch", url, *CAMERA)
@@ -50,17 +56,6 @@ def test_fetch_finds_them(command: Command, put: Put) -> None:
     assert (document["count"], document["missing"], document["component"]) == (4, [], 100)
     assert document["extended"]["CAM_KEY"] == {"value": None, "type": "CUSTOM", "index": 2, "hex": "ff00fe"}
     assert document["extended"]["CAM_NAME"]["value"] == "Front"
-
-
-def test_fetch_prints_only_the_chosen_ones(command: Command, put: Put) -> None:
-    url = put(small())
-    done = command("fetch", url, *CAMERA, "--only", "cam_n*")
-    assert [row[0] for row in done.words] == ["name", "CAM_NAME"]
-    assert "4 extended parameters of 1/100" in done.err
-    assert list(command("fetch", url, *CAMERA, "--only", "CAM_EV", "--json").json["extended"]) == ["CAM_EV"]
-    none = command("fetch", url, *CAMERA, "--only", "NOPE")
-    assert none.code == 2
-    assert "no extended parameter of 1/100 no autopilot is called NOPE" in none.err
 
 
 def test_get_and_set(command: Command, put: Put) -> None:
@@ -232,17 +227,6 @@ def test_an_unknown_name_does_not_stop_the_other_values(command: Command, put: P
     assert (camera.ext_values["CAM_MODE"], camera.ext_values["CAM_NAME"]) == (5, "Rear")
 
 
-def test_cache_list_has_the_number_of_extended_parameters(command: Command, put: Put) -> None:
-    url = put(Air.symmetric([PX4Vehicle(table={"A": 1}), small()]))
-    assert command("fetch", url).code == 0
-    assert "extended" not in command("cache", "list").rows[0]
-    assert command("fetch", url, *CAMERA).code == 0
-    listed = command("cache", "list")
-    assert {row[0]: row[3] for row in listed.rows[1:] if row[0] == "1/100"} == {"1/100": "4"}, listed.out
-    components = command("cache", "list", "--json").json["components"]
-    assert {each["component"]: each.get("extended") for each in components} == {1: None, 100: 4}
-
-
 def test_cached_extended_parameters_are_shown_offline(command: Command, put: Put) -> None:
     url = put(Air.symmetric([PX4Vehicle(table={"A": 1}), small()]))
     assert command("fetch", url).code == 0
@@ -258,12 +242,6 @@ def test_cached_extended_parameters_are_shown_offline(command: Command, put: Put
     assert command("show", "1/1", "--extended").code == 5
     assert command("show", 1, "--extended", "--changed").code == 2
     assert command("diff", 1, url, *CAMERA).code == 0
-
-
-def test_a_component_without_extended_parameters_is_reported(command: Command, put: Put) -> None:
-    url = put(PX4Vehicle(table={"A": 1}))
-    done = command("fetch", url, "--extended")
-    assert (done.code, "no reply: extended parameters of 1/1" in done.err) == (3, True)
 
 
 def test_the_history_of_extended_parameters(command: Command, put: Put) -> None:

@@ -92,13 +92,6 @@ def test_a_time_in_the_future_is_refused(text: str) -> None:
         parse_when(text, at("2026-11-20T08:00Z"), UTC)
 
 
-def test_a_number_is_a_snapshot() -> None:
-    assert (parse_when("12", NOW), type(parse_when(" 12 ", NOW))) == (12, int)
-    assert parse_when("20261120", NOW) == 20261120
-    with pytest.raises(UsageError, match="is not a time"):
-        parse_when("9" * 19, NOW)
-
-
 def test_the_default_time_zone_is_that_of_this_computer(monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         monkeypatch.setenv("TZ", "XYZ-3")

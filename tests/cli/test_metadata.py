@@ -71,15 +71,6 @@ def test_set_accepts_value_names_of_the_vehicle(command: Command, put: Any) -> N
     assert second["text"] == "Position|Heading"
 
 
-def test_set_accepts_value_names_of_a_file(command: Command, put: Any) -> None:
-    vehicle = copter()
-    done = command("set", put(vehicle), "FLTMODE1=Loiter", "tst_log=imu+gps", "--metadata", XML, "--no-cache")
-    assert done.code == 0
-    assert vehicle.values["FLTMODE1"] == 5
-    assert vehicle.values["TST_LOG"] == 9
-    assert vehicle.requests["COMMAND_LONG"] <= 1  # its metadata was not requested
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -130,14 +121,6 @@ def test_a_value_outside_of_the_range_is_sent_with_force(command: Command, put: 
     assert done.code == 0
     assert "paramclient: MC_ROLL_P: 40 is above the maximum of 12 1/s\n" in done.err
     assert vehicle.values["MC_ROLL_P"] == 40
-
-
-def test_set_names_parameters_that_need_a_reboot(command: Command, put: Any) -> None:
-    words = ("MAV_SYS_ID=2", "MC_ROLL_P=4", "--metadata", "vehicle", "--no-cache")
-    done = command("set", put(quad()), *words)
-    assert "takes effect after a reboot: MAV_SYS_ID\n" in done.err
-    done = command("set", put(quad()), *words, "--json")
-    assert [each.get("reboot_required") for each in done.json["results"]] == [True, None]
 
 
 # get
@@ -254,18 +237,3 @@ def test_show_prints_the_metadata_of_a_parameter(command: Command, shown: tuple[
         "  step: 1 cm",
         "  reboot: a change takes effect after a reboot",
     ]
-
-
-def test_show_refuses_metadata_of_the_vehicle(command: Command, shown: tuple[object, ...]) -> None:
-    done = command("show", "--metadata", "vehicle", *shown)
-    assert (done.code, done.out) == (2, "")
-    assert "needs a link" in done.err
-
-
-def test_a_simulated_vehicle_describes_its_parameters(command: Command) -> None:
-    words = ("MC_ROLLRATE_MAX", "--metadata", "vehicle", "--no-cache")
-    assert "deg/s" in command("get", "sim:px4?metadata=1", *words).out
-    assert command("get", "sim:px4?metadata=0", *words).code == 2
-    refused = command("sim", "ardupilot", "--metadata", "--link", "udpin:127.0.0.1:0")
-    assert refused.code == 2
-    assert "--metadata is for px4" in refused.err

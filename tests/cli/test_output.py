@@ -46,17 +46,6 @@ def test_no_value_is_broken_in_two(printed: Print, width: int) -> None:
     assert (len(lines) == 3) == (width >= 54)
 
 
-def test_rows_of_several_lines_are_indented(printed: Print) -> None:
-    assert printed(40, COLUMNS, ROWS, right="value index") == [
-        "name                    value  type",
-        "  index  trust",
-        "MC_ROLL_P                 4.0  REAL32",
-        "    547  live",
-        "CAL_MAG0_XCOMP_1  -16777216.5  REAL32",
-        "     12  verified",
-    ]
-
-
 def test_sentences_in_the_last_column_are_wrapped_at_spaces(printed: Print) -> None:
     reason = "the vehicle keeps its own value and gives no reason"
     lines = printed(40, ["name", "reason"], [("MC_ROLL_P", reason)])

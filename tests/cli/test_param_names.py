@@ -61,12 +61,6 @@ def test_get_takes_patterns_and_any_case(command: Command, put: Put, vehicle: Ve
     assert row[:2] == ["MC_ROLL_P", "4.0"]
 
 
-def test_get_of_a_pattern_without_a_match(command: Command, put: Put) -> None:
-    got = command("get", put(px4()), "FOO_*", "MC_ROLL_P")
-    assert (got.code, len(got.rows)) == (1, 2)
-    assert got.err == "paramclient: 1/1 has no parameter that matches FOO_*\n"
-
-
 @pytest.mark.parametrize("param_error", [False, True])
 def test_get_and_set_suggest_names_of_the_vehicle(command: Command, put: Put, param_error: bool) -> None:
     vehicle = px4(param_error=param_error)
@@ -212,11 +206,3 @@ def test_watch_follows_groups_that_appear(
 def growing() -> Growing:
     table = [SimParam("GRP_ENABLE", 2, 0), SimParam("MC_ROLL_P", 9, 4.0)]
     return Growing(table=table, groups={"GRP_ENABLE": GROUP}, live=(), ftp=False)
-
-
-def test_watch_of_an_unknown_name_is_an_error_with_a_suggestion(command: Command, put: Put) -> None:
-    vehicle = px4(param_error=True)
-    assert command("fetch", put(vehicle)).code == 0
-    watched = command("watch", put(vehicle), "MC_ROLLP", "--timeout", 5)
-    assert (watched.code, watched.out) == (1, "")
-    assert watched.err.endswith("Did you mean MC_ROLL_P?\n")

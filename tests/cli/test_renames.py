@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from paramclient import ParamSet, ParamType, WrittenParam, write_file
-from paramclient.model.identity import Identity
+from paramclient import ParamType
 from paramclient.model.values import WireValue
 from paramclient.sim import ArduPilotVehicle, Endpoint
 from tests.commands import Command, Put, behind, in_process, leaping
@@ -54,14 +53,6 @@ def file(text: str = FILE, name: str = "quad.param") -> str:
     return name
 
 
-def older_file(**values: WireValue) -> str:
-    """Write a file of ArduPilot 4.5.7."""
-    identity = Identity(1, "udp", autopilot=3, firmware=0x040507FF)
-    params = {name: WrittenParam(name, value) for name, value in values.items()}
-    write_file("older.json", ParamSet(params, system=1, component=1, identity=identity))
-    return "older.json"
-
-
 def test_apply_writes_under_the_name_of_the_vehicle(command: Command, put: Callable[[Endpoint], str]) -> None:
     vehicle = copter()
     outcome = command("apply", put(vehicle), file(), "--renames", "names.json", "--full")
@@ -90,19 +81,6 @@ def test_a_missing_parameter_names_its_other_name(command: Command, put: Callabl
     outcome = command("apply", put(vehicle), wanted, "--renames", "names.json")
     assert outcome.code == 1
     assert outcome.rows[1:] == [["GONE", "1", "skipped", f"not on this vehicle; {NOT_HERE}"]]
-
-
-def test_values_that_do_not_fit_and_names_that_collide_send_nothing(
-    command: Command, put: Callable[[Endpoint], str]
-) -> None:
-    vehicle = copter()
-    outcome = command("apply", put(vehicle), file("RTL_ALT,1550\n"), "--renames", "names.json")
-    assert outcome.code == 2
-    assert "RTL_ALT: as RTL_ALT_M, 15.5 is not a whole number, and the parameter is INT16" in outcome.err
-    outcome = command("apply", put(vehicle), file(FILE + "WP_SPD,1\n"), "--renames", "names.json")
-    assert outcome.code == 2
-    assert "are both WP_SPD by names.json; remove one of the two" in outcome.err
-    assert vehicle.requests["PARAM_SET"] == 0
 
 
 @pytest.mark.parametrize("subcommand", ["apply", "diff"])

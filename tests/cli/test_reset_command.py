@@ -73,12 +73,6 @@ def test_named_parameters_are_set_to_the_defaults_of_the_vehicle(command: Comman
     assert vehicle.values["FIXED"] == 3
 
 
-def test_a_switch_that_hides_others_is_reset_last(command: Command, put: Put) -> None:
-    tap = Tap(copter())
-    assert command("reset", put(tap), "MC_ENABLE", "MC_ROLL_P", "COUNT").code == 0
-    assert written(tap) == ["MC_ROLL_P", "COUNT", "MC_ENABLE"]
-
-
 def test_a_parameter_without_a_known_default_is_listed_and_not_written(command: Command, put: Put) -> None:
     tap = Tap(GenericVehicle(table={"A": 5.0, "B": 6.0}))
     done = command("reset", put(tap), "A", "B")

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from paramclient import ParamCache, ParamType, read_file
-from paramclient.cli.sources import names_vehicle
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam
 from tests.commands import Command, Put, behind, in_process, leaping
 
@@ -87,31 +86,6 @@ def test_useless_options_are_refused(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("where", "is_link"),
-    [
-        ("sim:px4", True),
-        ("udpin:0.0.0.0:14550", True),
-        ("/dev/ttyACM0,57600", True),
-        ("COM5", True),
-        ("nonsense:", True),
-        ("1", False),
-        ("0002", False),
-        ("uid:0002", False),
-        ("4954414c44494e4f/1", False),
-        ("system:1@udpin:0.0.0.0:14550", False),
-    ],
-)
-def test_links_and_cached_vehicles_are_distinguished(where: str, is_link: bool) -> None:
-    assert names_vehicle(where) is not is_link
-
-
-def test_an_invalid_file_name_fails_before_the_link_is_opened(command: Command, tmp_path: Path) -> None:
-    saved = command("save", "tcp:127.0.0.1:1", tmp_path / "quad.txt")
-    assert saved.code == 2
-    assert "unknown file extension '.txt'" in saved.err
-
-
 def test_a_vehicle_that_is_not_in_the_cache_is_an_error(command: Command, tmp_path: Path) -> None:
     saved = command("save", "7", tmp_path / "quad.param", "--cache", tmp_path / "cache.sqlite3")
     assert (saved.code, saved.out) == (2, "")
@@ -126,16 +100,6 @@ def test_save_writes_parameters_that_differ_from_the_defaults(command: Command, 
         assert (saved.code, saved.err) == (0, f"41 parameters of 1/1 written to {path} (mission-planner)\n")
         assert read_file(path).choose()["RELAY1_FUNCTION"].value == 1
         path.unlink()
-
-
-def test_without_defaults_nothing_is_written(command: Command, tmp_path: Path) -> None:
-    path = tmp_path / "quad.param"
-    path.write_bytes(b"OLD,1\n")
-    saved = command("save", "sim:px4", path, "--changed", "--no-cache")
-    assert (saved.code, saved.out) == (1, "")
-    assert "defaults are not known" in saved.err
-    assert f"nothing was written to {path}" in saved.err
-    assert path.read_bytes() == b"OLD,1\n"
 
 
 def test_nothing_is_written_if_no_parameter_differs(

@@ -9,8 +9,6 @@ import pytest
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle
 from tests.commands import Command, Put, behind, in_process, leaping
 
-ROOT = Path(__file__).parents[2]
-
 
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
@@ -119,17 +117,3 @@ def test_info_of_an_unknown_name_suggests_others(command: Command) -> None:
     undescribed = command("info", "RTL_ALT")
     assert "2/1 ardupilot" in undescribed.out
     assert "no metadata is stored for the firmware of ardupilot" in undescribed.err
-
-
-def test_a_metadata_file_is_searched_without_a_table(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    file = tmp_path / "apm.pdef.xml"
-    file.write_text(
-        '<paramfile><vehicles><parameters name="ArduCopter"><param name="ArduCopter:FENCE_ALT" '
-        'humanName="Fence Altitude" documentation="Highest altitude."><field name="Units">m</field></param>'
-        "</parameters></vehicles></paramfile>"
-    )
-    run = in_process(capsys, "--cache", str(tmp_path / "none.sqlite3"), "--metadata", str(file))
-    assert run("search", "highest").rows[1] == ["FENCE_ALT", "Fence Altitude"]
-    assert "FENCE_ALT: Fence Altitude" in run("info", "fence_alt").out

@@ -317,31 +317,6 @@ def test_restore_does_not_undo_an_apply_twice(command: Command, put: Put, file: 
     assert vehicle.values["RTL_ALT"] == 2500
 
 
-def test_restore_prints_left_out_parameters_and_succeeds(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
-) -> None:
-    vehicle = ArduPilotVehicle(
-        table={"RTL_ALT": 1500, "BARO1_GND_PRESS": 94500.0, "INS_GYROFFS_X": 0.25}, live_period=0.0
-    )
-    command("apply", put(vehicle), file("RTL_ALT,2500\n"))
-    vehicle.set_param("BARO1_GND_PRESS", 94600.0)
-    vehicle.set_param("INS_GYROFFS_X", 0.5)
-    back = command("restore", put(vehicle))
-    assert back.code == 0
-    assert {tuple(row) for row in back.rows[1:]} == {
-        ("RTL_ALT", "2500", "1500", "1500", "set"),
-        (
-            *("BARO1_GND_PRESS", "94600.0", "94500.0", "94600.0", "skipped"),
-            "left out: it can only be read: the vehicle writes it",
-        ),
-        (
-            *("INS_GYROFFS_X", "0.5", "0.25", "0.5", "skipped"),
-            "left out: it is measured by the vehicle at each start",
-        ),
-    }
-    assert vehicle.values == {"RTL_ALT": 1500, "BARO1_GND_PRESS": 94600.0, "INS_GYROFFS_X": 0.5}
-
-
 @pytest.mark.parametrize(
     ("when", "text"),
     [
@@ -469,23 +444,6 @@ def test_all_vehicles_are_restored_each_to_its_own_state(
     assert [vehicle.values["WPNAV_SPEED"] for vehicle in vehicles] == [750.5] * 3
 
 
-def test_a_vehicle_without_a_state_does_not_stop_the_restore_of_the_others(
-    command: Command, put: Put, file: Callable[..., Path]
-) -> None:
-    air, vehicles = fleet()
-    for system in (1, 3):
-        assert command("apply", put(air), file(), "--vehicle", system).code == 0
-    back = command("restore", put(air), "--vehicle", "all", "--json")
-    assert back.code == 5
-    assert [each["system"] for each in back.json["vehicles"]] == [1, 3]
-    [failed] = back.json["errors"]
-    assert failed["system"] == 2
-    assert "2/1 ardupilot: the cache has no snapshot from before an apply to uid:" in back.err
-    assert "writing to 2/1" not in back.err
-    assert [vehicle.values["RTL_ALT"] for vehicle in vehicles] == [1500] * 3
-    assert not vehicles[1].requests["PARAM_SET"]
-
-
 def test_one_state_is_not_restored_to_all_vehicles(
     command: Command, put: Put, file: Callable[..., Path]
 ) -> None:
@@ -571,19 +529,6 @@ class Dying(GenericVehicle):
         super()._on_set(request, sender)
         if self.requests["PARAM_SET"] == 12:
             self._switch_on(float("inf"))
-
-
-def test_a_silent_vehicle_is_reported_with_the_outcomes_so_far(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
-) -> None:
-    names = [f"P{number:02}" for number in range(40)]
-    vehicle = Dying(dict.fromkeys(names, 1))
-    wanted = file("".join(f"{name},2\n" for name in names))
-    outcome = command("apply", put(vehicle), wanted, "--json")
-    assert outcome.code == 3
-    assert outcome.json["error"]
-    assert outcome.json["counts"]["unproven"] + outcome.json["counts"]["failed"] > 0
-    assert "run it again" in command("apply", put(Dying(dict.fromkeys(names, 1))), wanted).err
 
 
 @pytest.mark.parametrize("options", [[], ["--vehicle", "1"]])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 
 from paramclient import AmbiguousVehicle, ParamCache, UnknownVehicle
 from paramclient.cache import CachedVehicle, TableState
-from paramclient.cache.lookup import VEHICLES_LISTED_MAX, find_vehicle, is_vehicle_name
+from paramclient.cache.lookup import find_vehicle, is_vehicle_name
 from paramclient.model.identity import Identity
 from paramclient.sim import PX4Vehicle
 from tests.caches import NOW, PX4, stored, update
@@ -133,34 +132,6 @@ def test_a_system_id_means_the_vehicle_with_the_autopilot_and_not_its_camera() -
     assert find_vehicle([camera], "3", place="here") is camera
     with pytest.raises(AmbiguousVehicle, match="fits 2 vehicles"):
         find_vehicle([camera, replace(camera, key="uid:ca3e0004")], "3", place="here")
-
-
-def test_the_vehicles_of_an_ambiguous_name_have_the_time_of_their_last_observation() -> None:
-    kept = [known(1, SHARED), replace(known(1, "beef000000000001"), last_seen=NOW + 86400)]
-    with pytest.raises(AmbiguousVehicle) as caught:
-        find_vehicle(kept, "1", place="here")
-    first, second = (re.search(r"last seen (\S+ \S+Z)\)", each) for each in caught.value.vehicles)
-    assert first is not None
-    assert second is not None
-    assert first[1] < second[1]
-
-
-def test_system_and_component_only_narrow_a_name() -> None:
-    assert find_vehicle(KEPT, "uid:4a0000", place="here", system=7) is KEPT[2]
-    assert find_vehicle(KEPT, "uid:4a0000", place="here", component=154) is KEPT[0]
-    assert find_vehicle(KEPT, None, place="here", component=154) is KEPT[0]
-    with pytest.raises(UnknownVehicle, match=f"vehicle {FOUR}, component 9 is not in the cache"):
-        find_vehicle(KEPT, FOUR, place="here", component=9)
-    with pytest.raises(UnknownVehicle, match="vehicle 3, system 4 is not in the cache"):
-        find_vehicle(KEPT, "3", place="here", system=4)
-
-
-def test_a_long_list_of_vehicles_is_shortened() -> None:
-    many = [known(1 + number % 255, f"{number:016x}") for number in range(VEHICLES_LISTED_MAX + 2)]
-    with pytest.raises(UnknownVehicle, match="and 2 more; `paramclient cache list` shows all") as caught:
-        find_vehicle(many, "uid:ffffff", place="here")
-    assert str(caught.value).count("\n") == VEHICLES_LISTED_MAX + 1
-    assert len(caught.value.vehicles) == VEHICLES_LISTED_MAX + 2
 
 
 def test_an_empty_cache_is_reported() -> None:

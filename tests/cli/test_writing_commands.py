@@ -17,7 +17,7 @@ from paramclient.links import SimLink
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, bits_of
 from paramclient.protocol.selection import LOOK_TIME
-from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, Vehicle
 from paramclient.wire import messages
 from tests.caches import NOW, update
 from tests.commands import Command, Put, behind, in_process, leaping
@@ -247,16 +247,6 @@ def test_a_vehicle_that_replaces_a_lost_one_is_not_written_to(
     assert untouched(one, two)
 
 
-def test_a_vehicle_lost_before_does_not_count(
-    command: Command, put: Put, words: Callable[[str], list[str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    one, two = px4(), copter()
-    put(Air([Late(one, 0.0, until=0.5), Late(two, 9.0)]))
-    done = command(*words("set"))
-    assert done.code in (0, 3)
-    assert untouched(two)
-
-
 # Ambiguous sources
 
 
@@ -354,11 +344,3 @@ def test_a_short_timeout_reports_the_remaining_wait(command: Command, put: Put) 
 
 
 # over a service
-
-
-def test_a_generic_vehicle_counts_as_a_vehicle(command: Command, put: Put) -> None:
-    one, two = px4(), GenericVehicle(TABLE, system=3)
-    put(Air([one, Late(two, 0.8)]))
-    done = command("set", URL, "MC_ROLL_P", "7.5")
-    assert done.code == 2
-    assert "1/1 PX4 quadrotor, 3/1 " in done.err

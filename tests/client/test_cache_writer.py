@@ -691,15 +691,6 @@ async def test_closing_writes_what_is_new(path: Path) -> None:
 
 
 @in_simulated_time
-async def test_a_parameter_removed_from_the_table_is_removed_from_the_cache(path: Path) -> None:
-    await session(small_px4(), path)
-    async with ParamClient(small_px4(), cache=path) as client:
-        component = await client.component()
-        component.core.machine.table.remove(lambda param: param.name == "PARAM_01")
-    assert "PARAM_01" not in kept(path)
-
-
-@in_simulated_time
 async def test_a_table_is_never_called_whole_that_is_not(path: Path) -> None:
     vehicle = PX4Vehicle(burst=1, period=0.05, table=VALUES)
     async with ParamClient(vehicle, cache=path) as client:
@@ -798,12 +789,6 @@ async def goes_on_without(path: Path | ParamCache, caplog: pytest.LogCaptureFixt
     assert "the last values are lost" in lost
 
 
-@in_simulated_time
-async def test_a_folder_that_cannot_be_written_to(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    (tmp_path / "file").write_text("in the way")
-    await goes_on_without(tmp_path / "file" / "cache", caplog)
-
-
 def test_a_folder_that_can_only_be_read(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     @in_simulated_time
     async def fill() -> None:
@@ -831,13 +816,6 @@ async def test_a_full_disk(path: Path, caplog: pytest.LogCaptureFixture) -> None
 
 
 @in_simulated_time
-async def test_a_cache_that_the_caller_closed(path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    cache = ParamCache(path)
-    cache.close()
-    await goes_on_without(cache, caplog)
-
-
-@in_simulated_time
 async def test_a_damaged_file_is_set_aside(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
@@ -845,43 +823,6 @@ async def test_a_damaged_file_is_set_aside(path: Path, caplog: pytest.LogCapture
     assert (await session(vehicle, path)).source == "stream"
     assert [record.name for record in caplog.records] == ["paramclient.cache"]
     assert len(set_aside(path)) == 1
-    assert (await session(vehicle, path)).source == "cache"
-
-
-@in_simulated_time
-async def test_values_that_could_not_be_written_are_written_later(
-    path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    class Moody(ParamCache):
-        is_broken = False
-
-        def __enter__(self) -> Moody:
-            return self
-
-        def save(self, update: Any, **more: Any) -> None:
-            if self.is_broken:
-                raise CacheError("no room")
-            super().save(update, **more)
-
-    vehicle = small_px4()
-    with Moody(path) as cache:
-        async with ParamClient(vehicle, cache=cache) as client:
-            component = await client.component()
-            await component.get("PARAM_01")
-            await asyncio.sleep(1.0)
-            cache.is_broken = True
-            await component.fetch_all()
-            await asyncio.sleep(cache_writer.RETRY_INTERVAL * 3)
-            cache.is_broken = False
-            await asyncio.sleep(cache_writer.RETRY_INTERVAL + 1.0)
-            assert kept(path) == bits(vehicle.params)
-            cache.is_broken = True
-            await component.set("PARAM_01", 5)
-            await asyncio.sleep(1.0)
-            cache.is_broken = False
-        reported = [record.getMessage() for record in caplog.records]
-        assert reported == ["continuing without the cache: no room"] * 2, "once for each time that it began"
-    assert kept(path) == bits(vehicle.params)
     assert (await session(vehicle, path)).source == "cache"
 
 

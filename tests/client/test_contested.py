@@ -313,7 +313,7 @@ async def test_of_split_vehicles_that_say_to_be_one_the_first_is_cached(
         assert table["SHARED_A"] == 1.0
         assert lines(path) == []
         [warning] = [each.getMessage() for each in caplog.records if each.levelno >= logging.WARNING]
-        assert "10.0.0.2:14550 has the same identity as the vehicle at 10.0.0.1:14550" in warning
+        assert "10.0.0.2:14550 has the identity of the vehicle at 10.0.0.1:14550" in warning
         await until(lambda: client.components[next(iter(client.components))].state == "lost")
         await anyio.sleep(2.0)
         [table] = cached(path).values()
@@ -329,27 +329,6 @@ async def test_a_split_vehicle_is_followed_to_its_new_system_id() -> None:
         await outcome(vehicle.set("SYSID_THISMAV", 7))
         found = await client.successor(vehicle, 7)
         assert (found.system, found.peer) == (7, "10.0.0.1:1")
-
-
-def test_the_command_speaks_to_one_of_two_peers(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    url = "udpin:0.0.0.0:14550"
-    leaping(monkeypatch)
-    put = behind(monkeypatch, url)
-    command: Command = in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
-    first, second = px4(), ardupilot()
-    put(PeersLink({("10.0.0.1", 14550): first, ("10.0.0.2", 14550): second}))
-    ambiguous = command("set", url, "SHARED_A", "5", "--split-peers")
-    assert ambiguous.code == 2
-    assert ambiguous.err.endswith("Choose one with --peer.\n")
-    done = command("set", url, "SHARED_A", "5", "--split-peers", "--peer", "10.0.0.2")
-    assert done.code == 0, done.err
-    assert (first.requests["PARAM_SET"], second.requests["PARAM_SET"]) == (0, 1)
-    assert command("set", url, "SHARED_A", "5", "--peer", "10.0.0.2").code == 2
-    both = command("save", url, str(tmp_path / "all.params"), "--all", "--split-peers")
-    assert both.code == 2, both.err
-    assert "exclude each other" in both.err
 
 
 def test_two_autopilots_on_one_udp_port(tmp_path: Path) -> None:

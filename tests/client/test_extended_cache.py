@@ -8,11 +8,12 @@ from pathlib import Path
 import anyio
 import pytest
 
-from paramclient import ExtChange, ParamCache, ParamClient, Policy, Trust
+from paramclient import ParamCache, ParamClient, Policy, Trust
 from paramclient.cache import CachedExtTable
 from paramclient.cache.sqlite import SqliteStore
 from paramclient.errors import CacheError
 from paramclient.logs.telemetry import import_log
+from paramclient.protocol.events import Change
 from paramclient.sim import Air, Camera, PX4Vehicle
 from tests.caches import extended
 from tests.shell import in_simulated_time
@@ -55,7 +56,7 @@ async def test_the_next_session_knows_the_table(tmp_path: Path) -> None:
         assert (await ext.get("CAM_MODE")).trust is Trust.LIVE
         result = await ext.fetch_all()
         assert result.complete
-        change: ExtChange = await anext(changes)
+        change: Change = await anext(changes)
         assert (change.name, change.old and change.old.value) == ("CAM_ISO", 100)
         assert not component.params
     assert history(path) == [

@@ -10,25 +10,23 @@ from unittest import mock
 
 import anyio
 import pytest
+from paramclient.model.ext_params import ExtParamType, ExtSettable
 
 from paramclient import (
     CacheError,
-    ExtChange,
-    ExtParamType,
-    ExtSetOutcome,
-    ExtSettable,
     LinkError,
     NoReply,
     NotDurable,
     ParamCache,
     Policy,
     Progress,
-    SetFailed,
     SetStatus,
     UnknownParameter,
     UsageError,
-    ValueUnsupported,
 )
+from paramclient.errors import SetFailed, ValueUnsupported
+from paramclient.protocol.events import Change
+from paramclient.protocol.set_results import SetOutcome
 from paramclient.sim import Air, Camera, PX4Vehicle
 from tests import shell
 from tests.caches import extended
@@ -84,7 +82,7 @@ async def test_outcomes_of_many_values() -> None:
         failing=["B"],
         limits={"C": (0, 5)},
     )
-    seen: list[ExtSetOutcome] = []
+    seen: list[SetOutcome] = []
     async with a_client(camera) as client:
         ext = (await client.component(1, 100)).ext
         await ext.fetch_all()
@@ -165,7 +163,7 @@ async def test_changes() -> None:
         await component.ext.set("A", 2)
         await component.ext.set("B", "other")
         await component.ext.set("B", "third")
-        found: list[ExtChange] = [await anext(changes), await anext(changes)]
+        found: list[Change] = [await anext(changes), await anext(changes)]
         assert [(each.name, each.old, each.new and each.new.value, each.by) for each in found] == [
             ("A", None, 2, "us"),
             ("B", None, "third", "us"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import os
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -22,12 +21,10 @@ from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.params.table import NameQuota, Table
 from paramclient.protocol.requests.retry import INITIAL_TIMEOUT
 from paramclient.protocol.stats import traffic as traffic_room
-from paramclient.protocol.vehicle.presence import LOST_AFTER
 
-from paramclient import FileTransferError, NoReply, ParamCache, ParamClient
+from paramclient import FileTransferError, NoReply, ParamClient
 from paramclient.cli import run as run_command
 from paramclient.cli import session as session_room
-from paramclient.client import cache_writer
 from paramclient.client import subscription as subscription_room
 from paramclient.client.streams import Changes
 from paramclient.links import SimLink
@@ -44,7 +41,6 @@ from paramclient.wire.messages import (
     NO_INDEX,
     PARAMETERS_MAX,
     TEXTS_MAX,
-    AutopilotVersion,
     Heartbeat,
     Message,
     ParamRequestRead,
@@ -53,7 +49,7 @@ from paramclient.wire.messages import (
     text_of,
 )
 from tests.hostile_vehicle import ESCAPE, LIES, HostileVehicle
-from tests.shell import bits, generic, in_simulated_time, small_px4
+from tests.shell import generic, in_simulated_time
 from tests.simulation import PEER, Simulation, known, listing_ardupilot, param_value
 
 ROOT = Path(__file__).parents[2]
@@ -405,51 +401,6 @@ def test_memory_is_bounded_under_all_kinds_of_lies_at_once() -> None:
 
 
 # The client, the cache, the terminal
-
-
-@pytest.mark.parametrize(("lies", "kept"), [((), 3), (("restless identity",), 0)], ids=["slowly", "at once"])
-@in_simulated_time
-async def test_a_vehicle_that_changes_its_identity_each_time_fills_no_cache(
-    lies: tuple[str, ...],
-    kept: int,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    monkeypatch.setattr(cache_writer, "VEHICLES_MAX", 3)
-    liar = HostileVehicle(*lies, rate=1)
-    path = tmp_path / "cache" / "parameters.sqlite3"
-    async with ParamClient(Air([liar, small_px4()]), cache=path) as client:
-        await client.component(66, 1)
-        vehicle = await client.component(1, 1)
-        assert (await vehicle.fetch_all()).complete
-        for number in range(4):
-            liar.say(AutopilotVersion(16, uid=number + 1))
-            liar.say(param_value(f"V{number}"))
-            await anyio.sleep(LOST_AFTER + 2 * cache_writer.CACHE_FLUSH_INTERVAL)  # till then it may be two
-            assert len(client.core.cache_writer._loading) <= 1
-    with ParamCache(path) as cache:
-        systems = [each.identity.system for each in cache.vehicles()]
-        assert systems.count(66) == kept
-        assert bits(cache.component(system=1).params) == bits(vehicle.params)
-    assert os.listdir(tmp_path) == ["cache"]  # noqa: PTH208 - nothing stands outside of its folder
-    assert os.listdir(path.parent) == ["parameters.sqlite3"]  # noqa: PTH208 - as above
-    assert [record.message for record in caplog.records] == [
-        "66/1: too many vehicles on this link: its table is not cached"
-    ]
-
-
-@in_simulated_time
-async def test_cached_tables_of_a_session_are_bounded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cache_writer, "TABLES_MAX", 2)
-    vehicles = [small_px4(system=system) for system in (1, 2, 3)]
-    async with ParamClient(Air(vehicles), cache=tmp_path / "cache.sqlite3") as client:
-        await client.component(3, 1)
-        assert len((await client.fetch_all()).results) == 3
-    with ParamCache(tmp_path / "cache.sqlite3") as cache:
-        assert len(cache.components()) == 2
 
 
 @in_simulated_time

@@ -23,18 +23,10 @@ from mavsdk import ComponentType, Configuration, ConnectionResult, Mavsdk, log_s
 from mavsdk.plugins.camera_server import CameraServer
 from mavsdk.plugins.ftp_server import FtpServer
 from mavsdk.plugins.param_server import ParamServer
+from paramclient.model.ext_params import ExtParamType
 
-from paramclient import (
-    Encoding,
-    ExtParamType,
-    LinkError,
-    NoReply,
-    ParamClient,
-    ParamType,
-    SetFailed,
-    UnknownParameter,
-    UsageError,
-)
+from paramclient import Encoding, LinkError, NoReply, ParamClient, ParamType, UnknownParameter, UsageError
+from paramclient.errors import SetFailed
 from paramclient.links import Peer
 from tests.shell import TIMEOUT, bits, residue, until
 

@@ -10,15 +10,11 @@ import time
 import weakref
 from collections import Counter
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import anyio
 import anyio.lowlevel
 import pytest
-from paramclient.client.fetch_all import FleetFetch
 from paramclient.client.loop_scheduler import TURN_MAX
 from paramclient.client.suspend_detection import SUSPEND_MIN
 from paramclient.protocol.component import ComponentMachine
@@ -28,7 +24,6 @@ from paramclient import ParamCache, ParamClient
 from paramclient.cache import CachedComponent
 from paramclient.client import link_task, loop_scheduler
 from paramclient.client.link_task import LOOP_LATENCY_MIN, TIMEOUT_DELAY_MAX, LinkTask
-from paramclient.errors import NoReply
 from paramclient.links import Peer
 from paramclient.model.values import ParamType
 from paramclient.protocol import scheduler, wire
@@ -168,24 +163,6 @@ def test_a_released_fetch_is_freed_without_a_garbage_collection() -> None:
         gc.enable()
 
 
-@in_simulated_time
-async def test_the_errors_of_silent_components_hold_no_calls() -> None:
-    station: Any = SimpleNamespace(components={})
-    together = FleetFetch(station, {}, system=None, refresh=False)
-    for system in range(1, 4):
-        fetch: Any = SimpleNamespace(error=None if system > 1 else NoReply("x", attempts=1, waited=1.0))
-        fetch.result = SimpleNamespace(complete=True) if system == 3 else None
-        fetch.partial = partial(_raise, NoReply("y", attempts=1, waited=1.0))
-        together._fetches[system, 1] = fetch
-    outcome = await together.outcome(0.0, waited=1.0)
-    assert outcome.results.keys() == {(3, 1)}
-    assert [error.__traceback__ for error in outcome.silent.values()] == [None, None]
-
-
-def _raise(error: Exception, *_: object) -> None:
-    raise error
-
-
 def test_a_forgotten_component_leaves_no_deadline_to_its_successor(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -298,7 +275,7 @@ async def test_a_cached_table_that_is_being_read_is_waited_for(
     path = tmp_path / "cache.sqlite3"
     async with ParamClient(small(1), cache=path) as client:
         await (await client.component()).fetch_all()
-    monkeypatch.setattr("paramclient.client.link_component.IDENTITY_TIMEOUT", 0.05)
+    monkeypatch.setattr("paramclient.client.component_core.IDENTITY_TIMEOUT", 0.05)
     with SlowCache(path) as cache:
         async with ParamClient(small(1), cache=cache) as client:
             assert (await client.fetch_all()).results[1, 1].source == "cache"

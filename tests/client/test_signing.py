@@ -24,21 +24,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import paramclient
-from paramclient import (
-    NoReply,
-    ParamClient,
-    Refusal,
-    Signing,
-    SigningKey,
-    SigningPolicy,
-    UsageError,
-    key_from_environment,
-    read_key,
-)
+from paramclient import NoReply, ParamClient, Signing, SigningKey, SigningPolicy, UsageError, read_key
 from paramclient.cli import run
 from paramclient.cli import session as cli_session
 from paramclient.cli import signing as signing_commands
 from paramclient.client import signing, signing_timestamps
+from paramclient.client.signing import key_from_environment
 from paramclient.client.signing_timestamps import (
     TIMESTAMP_CHECK_INTERVAL,
     TIMESTAMP_RESERVE,
@@ -47,6 +38,7 @@ from paramclient.client.signing_timestamps import (
 )
 from paramclient.links import SimLink
 from paramclient.sim import ArduPilotVehicle, Vehicle
+from paramclient.wire.signing import Refusal
 from tests.shell import VALUES, Tap, in_simulated_time, simulated_time_loop, small_px4
 
 SECRET = bytes(range(101, 133))

@@ -11,17 +11,8 @@ from typing import Any
 
 import pytest
 
-from paramclient import (
-    FileError,
-    FileFormat,
-    ParamFile,
-    ParamSet,
-    ParamType,
-    WrittenParam,
-    read_file,
-    write_file,
-)
-from paramclient.files import LARGEST_FILE, dumps, loads
+from paramclient import FileError, ParamFile, ParamSet, ParamType, WrittenParam, read_file, write_file
+from paramclient.files import LARGEST_FILE, FileFormat, dumps, loads
 from paramclient.files.formats import ENDINGS
 from paramclient.files.includes import FILES_MAX
 

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.mavparm import MAVParmDict
 
-from paramclient import FileError, FileFormat, Identity, ParamFile, ParamSet, ParamType, WrittenParam
+from paramclient import FileError, Identity, ParamFile, ParamSet, ParamType, WrittenParam
 from paramclient.errors import UsageError
-from paramclient.files import dumps, loads
+from paramclient.files import FileFormat, dumps, loads
 from paramclient.model.values import WireValue, bits_of, from_bits
 
 DATA = Path(__file__).parents[1] / "data"

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from paramclient import FileError, Rename, read_renames
-from paramclient.files import loads_renames
+from paramclient import FileError
+from paramclient.files import loads_renames, read_renames
 from paramclient.files.rename_file import SIZE_MAX
+from paramclient.model.renames import Rename
 
 FILE = b"""\
 [

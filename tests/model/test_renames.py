@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from paramclient import FileError, ParamSet, ParamType, Rename, Renames, UsageError, WrittenParam
+from paramclient import FileError, ParamSet, ParamType, UsageError, WrittenParam
+from paramclient.model.renames import Rename, Renames
 from paramclient.model.values import WireValue
 
 CHAIN = Renames([Rename("A", "B", 0.01), Rename("B", "C", 10)], "names.json")

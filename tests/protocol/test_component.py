@@ -9,10 +9,27 @@ from collections.abc import Callable
 import pytest
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params import table as table_room
-from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import DOUBT_TIME, FOREIGN_SET_MEMORY
 from paramclient.protocol.params.value_check import AMBIGUITY_WINDOW
-from paramclient.protocol.wire import (
+
+from paramclient.errors import (
+    LinkError,
+    NoReply,
+    UnknownParameter,
+    UsageError,
+)
+from paramclient.model.px4_hash import hash_params
+from paramclient.model.values import Encoding, Param, ParamType, Trust, WireValue
+from paramclient.protocol.events import (
+    Change,
+    ComponentIdentified,
+    Event,
+    EventMaker,
+    Fetched,
+    ParamChanged,
+)
+from paramclient.sim import GenericVehicle, PX4Vehicle, Vehicle
+from paramclient.wire.messages import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_PX4,
@@ -24,29 +41,10 @@ from paramclient.protocol.wire import (
     ParamError,
     ParamRequestList,
     ParamRequestRead,
-    ParamSetMessage,
+    ParamSet,
     ParamValue,
     StatusText,
 )
-
-from paramclient.errors import (
-    LinkError,
-    NoReply,
-    ParamErrorCode,
-    Refused,
-    UnknownParameter,
-    UsageError,
-)
-from paramclient.model.px4_hash import hash_params
-from paramclient.model.values import Encoding, Param, ParamType, Trust, WireValue
-from paramclient.protocol.events import (
-    ComponentIdentified,
-    Event,
-    EventMaker,
-    Fetched,
-    ParamChanged,
-)
-from paramclient.sim import GenericVehicle, PX4Vehicle, Vehicle
 from tests.simulation import Simulation, is_so, known, listed, param_value
 
 OWN = (255, 190)
@@ -160,12 +158,6 @@ def test_a_value_goes_into_the_table_and_is_reported() -> None:
     assert len(desk.changes) == 1
 
 
-def test_a_value_without_a_name_is_none() -> None:
-    desk = Desk()
-    desk.hear("")
-    assert desk.machine.table.params == {}
-
-
 def test_a_table_that_is_full_takes_no_more_names(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(table_room, "NAMES_MAX", 1)
     desk = Desk()
@@ -211,7 +203,7 @@ def test_ardupilot_answers_in_the_requested_spelling() -> None:
     assert read.done
     assert list(desk.machine.table.params) == ["WPNAV_SPEED"]
     write = desk.machine.write("wpnav_speed", 400.0, desk.now)
-    assert [each.param_id for each in desk.take() if isinstance(each, ParamSetMessage)] == ["WPNAV_SPEED"]
+    assert [each.param_id for each in desk.take() if isinstance(each, ParamSet)] == ["WPNAV_SPEED"]
     desk.hear("wpnav_speed", 400.0)
     assert write.done
 
@@ -238,29 +230,11 @@ def test_ardupilots_answer_to_a_set_does_not_change_an_integers_type() -> None:
     assert [change.new for change in desk.changes[before:]] == [known("B", 8, index=1).with_trust(Trust.LIVE)]
 
 
-def test_a_type_of_the_cache_gives_way() -> None:
-    """A write reads first, so it never depends on that."""
-    desk = Desk(ARDUPILOT)
-    desk.cached(known("A", 3, index=0, kind=ParamType.INT8))
-    write = desk.machine.write("A", 3, desk.now)
-    assert desk.reads() == ["A"]
-    desk.hear("A", 3.0)
-    assert types_of(desk) == {"A": ParamType.REAL32}
-    desk.hear("A", 3.0)
-    assert write.done
-
-
 def test_other_autopilots_mean_the_type_that_they_say() -> None:
     desk = Desk(SOMETHING)
     desk.hear("A", 3, ParamType.INT8, index=0)
     desk.hear("A", 3.0)
     assert types_of(desk) == {"A": ParamType.REAL32}
-
-
-def test_other_autopilots_mind_the_case() -> None:
-    desk = Desk()
-    desk.machine.read("a", desk.now)
-    assert desk.reads() == ["a"]
 
 
 def test_a_changed_count_marks_the_table_unsynced() -> None:
@@ -340,15 +314,6 @@ def test_a_refusal_for_another_station(target: tuple[int, int]) -> None:
     assert not write.done
 
 
-def test_a_refusal_of_a_write_is_not_one_of_a_read() -> None:
-    desk = Desk()
-    desk.hear("A", 1.0)
-    write, read = desk.machine.write("A", 2.0, desk.now), desk.machine.read("A", desk.now)
-    desk.receive(ParamError(*OWN, "A", -1, ParamErrorCode.READ_ONLY))
-    assert isinstance(write.error, Refused)
-    assert not read.done
-
-
 @pytest.mark.parametrize(
     ("text", "is_refusal"),
     [
@@ -383,24 +348,13 @@ def test_before_it_is_certain_how_values_are_written_nothing_is_judged_or_sent()
     desk = Desk(None)
     desk.receive(param_value("A", 5.0, kind=ParamType.INT32, encoding=Encoding.C_CAST))
     write = desk.machine.write("A", 1234.7, desk.now)
-    assert not any(isinstance(each, ParamSetMessage) for each in desk.take())
+    assert not any(isinstance(each, ParamSet) for each in desk.take())
     desk.receive(ARDUPILOT)
-    [message] = [each for each in desk.take() if isinstance(each, ParamSetMessage)]
+    [message] = [each for each in desk.take() if isinstance(each, ParamSet)]
     assert message.raw == param_value("A", 1234.7).raw
     desk.hear("A", 1234, ParamType.INT32)
     assert write.result is not None
     assert write.result.status == "adjusted"
-
-
-def test_an_unidentified_component_is_written_to_by_the_standard() -> None:
-    desk = Desk(None)
-    desk.receive(SOMETHING)
-    desk.hear("A", 5, ParamType.INT32)
-    desk.machine.write("A", 6, desk.now)
-    assert not any(isinstance(each, ParamSetMessage) for each in desk.take())
-    desk.pass_time(6.0)
-    assert desk.machine.identification.settled
-    assert any(isinstance(each, ParamSetMessage) for each in desk.take())
 
 
 # hashes
@@ -424,27 +378,6 @@ def test_after_our_write_the_hash_is_requested_once_things_have_settled() -> Non
     assert desk.machine.sync.synced
 
 
-def test_another_hash_than_expected_takes_the_table_out_of_step() -> None:
-    desk = Desk()
-    fetched(desk)
-    desk.machine.write("A", 7.0, desk.now)
-    desk.hear("A", 7.0, index=0)
-    desk.pass_time(0.1)
-    desk.hash(0x12345678)
-    assert not desk.machine.sync.synced
-    assert desk.machine.table.hash != 0x12345678
-
-
-def test_the_right_hash_with_another_count_confirms_nothing() -> None:
-    desk = Desk()
-    fetched(desk)
-    desk.machine.sync.ask(desk.now)
-    expected = desk.machine.table.hash
-    assert expected is not None
-    desk.hash(expected, count=4)
-    assert not desk.machine.sync.synced
-
-
 def test_no_hash_is_requested_from_a_vehicle_without_one() -> None:
     for heartbeat in (ARDUPILOT, SOMETHING):
         desk = Desk(heartbeat)
@@ -453,16 +386,6 @@ def test_no_hash_is_requested_from_a_vehicle_without_one() -> None:
         desk.hear("A", 2.0)
         desk.pass_time(1.0)
         assert HASH_CHECK not in desk.reads()
-
-
-def test_a_change_makes_an_announced_hash_old() -> None:
-    desk = Desk()
-    desk.hash(5)
-    desk.hear("A", 1.0)
-    assert desk.machine.sync.announced is not None
-    assert desk.machine.sync.announced.at == -math.inf
-    desk.hear("A", 2.0)
-    assert desk.machine.sync.announced.hash == 5
 
 
 # the cache
@@ -476,17 +399,6 @@ def test_values_received_before_the_cache_was_read_are_kept() -> None:
     table = desk.machine.table
     assert (table.params["A"].value, table.params["B"].value) == (9, 2)
     assert table.hash == hash_params(listed(table)) != hash_params(params)
-
-
-def test_a_hash_that_cannot_be_computed_is_dropped_after_a_change() -> None:
-    desk = Desk()
-    desk.hear("A", 9, ParamType.INT32, index=0, count=2)
-    desk.cached(known("A", 1, index=0), known("B", 2, index=1), confirmed=77)
-    assert desk.machine.table.hash is None
-    other = Desk()
-    other.hear("A", 1, ParamType.INT32, index=0, count=2)
-    other.cached(known("A", 1, index=0), known("B", 2, index=1), confirmed=77)
-    assert other.machine.table.hash == 77
 
 
 # its state
@@ -510,17 +422,6 @@ def test_the_states_of_a_table() -> None:
 
 
 # identity
-
-
-def test_a_late_hardware_id_is_announced_as_a_new_identity() -> None:
-    desk = Desk(None)
-    for _ in range(10):
-        desk.receive(PX4)
-        desk.pass_time(1.0)
-    assert desk.events == [ComponentIdentified(desk.machine)]
-    desk.receive(AutopilotVersion(0, uid=7))
-    assert desk.events == 2 * [ComponentIdentified(desk.machine)]
-    assert desk.machine.identity.key == "uid:0000000000000007"
 
 
 def test_another_vehicle_in_the_same_place() -> None:

@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from paramclient.protocol.no_reply_hint import LISTED_MAX, hint_of_component, hint_of_link
-from paramclient.protocol.params.fetch_result import Policy
+from paramclient.protocol.no_reply_hint import LISTED_MAX, hint_of_component
 from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.wire import (
+
+from paramclient.protocol.fetch import Policy
+from paramclient.protocol.selection import hint_of_link
+from paramclient.protocol.station import SENDERS_MAX, Station
+from paramclient.wire import messages
+from paramclient.wire.messages import (
     MAV_AUTOPILOT_INVALID,
     MAV_AUTOPILOT_PX4,
     MAV_TYPE_GCS,
@@ -16,9 +20,6 @@ from paramclient.protocol.wire import (
     Message,
     StatusText,
 )
-
-from paramclient.protocol import wire
-from paramclient.protocol.station import SENDERS_MAX, Station
 
 LINK = "udpin:0.0.0.0:14550"
 ASKS = "Is the vehicle sending to this port?"
@@ -39,7 +40,7 @@ def station() -> Station:
 @pytest.fixture
 def hear(station: Station) -> Hear:
     def receive(message: Message, system: int, component: int = 1, now: float = 1.0) -> None:
-        frame = wire.encode(message, system=system, component=component, sequence=0, version=2)
+        frame = messages.encode(message, system=system, component=component, sequence=0, version=2)
         station.receive(frame, "peer", now)
 
     return receive
@@ -93,7 +94,7 @@ def test_frames_of_unknown_senders() -> None:
     """A client that only listens looks at parameters and heartbeats alone."""
     settings = SyncSettings.chosen(None, Policy.AUTO, listen_only=True, is_log=False)
     listening = Station(link=LINK, is_stream=False, sync_settings=settings)
-    frame = wire.encode(TEXT, system=7, component=1, sequence=0, version=2)
+    frame = messages.encode(TEXT, system=7, component=1, sequence=0, version=2)
     listening.receive(frame, "peer", 1.0)
     expected = f"1 MAVLink frame was received on {LINK}, but no heartbeat."
     assert hint_of_link(listening, LINK) == expected
@@ -148,7 +149,7 @@ def test_a_vehicle_that_has_fallen_silent(station: Station, hear: Hear) -> None:
 
 
 def test_a_component_without_heartbeats(station: Station, hear: Hear) -> None:
-    hear(wire.ParamValue("A", bytes(4), 9, 1, 0), 3, now=2.0)
+    hear(messages.ParamValue("A", bytes(4), 9, 1, 0), 3, now=2.0)
     assert answer(station, 1.0, 3.0).startswith("3/1 sends messages (the last one 1.0 s ago) and answers no")
     assert answer(station, 2.5, 4.0) == f"Nothing was received on {LINK} for 2.0 s."
 

@@ -8,11 +8,11 @@ from collections.abc import Callable
 
 import pytest
 from paramclient.protocol.params.fetch import Fetch
-from paramclient.protocol.wire import ParamRequestList, ParamRequestRead
 
 from paramclient import ParamClient
 from paramclient.errors import LinkError, NoReply
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
+from paramclient.wire.messages import ParamRequestList, ParamRequestRead
 from tests.shell import in_simulated_time
 from tests.simulation import Simulation
 

@@ -12,19 +12,18 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.fetch import Fetch
-from paramclient.protocol.params.fetch_result import FetchResult, Policy
 from paramclient.protocol.params.list_download import REQUESTED_INDICES_MAX
 from paramclient.protocol.params.reads import Read, ValueRead
 from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.params.write_batch import SetOutcome, SetStatus, WriteBatch
+from paramclient.protocol.params.write_batch import WriteBatch
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.write_window import WRITES_IN_FLIGHT_MAX
-from paramclient.protocol.wire import HASH_CHECK
 
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.values import Encoding, Param, ParamType, encode_value
-from paramclient.protocol import wire
+from paramclient.protocol.fetch import FetchResult, Policy
+from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.protocol.station import Station
 from paramclient.sim import (
     Air,
@@ -35,6 +34,8 @@ from paramclient.sim import (
     PX4Vehicle,
     SimParam,
 )
+from paramclient.wire import messages
+from paramclient.wire.messages import HASH_CHECK
 from tests.simulation import Simulation
 
 LIMIT = 300.0
@@ -369,11 +370,11 @@ class Sessions(RuleBasedStateMachine):
         encoding = Encoding.C_CAST if isinstance(self.vehicle, ArduPilotVehicle) else Encoding.BYTEWISE
         kind = ParamType.REAL32 if name in FLOATS else ParamType.INT32
         raw = encode_value(float(number) if name in FLOATS else number, kind, encoding)
-        self.another_sends(wire.ParamSetMessage(1, 1, name, raw, kind), is_received)
+        self.another_sends(messages.ParamSet(1, 1, name, raw, kind), is_received)
 
     @rule(is_received=st.booleans(), component=st.sampled_from([0, 1]))
     def another_station_lists(self, is_received: bool, component: int) -> None:
-        self.another_sends(wire.ParamRequestList(1, component), is_received)
+        self.another_sends(messages.ParamRequestList(1, component), is_received)
 
     @rule()
     def a_group_comes_or_goes(self) -> None:
@@ -553,7 +554,7 @@ class Sessions(RuleBasedStateMachine):
             world.sent.clear()
             world.run(2 * SETTLING)
             # beside frames for another station the numbers may look begun anew: then the clock is requested
-            allowed = {wire.Heartbeat, wire.CommandLong} if world.air.others else {wire.Heartbeat}
+            allowed = {messages.Heartbeat, messages.CommandLong} if world.air.others else {messages.Heartbeat}
             assert {type(message) for _, message in world.sent} <= allowed
 
     # tools
@@ -619,9 +620,9 @@ class Sessions(RuleBasedStateMachine):
             world.run(self.sync_settings.interval + LOOK)
             world.until(lambda: not world.station.is_waiting, LIMIT)
 
-    def another_sends(self, message: wire.Message, is_received: bool) -> None:
+    def another_sends(self, message: messages.Message, is_received: bool) -> None:
         world = self.world
-        data = wire.encode(message, system=253, component=190, sequence=0)
+        data = messages.encode(message, system=253, component=190, sequence=0)
         world.air.receive(data, world.now)
         if is_received:
             world.air.downlink.send(data, world.now)

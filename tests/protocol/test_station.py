@@ -5,29 +5,28 @@ from __future__ import annotations
 import math
 
 import pytest
-from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.wire import (
+
+from paramclient.errors import LinkError
+from paramclient.model.values import Encoding, ParamType
+from paramclient.protocol import station as room
+from paramclient.protocol.events import ComponentDiscovered
+from paramclient.protocol.fetch import FetchResult
+from paramclient.protocol.station import Station
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
+from paramclient.wire import frames, messages
+from paramclient.wire.frames import Framer
+from paramclient.wire.messages import (
     MAV_AUTOPILOT_INVALID,
     MAV_AUTOPILOT_PX4,
     MAV_TYPE_GCS,
     AutopilotVersion,
     CommandLong,
-    Framer,
     Heartbeat,
     Message,
     ParamRequestList,
     ParamRequestRead,
-    ParamSetMessage,
     StatusText,
 )
-
-from paramclient.errors import LinkError
-from paramclient.model.values import Encoding, ParamType
-from paramclient.protocol import station as room
-from paramclient.protocol import wire
-from paramclient.protocol.events import ComponentDiscovered
-from paramclient.protocol.station import Station
-from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
 from tests.simulation import Simulation, param_value
 
 PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4)
@@ -36,17 +35,17 @@ CAMERA = Heartbeat(30, MAV_AUTOPILOT_INVALID)
 
 
 def frame(message: Message, system: int = 1, component: int = 1, *, version: int = 2) -> bytes:
-    return wire.encode(message, system=system, component=component, sequence=0, version=version)
+    return messages.encode(message, system=system, component=component, sequence=0, version=version)
 
 
 def sent(station: Station) -> list[tuple[Message, int, object]]:
     """The sent messages: message, MAVLink version, and addressee."""
-    framer = Framer(wire.DECODED_IDS, stream=False)
+    framer = Framer(messages.DECODED_IDS, stream=False)
     out = []
     for data, peer in station.data_to_send():
         for each in framer.receive(data):
             assert (each.system, each.component) == station.own_address
-            message = wire.decode(each)
+            message = messages.decode(each)
             assert message is not None
             out.append((message, each.version, peer))
     return out
@@ -76,26 +75,6 @@ def test_our_heartbeat_is_sent_once_a_second() -> None:
     assert beats == [float(second) for second in range(10)]
 
 
-def test_the_content_of_our_heartbeat() -> None:
-    station = Station(link="x", is_stream=False, system=250, component=7)
-    station.tick(0.0)
-    [(message, version, peer)] = sent(station)
-    assert message == Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, system_status=4)
-    assert (version, peer) == (2, None)
-    assert station.own_address == (250, 7)
-
-
-def test_frames_are_numbered_and_counted() -> None:
-    station = a_station()
-    for now in range(300):
-        station.tick(float(now))
-    data = [each for each, _ in station.data_to_send()]
-    frames = [each for datagram in data for each in Framer(wire.DECODED_IDS, stream=False).receive(datagram)]
-    assert [each.sequence for each in frames] == [number % 256 for number in range(300)]
-    assert station.bytes_sent == sum(map(len, data))
-    assert station.data_to_send() == []
-
-
 # Which components are found
 
 
@@ -118,7 +97,7 @@ ATTITUDE = 30
 
 def telemetry(system: int = 1, component: int = 1, *, version: int = 2) -> bytes:
     payload = bytes(range(1, 29))
-    return wire.build_frame(
+    return frames.build_frame(
         ATTITUDE, payload, system=system, component=component, sequence=0, version=version
     )
 
@@ -129,7 +108,8 @@ def heartbeat_requests(station: Station) -> list[tuple[int, int, object]]:
         (message.target_system, message.target_component, peer)
         for message, _, peer in sent(station)
         if isinstance(message, CommandLong)
-        and (message.command, message.params[0]) == (wire.MAV_CMD_REQUEST_MESSAGE, wire.HEARTBEAT_ID)
+        and (message.command, message.params[0])
+        == (messages.MAV_CMD_REQUEST_MESSAGE, messages.message_id(messages.Heartbeat))
     ]
 
 
@@ -150,15 +130,6 @@ def test_the_heartbeat_of_a_vehicle_that_sends_telemetry_is_requested(is_stream:
     assert heartbeat_requests(station) == []
 
 
-@pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
-def test_a_vehicle_in_mid_second_is_found_at_once(make: type[PX4Vehicle] | type[ArduPilotVehicle]) -> None:
-    """Both autopilots answer the request within some milliseconds (measured)."""
-    simulation = Simulation(make(telemetry=50.0))
-    simulation.run(0.3)
-    simulation.next_session()
-    simulation.until(lambda: bool(simulation.station.components), limit=0.1)
-
-
 def test_our_own_frames_and_those_without_a_sender_are_ignored() -> None:
     station = a_station()
     hear(station, GCS, 255, 190)
@@ -166,14 +137,6 @@ def test_our_own_frames_and_those_without_a_sender_are_ignored() -> None:
     assert station.components == {}
     hear(station, GCS, 255, 191)
     assert list(station.components) == [(255, 191)]
-
-
-def test_bytes_that_mean_nothing() -> None:
-    station = a_station()
-    station.receive(b"\xfd\x00 noise", "peer", 0.0)
-    station.receive(wire.build_frame(30, bytes(28), system=1, component=1, sequence=0), "peer", 0.0)
-    assert station.components == {}
-    assert station.bytes_received > 9
 
 
 def test_nothing_is_requested_from_a_ground_station() -> None:
@@ -191,12 +154,6 @@ def test_components_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(station.components) == 5
     hear(station, param_value("A"), 1, 3)  # known components are processed
     assert "A" in station.components[1, 3].table.params
-
-
-def test_the_users_encoding_is_for_all() -> None:
-    station = a_station(encoding=Encoding.C_CAST)
-    hear(station, PX4)
-    assert station.components[1, 1].table.encoding is Encoding.C_CAST
 
 
 # streams and datagrams, peers
@@ -342,27 +299,6 @@ def test_a_component_belongs_to_the_vehicle_that_its_autopilot_names() -> None:
     assert identity.uid == "0000000000000007"
 
 
-def test_a_write_that_met_a_short_doubt_is_begun_all_the_same() -> None:
-    """The camera has not spoken between the doubt about its vehicle and the end of that."""
-    station = a_station()
-    hear(station, PX4, 1, 1)
-    hear(station, AutopilotVersion(0, uid=7), 1, 1)
-    hear(station, CAMERA, 1, 100)
-    hear(station, AutopilotVersion(0, uid=7), 1, 100)
-    hear(station, param_value("A", 1.0), 1, 100)
-    autopilot, camera = station.components[1, 1], station.components[1, 100]
-    station.tick(0.1)
-    autopilot.identification.doubt(0.1)
-    assert autopilot.identification.is_doubted
-    camera.write("A", 2.5, 0.2)
-    hear(station, AutopilotVersion(0, uid=7), 1, 1, now=0.3)
-    sent(station)
-    station.tick(1.2)
-    assert [message.param_id for message, _, _ in sent(station) if isinstance(message, ParamSetMessage)] == [
-        "A"
-    ]
-
-
 # several at once
 
 
@@ -443,14 +379,6 @@ def test_several_vehicles_side_by_side() -> None:
         listed = {name: param.value for name, param in result.params.items() if param.index is not None}
         assert listed == vehicle.values
     assert world.now < 15.0
-
-
-def test_values_of_one_component_are_not_anothers() -> None:
-    world = Simulation(PX4Vehicle(table={"SAME": 1}), GenericVehicle({"SAME": 2.0}, component=2))
-    settle(world, 2)
-    first, second = fetch_of(world, (1, 1), (1, 2))
-    assert first.params["SAME"].value == 1
-    assert second.params["SAME"].value == 2.0
 
 
 def test_a_write_reaches_the_one_it_is_for() -> None:

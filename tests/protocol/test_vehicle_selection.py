@@ -7,8 +7,12 @@ from collections.abc import Callable
 
 import pytest
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.vehicle_selection import LOOK_TIME, VehicleChoice, vehicle_in_words
-from paramclient.protocol.wire import (
+
+from paramclient.errors import AmbiguousVehicle
+from paramclient.protocol.selection import LOOK_TIME, node_in_words, only_vehicle
+from paramclient.protocol.station import Station
+from paramclient.wire import messages
+from paramclient.wire.messages import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_GENERIC,
     MAV_AUTOPILOT_INVALID,
@@ -17,10 +21,6 @@ from paramclient.protocol.wire import (
     Heartbeat,
     Message,
 )
-
-from paramclient.errors import AmbiguousVehicle
-from paramclient.protocol import wire
-from paramclient.protocol.station import Station
 
 PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4)
 ROVER = Heartbeat(10, MAV_AUTOPILOT_ARDUPILOTMEGA)
@@ -40,7 +40,7 @@ class Listening:
 
     def hear(self, message: Message, now: float, system: int = 1, component: int = 1) -> Listening:
         self.station.tick(now)
-        frame = wire.encode(message, system=system, component=component, sequence=0, version=2)
+        frame = messages.encode(message, system=system, component=component, sequence=0, version=2)
         self.station.receive(frame, "peer", now)
         self.station.tick(now)
         return self
@@ -50,9 +50,9 @@ class Listening:
     ) -> tuple[int, int] | None:
         """The address of what is chosen."""
         self.station.tick(now)
-        return self.look(VehicleChoice(system, component), now)
+        return self.look(only_vehicle(system, component), now)
 
-    def look(self, choice: VehicleChoice, now: float) -> tuple[int, int] | None:
+    def look(self, choice: only_vehicle, now: float) -> tuple[int, int] | None:
         machines = self.station.components.values()
         found = choice.look(machines, now, listening_since=self.station.listening_since)
         return None if found is None else (found.system, found.component)
@@ -74,7 +74,7 @@ def listening() -> Listening:
 
 
 def test_the_only_autopilot_is_chosen_when_a_second_one_would_have_been_heard(listening: Listening) -> None:
-    choice = VehicleChoice(None, None)
+    choice = only_vehicle(None, None)
     assert listening.look(choice, 4.0) is None
     assert choice.due == math.inf
     listening.hear(PX4, 5.0)
@@ -96,7 +96,7 @@ def test_a_second_one_is_found_whatever_its_phase(listening: Listening, phase: f
 def test_the_look_begins_anew_when_the_link_was_disconnected(listening: Listening) -> None:
     listening.hear(PX4, 5.0).hear(PX4, 6.0)
     listening.station.pause()
-    choice = VehicleChoice(None, None)
+    choice = only_vehicle(None, None)
     assert listening.look(choice, 8.0) is None
     assert choice.due == math.inf
     listening.station.resume(9.0)
@@ -192,7 +192,7 @@ def of_all(*several: Listening) -> Callable[..., ComponentMachine | None]:
         now: float, system: int | None = None, component: int | None = None
     ) -> ComponentMachine | None:
         machines = [machine for each in several for machine in each.station.components.values()]
-        choice = VehicleChoice(system, component, spans_links=True)
+        choice = only_vehicle(system, component, spans_links=True)
         since = max(each.station.listening_since for each in several)
         return choice.look(machines, now, listening_since=since)
 
@@ -242,4 +242,4 @@ def test_one_address_on_two_links_is_two() -> None:
 )
 def test_a_vehicle_in_words(listening: Listening, heartbeat: Heartbeat, words: str) -> None:
     listening.hear(heartbeat, 1.0, system=7)
-    assert vehicle_in_words(listening.station.components[7, 1]) == words
+    assert node_in_words(listening.station.components[7, 1]) == words

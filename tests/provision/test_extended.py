@@ -5,20 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from paramclient.model.ext_params import ExtValue
 
 from paramclient import (
     CacheError,
     Component,
+    ExtParam,
+    ExtParamSet,
     NoReply,
     NotInCache,
     ParamCache,
-    ParamSet,
-    SetOutcome,
     SetStatus,
     UsageError,
-    Value,
 )
 from paramclient.files.disk import read_extended_file
+from paramclient.protocol.set_results import SetOutcome
 from paramclient.provision import (
     apply_extended,
     load_extended_state,
@@ -42,12 +43,12 @@ def small() -> Camera:
     )
 
 
-def wanted(camera: Camera, **values: Value) -> ParamSet:
+def wanted(camera: Camera, **values: ExtValue) -> ExtParamSet:
     """The set of a camera with some values changed."""
     other = Camera({name: (param.type, param.value) for name, param in camera.ext_params.items()})
     for name, value in values.items():
         other.set_ext_param(name, value)
-    return ParamSet.of({name: param for name, param in other.ext_params.items() if name in values})
+    return ExtParamSet({name: param for name, param in other.ext_params.items() if name in values})
 
 
 async def the_camera(client: object, number: int = 100) -> Component:
@@ -61,14 +62,14 @@ async def test_a_set_is_compared_and_nothing_is_written() -> None:
     async with a_client(camera) as client:
         component = await the_camera(client)
         content = wanted(camera, MODE=2, NAME="Front", KEY=b"\1")
-        more = {"LOST": Param.of("LOST", b"x", 11), "EV": Param.of("EV", b"x", 11)}
-        plan = await verify_extended(component, ParamSet.of({**content.params, **more}))
+        more = {"LOST": ExtParam.of("LOST", b"x", 11), "EV": ExtParam.of("EV", b"x", 11)}
+        plan = await verify_extended(component, ExtParamSet({**content.params, **more}))
         assert (list(plan.changes), plan.missing, plan.mistyped) == (["MODE", "KEY"], ("LOST",), ("EV",))
         assert (plan.is_possible, plan.is_met) == (False, False)
         assert (await verify_extended(component, wanted(camera, NAME="Front"))).is_met
         assert camera.ext_values["MODE"] == 1
         with pytest.raises(UsageError, match="of component 101, and 1/100 is chosen"):
-            await verify_extended(component, ParamSet.of({}, component=101))
+            await verify_extended(component, ExtParamSet({}, component=101))
 
 
 @in_simulated_time

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 import pytest
 
-from paramclient import ParamSet, ParamType, Rename, Renames, UsageError, WrittenParam
+from paramclient import ParamSet, ParamType, UsageError, WrittenParam
 from paramclient.model.identity import Identity
+from paramclient.model.renames import Rename, Renames
 from paramclient.model.values import Encoding, Param, WireValue, bits_of
 from paramclient.provision import (
     MISSING,

@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from paramclient import FileFormat
-from paramclient.files import loads
+from paramclient.files import FileFormat, loads
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle
 from tests.service.hub import V, problem, service, synced, until
 from tests.shell import VALUES, Tap, generic, in_simulated_time, small_px4

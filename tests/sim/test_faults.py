@@ -22,7 +22,7 @@ from paramclient.sim import (
     Vehicle,
 )
 from paramclient.wire import frames, messages
-from tests.ground_station import LIST, PERIODIC_MESSAGES, SMALL, Station, cast, indices, names, read, write
+from tests.ground_station import LIST, PERIODIC_MESSAGES, Station, cast, indices, names, read, write
 
 NO_INDEX = messages.NO_INDEX
 TEN = {f"P{number}": number for number in range(10)}
@@ -251,21 +251,6 @@ class TestHighLatency:
         )
 
     @EVERY_KIND
-    def test_high_latency_can_be_switched_at_any_time(self, kind: Callable[..., Vehicle]) -> None:
-        vehicle = kind(table=TEN, telemetry=2.0)
-        station = Station(vehicle).wait(3.5)
-        assert vehicle.high_latency is False
-        vehicle.high_latency = True
-        station.log.clear()
-        station.wait(7.0)
-        assert [time for time, _, _ in station.log] == [3.5, 8.5]
-        vehicle.high_latency = False
-        station.log.clear()
-        station.wait(1.2)
-        beats = [time for time, _, message in station.log if isinstance(message, messages.Heartbeat)]
-        assert beats == [10.5, 11.5]
-
-    @EVERY_KIND
     def test_reads_are_answered_and_the_list_waits(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN, high_latency=True)
         station = Station(vehicle)
@@ -299,28 +284,3 @@ class TestOtherStation:
         values = Station(air).ask(LIST, seconds=1.0)
         assert indices(values).count(0) == 4
         assert vehicle.requests["PARAM_REQUEST_LIST"] == 4
-
-    def test_another_station_is_received_by_all(self) -> None:
-        vehicles = [GenericVehicle(SMALL, system=1), GenericVehicle(SMALL, system=2)]
-        setting = SimParam("B_INT", ParamType.INT32, 8)
-        other = OtherStation(target_system=2, list_every=1.0, sets=[(2.5, setting), (0.5, setting)])
-        station = Station(Air(vehicles, others=[other])).wait(3.2)
-        assert [vehicle.requests["HEARTBEAT"] for vehicle in vehicles] == [4, 4]
-        assert vehicles[1].requests == {"HEARTBEAT": 4, "PARAM_REQUEST_LIST": 3, "PARAM_SET": 2}
-        assert (vehicles[0].values["B_INT"], vehicles[1].values["B_INT"]) == (7, 8)
-        received = [(time, frame, message) for time, frame, message in station.log if frame.system == 254]
-        assert [(time, type(message)) for time, _, message in received] == [
-            (0.0, messages.Heartbeat),
-            (0.5, messages.ParamSet),
-            (1.0, messages.Heartbeat),
-            (1.0, messages.ParamRequestList),
-            (2.0, messages.Heartbeat),
-            (2.0, messages.ParamRequestList),
-            (2.5, messages.ParamSet),
-            (3.0, messages.Heartbeat),
-            (3.0, messages.ParamRequestList),
-        ]
-        assert [frame.sequence for _, frame, _ in received] == list(range(9))
-        assert messages.ParamSet(2, 1, "B_INT", b"\x08\0\0\0", ParamType.INT32) in [
-            each[2] for each in received
-        ]

@@ -56,42 +56,6 @@ def pauses(station: Station, without: Container[int] = ()) -> list[tuple[float, 
     return [pair for pair in itertools.pairwise(times) if pair[1] - pair[0] > 0.02]
 
 
-def test_received_messages_wait_while_a_list_runs() -> None:
-    station = listing(0.15).send(SET).wait(0.3)
-    assert acknowledged(station) == near([0.23])
-    assert pauses(station) == []
-
-
-def test_a_second_request_restarts_and_pauses_the_list() -> None:
-    station = listing(0.25).send(LIST).wait(2.0)
-    (pause,) = pauses(station)
-    assert pause == near((0.375, 0.4))
-    times = station.times()
-    values = indices(station.values())
-    again = values.index(0, 1)
-    assert values == [*range(again), *range(1382)]
-    assert times[again] == near(0.36)
-    assert times[-1] == pytest.approx(1.2, abs=0.02)
-
-
-def test_the_first_10_reads_do_not_pause_the_list() -> None:
-    station = listing(0.15).send(*(read(index=index) for index in range(1300, 1310))).wait(0.4)
-    assert answered(station, range(1300, 1310)) == near([0.23] * 5 + [0.36] * 5)
-    assert [first for first, _ in pauses(station, range(1300, 1310))] == near([0.36])
-
-
-def test_reads_pause_the_list() -> None:
-    """Of many reads per second, 5 are answered in each 100 ms; the list runs for 130 of every 300 ms."""
-    station = listing(0.15)
-    for index in range(1200, 1380, 5):
-        station.send(*(read(index=each) for each in range(index, index + 5))).wait(0.1)
-    requested = range(1200, 1380)
-    runs = [(round(first, 2), round(last, 2)) for first, last in pauses(station, requested)]
-    assert runs[:4] == [(0.36, 0.5), (0.62, 0.8), (0.92, 1.1), (1.22, 1.4)]
-    answers = Counter(int(time * 10 + 0.01) for time in answered(station, requested) if time < 1.4)
-    assert answers == {2: 5, 3: 5} | dict.fromkeys(range(4, 14), 5)
-
-
 def test_40_reads_at_once_lose_15() -> None:
     station = listing(0.15).send(*(read(index=index) for index in range(1300, 1340))).wait(2.0)
     assert sorted(set(indices(station.values())) - set(range(1300))) == [*range(1300, 1382)]

@@ -7,7 +7,8 @@ from typing import Any, TypeVar
 
 import pytest
 
-from paramclient import CommandResult, UsageError
+from paramclient import UsageError
+from paramclient.errors import CommandResult
 from paramclient.model.values import Encoding, ParamType, encode_value
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.wire import frames, messages

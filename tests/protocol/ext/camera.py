@@ -7,15 +7,14 @@ from typing import TypeVar
 
 from paramclient.model.ext_params import ExtParam, ExtValue
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.ext.change import ExtChange
-from paramclient.protocol.ext.fetch import ExtFetchResult
-from paramclient.protocol.ext.writes import ExtSetResult
-from paramclient.protocol.wire import Message
 
-from paramclient.protocol import wire
-from paramclient.protocol.events import ExtParamChanged
+from paramclient.protocol.events import Change, ExtParamChanged
+from paramclient.protocol.fetch import FetchResult
+from paramclient.protocol.set_results import SetResult
 from paramclient.protocol.station import Station
 from paramclient.sim import Air, Camera, Endpoint
+from paramclient.wire import frames, messages
+from paramclient.wire.messages import Message
 from tests.simulation import Simulation
 
 __all__ = ["CameraSession", "lossy", "message_in"]
@@ -43,7 +42,7 @@ class CameraSession(Simulation):
         return {name: param.value for name, param in self.params.items()}
 
     @property
-    def changes(self) -> list[ExtChange]:
+    def changes(self) -> list[Change]:
         return [event.change for event in self.events if isinstance(event, ExtParamChanged)]
 
     def lose(self, is_lost: Callable[[Message | None], bool]) -> None:
@@ -53,7 +52,7 @@ class CameraSession(Simulation):
             each for each in deliver() if not is_lost(message_in(each))
         ]
 
-    def fetch_ext(self, limit: float = 120.0) -> ExtFetchResult:
+    def fetch_ext(self, limit: float = 120.0) -> FetchResult:
         fetch = self.camera.begin_ext_fetch(self.now)
         try:
             return self.outcome(fetch, limit)
@@ -67,7 +66,7 @@ class CameraSession(Simulation):
         finally:
             self.camera.ext.reads.release(read)
 
-    def set_ext(self, name: str, value: ExtValue, limit: float = 120.0) -> ExtSetResult:
+    def set_ext(self, name: str, value: ExtValue, limit: float = 120.0) -> SetResult:
         write = self.camera.write_ext(name, value, self.now)
         try:
             return self.outcome(write, limit)
@@ -82,7 +81,7 @@ class CameraSession(Simulation):
 
 def message_in(data: bytes) -> Message | None:
     """The message in a datagram with one frame."""
-    return wire.decode(wire.Framer(wire.DECODED_IDS, stream=False).receive(data)[0])
+    return messages.decode(frames.Framer(messages.DECODED_IDS, stream=False).receive(data)[0])
 
 
 def lossy(camera: Camera, *, loss: float = 0.2, seed: int = 1, delay: float = 0.02) -> Air:

@@ -15,10 +15,10 @@ from paramclient.protocol.ext.fetch import ExtFetch
 from paramclient.protocol.ext.write_batch import ExtWriteBatch
 from paramclient.protocol.ext.writes import ExtWrite
 from paramclient.protocol.params.reads import ValueRead
-from paramclient.protocol.params.write_batch import SetStatus
 from paramclient.protocol.requests.operation import Operation
 
 from paramclient.errors import NoReply, SetFailed, ValueNotApplied, ValueUnsupported
+from paramclient.protocol.set_results import SetStatus
 from paramclient.sim import Air, Camera, FaultyLink
 from tests.protocol.ext.camera import CameraSession
 

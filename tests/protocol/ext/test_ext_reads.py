@@ -9,18 +9,13 @@ import pytest
 from paramclient.model.ext_params import ExtParamType
 from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.wire import (
-    Message,
-    ParamExtRequestList,
-    ParamExtRequestRead,
-    ParamExtValue,
-)
 
 from paramclient.errors import LinkError, NoReply, UnknownParameter, UsageError
 from paramclient.model.values import ParamType, Trust
-from paramclient.protocol import wire
 from paramclient.protocol.station import Station
 from paramclient.sim import Camera, camera_table
+from paramclient.wire import messages
+from paramclient.wire.messages import Message, ParamExtRequestList, ParamExtRequestRead, ParamExtValue
 from tests.protocol.ext.camera import CameraSession, lossy
 
 MANY = {f"PARAM_{number:03}": number for number in range(300)}
@@ -104,7 +99,7 @@ def test_a_component_without_extended_parameters_is_given_up() -> None:
 def test_a_component_that_sends_only_a_value() -> None:
     station = Station(link="sim:test", is_stream=False)
     message = ParamExtValue("A", b"\7", 1, 1, 0)
-    data = wire.encode(message, system=1, component=33, sequence=0)
+    data = messages.encode(message, system=1, component=33, sequence=0)
     station.receive(data, "peer", 0.0)
     machine = station.components[1, 33]
     assert machine.ext.table.params["A"].value == 7
@@ -263,7 +258,7 @@ def test_a_listener_takes_what_others_request() -> None:
     session.other_station(ParamExtRequestList(1, 100))
     session.run(1.0)
     assert session.values == camera.ext_values
-    session.other_station(wire.ParamExtSet(1, 100, "CAM_MODE", b"\2", 5))
+    session.other_station(messages.ParamExtSet(1, 100, "CAM_MODE", b"\2", 5))
     session.run(1.0)
     assert session.values["CAM_MODE"] == 2
     assert not session.sent
@@ -275,5 +270,5 @@ def test_names_that_no_file_can_hold_are_left_out() -> None:
     station = Station(link="sim:test", is_stream=False)
     for number, name in enumerate(["", "a b", "#x", "=", "OK"]):
         message = ParamExtValue(name, b"\7", 1, 5, number)
-        station.receive(wire.encode(message, system=1, component=33, sequence=0), "peer", 0.0)
+        station.receive(messages.encode(message, system=1, component=33, sequence=0), "peer", 0.0)
     assert list(station.components[1, 33].ext.table.params) == ["OK"]

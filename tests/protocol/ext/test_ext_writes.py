@@ -6,7 +6,6 @@ import pytest
 from paramclient.model.ext_params import ExtParam, ExtValue
 from paramclient.protocol.ext.writes import LATE_ACK_TIME
 from paramclient.protocol.requests.retry import EXT_PROGRESS_TIMEOUT
-from paramclient.protocol.wire import ParamExtAck, ParamExtRequestRead, ParamExtSet
 
 from paramclient.errors import (
     ExtAckResult,
@@ -18,15 +17,16 @@ from paramclient.errors import (
     ValueNotApplied,
     ValueUnsupported,
 )
-from paramclient.protocol import wire
 from paramclient.sim import Camera
+from paramclient.wire import frames, messages
+from paramclient.wire.messages import ParamExtAck, ParamExtRequestRead, ParamExtSet
 from tests.protocol.ext.camera import CameraSession, lossy
 
 
 def acknowledge(session: CameraSession, name: str, value: bytes, number: int, result: int) -> None:
     """Receive an acknowledgement from any sender."""
     message = ParamExtAck(name, value, number, result)
-    data = wire.encode(message, system=1, component=100, sequence=0)
+    data = messages.encode(message, system=1, component=100, sequence=0)
     session.station.receive(data, "the only peer", session.now)
 
 
@@ -161,7 +161,7 @@ def test_a_set_that_nothing_answers() -> None:
     take = camera.receive
 
     def deaf(data: bytes, now: float) -> None:
-        if not isinstance(wire.decode(wire.Framer(stream=False).receive(data)[0]), ParamExtSet):
+        if not isinstance(messages.decode(frames.Framer(stream=False).receive(data)[0]), ParamExtSet):
             take(data, now)
 
     camera.receive = deaf  # type: ignore[method-assign]
@@ -211,7 +211,7 @@ def test_a_change_by_another_station_is_seen_and_read() -> None:
     session = CameraSession(Camera())
     session.fetch_ext()
     foreign = ParamExtSet(1, 100, "CAM_MODE", b"\6", 5)
-    data = wire.encode(foreign, system=254, component=190, sequence=0)
+    data = messages.encode(foreign, system=254, component=190, sequence=0)
     session.station.receive(data, "another", session.now)
     session.other_station(foreign)
     session.run(1.0)
@@ -226,11 +226,11 @@ def test_a_value_from_before_a_write_does_not_undo_it() -> None:
     session.fetch_ext()
     read = session.camera.read_ext("A", session.now)
     session.run(0.01)
-    camera_reply = wire.ParamExtValue("A", b"\1", 6, 1, 0)
+    camera_reply = messages.ParamExtValue("A", b"\1", 6, 1, 0)
     session.set_ext("A", 2)
     late = session.camera.read_ext("A", session.now)
     session.station.receive(
-        wire.encode(camera_reply, system=1, component=100, sequence=0), "the only peer", session.now
+        messages.encode(camera_reply, system=1, component=100, sequence=0), "the only peer", session.now
     )
     assert session.values["A"] == 2
     message = session.outcome(late)

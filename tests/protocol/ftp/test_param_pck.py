@@ -11,16 +11,16 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from paramclient.protocol.ftp.param_pck import (
+
+from paramclient.errors import PackError, UsageError
+from paramclient.model.values import ParamType
+from paramclient.protocol.param_pck import (
     PACK_SIZE_MAX,
     Pack,
     PackedParam,
     decode,
     encode,
 )
-
-from paramclient.errors import PackError, UsageError
-from paramclient.model.values import ParamType
 from paramclient.sim import ardupilot_table
 from tests.recordings import DATA
 

@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.retry import (
@@ -23,15 +22,24 @@ from paramclient.protocol.requests.retry import (
     UNANSWERED_ATTEMPTS_MAX,
     RetryPolicy,
 )
-from paramclient.protocol.wire import FileTransfer, Message
 
 from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoReply, UsageError
 from paramclient.model.px4_hash import crc32_px4
 from paramclient.model.values import ParamType
-from paramclient.protocol import wire
-from paramclient.protocol.ftp import DirectoryEntry, FileRead, FileTransfers, FileWrite, param_pck
+from paramclient.protocol.ftp import (
+    DATA_SIZE_MAX,
+    DirectoryEntry,
+    FileRead,
+    FileTransfers,
+    FileWrite,
+    Opcode,
+    Packet,
+    param_pck,
+)
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.sim.ftp import IDLE_LIMIT
+from paramclient.wire import frames, messages
+from paramclient.wire.messages import FileTransfer, Message
 from tests.recordings import DATA
 from tests.simulation import is_so
 
@@ -50,7 +58,7 @@ class Desk:
         self.retry = RetryPolicy()
         self.round_trip = self.retry.round_trip
         self.sent: list[Packet] = []
-        autopilot = wire.MAV_AUTOPILOT_ARDUPILOTMEGA if keeps_session else None
+        autopilot = messages.MAV_AUTOPILOT_ARDUPILOTMEGA if keeps_session else None
         self.context = Context((1, 1), self._send, OWN, self.retry, autopilot=autopilot)
         self.transfers = FileTransfers(self.context)
 
@@ -195,36 +203,6 @@ class TestReading:
         desk.closed()
         assert read.result == b"a" * 100 + b"b" * 100 + b"c" * 100
 
-    def test_an_end_that_is_lost_is_requested(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened(size=480)
-        desk.now += 0.1
-        desk.answer(burst, b"a" * 239)
-        desk.now += 0.01
-        desk.answer(burst, b"b" * 239, offset=239, nth=2)
-        assert desk.take() == []
-        desk.pass_time(0.2)
-        requested = desk.take()
-        assert [packet.opcode for packet in requested] == [Opcode.READ_FILE] * len(requested)
-        assert requested[0].offset == 478
-        desk.answer(requested[0], code=FileErrorCode.EOF)
-        desk.closed()
-        assert read.result == b"a" * 239 + b"b" * 239
-
-    def test_a_burst_that_ends_early_is_followed_by_another(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened(size=5000)
-        desk.answer(burst, b"a" * 239, complete=True)
-        second = desk.next(Opcode.BURST_READ_FILE)
-        assert second.offset == 239
-        desk.answer(burst, b"a" * 239, complete=True)
-        desk.answer(burst, code=FileErrorCode.FAIL, nth=2)
-        assert desk.take() == []
-        desk.answer(second, b"b" * 239, offset=239)
-        desk.answer(second, code=FileErrorCode.EOF, offset=478, nth=2)
-        desk.closed()
-        assert read.result == b"a" * 239 + b"b" * 239
-
     def test_a_burst_that_falls_silent_in_the_middle_is_requested_again(self) -> None:
         desk = Desk()
         read, burst = desk.opened(size=50_000)
@@ -281,17 +259,6 @@ class TestWhatIsNotForUs:
         desk.closed()
         assert read.result == b"new" * 50
 
-    def test_every_file_has_a_session_of_its_own(self) -> None:
-        desk = Desk()
-        sessions = set()
-        for _ in range(300):
-            read = desk.transfers.read("a", desk.now)
-            request = desk.first(Opcode.OPEN_FILE_RO)
-            sessions.add(request.session)
-            desk.answer(request, code=FileErrorCode.FILE_NOT_FOUND)
-            assert read.done
-        assert sessions == set(range(1, 256))
-
 
 class TestRefusals:
     @pytest.mark.parametrize(
@@ -313,14 +280,6 @@ class TestRefusals:
         assert error.is_not_found == (code in (10, 2))
         assert desk.take() == []
         assert desk.transfers.is_idle
-
-    def test_a_refused_read_closes_the_session(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened()
-        desk.answer(burst, b"x" * 239, offset=239)
-        desk.answer(desk.next(Opcode.READ_FILE), b"\x16", code=FileErrorCode.FAIL_ERRNO)
-        desk.closed()
-        assert error_of(read).errno == 22
 
     def test_a_session_that_is_lost_on_board_is_opened_again(self) -> None:
         desk = Desk()
@@ -391,21 +350,6 @@ class TestSilence:
             Opcode.TERMINATE_SESSION,
             Opcode.TERMINATE_SESSION,
         ]
-
-    def test_a_close_without_an_answer_does_not_hold_up_the_next_for_ever(self) -> None:
-        desk = Desk()
-        read, burst = desk.opened()
-        desk.answer(burst, b"abc")
-        desk.answer(burst, code=FileErrorCode.EOF, offset=3, nth=2)
-        desk.transfers.read("b", desk.now)
-        began = desk.now
-        while not read.done:
-            assert not [packet for packet in desk.take() if packet.opcode == Opcode.OPEN_FILE_RO]
-            desk.now = desk.transfers.next_deadline()
-            desk.transfers.tick(desk.now)
-        assert read.result == b"abc"
-        assert desk.now - began <= 5.0
-        assert b"b" in [packet.data for packet in desk.take()]
 
     def test_the_end_of_a_link_ends_everything(self) -> None:
         desk = Desk()
@@ -483,20 +427,6 @@ class TestTurns:
         desk.closed(session=3)
         assert not read.done
 
-    def test_one_whose_open_is_never_answered_is_closed_blindly(self) -> None:
-        desk = Desk()
-        read = desk.transfers.read("a", desk.now)
-        request = desk.opening()
-        desk.transfers.release(read, desk.now)
-        desk.take()
-        desk.pass_time()
-        *opens, last, copy = desk.take()
-        assert {packet.opcode for packet in opens} == {Opcode.OPEN_FILE_RO}
-        assert last == copy
-        assert (last.opcode, last.session) == (Opcode.TERMINATE_SESSION, request.session)
-        assert desk.transfers.is_idle
-        assert not read.done
-
 
 class TestHaste:
     def known_link(self) -> Desk:
@@ -528,26 +458,6 @@ class TestHaste:
         desk.answer(burst, code=FileErrorCode.EOF, offset=3, nth=2)
         desk.closed(first.session)
         assert read.result == b"abc"
-
-    def test_the_first_bytes_show_that_the_burst_was_of_another_file(self) -> None:
-        """The refusal of the open was lost: another station's session has its number."""
-        desk = self.known_link()
-        read = desk.transfers.read("a", desk.now, magics=(b"up",))
-        first, _, burst = desk.take()
-        desk.answer(burst, b"x" * 239)
-        desk.answer(burst, b"x" * 239, offset=239, nth=2)
-        assert desk.take() == []
-        desk.answer(burst, code=FileErrorCode.EOF, offset=478, nth=3)
-        *closes, again, _, burst = desk.take()
-        assert {packet.opcode for packet in closes} == {Opcode.TERMINATE_SESSION}
-        assert (again.opcode, again.data) == (Opcode.OPEN_FILE_RO, b"a")
-        assert again.sequence != first.sequence
-        assert read.result is None
-        desk.answer(again, bytes(4))
-        desk.answer(burst, b"up")
-        desk.answer(burst, code=FileErrorCode.EOF, offset=2, nth=2)
-        desk.closed(again.session)
-        assert read.result == b"up"
 
     def test_but_not_for_ever(self) -> None:
         desk = self.known_link()
@@ -581,24 +491,6 @@ class TestWriting:
         desk.closed()
         assert write.done
         assert write.error is None
-
-    def test_an_unanswered_request_is_repeated_with_its_sequence_number(self) -> None:
-        desk = Desk()
-        desk.transfers.write("a", b"abc", desk.now)
-        desk.answer(desk.next(Opcode.CREATE_FILE), session=9)
-        first = desk.next(Opcode.WRITE_FILE)
-        desk.pass_time(1.5)
-        again = desk.take()
-        assert again
-        assert set(again) == {first}
-
-    def test_a_piece_that_is_refused(self) -> None:
-        desk = Desk()
-        write = desk.transfers.write("a", b"abc", desk.now)
-        desk.answer(desk.next(Opcode.CREATE_FILE), session=9)
-        desk.answer(desk.next(Opcode.WRITE_FILE), b"\x1c", code=FileErrorCode.FAIL_ERRNO)
-        desk.closed()
-        assert str(error_of(write)) == "1/1 does not write a: fail errno 28"
 
     def test_a_file_that_is_refused_as_a_whole(self) -> None:
         desk = Desk()
@@ -704,9 +596,9 @@ class Ground:
             self.retry.answered(0.0, round_trip, 1)
         self.requests = 0
         self._outbox: list[Message] = []
-        self._framer = wire.Framer(wire.DECODED_IDS, stream=False)
+        self._framer = frames.Framer(messages.DECODED_IDS, stream=False)
         is_ardupilot = isinstance(vehicle, ArduPilotVehicle)
-        autopilot = wire.MAV_AUTOPILOT_ARDUPILOTMEGA if is_ardupilot else None
+        autopilot = messages.MAV_AUTOPILOT_ARDUPILOTMEGA if is_ardupilot else None
         self.transfers = FileTransfers(
             Context((1, 1), self._outbox.append, OWN, self.retry, autopilot=autopilot)
         )
@@ -717,7 +609,7 @@ class Ground:
             for data in self.air.data_to_send():
                 for frame in self._framer.receive(data):
                     self.round_trip.received_at = self.now
-                    message = wire.decode(frame)
+                    message = messages.decode(frame)
                     if isinstance(message, FileTransfer):
                         self.transfers.receive(message, self.now)
             if self.transfers.next_deadline() <= self.now:
@@ -725,7 +617,7 @@ class Ground:
             outgoing, self._outbox[:] = self._outbox[:], []
             for message in outgoing:
                 self.requests += 1
-                data = wire.encode(message, system=255, component=190, sequence=self.requests & 0xFF)
+                data = messages.encode(message, system=255, component=190, sequence=self.requests & 0xFF)
                 self.air.receive(data, self.now)
             self.air.tick(self.now)
             if not outgoing and self._next() > self.now:
@@ -829,30 +721,13 @@ class TestOnTheAir:
         assert ground.read("a") == content
         ground.settle()
 
-    def test_the_tail_of_a_large_file_is_read_by_bursts(self) -> None:
-        vehicle = PX4Vehicle()
-        vehicle.files["log/1.ulg"] = bytes(number * 7 % 251 for number in range(600_000))
-        ground = Ground(vehicle, delay=0.05)
-        assert ground.read("log/1.ulg") == vehicle.files["log/1.ulg"]
-        assert ground.now < 2.5  # 15 bursts; the last 90 kB alone took 9 s by single reads
-        assert ground.requests < 25
-
-    @pytest.mark.parametrize("loss", [0.02, 0.05, 0.1])
-    def test_a_file_from_px4_over_a_lossy_link_without_delay(self, loss: float) -> None:
-        for seed in range(6):
-            vehicle = PX4Vehicle()
-            vehicle.files["log/1.ulg"] = bytes(number * 7 % 251 for number in range(100_000))
-            ground = Ground(vehicle, loss=loss, seed=seed)
-            assert ground.read("log/1.ulg") == vehicle.files["log/1.ulg"]
-            assert ground.now < 2.0
-
     @pytest.mark.parametrize("job", ["list", "checksum"])
     def test_a_list_and_a_checksum_wait_for_the_session_of_another_station(self, job: str) -> None:
         vehicle = ardupilot()
         vehicle.files["d/log"] = b"a" * 1000
         ground = Ground(vehicle)
         opening = Packet(7, 99, Opcode.OPEN_FILE_RO, b"d/log")
-        data = wire.encode(FileTransfer(0, 1, 1, opening.pack()), system=254, component=190, sequence=0)
+        data = messages.encode(FileTransfer(0, 1, 1, opening.pack()), system=254, component=190, sequence=0)
         ground.air.receive(data, ground.now)
         ground.run(0.5)
         if job == "list":
@@ -867,20 +742,13 @@ class TestOnTheAir:
         vehicle.files.update({"log/1.ulg": b"a" * 1000, "log/2.ulg": b"b" * 1000})
         ground = Ground(vehicle)
         opening = Packet(7, 0, Opcode.OPEN_FILE_RO, b"log/1.ulg")
-        data = wire.encode(FileTransfer(0, 1, 1, opening.pack()), system=254, component=190, sequence=0)
+        data = messages.encode(FileTransfer(0, 1, 1, opening.pack()), system=254, component=190, sequence=0)
         ground.air.receive(data, ground.now)
         read = ground.transfers.read("log/2.ulg", ground.now)
         ground.run(9.0)
         assert (vehicle.open_files, read.done) == (["log/1.ulg"], False)
         assert ground.outcome(read) == b"b" * 1000
         assert 11.0 < ground.now < 16.0  # PX4 closes what is not used for 11 s
-
-    def test_a_file_of_several_bursts(self) -> None:
-        vehicle = PX4Vehicle()
-        vehicle.files["log"] = bytes(range(250)) * 400
-        ground = Ground(vehicle, loss=0.1, delay=0.05, seed=3)
-        assert ground.read("log") == vehicle.files["log"]
-        ground.settle()
 
     @thorough
     @given(faults, st.integers(0, 1500), st.booleans())
@@ -949,15 +817,6 @@ class TestOnTheAir:
         assert param_pck.decode(ground.outcome(read) or b"").total == 1382
         ground.settle()
 
-    def test_a_close_is_not_repeated_while_the_burst_still_arrives(self) -> None:
-        ground = Ground(ardupilot(ftp_rate=5760.0), delay=0.01)
-        read = ground.transfers.read(PARAMS, ground.now)
-        ground.run(1.0)
-        before = ground.requests
-        ground.transfers.release(read, ground.now)
-        ground.settle()
-        assert ground.requests - before == 1
-
     @pytest.mark.parametrize("after", [0.0, 0.06, 0.12, 0.3])
     def test_released_at_any_moment_it_leaves_nothing_open(self, after: float) -> None:
         for px4 in (False, True):
@@ -996,7 +855,7 @@ class TestOnTheAir:
         read = ground.transfers.read("a", ground.now)
         ground.run(0.02)
         other = Packet(5, 0, Opcode.READ_FILE, size=239, offset=1000)
-        data = wire.encode(FileTransfer(0, 1, 1, other.pack()), system=254, component=190, sequence=0)
+        data = messages.encode(FileTransfer(0, 1, 1, other.pack()), system=254, component=190, sequence=0)
         ground.air.receive(data, ground.now)
         assert ground.outcome(read) == b"a" * 5000
 
@@ -1044,9 +903,3 @@ class TestSpeed:
         beats = 2 * (ground.now - start + 1)  # HEARTBEAT and SYSTEM_TIME
         banner = 3
         assert ground.air.downlink.sent - sent <= 64 + 1 + banner + beats + 8
-
-    def test_a_slow_link_does_not_get_it_twice(self) -> None:
-        vehicle = ardupilot(ftp_rate=400.0)
-        ground = Ground(vehicle, round_trip=0.2, delay=0.075, rate=1200, queue=1024, loss=0.05, seed=2)
-        ground.read(PARAMS + "?withdefaults=1")
-        assert ground.air.downlink.sent < 64 * 1.5 + 2 * ground.now

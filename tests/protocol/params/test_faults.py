@@ -9,12 +9,12 @@ from typing import TypeAlias
 
 import pytest
 from paramclient.protocol.params.fetch import Fetch
-from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.protocol.params.sync import WATCH_INTERVAL, SyncSettings
 
 from paramclient.errors import NoReply
 from paramclient.model.values import Encoding, ParamType
 from paramclient.protocol.events import ComponentRebooted
+from paramclient.protocol.fetch import FetchResult
 from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, OtherStation, PX4Vehicle, SimParam, Vehicle
 from tests.simulation import Simulation

@@ -6,15 +6,14 @@ import math
 from collections.abc import Iterable
 
 import pytest
-from paramclient.protocol.params.change import Change
-from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSetMessage
 
 from paramclient.errors import LinkError, NoReply
 from paramclient.model.values import TYPES_BY_NAME, ParamType, Trust, WireValue
-from paramclient.protocol import wire
-from paramclient.protocol.events import Fetched, ParamChanged
+from paramclient.protocol.events import Change, Fetched, ParamChanged
+from paramclient.protocol.fetch import FetchResult
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
+from paramclient.wire import messages
+from paramclient.wire.messages import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet
 from tests.simulation import Memory, Simulation, is_so, known, listing_ardupilot
 
 VOLATILE = ("CAL_MAG0_XOFF", "COM_FLIGHT_UUID")
@@ -117,7 +116,9 @@ def test_the_hash_that_is_lost_at_the_head_is_requested_meanwhile() -> None:
     assert result.hash == vehicle.announced_hash()
     assert names_read(world) == [HASH_CHECK]
     assert result.notes == ()
-    requested = {type(message): at for at, message in world.sent if not isinstance(message, wire.Heartbeat)}
+    requested = {
+        type(message): at for at, message in world.sent if not isinstance(message, messages.Heartbeat)
+    }
     assert requested[ParamRequestRead] - requested[ParamRequestList] < 0.02 < result.elapsed
 
 
@@ -157,7 +158,7 @@ def test_a_hit_costs_one_request_and_the_volatile_values() -> None:
     world.until(lambda: refresh.done)
     assert sorted(names_read(world)) == sorted([HASH_CHECK, *volatile])
     assert world.sent_of(ParamRequestList) == []
-    assert world.sent_of(ParamSetMessage) == []
+    assert world.sent_of(ParamSet) == []
     assert {world.machine.table.params[name].trust for name in volatile} == {Trust.LIVE}
     assert world.machine.refresh is None
 
@@ -263,7 +264,7 @@ def test_a_group_that_appears_during_the_download() -> None:
     world.run(0.3)
     vehicle.set_param("EK2_ENABLE", 1)
     world.run(0.1)
-    world.other_station(wire.ParamRequestRead(1, 1, "", 3))  # its answer shows the new count
+    world.other_station(messages.ParamRequestRead(1, 1, "", 3))  # its answer shows the new count
     result = world.outcome(fetch)
     assert result.count in (1382, 1434)  # the count of the last received values
     result = world.fetch()

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_notes import FILE_IN_USE
 from paramclient.protocol.requests.retry import (
@@ -15,16 +14,11 @@ from paramclient.protocol.requests.retry import (
     FIRST_TIMEOUT,
     SESSION_IDLE_TIME,
 )
-from paramclient.protocol.wire import (
-    CommandLong,
-    FileTransfer,
-    Message,
-    ParamRequestList,
-    ParamRequestRead,
-)
 
-from paramclient.protocol import wire
+from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle
+from paramclient.wire import frames, messages
+from paramclient.wire.messages import CommandLong, FileTransfer, Message, ParamRequestList, ParamRequestRead
 from tests.shell import Tap, bits
 from tests.simulation import Simulation
 
@@ -46,7 +40,7 @@ class Uplink(Tap):
         self.arrived: list[Message] = []
 
     def receive(self, data: bytes, now: float) -> None:
-        message = wire.decode(wire.Framer(wire.DECODED_IDS, stream=False).receive(data)[0])
+        message = messages.decode(frames.Framer(messages.DECODED_IDS, stream=False).receive(data)[0])
         assert message is not None
         if not self.loses(message):
             self.arrived.append(message)

@@ -8,22 +8,22 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.protocol.params.fetch import Fetch
-from paramclient.protocol.params.file_download import PARAMETER_FILE, WITH_DEFAULTS
 from paramclient.protocol.params.sync import SyncSettings
 
 from paramclient import FetchResult, NoReply, Trust
 from paramclient.errors import LinkError
 from paramclient.model.values import ParamType
-from paramclient.protocol import wire
 from paramclient.protocol.events import ParamChanged, TableResynced
+from paramclient.protocol.file_download import PARAM_FILE, WITH_DEFAULTS
+from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, GenericVehicle, PX4Vehicle
+from paramclient.wire import frames, messages
 from tests.shell import Tap, bits
 from tests.simulation import Simulation, is_so, listing_ardupilot
 
-FULL_PATH = PARAMETER_FILE + WITH_DEFAULTS
+FULL_PATH = PARAM_FILE + WITH_DEFAULTS
 EXACT = 2_147_483_001
 """An INT32 that a float32 rounds."""
 
@@ -43,9 +43,9 @@ class Server(Tap):
         self._sequence = -1
 
     def receive(self, data: bytes, now: float) -> None:
-        frame = wire.Framer(wire.DECODED_IDS, stream=False).receive(data)[0]
-        message = wire.decode(frame)
-        if isinstance(message, wire.FileTransfer):
+        frame = frames.Framer(messages.DECODED_IDS, stream=False).receive(data)[0]
+        message = messages.decode(frame)
+        if isinstance(message, messages.FileTransfer):
             request = Packet.unpack(message.payload)
             if request.opcode == Opcode.OPEN_FILE_RO and request.sequence != self._sequence:
                 self._sequence = request.sequence
@@ -77,7 +77,7 @@ def remembered(session: Simulation) -> bool | None:
 
 
 def lists(session: Simulation) -> int:
-    return len(session.sent_of(wire.ParamRequestList))
+    return len(session.sent_of(messages.ParamRequestList))
 
 
 # As it should be
@@ -388,7 +388,7 @@ def test_cancelled_it_closes_the_file_on_board() -> None:
     assert vehicle.open_files == [FULL_PATH]
     session.machine.end_fetch(fetch, session.now)
     session.run(0.01)
-    last = session.sent_of(wire.FileTransfer)[-1]
+    last = session.sent_of(messages.FileTransfer)[-1]
     assert Packet.unpack(last.payload).opcode == Opcode.TERMINATE_SESSION
     session.run(1.0)
     assert not vehicle.open_files
@@ -423,7 +423,7 @@ def test_progress_and_partial_result_of_a_file_download() -> None:
 
 def test_no_common_list_is_requested_if_one_component_may_have_the_file() -> None:
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
-    camera = GenericVehicle({"A": 1.0, "B": 2}, component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)
+    camera = GenericVehicle({"A": 1.0, "B": 2}, component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
     session = Simulation(server, camera)
     session.meet()
     session.until(lambda: len(session.station.components) == 2)
@@ -432,7 +432,7 @@ def test_no_common_list_is_requested_if_one_component_may_have_the_file() -> Non
     results = [session.outcome(fetch) for fetch in both]
     assert sorted(result.source for result in results) == ["ftp", "stream"]
     assert all(result.complete for result in results)
-    assert [each.target_component for each in session.sent_of(wire.ParamRequestList)] == [100]
+    assert [each.target_component for each in session.sent_of(messages.ParamRequestList)] == [100]
     assert is_whole(next(result for result in results if result.source == "ftp"), vehicle)
 
 

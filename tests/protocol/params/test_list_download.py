@@ -22,16 +22,10 @@ from paramclient.protocol.requests.retry import (
     RetryPolicy,
 )
 from paramclient.protocol.scheduler import ListAdmission
-from paramclient.protocol.wire import (
-    NO_INDEX,
-    Message,
-    ParamError,
-    ParamRequestList,
-    ParamRequestRead,
-)
 
-from paramclient.errors import LinkError, NoReply
+from paramclient.errors import NoReply
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
+from paramclient.wire.messages import NO_INDEX, Message, ParamError, ParamRequestList, ParamRequestRead
 from tests.simulation import Simulation, is_so, listing_ardupilot, param_value
 
 GAP = 0.001
@@ -211,15 +205,6 @@ def test_an_index_that_is_refused_is_named() -> None:
     assert desk.download.missing == (7,)
 
 
-def test_an_index_that_was_given_up_may_still_be_received() -> None:
-    desk = Desk()
-    desk.stream([*range(7), 8, 9, 10])
-    desk.reads.refused(ParamError(255, 190, "", 7, 1), desk.now)
-    assert desk.download.given_up == {7}
-    desk.stream([7, *range(11, 100)])
-    assert desk.download.missing == ()
-
-
 # pushes into the stream
 
 
@@ -244,20 +229,6 @@ def test_a_list_that_starts_again_for_ever_does_not_hold_it_up() -> None:
         desk.pass_time(0.01)
     assert desk.download.done
     assert desk.download.missing == ()
-
-
-def test_a_stream_that_stops_is_requested_once_more_when_that_is_faster() -> None:
-    desk = Desk()
-    desk.stream(range(30), count=1000)
-    desk.take()
-    desk.pass_time(0.49)  # ArduPilot's list pauses while reads are served
-    assert desk.take() == []
-    desk.pass_time(0.1)
-    assert desk.take() == ["list"]
-    desk.stream(range(1000), count=1000)
-    assert desk.download.done
-    assert desk.download.missing == ()
-    assert desk.take() == []
 
 
 def test_when_the_vehicle_dies_the_rest_is_given_up_in_bounded_time() -> None:
@@ -333,14 +304,6 @@ def test_cancelling_gives_everything_back() -> None:
     assert not desk.download.done
 
 
-def test_the_end_of_the_link_while_a_read_is_open() -> None:
-    desk = Desk()
-    desk.stream([*range(7), *range(8, 20)])
-    desk.download.cancel()
-    desk.reads.fail_all(LinkError("gone", link="x"), desk.now)
-    assert len(desk.reads) == 0
-
-
 def test_when_the_link_is_back_the_list_is_requested_at_once_and_anew() -> None:
     desk = Desk()
     desk.pass_time(LIST_TIMEOUT - 1)
@@ -384,12 +347,6 @@ def test_ardupilot_that_has_just_booted() -> None:
     result = world.fetch()
     assert result.complete
     assert 4.0 < result.elapsed < 12.0
-
-
-def test_ardupilot_that_boots_for_longer() -> None:
-    vehicle = listing_ardupilot(table={f"P{n}": n for n in range(50)}, boot_time=15.0)
-    world = Simulation(air=Air.symmetric([vehicle], delay=0.05))
-    assert world.fetch().complete
 
 
 def test_px4_in_low_bandwidth_mode() -> None:

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.wire import ParamRequestList, ParamRequestRead
 
 from paramclient import ParamCache, ParamClient, Trust
+from paramclient.protocol.fetch import FetchResult
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
+from paramclient.wire.messages import ParamRequestList, ParamRequestRead
 from tests.caches import kill_when, params_on_disk
 from tests.shell import bits, in_simulated_time
 from tests.simulation import Simulation, listing_ardupilot
@@ -227,6 +227,7 @@ anyio.run(main)
 """
 
 
+@pytest.mark.slow  # it runs a process
 @pytest.mark.parametrize(
     ("make", "made", "after"),
     [

@@ -8,24 +8,14 @@ from itertools import pairwise
 
 import pytest
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.params.reads import Read
-from paramclient.protocol.params.sync import GAP_CHECK_INTERVAL, WATCH_INTERVAL, SyncSettings, SyncState
+from paramclient.protocol.params.sync import GAP_CHECK_INTERVAL, WATCH_INTERVAL, SyncSettings
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.retry import FETCH_RESTARTS_MAX
 from paramclient.protocol.vehicle.presence import LOST_AFTER
-from paramclient.protocol.wire import (
-    HASH_CHECK,
-    CommandLong,
-    FileTransfer,
-    ParamRequestList,
-    ParamRequestRead,
-    ParamSetMessage,
-)
 
-from paramclient.errors import CacheError, NoReply, UsageError
+from paramclient.errors import NoReply, UsageError
 from paramclient.model.values import ParamType, Trust
-from paramclient.protocol import wire
 from paramclient.protocol.events import (
     ComponentFound,
     ComponentLost,
@@ -35,8 +25,19 @@ from paramclient.protocol.events import (
     ParamChanged,
     TableResynced,
 )
+from paramclient.protocol.fetch import Policy
 from paramclient.protocol.station import Station
+from paramclient.protocol.watch import SyncState
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam
+from paramclient.wire import messages
+from paramclient.wire.messages import (
+    HASH_CHECK,
+    CommandLong,
+    FileTransfer,
+    ParamRequestList,
+    ParamRequestRead,
+    ParamSet,
+)
 from tests.shell import Tap
 from tests.simulation import Memory, Simulation, is_so, listed
 
@@ -95,7 +96,7 @@ class World(Simulation):
 
     def requests(self) -> int:
         """Everything sent that has to do with parameters."""
-        return sum(len(self.sent_of(kind)) for kind in (ParamRequestRead, ParamRequestList, ParamSetMessage))
+        return sum(len(self.sent_of(kind)) for kind in (ParamRequestRead, ParamRequestList, ParamSet))
 
 
 def fetched(
@@ -235,39 +236,6 @@ def test_a_vehicle_without_a_hash(sync_settings: SyncSettings) -> None:
     assert world.machine.table.params["P07"].value == 700
 
 
-def test_gaps_bring_about_no_lists() -> None:
-    world = World(
-        ArduPilotVehicle(ftp=False, table=PLAIN), sync_settings=SyncSettings(INTERVAL, without_hash=True)
-    )
-    world.fetch()
-    world.sent.clear()
-    for _ in range(5):
-        world.away(3.0)
-        world.run(2.0)
-    assert world.requests() == 0
-    world.run(INTERVAL)
-    assert len(world.sent_of(ParamRequestList)) == 1
-
-
-def test_a_resync_that_fails_is_tried_again() -> None:
-    vehicle = PX4Vehicle(table=TABLE)
-    tap = Tap(vehicle)
-    world = World(air=Air.symmetric([tap], delay=0.1))
-    world.fetch()
-    tap.is_mute = True
-    vehicle.set_param("P07", 700)
-    world.run(0.2)
-    tap.is_mute = False
-    world.until(lambda: world.machine.fetch is not None)
-    tap.is_deaf = True
-    world.until(lambda: world.machine.fetch is None)
-    assert resynced(world) == []
-    assert state(world) is SyncState.UNSYNCED
-    tap.is_deaf = False
-    world.run(INTERVAL + 1.0)
-    assert resynced(world) == [("P07",)]
-
-
 def test_a_table_received_as_a_file_is_kept_in_sync_by_its_hash_alone() -> None:
     unknown = [SimParam(row.name, row.type, row.value, volatile=row.name in NAMES[::9]) for row in TABLE]
     vehicle = PX4Vehicle(ftp=True, table=unknown)
@@ -281,18 +249,6 @@ def test_a_table_received_as_a_file_is_kept_in_sync_by_its_hash_alone() -> None:
     assert len(world.hashes()) == 3
     assert world.sent_of(ParamRequestList) == []
     assert world.sent_of(FileTransfer) == []
-
-
-def test_a_missing_value_of_our_own_set_is_settled_by_a_read() -> None:
-    world, vehicle = fetched()
-    world.tap.is_mute = True
-    write = world.machine.write("P07", 700, world.now)
-    world.run(0.05)
-    world.tap.is_mute = False
-    assert world.outcome(write).actual == 700
-    world.run(1.0)
-    assert world.machine.table.hash == vehicle.announced_hash()
-    assert state(world) is SyncState.SYNCED
 
 
 def test_another_count_leads_to_a_check_at_once() -> None:
@@ -319,37 +275,6 @@ def test_after_a_gap_in_the_heartbeats_the_hash_is_requested() -> None:
     assert world.reported(ComponentLost) == []
 
 
-def test_the_usual_interval_of_heartbeats_is_no_gap() -> None:
-    world, _ = fetched()
-    world.away(1.9)
-    world.run(1.0)
-    assert world.hashes() == []
-
-
-class Rare(Tap):
-    """Lets only every tenth heartbeat through, and no SYSTEM_TIME."""
-
-    def data_to_send(self) -> list[bytes]:
-        data = super().data_to_send()
-        kept = []
-        for each in data:
-            (frame,) = wire.Framer(stream=False).receive(each)
-            if frame.message_id == 0:
-                self.beats = getattr(self, "beats", -1) + 1
-            if frame.message_id not in (0, 2) or (frame.message_id == 0 and self.beats % 10 == 0):
-                kept.append(each)
-        return kept
-
-
-def test_a_component_with_a_slow_heartbeat_is_not_lost_again_and_again() -> None:
-    world = World(air=Air([Rare(PX4Vehicle(table=TABLE))]))
-    world.run(0.5)
-    world.fetch()
-    world.run(300.0)
-    assert len(world.reported(ComponentLost)) <= 1, "before it was known how rarely it beats"
-    assert len(world.hashes()) <= 300.0 / INTERVAL + 2, "and what lies between its heartbeats is no gap"
-
-
 class Heartless(Tap):
     """Lets no sign of life through."""
 
@@ -361,7 +286,7 @@ def test_a_component_without_heartbeats_is_never_lost() -> None:
     heartless = Heartless(GenericVehicle(table=PLAIN))
     world = World(air=Air([heartless]))
     world.station.receive(
-        wire.encode(wire.ParamValue("P00", bytes(4), 6, 40, 0), system=1, component=1, sequence=0),
+        messages.encode(messages.ParamValue("P00", bytes(4), 6, 40, 0), system=1, component=1, sequence=0),
         "the only peer",
         world.now,
     )
@@ -608,26 +533,6 @@ def test_a_write_waits_for_the_identity_of_the_vehicle() -> None:
     assert world.set("P07", 701).actual == 701
 
 
-def test_a_write_in_progress_is_held_while_the_identity_is_in_doubt() -> None:
-    berth = Berth(PX4Vehicle(table=TABLE, uid=1))
-    world = World(air=Air([berth]))
-    world.fetch()
-    berth.is_deaf = True
-    write = world.machine.write("P07", 700, world.now)
-    world.run(0.5)
-    assert write.attempts > 0
-    stranger = PX4Vehicle(table=TABLE, uid=2)
-    world.station.pause()
-    world.run(9.0)
-    berth.moor(stranger)
-    berth.is_deaf = False
-    world.station.resume(world.now)
-    world.run(5.0)
-    assert isinstance(write.error, NoReply)
-    assert stranger.requests["PARAM_SET"] == 0
-    assert stranger.param("P07").value == 7
-
-
 def test_writes_to_a_camera_wait_for_its_vehicle() -> None:
     berth = Berth(PX4Vehicle(table=TABLE, uid=1))
     camera = GenericVehicle(table=PLAIN, component=100)
@@ -662,14 +567,6 @@ def test_a_reboot_is_reported_and_the_table_checked() -> None:
     assert resynced(world) == [()]
     assert state(world) is SyncState.SYNCED
     assert world.sent_of(CommandLong), "it may be another one"
-
-
-def test_a_reboot_that_takes_its_time_is_a_loss_and_a_reboot() -> None:
-    world, vehicle = fetched(boot_time=3.0)
-    vehicle.reboot(world.now, down=7.0)
-    world.run(20.0)
-    kinds = [type(event) for event in world.events if not isinstance(event, ParamChanged)]
-    assert kinds == [ComponentLost, ComponentFound, ComponentRebooted, TableResynced]
 
 
 def test_a_vehicle_that_never_stops_starting_again_ends_a_fetch() -> None:
@@ -729,13 +626,6 @@ def test_cache_only_sends_nothing() -> None:
     assert world.fetch().source == "cache"
     assert world.requests() == 0
     assert world.sent_of(CommandLong)
-
-
-def test_cache_only_without_a_cache() -> None:
-    world = World(PX4Vehicle(table=TABLE), sync_settings=SyncSettings(policy=Policy.CACHE_ONLY))
-    assert isinstance(world.error_of(world.fetch), CacheError)
-    assert world.machine.fetch is None
-    assert world.requests() == 0
 
 
 def test_hash_only_requests_the_hash_and_nothing_more() -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 from paramclient.protocol.params import table as room
-from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.table import Table
-from paramclient.protocol.wire import ParamValue
 
 from paramclient.model.px4_hash import hash_params
 from paramclient.model.values import Encoding, Param, ParamType, Trust, as_reported
+from paramclient.protocol.events import Change
+from paramclient.wire.messages import ParamValue
 from tests.simulation import known, listed, param_value
 
 

@@ -4,13 +4,13 @@ how soon."""
 from __future__ import annotations
 
 import pytest
-from paramclient.protocol.params.change import Added, Change, Changed, FirstValue, Removed
-from paramclient.protocol.params.sync import DOWNLOAD_PAUSE_MIN, SyncSettings, SyncState
-from paramclient.protocol.wire import FileTransfer, ParamRequestList
+from paramclient.protocol.params.sync import DOWNLOAD_PAUSE_MIN, SyncSettings
 
 from paramclient.model.values import ParamType
-from paramclient.protocol.events import ParamChanged
+from paramclient.protocol.events import Change, ParamChanged
+from paramclient.protocol.watch import SyncState
 from paramclient.sim import Air, ArduPilotVehicle
+from paramclient.wire.messages import FileTransfer, ParamRequestList
 from tests.protocol.params.test_sync import INTERVAL, World, state
 
 GROUP = {f"GRIP_{number}": (ParamType.INT16, number) for number in range(7)}

@@ -7,26 +7,25 @@ from functools import partial
 
 import pytest
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.reads import Read
 from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.params.value_check import AMBIGUITY_WINDOW
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.retry import BATCH_INTERVAL
-from paramclient.protocol.wire import (
+
+from paramclient.model.values import ParamType
+from paramclient.protocol.events import Change, Event, EventMaker, ParamChanged
+from paramclient.protocol.station import Station
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
+from paramclient.wire.messages import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_PX4,
     AutopilotVersion,
     Heartbeat,
     Message,
     ParamRequestRead,
-    ParamSetMessage,
+    ParamSet,
 )
-
-from paramclient.model.values import ParamType
-from paramclient.protocol.events import Event, EventMaker, ParamChanged
-from paramclient.protocol.station import Station
-from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.simulation import Simulation, is_so, param_value
 
 NAMES = ("ATC_RAT_RLL_P", "ATC_RAT_PIT_P", "ATC_RAT_YAW_P", "PSC_ACCZ_P")
@@ -182,7 +181,7 @@ def test_a_set_back_is_not_proven_by_a_late_answer() -> None:
     desk.pass_time(AMBIGUITY_WINDOW)
     assert desk.reads() == ["A"]
     desk.hear("A", 2.0)
-    assert [each.param_id for each in desk.take() if isinstance(each, ParamSetMessage)] == ["A"]
+    assert [each.param_id for each in desk.take() if isinstance(each, ParamSet)] == ["A"]
     desk.hear("A", 1.0)
     assert write.done
     assert desk.values == [2.0, 1.0]

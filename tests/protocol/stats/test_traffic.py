@@ -9,23 +9,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from paramclient.protocol.stats import traffic as room
-from paramclient.protocol.stats.packet_loss import (
-    CERTAIN_GAP,
-    GAP_MAX,
-    REORDER_DEPTH,
-    SequenceCheck,
-)
-from paramclient.protocol.stats.sniffer import SeenFrame, Sniffer
-from paramclient.protocol.stats.traffic import ComponentTraffic, Traffic
-from paramclient.protocol.wire import Framer, Heartbeat
+from paramclient.protocol.stats.packet_loss import CERTAIN_GAP, GAP_MAX, REORDER_DEPTH
+from paramclient.protocol.stats.traffic import Traffic
 
-from paramclient import LinkError, ParamClient, TrafficReport
-from paramclient.protocol import wire
+from paramclient import LinkError, ParamClient
+from paramclient.client.frame_cutter import SeenFrame, Sniffer
+from paramclient.client.traffic import ComponentTraffic, TrafficReport
 from paramclient.protocol.station import Station
 from paramclient.sim import Air, FaultyLink, PX4Vehicle
+from paramclient.wire import frames, messages
+from paramclient.wire.frames import Framer
+from paramclient.wire.loss import SequenceCheck
+from paramclient.wire.messages import Heartbeat
 from tests.simulation import Simulation
 
-PX4 = Heartbeat(2, wire.MAV_AUTOPILOT_PX4, system_status=3)
+PX4 = Heartbeat(2, messages.MAV_AUTOPILOT_PX4, system_status=3)
 UNKNOWN = 4_711_000
 """A message id that no dialect has."""
 
@@ -35,11 +33,11 @@ def frame(
 ) -> bytes:
     payload = bytes(range(1, 29))
     where = {"system": system, "component": component, "sequence": sequence}
-    return wire.build_frame(message_id, payload, version=version, **where)
+    return frames.build_frame(message_id, payload, version=version, **where)
 
 
 def heartbeat(sequence: int = 0, *, system: int = 1, component: int = 1) -> bytes:
-    return wire.encode(PX4, system=system, component=component, sequence=sequence)
+    return messages.encode(PX4, system=system, component=component, sequence=sequence)
 
 
 def unknown(sequence: int = 0, *, size: int = 5, system: int = 1, component: int = 1) -> bytes:
@@ -51,7 +49,7 @@ def unknown(sequence: int = 0, *, size: int = 5, system: int = 1, component: int
 def signed(sequence: int = 0) -> bytes:
     plain = frame(sequence=sequence)
     body = plain[1:2] + b"\x01" + plain[3:-2]
-    crc = wire.checksum(30, body)
+    crc = frames.checksum(30, body)
     assert crc is not None
     return b"\xfd" + body + crc.to_bytes(2, "little") + b"\x55" * 13
 
@@ -208,10 +206,10 @@ def test_components_messages_and_totals() -> None:
 def test_a_radio_reports_its_status() -> None:
     traffic = Traffic(is_stream=False)
     payload = struct.pack("<HHBBBBB", 3, 2, 200, 190, 96, 40, 42)
-    data = wire.build_frame(109, payload, system=51, component=68, sequence=0)
+    data = frames.build_frame(109, payload, system=51, component=68, sequence=0)
     traffic.receive(data, "peer", 0.0)
     assert only(traffic.report(0.0)).radio == room.RadioStatus(200, 40, 190, 42, 96, 3, 2)
-    short = wire.build_frame(109, b"", system=51, component=68, sequence=1)
+    short = frames.build_frame(109, b"", system=51, component=68, sequence=1)
     traffic.receive(short, "peer", 0.0)
     assert only(traffic.report(0.0)).radio == room.RadioStatus(0, 0, 0, 0, 0, 0, 0)
 

@@ -7,11 +7,16 @@ import struct
 import pytest
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.wire import (
+
+from paramclient.errors import CommandResult
+from paramclient.model.values import ParamType
+from paramclient.protocol.events import ComponentRebooted, Event, EventMaker
+from paramclient.protocol.station import Station
+from paramclient.wire import frames, messages
+from paramclient.wire.messages import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_PX4,
     MAV_CMD_REQUEST_MESSAGE,
-    SYSTEM_TIME_ID,
     AutopilotVersion,
     CommandAck,
     CommandLong,
@@ -21,18 +26,14 @@ from paramclient.protocol.wire import (
     ParamValue,
     StatusText,
     SystemTime,
+    message_id,
 )
-
-from paramclient.model.values import ParamType
-from paramclient.protocol import wire
-from paramclient.protocol.events import ComponentRebooted, Event, EventMaker
-from paramclient.protocol.station import Station
 
 OWN = (255, 190)
 COPTER = Heartbeat(2, MAV_AUTOPILOT_ARDUPILOTMEGA, system_status=3)
 PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4, system_status=3)
 ATTITUDE_ID = 30
-CLOCK_REQUEST = CommandLong(1, 1, MAV_CMD_REQUEST_MESSAGE, (float(SYSTEM_TIME_ID), *[0.0] * 6))
+CLOCK_REQUEST = CommandLong(1, 1, MAV_CMD_REQUEST_MESSAGE, (float(message_id(SystemTime)), *[0.0] * 6))
 
 
 # requests
@@ -74,7 +75,7 @@ class Desk:
 
     def value(self, name: str, value: float = 1.0) -> None:
         raw = struct.pack("<f", value)
-        self.hear(ParamValue(name, raw, ParamType.REAL32, 4, wire.NO_INDEX))
+        self.hear(ParamValue(name, raw, ParamType.REAL32, 4, messages.NO_INDEX))
 
     def run(self, until: float) -> None:
         while self.machine.next_deadline() <= until:
@@ -143,7 +144,7 @@ def test_telemetry_that_begins_anew_is_a_restart() -> None:
     assert desk.reboots == 1
 
 
-ACCEPTED = CommandAck(wire.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, wire.MAV_RESULT_ACCEPTED, *OWN)
+ACCEPTED = CommandAck(messages.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, CommandResult.ACCEPTED, *OWN)
 
 
 def test_an_accepted_restart_shows_in_the_numbers_of_the_frames() -> None:
@@ -189,11 +190,11 @@ def test_numbers_that_prove_nothing(after: float, sequence: int) -> None:
 
 def attitude(boot_ms: int, system: int = 1, component: int = 1) -> bytes:
     payload = boot_ms.to_bytes(4, "little") + bytes(24)
-    return wire.build_frame(ATTITUDE_ID, payload, system=system, component=component, sequence=0)
+    return frames.build_frame(ATTITUDE_ID, payload, system=system, component=component, sequence=0)
 
 
 def beat(system: int = 1, component: int = 1, *, heartbeat: Heartbeat = PX4) -> bytes:
-    return wire.encode(heartbeat, system=system, component=component, sequence=0)
+    return messages.encode(heartbeat, system=system, component=component, sequence=0)
 
 
 @pytest.mark.parametrize("is_stream", [False, True])
@@ -214,7 +215,7 @@ def test_a_station_reads_clocks_after_a_heartbeat(is_stream: bool) -> None:
 
 def test_clocks_of_other_components_are_their_own() -> None:
     station = Station(link="x", is_stream=False)
-    gimbal = Heartbeat(26, wire.MAV_AUTOPILOT_INVALID)
+    gimbal = Heartbeat(26, messages.MAV_AUTOPILOT_INVALID)
     for second in range(20):
         now = float(second)
         station.receive(beat() + beat(1, 154, heartbeat=gimbal), "peer", now)
@@ -226,7 +227,9 @@ def test_clocks_of_other_components_are_their_own() -> None:
 def test_clocks_are_read_all_the_time_while_a_restart_is_awaited() -> None:
     station = Station(link="x", is_stream=False)
     station.receive(beat(), "peer", 0.0)
-    station.receive(wire.encode(AutopilotVersion(0, uid=7), system=1, component=1, sequence=1), "peer", 0.0)
+    station.receive(
+        messages.encode(AutopilotVersion(0, uid=7), system=1, component=1, sequence=1), "peer", 0.0
+    )
     station.receive(attitude(90_000), "peer", 0.5)
     machine = station.components[1, 1]
     restart = machine.begin_reboot(0.9)
@@ -241,12 +244,14 @@ def test_clocks_are_read_all_the_time_while_a_restart_is_awaited() -> None:
 
 def test_a_station_passes_on_the_numbers_of_frames() -> None:
     station = Station(link="x", is_stream=False)
-    station.receive(wire.encode(COPTER, system=1, component=1, sequence=100), "peer", 0.0)
-    station.receive(wire.encode(AutopilotVersion(0, uid=7), system=1, component=1, sequence=101), "peer", 0.0)
-    station.receive(wire.encode(SystemTime(0, 5_000), system=1, component=1, sequence=102), "peer", 0.0)
+    station.receive(messages.encode(COPTER, system=1, component=1, sequence=100), "peer", 0.0)
+    station.receive(
+        messages.encode(AutopilotVersion(0, uid=7), system=1, component=1, sequence=101), "peer", 0.0
+    )
+    station.receive(messages.encode(SystemTime(0, 5_000), system=1, component=1, sequence=102), "peer", 0.0)
     station.data_to_send()
-    station.receive(wire.encode(COPTER, system=1, component=1, sequence=0), "peer", 1.0)
+    station.receive(messages.encode(COPTER, system=1, component=1, sequence=0), "peer", 1.0)
     station.tick(1.0)
-    framer = wire.Framer(wire.DECODED_IDS, stream=False)
-    sent = [wire.decode(frame) for data, _ in station.data_to_send() for frame in framer.receive(data)]
+    framer = frames.Framer(messages.DECODED_IDS, stream=False)
+    sent = [messages.decode(frame) for data, _ in station.data_to_send() for frame in framer.receive(data)]
     assert CLOCK_REQUEST in sent

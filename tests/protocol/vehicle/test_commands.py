@@ -8,9 +8,10 @@ import pytest
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.retry import RetryPolicy
 from paramclient.protocol.vehicle.commands import Command, Commands
-from paramclient.protocol.wire import CommandAck, CommandLong, Message
 
-from paramclient import CommandRefused, CommandResult, LinkError, NoReply, Refused
+from paramclient import CommandRefused, LinkError, NoReply, Refused
+from paramclient.errors import CommandResult
+from paramclient.wire.messages import CommandAck, CommandLong, Message
 from tests.simulation import is_so
 
 OWN = (255, 190)

@@ -11,8 +11,9 @@ from paramclient.protocol.requests.retry import (
 )
 from paramclient.protocol.vehicle.commands import MessageRequests
 from paramclient.protocol.vehicle.identification import Identification, judge_encoding
-from paramclient.protocol.wire import (
-    AUTOPILOT_VERSION_ID,
+
+from paramclient.model.values import Encoding
+from paramclient.wire.messages import (
     CAPABILITY_PARAM_ENCODE_BYTEWISE,
     CAPABILITY_PARAM_ENCODE_C_CAST,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
@@ -29,9 +30,8 @@ from paramclient.protocol.wire import (
     CommandLong,
     Heartbeat,
     Message,
+    message_id,
 )
-
-from paramclient.model.values import Encoding
 from tests.simulation import is_so
 
 OWN = (255, 190)
@@ -162,7 +162,7 @@ def test_autopilot_version_is_requested_once() -> None:
     [message] = desk.sent
     assert isinstance(message, CommandLong)
     assert message.command == MAV_CMD_REQUEST_MESSAGE
-    assert message.params[0] == AUTOPILOT_VERSION_ID
+    assert message.params[0] == message_id(AutopilotVersion)
     desk.beat(PX4, 1.1)
     assert len(desk.sent) == 1
     assert is_so(not desk.who.settled)

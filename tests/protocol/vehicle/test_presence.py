@@ -14,14 +14,14 @@ from paramclient.protocol.vehicle.reboot_detection import (
     BOOT_CLOCK_WRAP,
     REORDERING_TIME,
 )
-from paramclient.protocol.wire import (
+
+from paramclient.wire.messages import (
     MAV_AUTOPILOT_PX4,
     MAV_STATE_ACTIVE,
     MAV_STATE_BOOT,
     Heartbeat,
     SystemTime,
 )
-
 from tests.simulation import is_so
 
 ACTIVE = Heartbeat(2, MAV_AUTOPILOT_PX4, system_status=MAV_STATE_ACTIVE)
