@@ -26,7 +26,7 @@ from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.model.identity import version_text
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.fetch import Policy
-from paramclient.protocol.kinds import kind_in_words
+from paramclient.protocol.kinds import expects_extended, kind_in_words
 from paramclient.protocol.selection import LOOK_TIME, hint_of_link
 from paramclient.wire.messages import MAV_AUTOPILOT_INVALID
 
@@ -252,7 +252,7 @@ async def sessions(
         if writes:
             await wait_for_firmware(found, deadline)
         for each in found if is_plain else ():
-            if each.ext.is_expected:
+            if expects_extended(each.identity.vehicle_type, each.component):
                 label = f"{each.system}/{each.component}"
                 say(f"{label} usually has extended parameters: --extended uses them")
         yield [CommandSession(client, each, deadline, options, choice) for each in found]
