@@ -394,7 +394,7 @@ class ParamClient:
         """
         before = component.identity
         found = await self.component(system, component.component, timeout=timeout)
-        with anyio.move_on_after(timeout):
+        with anyio.move_on_after(timeout), self.core.station.gate.until_closed():
             await found.node.identification.settled()
         if not before.is_same_vehicle(found.identity):
             raise AnotherVehicle(system, found.component, str(before), str(found.identity))

@@ -32,7 +32,7 @@ class ClientCore:
         taps: the telemetry log and the forwarder.
         keeper: stores the signature timestamps; None without a key.
         new_station: makes the station, of functions that queue bytes and start background work.
-        ended: called when a log has ended.
+        ended: called when the streams end: with a log, with a link that has failed for good, or at closing.
 
     Attributes:
         link_task, station, cache_writer, taps: the parts.
@@ -53,7 +53,7 @@ class ClientCore:
         self.cache_writer = cache_writer
         self.cache = cache_writer.cache
         self.is_over = False
-        self.link_task = LinkTask(link, taps=taps.taps, ended=self._log_ended)
+        self.link_task = LinkTask(link, taps=taps.taps, ended=self._link_ended)
         self.station = self.link_task.station = new_station(send=self.link_task.queue, spawn=self.spawn)
         self.taps = taps
         self._keeper = keeper
@@ -159,6 +159,6 @@ class ClientCore:
             if self._keeper is not None:
                 await self._keeper.close()
 
-    def _log_ended(self) -> None:
-        self.is_over = True
+    def _link_ended(self) -> None:
+        self.is_over = not self.station.gate.is_closed
         self._ended()

@@ -61,7 +61,7 @@ class LinkTask:
     Args:
         link: an open link.
         taps: receivers of all data on the link.
-        ended: called when a log has ended.
+        ended: called when a log has ended, or the link has failed for good.
 
     Attributes:
         station: takes the received data; set before `read`.
@@ -109,6 +109,7 @@ class LinkTask:
             except LinkError as error:
                 if not self._link.reconnects:
                     self.station.fail(error, for_good=True)
+                    self._ended()
                     self.notify()
                     return
                 await self._reconnect(error)

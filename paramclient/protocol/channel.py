@@ -59,6 +59,7 @@ class Gate:
         self._is_closed = False
         self._open = anyio.Event()
         self._open.set()
+        self._waits: set[anyio.CancelScope] = set()
 
     @property
     def is_closed(self) -> bool:
@@ -87,6 +88,9 @@ class Gate:
             self.error = error
             self._is_closed = for_good
             self._open.set()
+            if for_good:
+                for scope in self._waits:
+                    scope.cancel()
 
     def check(self) -> None:
         """Raise the error of the link, if it has failed."""
@@ -101,6 +105,22 @@ class Gate:
         """
         await self._open.wait()
         self.check()
+
+    @contextmanager
+    def until_closed(self) -> Iterator[None]:
+        """Run a block that waits for something else than a message, such as a pause.
+
+        Raises:
+            LinkError: the link has failed for good; the block was cancelled.
+        """
+        with anyio.CancelScope() as scope:
+            self._waits.add(scope)
+            try:
+                yield
+            finally:
+                self._waits.remove(scope)
+        if scope.cancelled_caught:
+            self.check()
 
 
 class Presence(Protocol):

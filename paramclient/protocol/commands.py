@@ -104,17 +104,19 @@ async def reboot(node: Node, *, returns: bool = True) -> None:
             component=node.component,
         )
     generation = node.generation
-    await anyio.sleep_until(node.plain.written_at + SAVING_TIME)
+    with channel.gate.until_closed():
+        await anyio.sleep_until(node.plain.written_at + SAVING_TIME)
     command = CommandLong(*channel.target, MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1.0)
     try:
         await send_command(channel, command)
     except NoReply:
         if node.generation == generation and not presence.is_lost:
             raise
-    await _wait_until_off(node, generation)
-    if not returns:
-        return
-    await _wait_until_back(node, generation)
+    with channel.gate.until_closed():
+        await _wait_until_off(node, generation)
+        if not returns:
+            return
+        await _wait_until_back(node, generation)
     if node.generation == generation:
         node.rebooted(anyio.current_time())
     await node.identified()

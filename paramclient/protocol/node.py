@@ -110,7 +110,7 @@ class Node:
         self.generation = 0
         self._spawn = spawn
         self._emit = emit
-        self._identifying: Shared[None] = Shared(spawn)
+        self._identifying: Shared[None] = Shared(spawn, gate)
 
     def receive(self, message: Message, now: float, version: int = 2) -> None:
         """Take a message of the component: into the tables, and to the conversations that wait for it."""

@@ -8,7 +8,7 @@ from typing import Any, Final, Generic, TypeVar
 
 import anyio
 
-from paramclient.protocol.channel import Channel
+from paramclient.protocol.channel import Channel, Gate
 from paramclient.protocol.dialect import Dialect, Digest
 from paramclient.protocol.events import Change
 from paramclient.protocol.identity import Identification
@@ -32,10 +32,12 @@ class Shared(Generic[T]):
 
     Args:
         spawn: starts the work in the background.
+        gate: fails after the work was cancelled with all background work.
     """
 
-    def __init__(self, spawn: Spawn) -> None:
+    def __init__(self, spawn: Spawn, gate: Gate) -> None:
         self._spawn = spawn
+        self._gate = gate
         self._run: _Run[T] | None = None
 
     @property
@@ -47,6 +49,9 @@ class Shared(Generic[T]):
         """Await the result of the work in progress, or of `work`, which begins then.
 
         Cancellation ends this wait only, and the work if no other caller awaits it.
+
+        Raises:
+            LinkError: the client was closed; or an error of the work.
         """
         run = self._run
         if run is None:
@@ -55,6 +60,9 @@ class Shared(Generic[T]):
         run.waiters += 1
         try:
             await run.done.wait()
+            if run.was_cancelled:
+                with self._gate.until_closed():
+                    await anyio.sleep_forever()
         finally:
             run.waiters -= 1
             if not run.waiters:
@@ -79,6 +87,10 @@ class _Run(Generic[T]):
         self._work = work
         self._results: list[T] = []
         self._error: Exception | None = None
+
+    @property
+    def was_cancelled(self) -> bool:
+        return self.done.is_set() and not self._results and self._error is None
 
     async def execute(self) -> None:
         try:
@@ -128,7 +140,7 @@ class Session:
         self.spawn = spawn
         self.table = Table(dialect, changed)
         self.table.author_of = self._author_of
-        self.fetching: Shared[Any] = Shared(spawn)
+        self.fetching: Shared[Any] = Shared(spawn, channel.gate)
         self.writing: dict[str, str] = {}
         self.serves_file: bool | None = None
         self.announced: Digest | None = None

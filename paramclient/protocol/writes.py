@@ -83,7 +83,9 @@ async def write(
         NoReply: it did not answer. The value may have been set.
         LinkError: the link is closed for good.
     """
-    await session.identification.encoding_certain()
+    gate = session.channel.gate
+    with gate.until_closed():
+        await session.identification.encoding_certain()
     async with session.lock(name):
         session.writing[name] = author
         try:
@@ -91,7 +93,8 @@ async def write(
             await _learn_type(session, name)
             result = await _Write(session, name, value).run()
             if settle > 0:
-                await anyio.sleep(settle)
+                with gate.until_closed():
+                    await anyio.sleep(settle)
                 await read(session, name)
                 now = session.table.params[name]
                 if not now.same_value(result.param):
