@@ -1,9 +1,10 @@
-"""Signatures: keys whose repr hides them, frames beside pymavlink's, what is refused, and signed sessions."""
+"""Signatures: keys whose repr hides them, frames beside pymavlink's, and what is refused."""
 
 from __future__ import annotations
 
 import base64
 import copy
+import hashlib
 import pickle
 import struct
 from typing import Any
@@ -14,29 +15,31 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
 
 from paramclient.errors import UsageError
-from paramclient.protocol.station import Station
-from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, Vehicle
-from paramclient.wire import frames, messages
-from paramclient.wire.frames import Framer, sign_frame
+from paramclient.wire.frames import Framer, build_frame, checksum, sign_frame
 from paramclient.wire.messages import (
-    TIMESTAMP_LAG_MAX,
+    Heartbeat,
     Message,
+    ParamRequestList,
     ParamRequestRead,
     ParamValue,
     SetupSigning,
+    StatusText,
+    decode,
     encode,
 )
 from paramclient.wire.signing import (
     ADOPTED_TIMESTAMP_MAX,
+    EPOCH,
+    LAST_TIMESTAMP,
+    TIMESTAMP_LAG_MAX,
     UNITS_PER_SECOND,
     Refusal,
     Signer,
     SigningKey,
     SigningPolicy,
     Verifier,
+    timestamp_of,
 )
-from tests.shell import VALUES, small_px4
-from tests.simulation import PEER, Simulation
 
 SECRET = bytes(range(1, 33))
 KEY = SigningKey(SECRET)
@@ -129,6 +132,15 @@ def test_the_repr_of_a_key_does_not_show_it() -> None:
     assert copy.copy(KEY) is copy.deepcopy(KEY) is KEY
 
 
+def test_keys_are_equal_by_their_bytes_and_distinguished_by_their_fingerprints() -> None:
+    assert SigningKey(SECRET) == KEY != OTHER_KEY
+    assert KEY != SECRET
+    assert len({SigningKey(SECRET), KEY, OTHER_KEY}) == 2
+    assert KEY.fingerprint != OTHER_KEY.fingerprint
+    assert len(bytes.fromhex(KEY.fingerprint)) == 8
+    assert not hashlib.sha256(SECRET).hexdigest().startswith(KEY.fingerprint)
+
+
 # Beside pymavlink
 
 
@@ -143,7 +155,7 @@ def test_the_repr_of_a_key_does_not_show_it() -> None:
 def test_our_signatures_are_pymavlinks(
     timestamp: int, link_id: int, sequence: int, system: int, component: int, payload: bytes
 ) -> None:
-    message = messages.ParamRequestList(*payload)
+    message = ParamRequestList(*payload)
     frame = encode(message, system=system, component=component, sequence=sequence)
     ours = sign_frame(frame, Signer(KEY, link_id=link_id, timestamp=timestamp - 1))
     mav = pymavlink(system=system, timestamp=timestamp, link_id=link_id)
@@ -167,7 +179,7 @@ def test_pymavlink_takes_what_we_sign_and_we_what_it_signs(
         assert names(theirs.parse_buffer(frame)) == ["PARAM_VALUE"]
         answer = dialect.MAVLink_param_request_read_message(1, 1, b"MC_ROLL_P", -1).pack(theirs)
         (got,) = framer.receive(answer)
-        assert messages.decode(got) == ParamRequestRead(1, 1, "MC_ROLL_P")
+        assert decode(got) == ParamRequestRead(1, 1, "MC_ROLL_P")
         assert verifier.report().signed == count
     assert theirs.signing.badsig_count == 0
 
@@ -222,6 +234,25 @@ def test_the_timestamp_rises_from_frame_to_frame_and_with_the_time() -> None:
     assert used() == NOW + 5 * UNITS_PER_SECOND + 2
 
 
+def test_a_frame_of_mavlink_1_stays_as_it_is() -> None:
+    frame = encode(VALUE, system=1, component=1, sequence=0, version=1)
+    signer = Signer(KEY, timestamp=NOW)
+    assert sign_frame(frame, signer) == frame
+    assert signer.timestamp == NOW
+
+
+def test_timestamps_count_from_2015_and_never_reach_their_end() -> None:
+    assert timestamp_of(EPOCH) == timestamp_of(0.0) == 0
+    assert timestamp_of(EPOCH + 1.00001) == 100_001
+    assert timestamp_of(1e12) == ADOPTED_TIMESTAMP_MAX
+    signer = Signer(KEY, timestamp=NOW)
+    verifier = Verifier(signer)
+    assert verifier.accepts(signed_frame(timestamp=LAST_TIMESTAMP))
+    assert signer.timestamp == ADOPTED_TIMESTAMP_MAX < LAST_TIMESTAMP
+    with pytest.raises(UsageError, match="0 to 255"):
+        Signer(KEY, link_id=256, timestamp=NOW)
+
+
 # What is refused
 
 
@@ -231,7 +262,7 @@ def test_no_changed_byte_passes(data: st.DataObject) -> None:
     frame = bytearray(signed_frame())
     at = data.draw(st.sampled_from([n for n in range(3, len(frame)) if n not in (7, 8, 9)]))
     frame[at] ^= data.draw(st.integers(1, 255))
-    crc = frames.checksum(22, bytes(frame[1:-15]))
+    crc = checksum(22, bytes(frame[1:-15]))
     assert crc is not None
     frame[-15:-13] = crc.to_bytes(2, "little")
     framer = Framer()
@@ -241,6 +272,16 @@ def test_no_changed_byte_passes(data: st.DataObject) -> None:
         assert framer.receive(bytes(frame)) == []
         assert verifier.report().refused == {Refusal.BAD_SIGNATURE: 1}
         assert verifier.report().streams == ()
+
+
+def test_a_forged_frame_does_not_move_our_timestamp_nor_its_streams() -> None:
+    signer = Signer(KEY, timestamp=NOW)
+    verifier = Verifier(signer)
+    assert not verifier.accepts(signed_frame(key=OTHER_KEY, timestamp=NOW + 1_000_000))
+    assert signer.timestamp == NOW
+    assert verifier.accepts(signed_frame(timestamp=NOW + 1))
+    assert not verifier.accepts(signed_frame(timestamp=NOW + 1))
+    assert verifier.report().refused == {Refusal.BAD_SIGNATURE: 1, Refusal.REPLAYED: 1}
 
 
 def test_every_stream_has_its_own_timestamps() -> None:
@@ -272,6 +313,15 @@ def test_a_stream_begins_at_most_a_minute_behind_us_and_may_fall_behind_later() 
     assert verifier.report().refused == {Refusal.OLD: 1}
 
 
+def test_streams_are_bounded_and_none_is_forgotten() -> None:
+    verifier = a_verifier(most_streams=3)
+    frames = [signed_frame(system=system) for system in range(1, 6)]
+    assert [verifier.accepts(frame) for frame in frames] == [True, True, True, False, False]
+    assert not verifier.accepts(frames[0])
+    assert verifier.accepts(signed_frame(system=3, timestamp=NOW + 1))
+    assert verifier.report().refused == {Refusal.TOO_MANY_STREAMS: 2, Refusal.REPLAYED: 1}
+
+
 @pytest.mark.parametrize("missing", range(1, 14))
 def test_a_cut_off_signature_is_refused_and_counted(missing: int) -> None:
     verifier = a_verifier(SigningPolicy.ACCEPT_ALL)
@@ -282,11 +332,24 @@ def test_a_cut_off_signature_is_refused_and_counted(missing: int) -> None:
     assert len(framer.receive(signed_frame())) == 1
 
 
+def test_in_a_stream_a_cut_off_signature_is_waited_for() -> None:
+    verifier = a_verifier()
+    framer = Framer()
+    framer.guard = verifier.accepts
+    frame = signed_frame()
+    assert framer.receive(frame[:-5]) == []
+    assert not verifier.report().refused
+    assert len(framer.receive(frame[-5:])) == 1
+    assert framer.receive(signed_frame(timestamp=NOW + 1)[:-1]) == []
+    assert framer.flush() == []
+    assert verifier.report().refused == {Refusal.TRUNCATED: 1}
+
+
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("number", [109, 166, 0, 22])
 @pytest.mark.parametrize("policy", SigningPolicy)
 def test_unsigned_frames_that_each_policy_accepts(policy: SigningPolicy, number: int, version: int) -> None:
-    frame = frames.build_frame(number, b"\1" * 9, system=51, component=68, sequence=0, version=version)
+    frame = build_frame(number, b"\1" * 9, system=51, component=68, sequence=0, version=version)
     verifier = a_verifier(policy)
     is_radio = number in (109, 166) and policy is SigningPolicy.UNSIGNED_RADIOS
     is_taken = is_radio or policy is SigningPolicy.ACCEPT_ALL
@@ -295,14 +358,26 @@ def test_unsigned_frames_that_each_policy_accepts(policy: SigningPolicy, number:
     assert verifier.report().refused == ({} if is_taken else {Refusal.UNSIGNED: 1})
 
 
+def test_to_accept_all_is_to_accept_what_is_wrong_and_to_count_it() -> None:
+    signer = Signer(KEY, timestamp=NOW)
+    verifier = Verifier(signer, SigningPolicy.ACCEPT_ALL)
+    assert verifier.accepts(signed_frame())
+    assert verifier.accepts(signed_frame())
+    assert verifier.accepts(signed_frame(key=OTHER_KEY, timestamp=NOW + 999))
+    report = verifier.report()
+    assert (report.signed, report.unsigned, report.refused) == (1, 0, {})
+    assert report.unproven == {Refusal.REPLAYED: 1, Refusal.BAD_SIGNATURE: 1}
+    assert signer.timestamp == NOW, "what is not proven moves nothing"
+
+
 @given(chunk=st.integers(1, 60), wanted=st.booleans())
 def test_a_guarded_framer_finds_what_another_finds(chunk: int, wanted: bool) -> None:
     """Where the guard lets all pass it changes nothing, signed or not, of either version."""
     frames = [
         signed_frame(),
         encode(VALUE, system=1, component=1, sequence=4, version=1),
-        encode(messages.Heartbeat(2, 12), system=1, component=1, sequence=5),
-        signed_frame(messages.StatusText(6, "\xfd\xfe" * 9)),
+        encode(Heartbeat(2, 12), system=1, component=1, sequence=5),
+        signed_frame(StatusText(6, "\xfd\xfe" * 9)),
     ]
     stream = b"noise\xfd".join(frames)
     plain, guarded = Framer([22] if wanted else None), Framer([22] if wanted else None)
@@ -318,157 +393,3 @@ def test_a_guarded_framer_finds_what_another_finds(chunk: int, wanted: bool) -> 
     assert guarded.flush() == plain.flush()
     assert seen == frames, "the guard is called for each frame, wanted or not"
     assert (guarded.frames, guarded.skipped) == (plain.frames, plain.skipped)
-
-
-# Sessions
-
-
-def a_station(
-    key: SigningKey | None = KEY,
-    policy: SigningPolicy = SigningPolicy.UNSIGNED_RADIOS,
-    *,
-    timestamp: int = NOW,
-    is_stream: bool = False,
-) -> Station:
-    station = Station(link="sim:test", is_stream=is_stream)
-    if key is not None:
-        signer = Signer(key, timestamp=timestamp)
-        station.begin_signing(signer, Verifier(signer, policy))
-    return station
-
-
-VEHICLES: list[Any] = [
-    lambda **options: small_px4(**options),
-    lambda **options: ArduPilotVehicle(table=VALUES, **options),
-    lambda **options: ArduPilotVehicle(table=VALUES, ftp=False, **options),
-    lambda **options: GenericVehicle(table=VALUES, **options),
-]
-EVERY_VEHICLE = pytest.mark.parametrize("make", VEHICLES, ids=["px4", "ardupilot", "by list", "generic"])
-
-
-@EVERY_VEHICLE
-@pytest.mark.parametrize("policy", SigningPolicy)
-def test_a_signed_session(make: Any, policy: SigningPolicy) -> None:
-    vehicle: Vehicle = make(signing_key=KEY)
-    simulation = Simulation(vehicle, station=a_station(policy=policy))
-    result = simulation.fetch()
-    assert result.complete
-    assert {name: param.value for name, param in result.params.items()} == vehicle.values
-    assert simulation.set("PARAM_04", 77).actual == 77
-    assert simulation.get("PARAM_04").value == vehicle.param("PARAM_04").value == 77
-    assert simulation.station.verifier is not None
-    report = simulation.station.verifier.report()
-    assert report.signed > 5
-    assert report.unsigned == 0
-    theirs = vehicle.signing_report
-    assert theirs is not None
-    assert (theirs.signed >= 3, theirs.refused) == (True, {})
-
-
-@EVERY_VEHICLE
-def test_frames_without_the_key_are_refused(make: Any) -> None:
-    vehicle: Vehicle = make(signing_key=KEY)
-    simulation = Simulation(vehicle, station=a_station(OTHER_KEY))
-    simulation.run(5.0)
-    assert simulation.station.components == {}
-    assert simulation.station.verifier is not None
-    assert simulation.station.verifier.report().refused.keys() == {Refusal.BAD_SIGNATURE}
-    assert vehicle.requests == {}
-
-
-def test_a_vehicle_with_a_key_does_not_respond_without_it() -> None:
-    vehicle = small_px4(signing_key=KEY)
-    simulation = Simulation(vehicle, station=a_station(None))
-    simulation.run(5.0)
-    assert simulation.machine.table.params == {}
-    assert vehicle.requests == {}, "it sees no request, and we take its frames, unproven"
-    assert vehicle.signing_report is not None
-    assert vehicle.signing_report.refused.keys() == {Refusal.UNSIGNED}
-
-
-def test_a_vehicle_with_old_timestamps_takes_ours_and_is_accepted() -> None:
-    """A clock that was never set; our heartbeat brings it to our time."""
-    vehicle = small_px4(signing_key=KEY, signing_timestamp=1)
-    simulation = Simulation(vehicle, station=a_station())
-    assert simulation.fetch().complete
-    assert simulation.station.verifier is not None
-    report = simulation.station.verifier.report()
-    assert report.refused.keys() == {Refusal.OLD}
-    assert report.streams[0].timestamp > NOW
-
-
-def test_frames_of_a_vehicle_that_starts_again_are_accepted_again() -> None:
-    vehicle = small_px4(signing_key=KEY)
-    simulation = Simulation(vehicle, station=a_station())
-    simulation.fetch()
-    vehicle.reboot(simulation.now, down=2.0)
-    simulation.run(6.0)
-    assert simulation.set("PARAM_04", 5).actual == 5
-
-
-def test_replayed_frames_change_nothing() -> None:
-    vehicle = ArduPilotVehicle(table=VALUES, ftp=False, signing_key=KEY)
-    simulation = Simulation(vehicle, station=a_station())
-    simulation.fetch()
-    recorded: list[bytes] = []
-
-    class Recorder(Air):
-        def data_to_send(self) -> list[bytes]:
-            data = super().data_to_send()
-            recorded.extend(data)
-            return data
-
-    simulation.air = Recorder([vehicle])
-    simulation.set("PARAM_04", 40)
-    simulation.set("PARAM_04", 41)
-    before = simulation.station.verifier
-    assert before is not None
-    refused = before.report().refused.get(Refusal.REPLAYED, 0)
-    for frame in recorded:
-        simulation.station.receive(frame, PEER, simulation.now)
-    assert simulation.machine.table.params["PARAM_04"].value == 41
-    assert before.report().refused[Refusal.REPLAYED] == refused + len(recorded)
-
-
-def test_a_forged_value_gets_into_no_table() -> None:
-    simulation = Simulation(small_px4(signing_key=KEY), station=a_station())
-    simulation.fetch()
-    table = dict(simulation.machine.table.params)
-    forged = ParamValue("PARAM_04", struct.pack("<i", 666), 6, len(table), table["PARAM_04"].index or 0)
-    stripped = encode(forged, system=1, component=1, sequence=0)
-    for frame in (
-        stripped,
-        encode(forged, system=1, component=1, sequence=0, version=1),
-        signed_frame(forged, key=OTHER_KEY, timestamp=NOW * 2),
-        signed_frame(forged, timestamp=NOW * 2)[:-1],
-    ):
-        assert not simulation.station.receive(frame, PEER, simulation.now)
-    assert simulation.machine.table.params == table
-    assert simulation.station.receive(signed_frame(forged, timestamp=NOW * 2), PEER, simulation.now)
-    assert simulation.machine.table.params["PARAM_04"].value == 666
-
-
-@EVERY_VEHICLE
-def test_a_vehicle_obeys_setup_signing(make: Any) -> None:
-    vehicle: Vehicle = make()
-    simulation = Simulation(vehicle, station=a_station(None))
-    simulation.meet()
-    simulation.station.send_setup_signing(1, 1, KEY, NOW)
-    simulation.run(1.0)
-    assert vehicle.signing_key == KEY
-    assert vehicle.requests["SETUP_SIGNING"] == 1
-    simulation.station.send_setup_signing(1, 1, OTHER_KEY, NOW)
-    simulation.station.send_setup_signing(1, 1, None, 0)
-    simulation.run(1.0)
-    assert vehicle.signing_key == KEY, "what is not signed is not for it any more"
-    simulation.next_session(a_station(timestamp=NOW + TIMESTAMP_LAG_MAX))
-    assert simulation.fetch().complete
-    simulation.station.send_setup_signing(1, 1, None, 0)
-    simulation.run(1.0)
-    assert is_unsigned(vehicle)
-    simulation.next_session(a_station(None))
-    assert simulation.fetch().complete
-
-
-def is_unsigned(vehicle: Vehicle) -> bool:
-    return vehicle.signing_key is None and vehicle.signing_report is None

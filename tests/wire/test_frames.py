@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
 from pymavlink.generator.mavcrc import x25crc_slow
 
-from paramclient.wire import frames, messages
-from paramclient.wire.frames import BOOT_CLOCK_OFFSETS, Frame, Framer, build_frame
+from paramclient.wire.frames import BOOT_CLOCK_OFFSETS, Frame, Framer, build_frame, message_name
 from paramclient.wire.messages import (
+    DECODED_IDS,
     AutopilotVersion,
     CommandAck,
     CommandLong,
@@ -41,11 +41,10 @@ from paramclient.wire.messages import (
     SystemTime,
     decode,
     encode,
-    frames,
 )
 from paramclient.wire.signing import SigningKey
 
-DATA = Path(__file__).parents[2] / "data"
+DATA = Path(__file__).parents[1] / "data"
 RECORDINGS = {
     "ardupilot_ftp_download": 0,
     "ardupilot_full_download": 1382,
@@ -143,7 +142,7 @@ MESSAGES: list[tuple[Message, Any]] = [
         ),
     ),
     (
-        CommandLong(1, 2, 512, (148.0, 0.5, 0.0, -1.0, 0.0, 0.0, 3.0), 1),
+        CommandLong(1, 2, 512, 148.0, 0.5, 0.0, -1.0, 0.0, 0.0, 3.0, 1),
         dialect.MAVLink_command_long_message(1, 2, 512, 1, 148.0, 0.5, 0.0, -1.0, 0.0, 0.0, 3.0),
     ),
     (CommandAck(512, 3, 255, 190), dialect.MAVLink_command_ack_message(512, 3, 0, 0, 255, 190)),
@@ -218,13 +217,13 @@ def kind_of(value: object) -> str:
 
 
 def test_every_message_that_is_understood_is_tested() -> None:
-    assert {theirs.get_msgId() for _, theirs in MESSAGES} | {397} == messages.DECODED_IDS
+    assert {theirs.get_msgId() for _, theirs in MESSAGES} | {397} == DECODED_IDS
 
 
 def test_a_message_that_pymavlink_does_not_have() -> None:
     """COMPONENT_METADATA: uint32 time_boot_ms, uint32 file_crc, char uri[100] (MAVLink, common.xml)."""
     assert 397 not in dialect.mavlink_map
-    assert frames.message_name(397) == "COMPONENT_METADATA"
+    assert message_name(397) == "COMPONENT_METADATA"
     seed = x25crc_slow(
         b"COMPONENT_METADATA uint32_t time_boot_ms uint32_t file_crc char uri " + bytes((100,))
     )
@@ -272,6 +271,11 @@ def test_fields_missing_in_mavlink_1_are_zero() -> None:
     version = AutopilotVersion(16, uid=5, uid2=b"eighteen bytes uid")
     frame = encode(version, system=1, component=1, sequence=0, version=1)
     assert decode(one_frame(frame)) == AutopilotVersion(16, uid=5)
+
+
+def test_an_id_above_255_has_no_mavlink_1_frame() -> None:
+    with pytest.raises(ValueError, match="range"):
+        encode(ParamError(1, 1, "A", -1, 5), system=1, component=1, sequence=0, version=1)
 
 
 @pytest.mark.parametrize(("ours", "theirs"), MESSAGES, ids=kind_of)
@@ -488,6 +492,17 @@ def test_a_frame_may_be_cut_anywhere_in_a_stream(frame: bytes) -> None:
         assert framer.flush() == []
 
 
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_header_may_be_cut_anywhere_whatever_its_id(version: int) -> None:
+    for number in dialect.mavlink_map:
+        if number < 256 or version == 2:
+            frame = bare_frame(number, b"\1", version=version)
+            for cut in range(1, len(frame)):
+                framer = Framer()
+                assert framer.receive(frame[:cut]) == []
+                assert framer.receive(frame[cut:]) == [one_frame(frame)]
+
+
 @FORMS
 def test_datagrams_are_never_joined(frame: bytes) -> None:
     for cut in range(1, len(frame)):
@@ -503,6 +518,14 @@ def test_a_cut_off_frame_does_not_hide_the_next_ones(frame: bytes) -> None:
         for stream in (True, False):
             found = take(Framer(stream=stream), [frame[:cut] + HEARTBEAT + PV])
             assert found == [one_frame(HEARTBEAT), one_frame(PV)]
+
+
+def test_a_cut_off_signature_is_filled_with_what_follows() -> None:
+    """Without the key nothing distinguishes a signature from other bytes: the frame counts and takes its
+    13."""
+    for cut in range(len(PV_SIGNED) - 13, len(PV_SIGNED)):
+        found = take(Framer(), [PV_SIGNED[:cut] + HEARTBEAT + PV])
+        assert found == [one_frame(PV_SIGNED), one_frame(PV)]
 
 
 @FORMS
@@ -530,6 +553,36 @@ def test_an_unfinished_candidate_holds_back_and_flush_gives_what_is_inside() -> 
     assert framer.receive(bytes(300)) == [one_frame(PV)]
 
 
+@pytest.mark.parametrize(
+    "head",
+    [
+        pytest.param(b"\xfd\xff\0\0\0\1\1\xff\xff\xff", id="an unknown id"),
+        pytest.param(b"\xfd\xff\x02\0\0\1\1\x16\0\0", id="unknown flags"),
+        pytest.param(b"\xfe\xff\0\1\1\x08", id="an unknown id in MAVLink 1"),
+    ],
+)
+def test_a_head_that_can_be_no_frames_holds_nothing_back(head: bytes) -> None:
+    assert 8 not in dialect.mavlink_map
+    framer = Framer()
+    assert framer.receive(head) == []
+    assert framer.skipped == len(head)
+    assert framer.receive(head + PV) == [one_frame(PV)]
+
+
+@pytest.mark.parametrize("flags", [0x02, 0x03, 0x80])
+def test_a_frame_with_unknown_flags_is_passed_over(flags: int) -> None:
+    frame = bare_frame(22, PV[10:-2], flags=flags)
+    padded = frame + (bytes(13) if flags & 1 else b"")
+    assert take(Framer(), [padded + HEARTBEAT]) == [one_frame(HEARTBEAT)]
+
+
+def test_an_unknown_id_cannot_be_checked_and_is_passed_over() -> None:
+    framer = Framer()
+    assert take(framer, [UNKNOWN + PV]) == [one_frame(PV)]
+    assert framer.skipped == len(UNKNOWN)
+    assert take(framer, [bare_frame(410, PV)]) == [one_frame(PV)]
+
+
 def test_a_frame_inside_a_valid_one_is_payload() -> None:
     outer = bare_frame(dialect.MAVLINK_MSG_ID_TUNNEL, bytes(5) + PV + HEARTBEAT)
     assert take(Framer(), [outer]) == [one_frame(outer)]
@@ -554,35 +607,24 @@ HOSTILE = {
 def test_work_and_memory_are_bounded_on_hostile_input(
     pattern: bytes, stream: bool, chunk: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At most one checksum for each byte, at most one look at a header for each byte and each call."""
+    """At most one checksum for each byte, of no more bytes than a frame has."""
     size = 20_000
     data = (pattern * size)[:size]
     checked: list[int] = []
-    headers: list[int] = []
-    read_header = frames._START
 
     def counting_checksum(covered: bytes) -> int:
         checked.append(len(covered))
         result: int = mcrf4xx(covered)
         return result
 
-    def counting_header(buffer: bytes, at: int) -> tuple[Any, ...]:
-        headers.append(at)
-        return read_header(buffer, at)
-
-    monkeypatch.setattr("paramclient.protocol.wire.frames.mcrf4xx", counting_checksum)
-    monkeypatch.setattr("paramclient.protocol.wire.frames._START", counting_header)
+    monkeypatch.setattr("paramclient.wire.frames.mcrf4xx", counting_checksum)
     framer = Framer(stream=stream)
-    calls = 0
     for at in range(0, size, chunk):
         framer.receive(data[at : at + chunk])
-        calls += 1
-        assert len(framer._tail) < FRAME_SIZE_MAX
     framer.flush()
     assert framer.skipped == size
     assert len(checked) <= size
     assert max(checked, default=0) <= FRAME_SIZE_MAX
-    assert len(headers) <= size + calls + 1
 
 
 # Any mix of frames and noise
@@ -694,7 +736,6 @@ def test_in_a_stream_every_whole_frame_is_found(mix: list[Piece], data: st.DataO
     found = []
     for chunk in chunks:
         found += framer.receive(chunk)
-        assert len(framer._tail) < FRAME_SIZE_MAX
     found += framer.flush()
     assert found == list(expected.values())
     assert framer.frames == len(found)
@@ -733,6 +774,11 @@ def test_the_position_of_time_boot_ms_in_each_message(number: int) -> None:
         (frame,) = Framer(stream=False).receive(bytes(packed))
         at = BOOT_CLOCK_OFFSETS[number]
         assert int.from_bytes(frame.payload[at : at + 4], "little") == boot_ms
+
+
+def test_requests_and_times_of_applications_are_no_clocks() -> None:
+    assert {2, 30, 32, 33, 83} <= BOOT_CLOCK_OFFSETS.keys()
+    assert BOOT_CLOCK_OFFSETS.keys().isdisjoint({84, 86, 251, 252, 254, 263})
 
 
 def test_occasional_ids_are_decoded_while_they_are_requested() -> None:
