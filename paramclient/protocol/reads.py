@@ -52,8 +52,11 @@ async def read(session: Session, which: str | int) -> ReportedValue:
             try:
                 return await channel.exchange(request, inbox, accept, what=what)
             except NoReply:
-                if which == HASH_CHECK or not await _answers_reads(session, which):
+                control = None if which == HASH_CHECK else await _control_read(session, which)
+                if control is None:
                     raise
+    if control.param_id == which:
+        return control
     raise _unknown(session, which)
 
 
@@ -100,19 +103,27 @@ def refusal(session: Session, which: str | int, code: int) -> UnknownParameter |
     )
 
 
-async def _answers_reads(session: Session, which: str | int) -> bool:
-    """Return whether the component answers a read of something that it certainly has."""
+async def _control_read(session: Session, which: str | int) -> ReportedValue | None:
+    """Read something that the component certainly has; return None if that is not answered either.
+
+    That is the same parameter by its index, where that is known: some components answer no read by name.
+    """
     channel, dialect, table = session.channel, session.dialect, session.table
-    known = next((name for name in table.moments if name != which), None)
-    control: str | int = HASH_CHECK if session.identification.is_px4 else 0 if known is None else known
+    same = table.params[which].index if isinstance(which, str) and which in table.moments else None
+    known = next((name for name in table.moments if name != which), 0) if same is None else same
+    control: str | int = HASH_CHECK if session.identification.is_px4 else known
+
+    def accept(message: Message) -> ReportedValue | None:
+        return message if isinstance(message, dialect.value) else None
+
     with channel.inbox((dialect.value, control)) as inbox:
         request = dialect.request_read(channel.target, control)
         try:
             return await channel.exchange(
-                request, inbox, lambda message: True, what="a control read", attempts=CONTROL_ATTEMPTS
+                request, inbox, accept, what="a control read", attempts=CONTROL_ATTEMPTS
             )
         except NoReply:
-            return False
+            return None
 
 
 def _unknown(session: Session, which: str | int) -> UnknownParameter:

@@ -77,7 +77,7 @@ class Timing:
     def bound(self, elapsed: float) -> None:
         """Take the time from the first attempt of a repeated exchange to its answer: an upper bound."""
         if self.round_trip is None or elapsed < self.round_trip:
-            self.round_trip, self._variation = elapsed, 0.0
+            self.round_trip, self._variation = elapsed, elapsed / 4
             self._is_bound = True
 
     def answered(self, attempts: int) -> None:

@@ -10,7 +10,6 @@ import pytest
 from paramclient.errors import NoReply
 from paramclient.model.values import Trust
 from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all
-from paramclient.protocol.node import Node
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle, px4_table
 from tests.conversations.virtual import Silence, converse, run
 

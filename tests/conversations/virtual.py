@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 import selectors
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from contextlib import asynccontextmanager
+from functools import wraps
 from typing import Any, TypeVar
 
 import anyio
+import pytest
 from trio.testing import MockClock
 
 from paramclient.links.sim import SimLink
@@ -17,6 +20,8 @@ from paramclient.protocol.node import Node
 from paramclient.protocol.session import Session
 from paramclient.protocol.station import Station
 from paramclient.sim import Endpoint
+from paramclient.wire.frames import Framer
+from paramclient.wire.messages import DECODED_IDS, Heartbeat, Message, decode, encode
 
 T = TypeVar("T")
 
@@ -61,6 +66,30 @@ def run(test: Callable[..., Awaitable[T]], *arguments: Any, backend: str = "trio
     return anyio.run(limited, backend=backend, backend_options=options)
 
 
+def virtual(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:
+    """Make an async test one that runs in virtual time on trio."""
+
+    @wraps(test)
+    def wrapper(*arguments: Any, **options: Any) -> None:
+        run(lambda: test(*arguments, **options))
+
+    return wrapper
+
+
+def virtual_on_both(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:
+    """Make an async test one that runs in virtual time on trio, and on asyncio."""
+
+    @wraps(test)
+    def wrapper(*arguments: Any, backend: str, **options: Any) -> None:
+        run(lambda: test(*arguments, **options), backend=backend)
+
+    signature = inspect.signature(test)
+    backend = inspect.Parameter("backend", inspect.Parameter.KEYWORD_ONLY, annotation=str)
+    with_backend = signature.replace(parameters=[*signature.parameters.values(), backend])
+    wrapper.__signature__ = with_backend  # type: ignore[attr-defined]  # of every function, for pytest
+    return pytest.mark.parametrize("backend", ["trio", "asyncio"])(wrapper)  # type: ignore[no-any-return]
+
+
 class Conversation:
     """A station that talks to a simulated endpoint, and what happened.
 
@@ -76,6 +105,17 @@ class Conversation:
         self.events: list[ComponentEvent] = []
         self.changes: list[Change] = []
         self.sent: list[bytes] = []
+        self._sequence = 0
+
+    def sent_of(self, kind: type[T]) -> list[T]:
+        """Return the sent messages of a kind."""
+        return [each for data in self.sent for each in messages_in(data) if isinstance(each, kind)]
+
+    def hear(self, message: Message, *, system: int = 1, component: int = 1, peer: object = "sim") -> None:
+        """Receive a message now, beside those of the endpoint."""
+        self._sequence = (self._sequence + 1) & 0xFF
+        data = encode(message, system=system, component=component, sequence=self._sequence)
+        self.station.receive(data, peer, anyio.current_time())
 
     async def node(self, system: int = 1, component: int = 1) -> Node:
         """Wait for a component."""
@@ -137,6 +177,102 @@ async def converse(endpoint: Endpoint, **options: Any) -> AsyncIterator[Conversa
             yield conversation
         finally:
             tasks.cancel_scope.cancel()
+
+
+def messages_in(data: bytes) -> list[Message]:
+    """Return the messages in a datagram."""
+    frames = Framer(DECODED_IDS, stream=False).receive(data)
+    return [message for frame in frames if (message := decode(frame)) is not None]
+
+
+class Tap:
+    """An endpoint behind a filter: messages to it and from it are passed on where a function says so.
+
+    Args:
+        endpoint: the vehicle.
+        up, down: return whether a message to the vehicle, or from it, arrives.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        *,
+        up: Callable[[Message], bool] = lambda message: True,
+        down: Callable[[Message], bool] = lambda message: True,
+    ) -> None:
+        self.up = up
+        self.down = down
+        self._endpoint = endpoint
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Pass a datagram on to the vehicle."""
+        if all(map(self.up, messages_in(data))):
+            self._endpoint.receive(data, now)
+
+    def tick(self, now: float) -> None:
+        """Pass the time on."""
+        self._endpoint.tick(now)
+
+    def next_deadline(self) -> float | None:
+        """Return the vehicle's deadline."""
+        return self._endpoint.next_deadline()
+
+    def data_to_send(self) -> list[bytes]:
+        """Return what arrives of the vehicle's frames."""
+        return [data for data in self._endpoint.data_to_send() if all(map(self.down, messages_in(data)))]
+
+
+class Puppet:
+    """A component that answers each message by a function of the test, and sends a heartbeat each second.
+
+    Args:
+        answer: returns the answers to a message.
+        heartbeat: once a second; None for a component without heartbeats.
+        system, component: its address.
+    """
+
+    def __init__(
+        self,
+        answer: Callable[[Message], Iterable[Message]],
+        *,
+        heartbeat: Heartbeat | None = Heartbeat(2, 0, system_status=4),
+        system: int = 1,
+        component: int = 1,
+    ) -> None:
+        self.received: list[Message] = []
+        self._answer = answer
+        self._heartbeat = heartbeat
+        self._address = {"system": system, "component": component}
+        self._sequence = 0
+        self._beat_at = 0.0
+        self._out: list[bytes] = []
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Answer the messages in a datagram."""
+        for message in messages_in(data):
+            self.received.append(message)
+            for each in self._answer(message):
+                self.say(each)
+
+    def say(self, message: Message) -> None:
+        """Send a message."""
+        self._sequence = (self._sequence + 1) & 0xFF
+        self._out.append(encode(message, sequence=self._sequence, **self._address))
+
+    def tick(self, now: float) -> None:
+        """Send the heartbeat if it is due."""
+        if self._heartbeat is not None and now >= self._beat_at:
+            self._beat_at = now + 1.0
+            self.say(self._heartbeat)
+
+    def next_deadline(self) -> float | None:
+        """Return the time of the next heartbeat."""
+        return None if self._heartbeat is None else self._beat_at
+
+    def data_to_send(self) -> list[bytes]:
+        """Return the frames to send, and clear them."""
+        out, self._out = self._out, []
+        return out
 
 
 class Silence:
