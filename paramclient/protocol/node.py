@@ -123,7 +123,7 @@ class Node:
             self._spawn(self.identify)
         match message:
             case ParamValue():
-                self.plain.table.store(message, now)
+                self.plain.receive(message, now)
                 if message.param_id == HASH_CHECK:
                     self.plain.announced = Digest.of(message)
             case ParamExtValue():

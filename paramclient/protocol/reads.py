@@ -24,6 +24,10 @@ __all__ = ["read", "read_many", "refusal"]
 
 CONTROL_ATTEMPTS: Final = 8
 """Attempts of the control read that decides whether a silent component answers reads at all."""
+SLOT_ARDUPILOT: Final = 0.1
+"""Seconds between two times at which an ArduPilot answers reads."""
+READS_PER_SLOT_ARDUPILOT: Final = 5
+"""Reads that it answers then; others wait for the next slot."""
 
 
 async def read(session: Session, which: str | int) -> ReportedValue:
@@ -50,7 +54,9 @@ async def read(session: Session, which: str | int) -> ReportedValue:
     async with channel.window:
         with channel.inbox((dialect.value, which)) as inbox:
             try:
-                return await channel.exchange(request, inbox, accept, what=what)
+                return await channel.exchange(
+                    request, inbox, accept, what=what, timeout_min=_queue_time(session)
+                )
             except NoReply:
                 control = None if which == HASH_CHECK else await _control_read(session, which)
                 if control is None:
@@ -101,6 +107,18 @@ def refusal(session: Session, which: str | int, code: int) -> UnknownParameter |
         name=name,
         index=index,
     )
+
+
+def _queue_time(session: Session) -> float:
+    """Return the seconds that an ArduPilot takes to answer the reads in flight; 0 for others.
+
+    Without it, sets, which are answered at once, would measure a round trip at which all reads are repeated.
+    """
+    if not session.identification.is_ardupilot:
+        return 0.0
+    channel = session.channel
+    slots = 1 + (channel.window_size - channel.window.value) // READS_PER_SLOT_ARDUPILOT
+    return slots * SLOT_ARDUPILOT + (channel.timing.round_trip or 0.0)
 
 
 async def _control_read(session: Session, which: str | int) -> ReportedValue | None:

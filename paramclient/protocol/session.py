@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
 import anyio
 
+<<<<<<< HEAD
 from paramclient.protocol.channel import Channel, Gate
 from paramclient.protocol.dialect import Dialect, Digest
+=======
+from paramclient.model.values import Param
+from paramclient.protocol.channel import Channel
+from paramclient.protocol.dialect import Dialect, Digest, ReportedValue
+>>>>>>> c4b8774d (Wait as long for ArduPilot's reads as its queue takes; ignore answers from before a write)
 from paramclient.protocol.events import Change
 from paramclient.protocol.identity import Identification
 from paramclient.protocol.table import Table
 
-__all__ = ["Session", "Shared", "Spawn"]
+__all__ = ["Replaced", "Session", "Shared", "Spawn"]
 
 T = TypeVar("T")
 
@@ -107,6 +115,21 @@ class _Run(Generic[T]):
         return self._results[0]
 
 
+@dataclass(slots=True)
+class Replaced:
+    """The value before a write, while an answer to an earlier read may still bring it.
+
+    Attributes:
+        param: the parameter before the write.
+        until: when such an answer can arrive no more.
+        was_received: whether the value was received meanwhile, and ignored.
+    """
+
+    param: Param
+    until: float
+    was_received: bool = False
+
+
 class Session:
     """One component's parameters in one dialect, and the conversations about them.
 
@@ -123,6 +146,7 @@ class Session:
         serves_file: whether the parameter file was served on this link; None while unknown.
         announced: the last PX4 hash that was received, also in another station's list, or None.
         written_at: when the last write ended; minus infinity before the first.
+        replaced: by name, the values before writes that have just ended.
         observers: called with the parameters received and their number, while a fetch runs.
     """
 
@@ -145,9 +169,20 @@ class Session:
         self.serves_file: bool | None = None
         self.announced: Digest | None = None
         self.written_at = -math.inf
+        self.replaced: defaultdict[str, list[Replaced]] = defaultdict(list)
         self.observers: set[Callable[[int, int | None], None]] = set()
         self._locks: dict[str, anyio.Lock] = {}
         self._foreign_sets: dict[str, tuple[str, float]] = {}
+
+    def receive(self, message: ReportedValue, now: float) -> None:
+        """Store a value, unless it may be the answer to a read from before a write."""
+        name, raw, number, _, _ = message
+        for each in self.replaced.get(name, ()):
+            param = self.dialect.param(name, raw, number, None, self.table.encoding)
+            if now <= each.until and param.same_value(each.param):
+                each.was_received = True
+                return
+        self.table.store(message, now)
 
     def lock(self, name: str) -> anyio.Lock:
         """Return the lock of the writes to one name: they run one after the other."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Final
 
@@ -34,7 +35,7 @@ from paramclient.model.values import (
 )
 from paramclient.protocol.channel import Inbox
 from paramclient.protocol.reads import read, refusal
-from paramclient.protocol.session import Session
+from paramclient.protocol.session import Replaced, Session
 from paramclient.protocol.set_results import SetOutcome, SetResult, SetStatus
 from paramclient.wire.messages import Message, ParamError, ParamExtAck, StatusText
 
@@ -46,6 +47,9 @@ EXT_PROGRESS_TIMEOUT: Final = 60.0
 """Seconds for a component that reports progress to finish: a camera formats a card meanwhile."""
 BATCH_SIZE: Final = 20
 """Sets in flight: bursts of 20 to a PX4 and 30 to an ArduPilot were all acknowledged (measured)."""
+LATE_ANSWER_TIME: Final = 0.3
+"""Seconds after a write in which an ArduPilot may answer an earlier read: it takes the value when it queues
+the answer, and sends it up to 100 ms later."""
 DENIED: Final = "Param write denied ("
 """The beginning of ArduPilot's STATUSTEXT for a read-only parameter."""
 
@@ -91,7 +95,12 @@ async def write(
         try:
             _check_finite(session, name, value, force=force)
             await _learn_type(session, name)
+            before = session.table.params[name]
             result = await _Write(session, name, value).run()
+            if session.identification.is_ardupilot and not result.param.same_value(before):
+                late = Replaced(before, anyio.current_time() + LATE_ANSWER_TIME)
+                session.replaced[name].append(late)
+                session.spawn(_ignore_late_answers, session, late)
             if settle > 0:
                 with gate.until_closed():
                     await anyio.sleep(settle)
@@ -195,6 +204,9 @@ class _Write:
         unanswered = unchanged = 0
         with channel.inbox(*keys) as inbox:
             self._encode()
+            for each in list(self.session.replaced.get(self.name, ())):
+                if self._is_wanted(each.param):  # its acknowledgement would be ignored
+                    await anyio.sleep_until(each.until + 0.001)
             while True:
                 await channel.gate.wait()
                 sent = anyio.current_time()
@@ -363,6 +375,18 @@ async def _learn_type(session: Session, name: str) -> None:
     known = session.table.params.get(name)
     if known is None or known.trust is Trust.CACHED:
         await read(session, name)
+
+
+async def _ignore_late_answers(session: Session, late: Replaced) -> None:
+    """Let the value before a write be ignored for its time; read the present one if it was received."""
+    name = late.param.name
+    await anyio.sleep_until(late.until)
+    session.replaced[name].remove(late)
+    if not session.replaced[name]:
+        del session.replaced[name]
+    if late.was_received:
+        with suppress(ParamClientError):
+            await read(session, name)
 
 
 def _check_finite(session: Session, name: str, value: WireValue, *, force: bool) -> None:

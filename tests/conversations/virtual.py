@@ -119,7 +119,7 @@ class Conversation:
 
     async def node(self, system: int = 1, component: int = 1) -> Node:
         """Wait for a component."""
-        while (system, component) not in self.station.nodes:
+        while (system, component) not in self.station.nodes:  # noqa: ASYNC110 - in virtual time
             await anyio.sleep(0.01)
         return self.station.nodes[system, component]
 
@@ -222,6 +222,10 @@ class Tap:
         return [data for data in self._endpoint.data_to_send() if all(map(self.down, messages_in(data)))]
 
 
+QUIET = Heartbeat(2, 0, system_status=4)
+"""The heartbeat of a generic quadrotor."""
+
+
 class Puppet:
     """A component that answers each message by a function of the test, and sends a heartbeat each second.
 
@@ -235,7 +239,7 @@ class Puppet:
         self,
         answer: Callable[[Message], Iterable[Message]],
         *,
-        heartbeat: Heartbeat | None = Heartbeat(2, 0, system_status=4),
+        heartbeat: Heartbeat | None = QUIET,
         system: int = 1,
         component: int = 1,
     ) -> None:
