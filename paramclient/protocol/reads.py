@@ -58,7 +58,9 @@ async def read(session: Session, which: str | int) -> ReportedValue:
                     request, inbox, accept, what=what, timeout_min=_queue_time(session)
                 )
             except NoReply:
-                control = None if which == HASH_CHECK else await _control_read(session, which)
+                if which == HASH_CHECK or channel.is_lost(anyio.current_time()):
+                    raise
+                control = await _control_read(session, which)
                 if control is None:
                     raise
     if control.param_id == which:
