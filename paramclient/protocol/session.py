@@ -10,14 +10,9 @@ from typing import Any, Final, Generic, TypeVar
 
 import anyio
 
-<<<<<<< HEAD
-from paramclient.protocol.channel import Channel, Gate
-from paramclient.protocol.dialect import Dialect, Digest
-=======
 from paramclient.model.values import Param
-from paramclient.protocol.channel import Channel
+from paramclient.protocol.channel import Channel, Gate
 from paramclient.protocol.dialect import Dialect, Digest, ReportedValue
->>>>>>> c4b8774d (Wait as long for ArduPilot's reads as its queue takes; ignore answers from before a write)
 from paramclient.protocol.events import Change
 from paramclient.protocol.identity import Identification
 from paramclient.protocol.table import Table
