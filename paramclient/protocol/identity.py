@@ -76,6 +76,7 @@ class Identification:
         system: system id.
         link: the link's name.
         chosen: the encoding that the user has chosen, or None.
+        listens_only: whether nothing is requested, so that the heartbeat decides.
 
     Attributes:
         identity: the vehicle's identity; without a hardware id until AUTOPILOT_VERSION is received.
@@ -85,7 +86,9 @@ class Identification:
         is_settled: whether `identity` is as complete as it gets: the version was received, or never will be.
     """
 
-    def __init__(self, system: int, link: str, chosen: Encoding | None) -> None:
+    def __init__(
+        self, system: int, link: str, chosen: Encoding | None, *, listens_only: bool = False
+    ) -> None:
         self.identity = Identity(system, link)
         self.autopilot: int | None = None
         self.vehicle_type: int | None = None
@@ -93,6 +96,7 @@ class Identification:
         self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
         self.is_settled = False
         self._chosen = chosen
+        self._listens_only = listens_only
         self._changed = anyio.Event()
 
     @property
@@ -130,7 +134,9 @@ class Identification:
     @property
     def is_encoding_certain(self) -> bool:
         """Whether no further message can change the encoding."""
-        return self._chosen is not None or self.is_px4 or self.is_ardupilot or self.is_settled
+        if self._chosen is not None or self.is_px4 or self.is_ardupilot or self.is_settled:
+            return True
+        return self._listens_only and self.autopilot is not None
 
     async def settled(self) -> None:
         """Wait until the identity is as complete as it gets."""

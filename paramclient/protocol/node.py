@@ -60,6 +60,7 @@ class Node:
         transmit: queues a message for the component.
         gate: whether the link carries messages.
         encoding: chosen by the user, or None.
+        listens_only: whether nothing is requested.
         spawn: starts an async function in the background.
         emit: called with each event.
         changed: called with each change of a parameter, and its session.
@@ -86,6 +87,7 @@ class Node:
         transmit: Callable[[Message], None],
         gate: Gate,
         encoding: Encoding | None,
+        listens_only: bool,
         spawn: Spawn,
         emit: Callable[[ComponentEvent], None],
         changed: Callable[[Session, Change], None],
@@ -98,7 +100,7 @@ class Node:
         self.rival: tuple[Peer, float] | None = None
         self.presence = Presence()
         self.channel = Channel(system, component, transmit, gate, self.presence)
-        self.identification = Identification(system, link, encoding)
+        self.identification = Identification(system, link, encoding, listens_only=listens_only)
         self.plain = Session(
             self.channel, self.identification, PLAIN, spawn, lambda change: changed(self.plain, change)
         )
@@ -184,6 +186,8 @@ class Node:
         if self.identification.is_px4:
             self.channel.widen(WINDOW_PX4)
         self.plain.table.encoding = self.identification.encoding
+        if self.identification.is_encoding_certain:
+            self.plain.table.report_held()
 
     def _doubt(self) -> None:
         self.generation += 1

@@ -275,6 +275,7 @@ class Station:
             transmit=transmit,
             gate=self.gate,
             encoding=self._encoding,
+            listens_only=self.listens_only,
             spawn=self._spawn,
             emit=lambda event: self._emit(node, event),
             changed=lambda session, change: self._changed(node, session, change),

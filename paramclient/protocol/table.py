@@ -59,6 +59,7 @@ class Table:
         self.author_of: Callable[[str], str] = lambda name: "vehicle"
         self.recounted: Callable[[], None] = lambda: None
         self._changed = changed
+        self._held: dict[str, Change] | None = {} if dialect is PLAIN else None
         self._encoding = Encoding.BYTEWISE
         self._wire: dict[str, tuple[bytes, int]] = {}  # as received, to decode again in another encoding
         self._was_complete = False
@@ -189,7 +190,7 @@ class Table:
             del self.params[change.name]
             self.moments.pop(change.name, None)
             self._wire.pop(change.name, None)
-            self._changed(change)
+            self._report(change)
         self._hash_is_stale = self._hash is not None
         return changes
 
@@ -232,8 +233,21 @@ class Table:
             change = Change(name, None, new, by, "added" if self._was_complete else "first")
         else:
             change = Change(name, old, new, by, "changed")
-        self._changed(change)
+        self._report(change)
         return change
+
+    def _report(self, change: Change) -> None:
+        if self._held is None:
+            self._changed(change)
+        else:
+            self._held.setdefault(change.name, change)
+
+    def report_held(self) -> None:
+        """Report the changes that waited until the encoding was certain, with the values in that encoding."""
+        held, self._held = self._held or {}, None
+        for name, change in held.items():
+            if change.new is not None and name in self.params:
+                self._changed(replace(change, new=self.params[name]))
 
     # trust
 
