@@ -22,8 +22,10 @@ from paramclient.wire.messages import HASH_CHECK, Message, ParamError
 
 __all__ = ["read", "read_many", "refusal"]
 
-CONTROL_ATTEMPTS: Final = 8
-"""Attempts of the control read that decides whether a silent component answers reads at all."""
+CONTROL_LOST: Final = 1e-4
+"""Probability that all attempts of the control read are lost, which decides whether a component answers
+reads at all."""
+CONTROL_ATTEMPTS_MIN: Final = 8
 SLOT_ARDUPILOT: Final = 0.1
 """Seconds between two times at which an ArduPilot answers reads."""
 READS_PER_SLOT_ARDUPILOT: Final = 5
@@ -138,10 +140,9 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
 
     with channel.inbox((dialect.value, control)) as inbox:
         request = dialect.request_read(channel.target, control)
+        attempts = max(channel.timing.attempts_for(CONTROL_LOST), CONTROL_ATTEMPTS_MIN)
         try:
-            return await channel.exchange(
-                request, inbox, accept, what="a control read", attempts=CONTROL_ATTEMPTS
-            )
+            return await channel.exchange(request, inbox, accept, what="a control read", attempts=attempts)
         except NoReply:
             return None
 

@@ -15,6 +15,9 @@ TIMEOUT_MAX: Final = 4.0
 """Longest timeout in seconds: a round trip of 2.5 s with its variation."""
 VARIATION_MIN: Final = 0.02
 """Seconds above the smoothed round trip, at least: the granularity of vehicles' main loops."""
+BOUND_VARIATION: Final = 0.025
+"""Assumed variation of a round trip of which only an upper bound is known, at most: without any, jitter would
+have each request repeated, and none measured."""
 BACKOFF: Final = 1.5
 """Factor from one timeout to the next: at a round trip of 2.5 s, five requests are sent before the first
 answer, one more than with a factor of 2, and at 20 % loss a list begins in half the time."""
@@ -77,7 +80,7 @@ class Timing:
     def bound(self, elapsed: float) -> None:
         """Take the time from the first attempt of a repeated exchange to its answer: an upper bound."""
         if self.round_trip is None or elapsed < self.round_trip:
-            self.round_trip, self._variation = elapsed, elapsed / 4
+            self.round_trip, self._variation = elapsed, min(elapsed / 4, BOUND_VARIATION)
             self._is_bound = True
 
     def answered(self, attempts: int) -> None:

@@ -152,7 +152,7 @@ async def test_many_are_set_and_a_lost_camera_ends_it() -> None:
         endpoint.at = anyio.current_time() + 0.3
         await write_many(session, [(name, 7) for name, _ in pairs], outcomes, lambda outcome: None)
         assert anyio.current_time() - endpoint.at < 7.0
-        assert outcomes[-1].status is SetStatus.NOT_TRIED
+        assert {each.status for each in outcomes} >= {SetStatus.UNKNOWN, SetStatus.NOT_TRIED}
 
 
 @virtual
