@@ -219,8 +219,8 @@ class Hub:
         target = link.targets.get((component.system, component.component))
         if target is None or target.component is not component:
             target = link.targets[component.system, component.component] = Target(link, component)
-            tasks.start_soon(self._publish_changes, target)
-            tasks.start_soon(self._publish_extended_changes, target)
+            for ext in (False, True):
+                tasks.start_soon(self._publish_changes, target, ext)
         if isinstance(event, Resynced):
             target.fetches += 1
         self._check(target)
@@ -244,26 +244,16 @@ class Hub:
         target.metadata = await anyio.to_thread.run_sync(store.known, identity, component)
         target.described = identity
 
-    async def _publish_changes(self, target: Target) -> None:
-        """Publish the changes of a table, until the client has removed the component or is closed.
+    async def _publish_changes(self, target: Target, ext: bool) -> None:
+        """Publish the changes of the plain or the extended parameters, until the client is closed.
 
         First values are not published: a fetch has thousands, and its end is published.
         """
         with suppress(ParamClientError):
-            async for change in target.component.changes():
+            async for change in target.parameters(ext=ext).changes():
                 if change.kind != "first":
-                    members = documents.change(change, target.metadata)
-                    self.feed.publish("change", **target.address, **members)
-            return  # the end of a log
-        self._forget(target)
-
-    async def _publish_extended_changes(self, target: Target) -> None:
-        """Publish the changes of extended parameters."""
-        with suppress(ParamClientError):
-            async for change in target.component.ext.changes():
-                if change.kind != "first":
-                    members = documents.ext_change(change)
-                    self.feed.publish("extended_change", **target.address, **members)
+                    members = documents.change(change, target, ext=ext)
+                    self.feed.publish("extended_change" if ext else "change", **target.address, **members)
 
     async def _check_regularly(self, link: ServiceLink) -> None:
         while True:

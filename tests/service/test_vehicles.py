@@ -331,3 +331,10 @@ async def test_extended_parameters_are_set_up_and_restored(tmp_path: Path) -> No
         await asyncio.sleep(1)
         history = (await browser.get(f"{CAMERA}/history", params=EXT)).json()["history"]
         assert [each["new"]["hex"] for each in history] == ["52656172", before]
+        made = await browser.post(f"{CAMERA}/snapshots", params=EXT, json={"reason": "by hand"})
+        *_, kept = (await browser.get(f"{CAMERA}/snapshots", params=EXT)).json()["snapshots"]
+        assert (made.json(), kept["reason"]) == ({"id": kept["id"]}, "by hand")
+        key = (await browser.get(CAMERA)).json()["key"]
+    async with service(small_px4(), cache=str(tmp_path / "cache.sqlite3")) as (_, browser):
+        query = {**EXT, "key": key}
+        assert (await browser.get(f"{CAMERA}/params", params=query)).json()["params"][text]["hex"] == before
