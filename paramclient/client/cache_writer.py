@@ -96,6 +96,7 @@ class CacheWriter:
         self._cached: dict[ComponentMachine, _CachedComponent] = {}
         self._flushing = anyio.Lock()
         self._failure: CacheError | None = None  # None after a successful write
+        self._logs_failures = True
         self._retry_at = -math.inf
         self._syncs_begun = self._synced = 0  # numbers of the last sync begun, and the last that succeeded
         self._tables: dict[tuple[int, int], bool] = {}
@@ -113,10 +114,12 @@ class CacheWriter:
                 self._tables[address] = self._tables.get(address, False) or each.hash is not None
 
     async def close(self) -> None:
-        """Write all new values, log a warning for lost ones, and close the cache if it is owned."""
+        """Write all new values, and close the cache if it is owned. Log a warning if the values are lost."""
         cache, is_written = self._cache, False
         if cache is None:
             return
+        has_failed = self._failure is not None  # and was logged
+        self._logs_failures = False  # one warning says what is lost
         with anyio.move_on_after(CLOSE_WAIT_MAX, shield=True):
             give_up_at = anyio.current_time() + (DATABASE_WAIT_MAX if is_database_url(cache.place) else 0)
             # the second flush rewrites a replaced file
@@ -124,16 +127,14 @@ class CacheWriter:
                 if anyio.current_time() >= give_up_at:
                     break
                 await anyio.sleep(DATABASE_RETRY_INTERVAL)
-        for kept in self._cached.values():
-            machine = kept.machine
-            if not is_written and (kept.pending or machine.table.dirty or machine.ext.table.dirty):
-                logger.warning(
-                    "%d/%d (%s): the last values are lost, as they could not be written to the cache: %s",
-                    machine.system,
-                    machine.component,
-                    kept.identity.key,
-                    self._failure or "it did not respond",
-                )
+        lost = [
+            f"{kept.machine.system}/{kept.machine.component} ({kept.identity.key})"
+            for kept in self._cached.values()
+            if kept.pending or kept.machine.table.dirty or kept.machine.ext.table.dirty
+        ]
+        if lost and not is_written and not has_failed:
+            why = self._failure or "it did not respond"
+            logger.warning("the last values of %s are not in the cache, and lost: %s", ", ".join(lost), why)
         if self._owned:
             with anyio.move_on_after(CLOSE_WAIT_MAX, shield=True):
                 await self.run_in_thread(cache.close)
@@ -357,7 +358,7 @@ class CacheWriter:
 
     def _note(self, failure: CacheError) -> None:
         """Log the first of several failures."""
-        if self._failure is None:
+        if self._failure is None and self._logs_failures:
             logger.warning("continuing without the cache: %s", failure)
         self._failure = failure
 
