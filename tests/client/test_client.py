@@ -35,11 +35,9 @@ from paramclient import (
     ValueNotApplied,
 )
 from paramclient.client import arguments, link_task, reconnect_delays
-from paramclient.client.component_core import IDENTITY_TIMEOUT
 from paramclient.errors import ParamErrorCode
-from paramclient.links import Peer, create_link, serve_endpoint
+from paramclient.links import create_link, serve_endpoint
 from paramclient.protocol import wire
-from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
 from tests.shell import (
     TIMEOUT,
@@ -114,18 +112,6 @@ async def test_an_error_of_a_call_is_raised_unchanged() -> None:
 
     with pytest.raises(UnknownParameter):
         await session()
-
-
-@in_simulated_time
-async def test_the_traceback_of_an_error_in_a_callback_is_whole() -> None:
-    def give_up(progress: Progress) -> None:
-        raise UsageError("the end")
-
-    async with a_client(generic()) as client:
-        component = await client.component()
-        with pytest.raises(UsageError, match="the end") as caught:
-            await component.fetch_all(progress=give_up)
-    assert caught.traceback[-1].name == "give_up"
 
 
 @in_simulated_time
@@ -356,19 +342,6 @@ async def test_the_heartbeat_of_a_ground_station_goes_out_every_second() -> None
     for _, frame, message in beats:
         assert (frame.system, frame.component) == (200, 25)
         assert (message.type, message.autopilot) == (wire.MAV_TYPE_GCS, wire.MAV_AUTOPILOT_INVALID)
-
-
-@in_simulated_time
-async def test_our_ids_are_those_of_a_ground_station_by_default() -> None:
-    tap = Tap(generic())
-    async with a_client(tap) as client:
-        await client.component()
-    assert {(frame.system, frame.component) for _, frame, _ in tap.received} == {(255, 190)}
-    for bad in (0, 256, -1):
-        with pytest.raises(UsageError, match="1 to 255"):
-            a_client(tap, system=bad)
-        with pytest.raises(UsageError, match="1 to 255"):
-            a_client(tap, component=bad)
 
 
 @in_simulated_time
@@ -842,21 +815,6 @@ async def test_a_first_fetch_waits_to_hear_whether_there_is_a_file(refresh: bool
 
 
 @in_simulated_time
-async def test_a_first_fetch_does_not_wait_for_long_to_hear_that() -> None:
-    class Unknown(ArduPilotVehicle):
-        def _on_command(self, request: wire.CommandLong, sender: wire.Frame) -> None:
-            """It never says who it is."""
-
-    async with a_client(Unknown()) as client:
-        component = await client.component()
-        began = anyio.current_time()
-        result = await component.fetch_all()
-        # the heartbeat says ArduPilot, so the file is tried whatever it says of itself
-        assert (result.complete, result.source) == (True, "ftp")
-        assert anyio.current_time() - began < IDENTITY_TIMEOUT + 2.0  # simulated seconds
-
-
-@in_simulated_time
 async def test_fetches_at_the_same_time_are_one() -> None:
     vehicle = generic(period=0.1)
     async with a_client(vehicle) as client:
@@ -1074,36 +1032,6 @@ async def test_queued_changes_of_one_parameter_are_merged() -> None:
 
 
 @in_simulated_time
-async def test_several_tasks_may_wait_for_the_changes_of_one_subscription() -> None:
-    async with a_client(small_px4()) as client:
-        component = await client.component()
-        changes = component.changes()
-        tasks = [asyncio.create_task(outcome(anext(changes))) for _ in range(3)]
-        await settled()
-        await component.get("PARAM_01")
-        await component.get("PARAM_02")
-        await settled()
-    names = sorted(
-        each.name if isinstance(each, Change) else type(each).__name__ for each in [await t for t in tasks]
-    )
-    assert names == ["ClientClosed", "PARAM_01", "PARAM_02"]
-
-
-@in_simulated_time
-async def test_changes_begin_when_they_are_requested() -> None:
-    async with a_client(small_px4()) as client:
-        component = await client.component()
-        await component.fetch_all()
-        for name in ("PARAM_02", "PARAM_04"):
-            changes = component.changes()
-            await component.set(name, 77)
-            assert (await anext(changes)).name == name
-            del changes
-            await component.set("PARAM_06", 77)
-            await component.set("PARAM_06", 78)
-
-
-@in_simulated_time
 async def test_changes_end_with_the_client_after_the_queued_ones() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
@@ -1221,21 +1149,6 @@ async def test_a_link_that_stays_disconnected_fails_the_calls_and_not_the_client
     reported = [record for record in caplog.records if record.levelno >= logging.WARNING]
     assert len(reported) == 1
     assert "reconnecting" in reported[0].getMessage()
-
-
-@in_simulated_time
-async def test_the_errors_of_a_long_absence_do_not_grow() -> None:
-    link = FlakyLink(generic())
-    async with a_client(link) as client:
-        component = await client.component()
-        await link.drop(stays_offline=True)
-        await asyncio.sleep(20.0)
-        lengths = set()
-        for _ in range(5):
-            with pytest.raises(LinkError) as caught:
-                await component.get("PARAM_01")
-            lengths.add(len(caught.traceback))
-        assert len(lengths) == 1
 
 
 @in_simulated_time
@@ -1379,17 +1292,6 @@ async def known_component(client: ParamClient) -> Component:
 
 
 @in_simulated_time
-async def test_telemetry_alone_lets_the_reader_rest() -> None:
-    vehicle = Chatter(generic(), 1 / 2000)
-    async with a_client(vehicle) as client:
-        await known_component(client)
-        vehicle.portions.clear()
-        await asyncio.sleep(1.0)
-        assert sum(map(len, vehicle.portions)) >= 1950
-        assert len(vehicle.portions) < 1.2 / link_task.READ_PAUSE
-
-
-@in_simulated_time
 async def test_nothing_rests_while_an_answer_is_awaited() -> None:
     vehicle = Chatter(generic(), 1 / 2000)
     async with a_client(vehicle) as client:
@@ -1402,61 +1304,6 @@ async def test_nothing_rests_while_an_answer_is_awaited() -> None:
         assert not call.done()
         assert len(vehicle.portions) >= 190
         call.cancel()
-
-
-@in_simulated_time
-async def test_datagrams_that_arrive_during_a_pause_are_processed_in_order(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    taken: list[bytes] = []
-    receive = Station.receive
-
-    def record(station: Station, data: bytes, peer: Peer, now: float, moment: float) -> bool:
-        taken.append(data)
-        return receive(station, data, peer, now, moment)
-
-    monkeypatch.setattr(Station, "receive", record)
-    vehicle = small_px4()
-    chatter = Chatter(vehicle, 1 / 2000)
-    async with a_client(chatter) as client:
-        component = await known_component(client)
-        for value in range(50, 70):
-            vehicle.set_param("PARAM_04", value)
-            vehicle.set_param("PARAM_01", value + 100)
-            await asyncio.sleep(0.025)
-        await asyncio.sleep(0.1)
-        assert component.params["PARAM_01"].value == vehicle.param("PARAM_01").value
-        given = [data for portion in chatter.portions for data in portion]
-        assert len(taken) >= 1000
-        assert taken == given
-
-
-@in_simulated_time
-async def test_a_change_waits_for_the_end_of_a_rest_at_the_most() -> None:
-    vehicle = Chatter(generic(), 1 / 2000)
-    async with a_client(vehicle) as client:
-        component = await known_component(client)
-        changes = component.changes()
-        for value in range(20):
-            await asyncio.sleep(0.0137)
-            began = anyio.current_time()
-            message = wire.ParamValue("PARAM_01", bytes((value + 1, 0, 0, 0)), ParamType.INT32, 24, 1)
-            vehicle.say(wire.encode(message, system=1, component=1, sequence=0))
-            with anyio.fail_after(1.0):
-                assert (await anext(changes)).name == "PARAM_01"
-            assert anyio.current_time() - began < link_task.READ_PAUSE + 0.001
-
-
-@in_simulated_time
-async def test_a_busy_link_shortens_the_rests() -> None:
-    vehicle = Chatter(generic(), 1 / 20_000)
-    async with a_client(vehicle) as client:
-        await known_component(client)
-        await asyncio.sleep(0.1)
-        vehicle.portions.clear()
-        await asyncio.sleep(0.5)
-        largest = max(map(len, vehicle.portions))
-    assert 0.9 * link_task.PAUSE_DATAGRAMS_MAX < largest < 1.1 * link_task.PAUSE_DATAGRAMS_MAX
 
 
 @pytest.mark.parametrize("call", ["get", "set", "fetch_all", "client.fetch_all"])
@@ -1480,39 +1327,7 @@ async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyP
     assert with_rests < without + 0.05
 
 
-@in_simulated_time
-async def test_closing_does_not_wait_for_the_end_of_a_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_task, "READ_PAUSE", 60.0)
-    monkeypatch.setattr(link_task, "PAUSE_DATAGRAMS_MAX", math.inf)
-    async with a_client(Chatter(generic(), 0.005)) as client:
-        await known_component(client)
-        await asyncio.sleep(1.0)
-        began = anyio.current_time()
-    assert anyio.current_time() - began < 0.01
-    assert not tasks_beside()
-
-
 # How they look
-
-
-@in_simulated_time
-async def test_their_style_shows_the_comparison() -> None:
-    client = a_client(Air([small_px4(burst=1, period=0.05), generic(system=2)]))
-    assert repr(client) == "<ParamClient sim:custom closed, 0 components>"
-    async with client:
-        component = await client.component()
-        assert repr(client) == "<ParamClient sim:custom open, 2 components>"
-        assert repr(component) == "<Component 1/1 px4 new 0 params>"
-        fetch = asyncio.create_task(component.fetch_all())
-        await asyncio.sleep(0.5)
-        assert repr(component) == "<Component 1/1 px4 fetching 9 of 25 params>"
-        result = await fetch
-        assert (
-            repr(component) == f"<Component 1/1 px4 synced 25 params from stream in {result.elapsed:.2f} s>"
-        )
-        assert repr(component.params) == "<ParamMap 25 params>"
-        assert repr(await client.component(system=2)) == "<Component 2/1 generic new 0 params>"
-    assert repr(client) == "<ParamClient sim:custom closed, 2 components>"
 
 
 @in_simulated_time
