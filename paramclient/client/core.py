@@ -112,7 +112,10 @@ class ClientCore:
         if self.link_task.broken is not None:
             raise self.link_task.broken.with_traceback(None)
         if self._tasks is None:
-            raise ClientClosed("the client is not open; use `async with` or `open`", link=self.link.name)
+            raise ClientClosed(
+                "the client is not open; use `async with` (`with` in paramclient.sync) or `open`",
+                link=self.link.name,
+            )
 
     def wake(self) -> None:
         """Run the sender: something is to be sent, or a deadline has changed."""
