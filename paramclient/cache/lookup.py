@@ -21,6 +21,7 @@ from typing import Final
 from paramclient.cache.records import CachedVehicle
 from paramclient.errors import AmbiguousVehicle, UnknownVehicle
 from paramclient.model.identity import autopilot_name, has_autopilot
+from paramclient.model.wording import counted
 
 __all__ = ["KINDS", "address_of", "find_vehicle", "is_vehicle_name"]
 
@@ -94,7 +95,7 @@ def find_vehicle(
     reason = "" if problem is None else f": {problem}"
     raise UnknownVehicle(
         f"{wanted} is not in the cache {place}{reason}. The cache holds "
-        + (f"{_number(kept)}:{_listed(kept)}" if kept else "no vehicle."),
+        + (f"{counted(len(kept), 'vehicle')}:{_listed(kept)}" if kept else "no vehicle."),
         vehicles=tuple(map(str, kept)),
     )
 
@@ -133,10 +134,6 @@ def _named(kept: Sequence[CachedVehicle], name: str) -> tuple[Sequence[CachedVeh
     if len(digits) < PREFIX_DIGITS_MIN:
         return [], f"uid: takes at least {PREFIX_DIGITS_MIN} digits of a hardware id"
     return [known for known in candidates if (known.identity.uid or "").startswith(digits)], None
-
-
-def _number(vehicles: Sequence[CachedVehicle]) -> str:
-    return f"{len(vehicles)} vehicle{'' if len(vehicles) == 1 else 's'}"
 
 
 def _listed(vehicles: Sequence[CachedVehicle]) -> str:

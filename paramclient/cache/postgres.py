@@ -41,7 +41,9 @@ T = TypeVar("T")
 
 
 class PostgresStore:
-    """A cache in a database; see `Store`. One connection, opened by the first call, and again after a loss.
+    """A cache in a database, with the methods and attributes of `SqliteStore`.
+
+    It has one connection, opened by the first call, and again after a loss.
 
     The tables are in a schema of their own, which the first station creates; its role needs the privilege
     CREATE on the database.
@@ -72,7 +74,7 @@ class PostgresStore:
         self._is_closed = False
 
     def run(self, work: Callable[[Transaction], T], *, writing: bool, durable: bool = False) -> T:
-        """See `Store.run`. Each committed transaction is durable."""
+        """See `SqliteStore.run`. Each committed transaction is durable."""
         with self._lock:
             if self._is_closed:
                 raise CacheError(f"the cache {self.place} is closed")
@@ -90,7 +92,7 @@ class PostgresStore:
                     raise
 
     def close(self) -> None:
-        """See `Store.close`."""
+        """Close it; later calls raise CacheError."""
         with self._lock:
             self._is_closed = True
             self._drop()

@@ -6,10 +6,10 @@ database keeps each version in a schema of its own. Values are marked by `?`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, Final, Protocol, TypeVar
+from collections.abc import Sequence
+from typing import Any, Final
 
-__all__ = ["IDENTITY", "TABLES", "SCHEMA_VERSION", "Store", "Transaction"]
+__all__ = ["IDENTITY", "TABLES", "SCHEMA_VERSION", "Transaction"]
 
 SCHEMA_VERSION: Final = 20
 """Version of the tables. Unreleased versions had lower numbers."""
@@ -109,8 +109,6 @@ TABLES: Final = (
 """Statements that create the tables. `{id}` is a number that is never used again, `{clustered}` stores the
 rows in the order of the primary key."""
 
-T = TypeVar("T")
-
 
 class Transaction:
     """Runs the statements of one transaction. A write transaction excludes all others.
@@ -140,34 +138,3 @@ class Transaction:
 
     def _marked(self, sql: str) -> str:
         return sql.replace("?", self._mark)
-
-
-class Store(Protocol):
-    """A place that stores a cache. Thread-safe.
-
-    Attributes:
-        place: the file, or the URL of the database without password, for messages.
-        notes: one text for each file that was set aside.
-        replacements: number of times that a new file was created in place of one that this program has used.
-    """
-
-    place: str
-    notes: list[str]
-    replacements: int
-
-    def run(self, work: Callable[[Transaction], T], *, writing: bool, durable: bool = False) -> T:
-        """Run a function in one transaction and return its result: either all or nothing is written.
-
-        Args:
-            work: the function. It may run again from the start.
-            writing: whether it writes.
-            durable: return only when this and all earlier transactions are safe from power loss.
-
-        Raises:
-            CacheError: the cache cannot be used. Nothing was written.
-        """
-        ...
-
-    def close(self) -> None:
-        """Close it; later calls raise CacheError."""
-        ...

@@ -154,16 +154,11 @@ def load_state(tx: Transaction, table: StoredTable, when: float) -> EarlierState
             return _of_snapshot(tx, table, each.id)
     since = table.known_since
     if since is None or when < since:
-        near = sorted(snapshots, key=lambda each: abs(each.at - when))[:2]
-        listed = [f"snapshot {each.id} of {_second(each.at)}" for each in sorted(near, key=lambda n: n.id)]
-        reach = (
-            "is not known: its table was never complete"
-            if since is None
-            else f"at {_second(when)} is not known: the history begins at {_second(since)}"
-        )
+        reach = "its table was never complete" if since is None else f"the history begins at {_second(since)}"
+        kept = ", ".join(f"{each.id} of {_second(each.at)}" for each in snapshots) or "none"
         raise NotInCache(
-            f"the state of {table.key}, component {table.component}, {reach}; there is"
-            f" {' and '.join(listed) or 'no snapshot'}"
+            f"the state of {table.key}, component {table.component}, at {_second(when)} is not known:"
+            f" {reach}; snapshots: {kept}"
         )
     [vehicle] = load_vehicles(tx, table.key)
     identity = replace(vehicle.identity, firmware=0, git_hash="", capabilities=0)

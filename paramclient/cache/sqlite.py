@@ -57,13 +57,18 @@ class _Replaced(Exception):
 
 
 class SqliteStore:
-    """A cache in a file, opened by the first call; see `Store`. Reading creates no file.
+    """A cache in a file, opened by the first call. Thread-safe. Reading creates no file.
 
     A file that is damaged, of another version of paramclient or no cache is renamed, with a warning in the
     log, and a new one is created. No file is deleted.
 
     Args:
         path: the file, absolute.
+
+    Attributes:
+        place: the file, for messages.
+        notes: one text for each file that was set aside.
+        replacements: number of times that another file has taken the place of one that was used.
     """
 
     def __init__(self, path: Path) -> None:
@@ -78,7 +83,16 @@ class SqliteStore:
         self._is_closed = False
 
     def run(self, work: Callable[[Transaction], T], *, writing: bool, durable: bool = False) -> T:
-        """See `Store.run`."""
+        """Run a function in one transaction and return its result: either all or nothing is written.
+
+        Args:
+            work: the function. It may run again from the start.
+            writing: whether it writes.
+            durable: return only when this and all earlier transactions are safe from power loss.
+
+        Raises:
+            CacheError: the file cannot be used. Nothing was written.
+        """
         with self._lock:
             if self._is_closed:
                 raise CacheError(f"the cache {self.place} is closed")
@@ -121,7 +135,7 @@ class SqliteStore:
             raise CacheError(f"the cache {self.place} was replaced {CALL_ATTEMPTS_MAX} times during one call")
 
     def close(self) -> None:
-        """See `Store.close`."""
+        """Close it; later calls raise CacheError."""
         with self._lock:
             self._is_closed = True
             self._drop()
@@ -215,9 +229,8 @@ class SqliteStore:
 
 _KINDS: Final = {
     "damaged": "damaged",
-    "foreign": "a database of another program",
+    "foreign": "a database of another program, or of an unreleased version of paramclient",
     "newer": "of a newer version of paramclient",
-    "older": "of an earlier, unreleased version of paramclient",
 }
 
 
@@ -252,9 +265,9 @@ def _has_tables(connection: sqlite3.Connection) -> bool:
     [(tables,)] = connection.execute("SELECT count(*) FROM sqlite_master")
     if not tables:
         return False
-    if application != APPLICATION_ID:
-        raise _Unusable("foreign")
-    raise _Unusable("newer" if version > SCHEMA_VERSION else "older")
+    if application == APPLICATION_ID and version > SCHEMA_VERSION:
+        raise _Unusable("newer")
+    raise _Unusable("foreign")
 
 
 def _create(connection: sqlite3.Connection) -> None:

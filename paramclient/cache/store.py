@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import platformdirs
 
@@ -23,7 +23,7 @@ from paramclient.cache.records import (
     StoredParam,
     TableUpdate,
 )
-from paramclient.cache.schema import Store, Transaction
+from paramclient.cache.schema import Transaction
 from paramclient.cache.sqlite import SqliteStore
 from paramclient.cache.updates import ensure_table, save_table
 from paramclient.errors import NotInCache, UsageError
@@ -31,6 +31,9 @@ from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 
 __all__ = ["ParamCache", "default_path", "is_database_url"]
+
+if TYPE_CHECKING:
+    from paramclient.cache.postgres import PostgresStore
 
 T = TypeVar("T")
 
@@ -71,7 +74,7 @@ class ParamCache:
     """
 
     def __init__(self, path: str | os.PathLike[str] | None = None) -> None:
-        self._store: Store
+        self._store: SqliteStore | PostgresStore
         if is_database_url(path):
             try:
                 from paramclient.cache.postgres import PostgresStore  # psycopg is an extra

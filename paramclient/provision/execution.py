@@ -560,18 +560,25 @@ class ApplyRun:
             await client.cache_writer.run_in_thread(lambda: write_file(path, inspection.table))
         cache = client.cache
         if cache is not None and self.plan.steps:
-            await client.cache_writer.write_all()  # the history then has the values from before the change
-            snapshot = await client.cache_writer.run_in_thread(
-                lambda: cache.store_snapshot(
-                    component.identity,
-                    component.component,
-                    inspection.table,
-                    reason=self._options.reason,
-                    hash=inspection.hash,
-                    complete=inspection.complete,
-                    is_of_operation=True,
+            try:
+                # the history then has the values from before the change
+                await client.cache_writer.write_all()
+                snapshot = await client.cache_writer.run_in_thread(
+                    lambda: cache.store_snapshot(
+                        component.identity,
+                        component.component,
+                        inspection.table,
+                        reason=self._options.reason,
+                        hash=inspection.hash,
+                        complete=inspection.complete,
+                        is_of_operation=True,
+                    )
                 )
-            )
+            except CacheError as error:
+                raise CacheError(
+                    f"nothing was sent, as the state before cannot be stored: {error}. Without a cache"
+                    " (--no-cache, or cache=False), no state is stored"
+                ) from error
             self._snapshot = snapshot.id
 
     async def _record_end(self) -> None:

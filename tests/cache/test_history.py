@@ -95,7 +95,7 @@ def test_the_state_at_a_time(cache: ParamCache) -> None:
 
 def test_the_states_of_a_table_that_was_never_complete_are_unknown(cache: ParamCache) -> None:
     change(cache, 1, 0)
-    with pytest.raises(CacheError, match="never complete; there is no snapshot"):
+    with pytest.raises(CacheError, match="never complete; snapshots: none"):
         cache.state_at("1", 1, NOW + 1)
 
 

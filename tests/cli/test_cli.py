@@ -919,6 +919,14 @@ def test_rich_and_the_simulators_load_only_if_needed() -> None:
     assert printed_by(program) == "[]\n"
 
 
+def test_the_help_of_fetch_fits_on_a_screen_with_the_connection_last() -> None:
+    lines = run_process("fetch", "--help", env={**PLAIN, "COLUMNS": "80"}).out.splitlines()
+    assert len(lines) <= 50
+    assert [line.split()[1] for line in lines if line.startswith("╭")] == [
+        *("Arguments", "Parameters", "Connection"),
+    ]
+
+
 def test_the_module_runs_the_command_line() -> None:
     assert run_process("--version") == Outcome(0, f"paramclient {paramclient.__version__}\n", "")
 

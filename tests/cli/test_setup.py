@@ -321,7 +321,7 @@ def test_restore_does_not_undo_an_apply_twice(command: Command, put: Put, file: 
     ("when", "text"),
     [
         ([], "the cache has no snapshot from before an apply to uid:"),
-        (["2h ago"], "is not known: its table was never complete; there is no snapshot"),
+        (["2h ago"], "is not known: its table was never complete; snapshots: none"),
         (["4"], "there is no snapshot 4 of uid:"),
     ],
 )

@@ -17,12 +17,10 @@ import pytest
 
 from paramclient import (
     AmbiguousVehicle,
-    Change,
     ClientClosed,
     Component,
     Discovered,
     Event,
-    Param,
     ParamCache,
     ParamClient,
     ParamSet,
@@ -231,12 +229,6 @@ async def test_a_table_is_served_as_a_file_and_files_are_read_and_written() -> N
         assert "notes.txt" in {entry.name for entry in await files.list("/APM")}
 
 
-async def test_a_vehicle_describes_its_parameters() -> None:
-    async with beside(), a_client(small_px4(metadata=True)) as client:
-        described = await metadata_of(await client.component(), store=False)
-        assert described is not None
-
-
 async def test_several_vehicles_are_fetched_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(client_module, "LISTENING_TIME", 0.1)
     vehicles = [generic(system=system, **QUICK) for system in (1, 2, 3)]
@@ -244,25 +236,6 @@ async def test_several_vehicles_are_fetched_at_once(monkeypatch: pytest.MonkeyPa
         fetched = await client.fetch_all()
         assert set(fetched.results) == {(1, 1), (2, 1), (3, 1)}
         assert fetched.complete
-
-
-async def test_many_calls_at_once() -> None:
-    vehicle = generic(**QUICK)
-    got: list[Param] = []
-    async with beside(), a_client(vehicle) as client:
-        component = await client.component()
-
-        async def get(name: str) -> None:
-            got.append(await component.get(name))
-
-        async def set_(name: str) -> None:
-            await component.set(name, 5)
-
-        async with anyio.create_task_group() as calls:
-            for number in range(24):
-                calls.start_soon(get if number % 2 else set_, f"PARAM_{number:02}")
-        assert {param.name for param in got} == {f"PARAM_{number:02}" for number in range(1, 24, 2)}
-        assert {vehicle.params[f"PARAM_{number:02}"].value for number in range(0, 24, 2)} == {5}
 
 
 async def test_a_vehicle_is_set_up_and_put_back() -> None:
@@ -288,33 +261,6 @@ async def test_a_link_whose_bytes_are_signed(tmp_path: Path) -> None:
 
 
 # Reports
-
-
-async def test_changes_are_reported_until_the_client_ends() -> None:
-    vehicle = generic(**QUICK)
-    received: list[Change] = []
-
-    async def listen(component: Component) -> None:
-        try:
-            async for change in component.changes():
-                received.append(change)  # noqa: PERF401 - it never ends by itself
-        except ClientClosed:
-            ended.set()
-
-    async with beside() as tasks:
-        ended = anyio.Event()
-        async with a_client(vehicle) as client:
-            component = await client.component()
-            await component.fetch_all()
-            tasks.start_soon(listen, component)
-            await anyio.lowlevel.checkpoint()
-            await component.set("PARAM_01", 78)
-            while not received:  # noqa: ASYNC110 - no event reports it
-                await anyio.sleep(0.001)
-        await ended.wait()
-    assert [(change.name, change.new and change.new.value, change.by) for change in received] == [
-        ("PARAM_01", 78, "us")
-    ]
 
 
 async def test_a_reboot_is_reported_to_listeners() -> None:

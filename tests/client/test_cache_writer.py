@@ -773,7 +773,7 @@ async def test_the_users_cache_is_used_by_default(tmp_path: Path, monkeypatch: p
 
 
 async def goes_on_without(path: Path | ParamCache, caplog: pytest.LogCaptureFixture) -> None:
-    """A session works, one warning says why nothing is kept, and one at its end how much is lost."""
+    """A session works, and one warning says why nothing is kept."""
     vehicle = small_px4()
     with caplog.at_level(logging.WARNING):
         async with ParamClient(vehicle, cache=path) as client:
@@ -782,11 +782,8 @@ async def goes_on_without(path: Path | ParamCache, caplog: pytest.LogCaptureFixt
             await component.set("PARAM_01", 5)
             await asyncio.sleep(20.0)
             assert (await component.get("PARAM_01")).value == 5
-    assert [record.name for record in caplog.records] == ["paramclient.client.cache_writer"] * 2, caplog.text
-    why, lost = [record.getMessage() for record in caplog.records]
-    assert "continuing without the cache" in why
-    assert lost.startswith("1/1 (uid:")
-    assert "the last values are lost" in lost
+    [warning] = [record.getMessage() for record in caplog.records]
+    assert warning.startswith("continuing without the cache: ")
 
 
 def test_a_folder_that_can_only_be_read(path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -117,18 +117,6 @@ async def test_an_error_of_a_call_is_raised_unchanged() -> None:
 
 
 @in_simulated_time
-async def test_the_traceback_of_an_error_in_a_callback_is_whole() -> None:
-    def give_up(progress: Progress) -> None:
-        raise UsageError("the end")
-
-    async with a_client(generic()) as client:
-        component = await client.component()
-        with pytest.raises(UsageError, match="the end") as caught:
-            await component.fetch_all(progress=give_up)
-    assert caught.traceback[-1].name == "give_up"
-
-
-@in_simulated_time
 async def test_the_task_of_a_client_can_be_cancelled() -> None:
     entered = asyncio.Event()
 
@@ -358,19 +346,6 @@ async def test_the_heartbeat_of_a_ground_station_goes_out_every_second() -> None
     for _, frame, message in beats:
         assert (frame.system, frame.component) == (200, 25)
         assert (message.type, message.autopilot) == (messages.MAV_TYPE_GCS, messages.MAV_AUTOPILOT_INVALID)
-
-
-@in_simulated_time
-async def test_our_ids_are_those_of_a_ground_station_by_default() -> None:
-    tap = Tap(generic())
-    async with a_client(tap) as client:
-        await client.component()
-    assert {(frame.system, frame.component) for _, frame, _ in tap.received} == {(255, 190)}
-    for bad in (0, 256, -1):
-        with pytest.raises(UsageError, match="1 to 255"):
-            a_client(tap, system=bad)
-        with pytest.raises(UsageError, match="1 to 255"):
-            a_client(tap, component=bad)
 
 
 @in_simulated_time
@@ -1076,36 +1051,6 @@ async def test_queued_changes_of_one_parameter_are_merged() -> None:
 
 
 @in_simulated_time
-async def test_several_tasks_may_wait_for_the_changes_of_one_subscription() -> None:
-    async with a_client(small_px4()) as client:
-        component = await client.component()
-        changes = component.changes()
-        tasks = [asyncio.create_task(outcome(anext(changes))) for _ in range(3)]
-        await settled()
-        await component.get("PARAM_01")
-        await component.get("PARAM_02")
-        await settled()
-    names = sorted(
-        each.name if isinstance(each, Change) else type(each).__name__ for each in [await t for t in tasks]
-    )
-    assert names == ["ClientClosed", "PARAM_01", "PARAM_02"]
-
-
-@in_simulated_time
-async def test_changes_begin_when_they_are_requested() -> None:
-    async with a_client(small_px4()) as client:
-        component = await client.component()
-        await component.fetch_all()
-        for name in ("PARAM_02", "PARAM_04"):
-            changes = component.changes()
-            await component.set(name, 77)
-            assert (await anext(changes)).name == name
-            del changes
-            await component.set("PARAM_06", 77)
-            await component.set("PARAM_06", 78)
-
-
-@in_simulated_time
 async def test_changes_end_with_the_client_after_the_queued_ones() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
@@ -1223,21 +1168,6 @@ async def test_a_link_that_stays_disconnected_fails_the_calls_and_not_the_client
     reported = [record for record in caplog.records if record.levelno >= logging.WARNING]
     assert len(reported) == 1
     assert "reconnecting" in reported[0].getMessage()
-
-
-@in_simulated_time
-async def test_the_errors_of_a_long_absence_do_not_grow() -> None:
-    link = FlakyLink(generic())
-    async with a_client(link) as client:
-        component = await client.component()
-        await link.drop(stays_offline=True)
-        await asyncio.sleep(20.0)
-        lengths = set()
-        for _ in range(5):
-            with pytest.raises(LinkError) as caught:
-                await component.get("PARAM_01")
-            lengths.add(len(caught.traceback))
-        assert len(lengths) == 1
 
 
 @in_simulated_time
@@ -1381,17 +1311,6 @@ async def known_component(client: ParamClient) -> Component:
 
 
 @in_simulated_time
-async def test_telemetry_alone_lets_the_reader_rest() -> None:
-    vehicle = Chatter(generic(), 1 / 2000)
-    async with a_client(vehicle) as client:
-        await known_component(client)
-        vehicle.portions.clear()
-        await asyncio.sleep(1.0)
-        assert sum(map(len, vehicle.portions)) >= 1950
-        assert len(vehicle.portions) < 1.2 / link_task.READ_PAUSE
-
-
-@in_simulated_time
 async def test_nothing_rests_while_an_answer_is_awaited() -> None:
     vehicle = Chatter(generic(), 1 / 2000)
     async with a_client(vehicle) as client:
@@ -1482,39 +1401,7 @@ async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyP
     assert with_rests < without + 0.05
 
 
-@in_simulated_time
-async def test_closing_does_not_wait_for_the_end_of_a_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_task, "READ_PAUSE", 60.0)
-    monkeypatch.setattr(link_task, "PAUSE_DATAGRAMS_MAX", math.inf)
-    async with a_client(Chatter(generic(), 0.005)) as client:
-        await known_component(client)
-        await asyncio.sleep(1.0)
-        began = anyio.current_time()
-    assert anyio.current_time() - began < 0.01
-    assert not tasks_beside()
-
-
 # How they look
-
-
-@in_simulated_time
-async def test_their_style_shows_the_comparison() -> None:
-    client = a_client(Air([small_px4(burst=1, period=0.05), generic(system=2)]))
-    assert repr(client) == "<ParamClient sim:custom closed, 0 components>"
-    async with client:
-        component = await client.component()
-        assert repr(client) == "<ParamClient sim:custom open, 2 components>"
-        assert repr(component) == "<Component 1/1 px4 new 0 params>"
-        fetch = asyncio.create_task(component.fetch_all())
-        await asyncio.sleep(0.5)
-        assert repr(component) == "<Component 1/1 px4 fetching 9 of 25 params>"
-        result = await fetch
-        assert (
-            repr(component) == f"<Component 1/1 px4 synced 25 params from stream in {result.elapsed:.2f} s>"
-        )
-        assert repr(component.params) == "<ParamMap 25 params>"
-        assert repr(await client.component(system=2)) == "<Component 2/1 generic new 0 params>"
-    assert repr(client) == "<ParamClient sim:custom closed, 2 components>"
 
 
 @in_simulated_time

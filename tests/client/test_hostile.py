@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import tracemalloc
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -13,12 +12,11 @@ import pytest
 from paramclient.protocol.ftp.blocks import Blocks
 from paramclient.protocol.params import change_origin as authors_room
 from paramclient.protocol.params import list_download as download_room
-from paramclient.protocol.params import sync as sync_room
 from paramclient.protocol.params import table as table_room
 from paramclient.protocol.params import value_check
 from paramclient.protocol.params.change_origin import Authors
 from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.params.table import NameQuota, Table
+from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.retry import INITIAL_TIMEOUT
 from paramclient.protocol.stats import traffic as traffic_room
 
@@ -51,8 +49,6 @@ from paramclient.wire.messages import (
 from tests.hostile_vehicle import ESCAPE, LIES, HostileVehicle
 from tests.shell import generic, in_simulated_time
 from tests.simulation import PEER, Simulation, known, listing_ardupilot, param_value
-
-ROOT = Path(__file__).parents[2]
 
 
 def say(session: Simulation, message: Message, *, system: int = 1, component: int = 1) -> None:
@@ -134,25 +130,6 @@ def test_a_table_holds_so_many_names_and_no_more(monkeypatch: pytest.MonkeyPatch
     assert [*table.params] == ["B", "C", "D"]
 
 
-def test_the_tables_of_a_link_share_a_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """When it is full, each may still hold as many as an autopilot has."""
-    monkeypatch.setattr(table_room, "LINK_NAMES_MAX", 6)
-    monkeypatch.setattr(table_room, "NAMES_GUARANTEED", 2)
-    room = NameQuota()
-    liar, honest = Table(name_quota=room), Table(name_quota=room)
-    for name in "ABCDEFGH":
-        receive(liar, name)
-    assert [*liar.params] == [*"ABCDEF"]
-    for name in "ABCD":
-        receive(honest, name)
-    assert [*honest.params] == [*"AB"]
-    liar.forget()
-    assert room.taken == 2
-    for name in "CDEFGH":
-        receive(honest, name)
-    assert len(honest.params) == room.taken == 6
-
-
 def test_a_link_has_so_many_components_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those that are there keep their place; a lost one without a parameter gives it up."""
     monkeypatch.setattr(station_room, "COMPONENTS_MAX", 3)
@@ -171,19 +148,6 @@ def test_a_link_has_so_many_components_and_no_more(monkeypatch: pytest.MonkeyPat
     assert [*session.station.components] == [(1, 1), (2, 1), (4, 1)]
     forgotten = [event for event in session.events if isinstance(event, ComponentForgotten)]
     assert [(event.machine.system, event.machine.component) for event in forgotten] == [(3, 1)]
-
-
-@pytest.mark.slow
-def test_ten_thousand_components_cost_what_a_thousand_do() -> None:
-    session = Simulation()
-    beat(session)
-    tracemalloc.start()
-    for number in range(10_000):
-        beat(session, system=2 + number % 250, component=1 + number // 250)
-    held, _ = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert len(session.station.components) == station_room.COMPONENTS_MAX
-    assert held < station_room.COMPONENTS_MAX * 30_000
 
 
 @pytest.mark.slow
@@ -210,115 +174,11 @@ def test_the_number_of_unread_changes_is_bounded(monkeypatch: pytest.MonkeyPatch
     assert [*changes._waiting] == ["C", "D", "E"]
 
 
-def test_remembered_changes_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(authors_room, "RECENT_CHANGES_MAX", 3)
-    authors = Authors()
-    for at, name in enumerate("ABCDABCD"):
-        authors.changed(name, at / 100, False)
-    assert [*authors._changed_at] == ["B", "C", "D"]
-    for _ in range(2):
-        for name in "BCDE":
-            authors.changed(name, 0.1, False)
-    assert len(authors._doubts) <= 3
-
-
-def test_removed_names_are_reported_to_the_cache_up_to_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(table_room, "REMOVED_NAMES_MAX", 4)
-    table = Table()
-    for name in "ABCDE":
-        receive(table, name)
-    assert len(table.take_dirty()) == 5
-    table.forget()
-    assert [*table.dirty] == [*"ABCD"]
-    receive(table, "F")  # what is there is always returned
-    assert "F" in table.dirty
-
-
-def test_a_value_that_flips_is_read_a_bounded_number_of_times(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(value_check, "REREADS_MAX", 2)
-    session = Simulation()
-    beat(session)
-    for value in (1.0, 2.0):
-        for name in "ABCDE":
-            say(session, param_value(name, value))
-    session.run(1.2)
-    assert len(session.machine.reads) == 2
-
-
-def test_remembered_texts_are_bounded() -> None:
-    """Repeated values are one object each."""
-    known_well = text_of(b"MC_ROLL_P")
-    for number in range(2 * TEXTS_MAX):
-        text_of(b"NAME%d" % number)
-        assert text_of(b"MC_ROLL_P") is known_well
-    assert text_of.cache_info().currsize == TEXTS_MAX
-
-
-def test_a_file_has_so_many_gaps_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What would leave one more is passed over; all else still fits, and the file is whole in the end."""
-    monkeypatch.setattr(blocks_room, "GAPS_MAX", 2)
-    blocks = Blocks()
-    for offset in (2, 6, 10, 14):
-        blocks.take(offset, b"ab")
-    assert (blocks.reached, blocks.received, [*blocks.missing(9)]) == (8, 4, [0, 4])
-    for offset in (0, 4, 8, 10, 12, 14):
-        blocks.take(offset, b"cd")
-    blocks.ends_at(16)
-    assert blocks.is_complete
-    assert blocks.content == b"cdabcdabcdcdcdcd"
-
-
-def test_the_number_of_pieces_of_a_file_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading_room, "SPARE_PIECES", 10)
-    session = Simulation(HostileVehicle("crumbs", system=1))
-    job = session.meet().files.read("/crumbs", session.now, limit=10 * DATA_SIZE_MAX)
-    session.until(lambda: job.done)
-    assert isinstance(job.error, FileTransferError)
-    assert "too many pieces" in str(job.error)
-    assert job._blocks.pieces == reading_room.PIECES_PER_BLOCK * 10 + 10 + 1
-
-
 def test_a_directory_has_so_many_entries_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transfers_room, "ENTRIES_MAX", 100)
     session = Simulation(HostileVehicle("endless file", system=1))
     job = session.meet().files.list("/endless", session.now)
     assert len(session.outcome(job)) == 100
-
-
-def test_remembered_reads_of_a_file_are_bounded() -> None:
-    session = Simulation(HostileVehicle("crumbs", system=1))
-    job = session.meet().files.read("/crumbs", session.now)
-    for number in range(2 * reading_room.LATE_READS_MAX):
-        job._pending_reads[number] = reading_room._PendingRead(number, number, session.now, 0, False)
-        job._give_up(number)
-    for _ in range(3 * reading_room.BURSTS_MAX):
-        job._burst(session.now)
-        job._burst_attempts.restart()
-    assert len(job._late) == reading_room.LATE_READS_MAX
-    assert len(job._bursts) == reading_room.BURSTS_MAX
-
-
-def test_a_resync_reports_a_bounded_number_of_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sync_room, "NAMES_MAX", 3)
-    session = Simulation(listing_ardupilot())
-    session.fetch()
-    say(session, param_value("ONE_MORE", 1.0, count=9))  # another count: it has fallen behind
-    for name in "ABCDE":
-        session.machine.sync.changed(name, "vehicle")
-    assert len(session.machine.sync._changed_names) == 3
-
-
-def test_one_head_after_the_other_keeps_no_turn() -> None:
-    """Each `_HASH_CHECK` says that the list begins; without a list it is over with the usual time-out."""
-    honest, liar = listing_ardupilot(), HostileVehicle("endless hashes")
-    session = Simulation(honest, liar)
-    session.meet()
-    session.until(lambda: (66, 1) in session.station.components)
-    fetch = session.station.components[66, 1].begin_fetch(session.now)
-    session.run(0.2)
-    assert session.fetch(limit=5).complete
-    session.until(lambda: fetch.done, limit=60)
-    assert isinstance(fetch.error, NoReply)
 
 
 # Others on the same link

@@ -16,7 +16,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_sta
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.table import Table
 
-from paramclient import Param, ParamCache, ParamType
+from paramclient import ParamCache, ParamType
 from paramclient.cache import HistoryEntry
 from paramclient.client import suspend_detection
 from paramclient.client.cache_writer import CacheWriter
@@ -40,104 +40,7 @@ def receive(table: Table, value: int, by: str, moment: float) -> None:
     table.store_value(param_value("A", value, index=0, kind=ParamType.INT32), by, moment)
 
 
-def test_a_value_that_is_received_again_has_the_later_moment() -> None:
-    table = Table()
-    receive(table, 1, "vehicle", 1.0)
-    receive(table, 1, "vehicle", 2.0)
-    assert table.params.moments == {"A": 2.0}
-    assert table.take_overwritten() == [], "it is no change"
-
-
-def test_overwritten_values_keep_their_observation_times() -> None:
-    table = Table()
-    receive(table, 1, "vehicle", 1.0)
-    receive(table, 2, "us", 2.0)
-    receive(table, 2, "us", 2.5)
-    receive(table, 3, "us", 3.0)
-    receive(table, 3, "us", 3.5)
-    assert [(each.param.value, each.by, each.moment) for each in table.take_overwritten()] == [
-        (1, "vehicle", 1.0),
-        (2, "us", 2.0),
-        (2, "us", 2.5),
-        (3, "us", 3.0),
-    ]
-    assert table.params.moments == {"A": 3.5}
-    assert table.take_overwritten() == []
-
-
-def test_a_change_that_is_received_again_keeps_the_moment_of_the_change() -> None:
-    table = Table()
-    receive(table, 1, "vehicle", 1.0)
-    table.take_dirty()
-    receive(table, 2, "station 254/190", 2.0)
-    receive(table, 2, "vehicle", 2.5)
-    [(param, by, moment)] = table.take_overwritten()
-    assert (param.value, by, moment) == (2, "station 254/190", 2.0)
-
-
-def test_a_removed_name_has_the_time_of_the_last_value_of_the_download() -> None:
-    table = Table()
-    receive(table, 1, "vehicle", 1.0)
-    table.store_value(param_value("B", 1.0, index=0, count=1), "vehicle", 2.0)
-    table.settle({0: "B"})
-    assert table.take_removed_at() == {"A": 2.0}
-    assert table.params.moments == {"B": 2.0}
-
-
-def test_a_file_counts_from_when_it_was_requested() -> None:
-    table = Table()
-    receive(table, 1, "vehicle", 1.0)
-    table.store_file_entry("A", ParamType.INT32, 2, 0, None, 1.5, is_older=False)
-    assert table.params.moments == {"A": 1.5}
-    receive(table, 3, "vehicle", 2.0)
-    for value in (2, 3):  # also where the file has what was received since
-        table.store_file_entry("A", ParamType.INT32, value, 0, None, 1.7, is_older=True)
-        assert table.params.moments == {"A": 2.0}
-
-
-def test_cached_values_keep_their_observation_times() -> None:
-    table = Table()
-    param = Param("A", 1, ParamType.INT32, 0, 1)
-    table.fill({"A": param}, moments={"A": -500.0})
-    assert table.params.moments == {"A": -500.0}
-
-
-def test_sleep_that_the_clock_leaves_out_makes_everything_older() -> None:
-    table = Table()
-    for number, moment in ((1, 1.0), (2, 2.0)):
-        receive(table, number, "us", moment)
-    table.store_value(param_value("B", 1.0, index=1), "vehicle", 3.0)
-    table.remove(lambda param: param.name == "B")
-    table.age(1000.0)
-    assert table.params.moments == {"A": -998.0}
-    assert [each.moment for each in table.take_overwritten()] == [-999.0]
-    assert table.take_removed_at() == {"B": -997.0}
-    assert table.suspended == 1000.0
-
-
 # On the way to the cache
-
-
-def test_an_interruption_between_two_clocks_is_no_difference() -> None:
-    now = 0.0
-    interruptions = iter([0.0, 0.02, 0.0, 0.03, 0.0, 0.0])
-
-    def look(ahead: float) -> float:
-        nonlocal now
-        now += 1e-6
-        return now + ahead
-
-    def interrupted() -> float:
-        nonlocal now
-        now += next(interruptions, 0.0)
-        return look(NOW)
-
-    def interrupting() -> float:
-        nonlocal now
-        now += next(interruptions, 0.0)
-        return look(0.0)
-
-    assert seconds_ahead(interrupted, interrupting) == pytest.approx(NOW, abs=2e-6)
 
 
 # Two programs, one cache

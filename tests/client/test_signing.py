@@ -101,30 +101,6 @@ def test_a_key_that_others_can_get_at_is_refused(tmp_path: Path, mode: int) -> N
         read_key(path)
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
-def test_a_key_of_another_user_is_refused_also_for_root(tmp_path: Path) -> None:
-    path = a_file(tmp_path / "key", SECRET)
-    os.chown(path, 12345, 0)
-    (tmp_path / "link").symlink_to(path)
-    for named in (path, tmp_path / "link"):
-        with pytest.raises(UsageError, match=r"this signing key belongs to another user \(id 12345\)"):
-            read_key(named)
-    os.chown(path, 0, 0)
-    assert read_key(tmp_path / "link") == KEY
-
-
-@pytest.mark.skipif(os.name != "posix", reason="there are no such pipes")
-def test_a_named_pipe_without_a_writer_is_refused_at_once(tmp_path: Path) -> None:
-    """Opening it would wait for its writer, and no signal would end that."""
-    os.mkfifo(pipe := tmp_path / "pipe", 0o600)
-    command = ["get", "sim:px4", "MC_ROLL_P", "--no-cache", "--signing-key", str(pipe)]
-    done = subprocess.run(
-        [sys.executable, "-m", "paramclient", *command], capture_output=True, text=True, timeout=60
-    )
-    assert done.returncode == 2
-    assert "cannot be read: Not a regular file" in done.stderr
-
-
 @pytest.mark.parametrize(
     "data", [b"", b"hunter2-hunter2", SECRET[:31], SECRET + b"\n", b"\xff" * 44, bytes(32), b"ab" * 600]
 )
@@ -137,11 +113,6 @@ def test_a_file_without_a_key_is_named_and_not_quoted(tmp_path: Path, data: byte
     assert not data or data.decode("latin-1") not in shown
     assert caught.value.__cause__ is None
     assert caught.value.__suppress_context__
-
-
-def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"nowhere: the signing key cannot be read: No such file"):
-        read_key(tmp_path / "nowhere")
 
 
 def test_the_environment_names_a_key_in_one_of_three_ways(key_file: Path) -> None:
@@ -307,56 +278,11 @@ def test_no_timestamp_is_used_twice_whatever_clock_and_crashes_do(
         in_session(use, crashes=crashes, state=tmp_path / str(number))
 
 
-def test_after_a_good_end_nothing_is_skipped(clock: Clock) -> None:
-    last = []
-    for _ in range(3):
-        in_session(lambda signer: last.append(signer.timestamp))
-    assert last == [NOW, NOW, NOW]
-    in_session(lambda signer: signer.catch_up(NOW + 5))
-    in_session(lambda signer: last.append(signer.timestamp))
-    assert last[-1] == NOW + 5
-
-
 def test_after_a_crash_at_most_a_minute_is_skipped(clock: Clock) -> None:
     in_session(lambda signer: signer.catch_up(NOW + 5), crashes=True)
     last = []
     in_session(lambda signer: last.append(signer.timestamp))
     assert NOW + 5 < last[0] <= NOW + 5 + TIMESTAMP_RESERVE
-
-
-@in_simulated_time
-async def test_timestamps_are_written_ahead_and_seldom(
-    state: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    written: list[int] = []
-    write = TimestampFile.write
-
-    def note(file: TimestampFile, timestamp: int) -> None:
-        written.append(timestamp)
-        write(file, timestamp)
-
-    monkeypatch.setattr(TimestampFile, "write", note)
-
-    class Wire(Tap):
-        """Sees every frame that goes to the vehicle."""
-
-        frames = 0
-
-        def receive(self, data: bytes, now: float) -> None:
-            self.frames += 1
-            assert int.from_bytes(data[-12:-6], "little") <= written[-1]
-            super().receive(data, now)
-
-    wire = Wire(signed_vehicle(signing_timestamp=NOW))
-    async with a_client(wire) as client:
-        vehicle = await client.component()
-        await vehicle.fetch_all()
-        await anyio.sleep(600.0)
-        assert wire.frames > 600
-        assert len(written) <= 600 * 100_000 / (TIMESTAMP_RESERVE // 2) + 2
-        assert client.signing_report() is not None
-    assert written[-1] - NOW == pytest.approx(600 * 100_000, rel=0.05)
-    assert (state / f"{KEY.fingerprint}-0.timestamp").read_text() == f"{written[-1]}\n"
 
 
 @in_simulated_time
@@ -370,23 +296,6 @@ async def test_an_unusable_folder_is_reported_and_the_session_continues(
         await anyio.sleep(3 * TIMESTAMP_CHECK_INTERVAL)
     assert len(caplog.records) == 1
     assert "cannot store signature timestamps (Not a directory)" in caplog.text
-
-
-@in_simulated_time
-async def test_a_disk_that_fails_later_is_reported_once(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    async with a_client(signed_vehicle()) as client:
-        await client.component()
-
-        def fail(*_: object) -> None:
-            raise OSError(28, "No space left on device")
-
-        monkeypatch.setattr(TimestampFile, "write", fail)
-        await anyio.sleep(300.0)
-        assert await (await client.component()).get("PARAM_04")
-    assert [record.levelname for record in caplog.records] == ["WARNING"]
-    assert "No space left on device" in caplog.text
 
 
 # Clients
@@ -410,20 +319,6 @@ async def test_a_signed_client(state: Path) -> None:
         assert (report.link_id, beside.link_id) == (0, 1)
     async with ParamClient(small_px4(), cache=False) as unsigned:
         assert unsigned.signing_report() is None
-
-
-@in_simulated_time
-async def test_a_link_id_of_ones_own_is_taken_once() -> None:
-    mine = Signing(KEY, link_id=9)
-    async with a_client(signed_vehicle(), signing=mine) as client:
-        report = client.signing_report()
-        assert report is not None
-        assert report.link_id == 9
-        second = a_client(signed_vehicle(), signing=mine)
-        with pytest.raises(UsageError, match="link id 9"):
-            await second.__aenter__()
-    async with a_client(signed_vehicle(), signing=mine) as client:
-        await client.component()
 
 
 @in_simulated_time
@@ -626,17 +521,6 @@ def test_setup_and_disable_with_their_proof(
     assert (code, err) == (0, "")
     assert out == ('{"system": 1, "component": 1, "autopilot": "px4", "signs": false, "fingerprint": null}\n')
     assert vehicle.signing_key is None
-
-
-def test_the_steps_are_reported_without_the_key(
-    put: Callable[[Vehicle], str], key_file: Path, command: Command
-) -> None:
-    words = ("--signing-key", key_file, "--link-is-safe", "--verbose")
-    code, _, err = command("signing", "setup", put(small_px4()), *words)
-    assert code == 0
-    assert "protocol: to system 1: SetupSigning\n" in err
-    secret = KEY.secret
-    assert not any(each in err for each in (secret.hex(), repr(secret), str(list(secret)), secret.hex(" ")))
 
 
 def test_a_key_is_changed_with_the_one_before(

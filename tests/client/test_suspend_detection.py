@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
 from collections.abc import Callable
 
 import anyio
@@ -20,7 +19,6 @@ from tests.shell import (
     Tap,
     a_client,
     bits,
-    generic,
     in_simulated_time,
     simulated_time_loop,
     small_px4,
@@ -228,19 +226,6 @@ async def test_a_link_that_is_disconnected_at_the_suspend_of_the_computer(sleep:
         assert drained(events) == [Resynced(component, ("PARAM_01",), vehicle.announced_hash())]
 
 
-@in_simulated_time
-async def test_a_short_nap_is_none(sleep: Sleep) -> None:
-    tap = Tap(generic())
-    async with a_client(tap) as client:
-        component = await client.component()
-        await component.fetch_all()
-        tap.received.clear()
-        sleep(SUSPEND_MIN - 0.1)
-        await anyio.sleep(3.0)
-        assert trusts(component) == {Trust.LIVE}
-        assert len(tap.received) < 6, "heartbeats alone"
-
-
 async def _error_of(component: Component, name: str, value: float | None = None) -> Exception | None:
     try:
         await (component.get(name) if value is None else component.set(name, value))
@@ -250,36 +235,3 @@ async def _error_of(component: Component, name: str, value: float | None = None)
 
 
 # The clocks
-
-
-def test_a_long_delay_counts_as_a_suspend() -> None:
-    clock = SuspendDetector()
-    assert clock.unseen(100.0) is None, "nothing was expected"
-    clock.expect(101.0)
-    assert clock.unseen(101.0 + SUSPEND_MIN - 0.01) is None
-    assert clock.unseen(101.0 + SUSPEND_MIN) == pytest.approx(0.0, abs=0.5)
-    assert clock.unseen(1000.0) is None, "that is known by now"
-
-
-def test_sleep_that_the_clock_leaves_out_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(suspend_detection, "time_asleep", lambda: 50.0)
-    clock = SuspendDetector()
-    clock.expect(math.inf)
-    monkeypatch.setattr(suspend_detection, "time_asleep", lambda: 50.0 + HOURS)
-    assert clock.unseen(1.0) == HOURS
-    assert clock.unseen(1.0) is None
-
-
-def test_time_asleep_is_finite_and_stands_still_while_awake() -> None:
-    assert math.isfinite(before := time_asleep())
-    assert time_asleep() - before < 1.0
-
-
-def test_time_that_the_clock_left_out_counts_for_a_vehicles_own_clock() -> None:
-    presence = Presence()
-    presence.receive(10.0)
-    assert not presence.system_time(SystemTime(0, 100_000_000), 10.0)
-    assert not presence.system_time(SystemTime(0, 3_600_000), 20.0), "an hour of ten seconds: an old message"
-    presence.age(HOURS)
-    assert presence.system_time(SystemTime(0, 3_600_000), 20.0)
-    assert presence.receive(20.0) == HOURS + 10.0
