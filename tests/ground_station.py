@@ -53,8 +53,8 @@ class Station:
         endpoint.tick(start)
         self._collect()
 
-    def send(self, *messages: messages.Message) -> Station:
-        for message in messages:
+    def send(self, *requests: messages.Message) -> Station:
+        for message in requests:
             self.send_bytes(messages.encode(message, system=255, component=190, sequence=0))
         return self
 
@@ -87,10 +87,10 @@ class Station:
         """Return the times of the received PARAM_VALUEs."""
         return [time for time, _, message in self.log if isinstance(message, messages.ParamValue)]
 
-    def ask(self, *messages: messages.Message, seconds: float = 0.2) -> list[messages.ParamValue]:
+    def ask(self, *requests: messages.Message, seconds: float = 0.2) -> list[messages.ParamValue]:
         """Send messages; return the PARAM_VALUEs received within this time."""
         self.log.clear()
-        return self.send(*messages).wait(seconds).values()
+        return self.send(*requests).wait(seconds).values()
 
     def _collect(self) -> None:
         for data in self.endpoint.data_to_send():

@@ -235,12 +235,12 @@ class _Pair(NamedTuple):
     sent: float
 
 
-def _series(name: str, messages: Messages, unasked: Collection[str]) -> defaultdict[str, Messages]:
+def _series(name: str, log: Messages, unasked: Collection[str]) -> defaultdict[str, Messages]:
     """Return the messages by series; index 0 starts a pass if a list was requested since the last pass."""
     lists = [time for time, request in _requests(name) if isinstance(request, messages.ParamRequestList)]
     series: defaultdict[str, Messages] = defaultdict(list)
     last, passes = None, 0
-    for time, message in messages:
+    for time, message in log:
         key = type(message).__name__
         if isinstance(message, messages.ParamValue):
             index = message.param_index

@@ -27,8 +27,8 @@ class Log:
         self.values: dict[str, int] = {}
         self.data = b""
 
-    def say(self, *messages: messages.Message, system: int = 1, component: int = 1) -> Self:
-        for message in messages:
+    def say(self, *sent: messages.Message, system: int = 1, component: int = 1) -> Self:
+        for message in sent:
             self.data += packed_time(self.at) + messages.encode(
                 message, system=system, component=component, sequence=0
             )

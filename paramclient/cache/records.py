@@ -74,8 +74,10 @@ class StoredValue(NamedTuple):
     def param(self, name: str, index: int | None = None, default: bytes | None = None) -> Param:
         """Return it as a parameter, with trust CACHED."""
         bits = int.from_bytes(self.value, "little")
-        value = from_bits(bits, self.type, is_raw=bool(self.is_raw))
-        return Param(name, value, self.type, index, bits, Trust.CACHED, default_value(default, self.type))
+        is_raw = bool(self.is_raw)
+        value = from_bits(bits, self.type, is_raw=is_raw)
+        given = default_value(default, self.type)
+        return Param(name, value, self.type, index, bits, Trust.CACHED, given, is_raw)
 
 
 class StoredParam(NamedTuple):

@@ -67,7 +67,8 @@ class EarlierState(NamedTuple):
         params = {}
         for name, (number, bits, is_raw), default in self.rows:
             value = from_bits(int.from_bytes(bits, "little"), number, is_raw=bool(is_raw))
-            params[name] = WrittenParam(name, value, number, default_value(default, number))
+            given = default_value(default, number)
+            params[name] = WrittenParam(name, value, number, given, is_raw=bool(is_raw))
         return ParamSet(params, self.component, self.identity.system, self.identity, self.at, self.source)
 
 

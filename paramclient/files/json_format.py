@@ -47,7 +47,6 @@ from paramclient.model.values import (
     check_name,
     from_bits,
     is_portable_name,
-    known_type,
     type_name,
 )
 
@@ -67,6 +66,8 @@ _EXT_KEY: Final = "paramclient_extended"
 """The key with the version of a document of extended parameters."""
 _NUMBER_EXPECTED: Final = "expected a number (or NaN, Infinity, 0x and 8 digits for raw bytes)"
 _CUSTOM: Final = ParamType.CUSTOM
+_EXT_PREFIX: Final = "EXT_"
+"""Begins the name of an unknown type of extended parameters: EXT_TYPE_77."""
 _WORDS: Final = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 _raw: Final = re.compile(r"0x([0-9a-fA-F]{8})").fullmatch
 _type_number: Final = re.compile(r"TYPE_([0-9]{1,3})").fullmatch
@@ -152,7 +153,8 @@ def _param(reader: Reader, name: str, content: object, place: Place) -> WrittenP
             default = None if default is None else as_type(default, kind)
         if "bits" in fields:
             value = _with_bits(value, kind, fields["bits"])
-        return WrittenParam(check_name(name), value, kind, default, fields.get("comment", ""))
+        comment, is_raw = fields.get("comment", ""), isinstance(value, bytes)
+        return WrittenParam(check_name(name), value, kind, default, comment, is_raw=is_raw)
     except UsageError as error:
         reader.problem(place, str(error))
         return None
@@ -166,10 +168,10 @@ def ext_param_of_fields(name: str, fields: object) -> WrittenParam:
     """
     if not isinstance(name, str) or not is_portable_name(name):
         raise ValueError(f"{name!r:.40} is no name of a parameter")
-    if not isinstance(fields, dict) or not fields.keys() <= {"value", "hex", "type"}:
+    if not isinstance(fields, dict) or not {"type"} <= fields.keys() <= {"value", "hex", "type"}:
         raise ValueError("expected value or hex, and type")
     written = fields.get("type")
-    number = _CUSTOM if written == _CUSTOM.name else _type(written)
+    number = _CUSTOM if written == _CUSTOM.name else _type(written, _EXT_PREFIX)
     if ("value" in fields) == ("hex" in fields):
         raise ValueError("expected either value or hex")
     if "hex" in fields:
@@ -209,13 +211,13 @@ def _time(content: object) -> float:
     return moment.timestamp()
 
 
-def _type(content: object) -> ParamType | int:
+def _type(content: object, prefix: str = "") -> ParamType | int:
     text = _text(content)
     if text in TYPES_BY_NAME:
         return TYPES_BY_NAME[text]
-    if match := _type_number(text):
+    if text.startswith(prefix) and (match := _type_number(text.removeprefix(prefix))):
         number = int(match[1])
-        if number <= 255 and not isinstance(known_type(number), ParamType):
+        if number <= 255 and number not in TYPES_BY_NAME.values():
             return number
     raise UsageError(f"unknown type {text!r}; the types are {', '.join(TYPES_BY_NAME)}")
 
@@ -342,7 +344,7 @@ def _fields(param: WrittenParam) -> dict[str, object]:
     fields: dict[str, object] = {"value": value_written(param.settable, param)}
     if param.type_number is not None:
         is_wide = param.type is not None and param.type.size == 8
-        fields["type"] = type_name(param.type_number)
+        fields["type"] = _type_text(param)
         fields["bits"] = f"{param.bits_as(param.type_number):0{16 if is_wide else 8}x}"
     elif isinstance(param.value, float) and not is_plain(param.value):
         raise UsageError(f"{param.name} is a NaN with payload bits, and has no type for them")
@@ -353,11 +355,18 @@ def _fields(param: WrittenParam) -> dict[str, object]:
     return fields
 
 
+def _type_text(param: WrittenParam) -> str:
+    number = param.type_number or ParamType.UNKNOWN
+    return f"TYPE_{number}" if param.type is ParamType.UNKNOWN else type_name(number)
+
+
 def _ext_fields(param: WrittenParam) -> dict[str, object]:
     """Return the fields of an extended parameter; reading them gives the same bytes."""
     number = param.type_number or ParamType.UNKNOWN
     value, raw = param.settable, encode_ext_value(param.settable, number)
     kind = type_name(number)
+    if param.type is ParamType.UNKNOWN:
+        kind = _EXT_PREFIX + kind
     if isinstance(value, float):
         written = value_json(value, ParamType(number))
         if not isinstance(written, str) or encode_ext_value(_WORDS[written], number) == raw:

@@ -71,9 +71,10 @@ class WrittenParam:
         type_number: int | None = None,
     ) -> None:
         number = None if type is None else known_type(type or type_number or 0)
-        if isinstance(value, bytes) and number != ParamType.CUSTOM:
+        if isinstance(value, bytes) and (is_raw or number != ParamType.CUSTOM):
             value, is_raw = int.from_bytes(value, "little"), True
-        kind = number if number is None or isinstance(number, ParamType) else ParamType.UNKNOWN
+        is_known = isinstance(number, ParamType) and not (is_raw and number == ParamType.CUSTOM)
+        kind = ParamType(number) if number is not None and is_known else number and ParamType.UNKNOWN
         default = None if isinstance(default, bytes) else default
         given = (name, value, kind, default, comment, line, is_raw, number)
         for attribute, each in zip(self.__slots__, given, strict=True):
@@ -93,7 +94,7 @@ class WrittenParam:
     @classmethod
     def of(cls, param: Param) -> WrittenParam:
         """Return the value, type and default of a table's parameter, without index and trust."""
-        return cls(param.name, param.settable, param.type_number, param.default)
+        return cls(param.name, param.settable, param.type_number, param.default, is_raw=param.is_raw)
 
     def bits_as(self, number: ParamType | int) -> int:
         """Return the bits (see `Param.bits`) of a parameter of this type with this value.

@@ -214,7 +214,7 @@ def _multiplied(value: WireValue, kind: ParamType | int | None, ratio: Fraction)
     """Return the product, as an int if it is a whole number.
 
     Raises:
-        UsageError: the value is raw bytes.
+        UsageError: the value is no number.
     """
     if isinstance(value, bytes | str):
         raise UsageError("its value is no number, and cannot be multiplied")

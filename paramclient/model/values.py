@@ -85,7 +85,8 @@ class ParamType(IntEnum):
     REAL32 = 9
     REAL64 = 10
     CUSTOM = 11
-    """Text or bytes, of extended parameters only (MAV_PARAM_EXT_TYPE)."""
+    """Text or bytes, of extended parameters only (MAV_PARAM_EXT_TYPE). A plain parameter of this number has an
+    unknown type."""
 
     @property
     def size(self) -> int:
@@ -175,9 +176,9 @@ class Param:
     ) -> None:
         # The generated __init__ takes twice as long, and every PARAM_VALUE makes a Param.
         number = known_type(type or type_number)
-        if isinstance(value, bytes) and number != _CUSTOM:
+        if isinstance(value, bytes) and (is_raw or number != _CUSTOM):
             value, is_raw = int.from_bytes(value, "little"), True
-        is_known = isinstance(number, ParamType)
+        is_known = isinstance(number, ParamType) and not (is_raw and number == _CUSTOM)
         _set_name(self, name)
         _set_value(self, value)
         _set_type(self, number if is_known else _UNKNOWN)
@@ -248,8 +249,8 @@ _BYTEWISE = Encoding.BYTEWISE
 _LAYOUTS = {int(kind): layout for kind, layout in _LAYOUT.items()}
 _FITTING = {number: (1 << 8 * each.size) - 1 for number, each in _LAYOUTS.items() if each.size <= 4}
 _BOUNDS = {int(kind): kind.bounds for kind in ParamType if kind.is_integer}
-TYPES_BY_NAME: Final = {kind.name: kind for kind in ParamType if kind}
-"""The types that MAVLink defines, by name."""
+TYPES_BY_NAME: Final = {kind.name: kind for kind in _LAYOUT}
+"""The types of numbers, by name."""
 
 
 def known_type(number: int) -> ParamType | int:
@@ -257,7 +258,7 @@ def known_type(number: int) -> ParamType | int:
     return _TYPES[number] if number < len(_TYPES) else number
 
 
-_TYPES: tuple[ParamType | int, ...] = (0, *TYPES_BY_NAME.values())
+_TYPES: tuple[ParamType | int, ...] = (0, *TYPES_BY_NAME.values(), ParamType.CUSTOM)
 
 
 def type_name(number: ParamType | int) -> str:
@@ -416,7 +417,7 @@ def from_bits(bits: int, number: int, *, is_raw: bool = False) -> WireValue:
     """
     if number == _REAL32:
         return _shortest_of_bits(bits)
-    if number == _CUSTOM:
+    if number == _CUSTOM and not is_raw:
         return _text_or_bytes(bits)
     layout = None if is_raw else _LAYOUTS.get(number)
     if layout is None:

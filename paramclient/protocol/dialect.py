@@ -111,7 +111,7 @@ class _Plain(Dialect):
     def param(self, name: str, raw: bytes, number: int, index: int | None, encoding: Encoding) -> Param:
         bits, is_raw = bits_of_wire(raw, number, encoding)
         value = from_bits(bits, number, is_raw=is_raw)
-        return Param(name, value, known_type(number), index, bits)
+        return Param(name, value, known_type(number), index, bits, is_raw=is_raw)
 
 
 class _Extended(Dialect):

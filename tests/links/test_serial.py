@@ -20,7 +20,7 @@ import anyio.lowlevel
 import pytest
 import serialx
 
-from paramclient.client import reconnect_delays
+from paramclient.client import link_task
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link, serial
 from paramclient.links.serial_transport import UNREAD_BYTES_MAX, Transport
@@ -121,9 +121,9 @@ async def test_unplugged_in_the_middle_of_a_download(
 
 @pytest.mark.asyncio
 async def test_unplugged_permanently(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnect_delays, "LINK_TIMEOUT", 0.2)
-    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.05)
-    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MAX", 0.1)
+    monkeypatch.setattr(link_task, "LINK_TIMEOUT", 0.2)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.05)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MAX", 0.1)
     vehicle = generic(stream=True)
     async with (
         asyncio.timeout(TIMEOUT),

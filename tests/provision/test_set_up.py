@@ -839,9 +839,9 @@ def tuned(vehicle: ArduPilotVehicle, count: int) -> ParamSet:
 
 def reads_after_the_last_set(tap: Tap) -> list[str]:
     """Return the names that were read by name after the last write."""
-    messages = [message for _, _, message in tap.received]
-    last = max(place for place, message in enumerate(messages) if isinstance(message, messages.ParamSet))
-    return [each.param_id for each in messages[last + 1 :] if isinstance(each, messages.ParamRequestRead)]
+    received = [message for _, _, message in tap.received]
+    last = max(place for place, message in enumerate(received) if isinstance(message, messages.ParamSet))
+    return [each.param_id for each in received[last + 1 :] if isinstance(each, messages.ParamRequestRead)]
 
 
 @in_simulated_time

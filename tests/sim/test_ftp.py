@@ -253,8 +253,8 @@ class TestSessions:
         vehicle.receive(file_request(Packet(2, 3, Opcode.OPEN_FILE_RO, path)), 0.0)
         vehicle.tick(0.1)
         framer = frames.Framer(stream=False)
-        frames = [frame for data in vehicle.data_to_send() for frame in framer.receive(data)]
-        assert sum(isinstance(messages.decode(frame), messages.StatusText) for frame in frames) == texts
+        sent = [frame for data in vehicle.data_to_send() for frame in framer.receive(data)]
+        assert sum(isinstance(messages.decode(frame), messages.StatusText) for frame in sent) == texts
 
     def test_px4_closes_a_session_after_11_s(self) -> None:
         pilot = Pilot(PX4Vehicle())
@@ -401,13 +401,11 @@ class TestSwitches:
     )
     def test_capabilities_have_the_ftp_bit(self, vehicle: Vehicle, has_it: bool) -> None:
         vehicle.tick(0.0)
-        ask = messages.CommandLong(1, 1, messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, (1.0,) + (0.0,) * 6)
+        ask = messages.CommandLong(1, 1, messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0)
         vehicle.receive(messages.encode(ask, system=255, component=190, sequence=0), 0.1)
         framer = frames.Framer(stream=False)
-        messages = [
-            messages.decode(frame) for data in vehicle.data_to_send() for frame in framer.receive(data)
-        ]
-        (version,) = [each for each in messages if isinstance(each, messages.AutopilotVersion)]
+        sent = [messages.decode(frame) for data in vehicle.data_to_send() for frame in framer.receive(data)]
+        (version,) = [each for each in sent if isinstance(each, messages.AutopilotVersion)]
         assert bool(version.capabilities & messages.CAPABILITY_FTP) is has_it
 
     @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])

@@ -76,10 +76,10 @@ class TestDecoding:
         records = [record for record in read(name) if record.frame is not None]
         framer = frames.Framer()
         stream = b"".join(record.data for record in records)
-        frames = [
+        found = [
             frame for at in range(0, len(stream), 100) for frame in framer.receive(stream[at : at + 100])
         ]
-        assert frames == [record.frame for record in records]
+        assert found == [record.frame for record in records]
         assert framer.skipped == 0
 
     @pytest.mark.parametrize("name", NAMES)
@@ -145,14 +145,14 @@ COMMITS = {
 """The commits of the recorded autopilots, and those that the simulated ones report instead."""
 
 
-def compared(messages: Messages) -> Messages:
+def compared(recorded: Messages) -> Messages:
     """Return the messages that a replay must reproduce, without unsolicited values.
 
     The first 3 s after a start PX4's heartbeat has the state 0; the simulated one has been on for longer.
     Recorded commits are replaced with the simulated ones.
     """
     kept: Messages = []
-    for time, message in messages:
+    for time, message in recorded:
         if isinstance(message, messages.StatusText) and message.text.startswith(OTHER_TEXTS):
             continue
         if isinstance(message, messages.Heartbeat) and message.system_status == 0:
@@ -231,12 +231,12 @@ def with_groups(name: str) -> ArduPilotVehicle:
     return vehicle
 
 
-def without_pushes(name: str, messages: Messages, start: float) -> Messages:
+def without_pushes(name: str, recorded: Messages, start: float) -> Messages:
     """Leave out PARAM_VALUEs after a time, except the first one after a set of its name."""
     sets = [record.message for record in from_ground(name) if record.time >= start]
     awaited = {message.param_id for message in sets if isinstance(message, messages.ParamSet)}
     kept: Messages = []
-    for time, message in messages:
+    for time, message in recorded:
         if isinstance(message, messages.ParamValue) and time >= start:
             if message.param_id not in awaited:
                 continue
@@ -285,15 +285,13 @@ class TestDifferences:
 
     def changed(self, at: int, *instead: tuple[float, messages.Message]) -> Messages:
         """Return the log with other messages in place of one response to a read or set."""
-        messages = compared(from_vehicle(self.NAME))
-        place = [place for place, (_, each) in enumerate(messages) if isinstance(each, messages.ParamValue)][
-            at
-        ]
-        return sorted([*messages[:place], *instead, *messages[place + 1 :]], key=lambda item: item[0])
+        log = compared(from_vehicle(self.NAME))
+        place = [place for place, (_, each) in enumerate(log) if isinstance(each, messages.ParamValue)][at]
+        return sorted([*log[:place], *instead, *log[place + 1 :]], key=lambda item: item[0])
 
     def answer(self, at: int) -> tuple[float, messages.ParamValue]:
-        messages = compared(from_vehicle(self.NAME))
-        return [(time, each) for time, each in messages if isinstance(each, messages.ParamValue)][at]
+        log = compared(from_vehicle(self.NAME))
+        return [(time, each) for time, each in log if isinstance(each, messages.ParamValue)][at]
 
     def test_the_original_log_passes(self) -> None:
         assert self.found(compared(from_vehicle(self.NAME))) == []

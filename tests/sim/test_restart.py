@@ -53,7 +53,7 @@ class Desk:
     def command(self, mode: float = 1.0) -> list[int]:
         """Send the reboot command; return the immediate responses."""
         self.received.clear()
-        self.send(messages.CommandLong(self.vehicle.system, 1, REBOOT, (mode, *[0.0] * 6)))
+        self.send(messages.CommandLong(self.vehicle.system, 1, REBOOT, mode))
         acks = self.messages(messages.CommandAck)
         assert acks == [messages.CommandAck(REBOOT, ack.result, 255, 190) for ack in acks]
         return [ack.result for ack in acks]

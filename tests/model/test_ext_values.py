@@ -9,26 +9,19 @@ import struct
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from paramclient.model.ext_params import (
-    EXT_VALUE_SIZE,
-    ExtParam,
-    ExtParamType,
-    ExtSettable,
-    ExtValue,
-    check_ext_value,
-    decode_ext_value,
-    encode_ext_value,
-)
 
 from paramclient.errors import UsageError
-from paramclient.model.values import TYPES_BY_NAME
+from paramclient.model.ext_values import (
+    EXT_VALUE_SIZE,
+    check_ext_value,
+    encode_ext_value,
+    ext_bytes,
+    ext_param,
+)
+from paramclient.model.values import Param, ParamType, Settable, Value, type_name
 
-KINDS = ExtParamType
+KINDS = ParamType
 NAN = struct.pack("<f", math.nan)
-
-
-def test_the_numeric_types_have_the_numbers_of_plain_ones() -> None:
-    assert {kind.name: int(kind) for kind in ExtParamType if kind is not ExtParamType.CUSTOM} == TYPES_BY_NAME
 
 
 @pytest.mark.parametrize(
@@ -55,20 +48,22 @@ def test_the_numeric_types_have_the_numbers_of_plain_ones() -> None:
         (0, b"", b""),
     ],
 )
-def test_values_of_every_type(number: int, value: ExtValue, raw: bytes) -> None:
+def test_values_of_every_type(number: int, value: Value, raw: bytes) -> None:
     assert encode_ext_value(value, number) == raw
     in_message = raw.ljust(EXT_VALUE_SIZE, b"\0")
-    assert decode_ext_value(in_message, number) == value
-    param = ExtParam.of("A", in_message, number, 3)
-    assert (param.name, param.value, param.type, param.index, param.raw) == ("A", value, number, 3, raw)
-    assert type(param.value) is type(value)
-    assert ExtParam.of("A", raw, number, 3) == param
+    param = ext_param("A", in_message, number, 3)
+    assert (param.name, param.type_number, param.index) == ("A", number, 3)
+    assert ext_bytes(param) == encode_ext_value(param.settable, number) == raw
+    assert type(param.settable) is type(value)
+    assert param.is_raw == (type_name(number) == f"TYPE_{number}")
+    assert param.is_raw or param.value == value
+    assert ext_param("A", raw, number, 3) == param
 
 
 @given(st.binary(max_size=128))
 def test_every_custom_value_can_be_set_again(data: bytes) -> None:
-    param = ExtParam.of("A", data.ljust(128, b"\0"), KINDS.CUSTOM)
-    assert encode_ext_value(param.value, KINDS.CUSTOM) == param.raw == data.rstrip(b"\0")
+    param = ext_param("A", data.ljust(128, b"\0"), KINDS.CUSTOM)
+    assert encode_ext_value(param.value, KINDS.CUSTOM) == ext_bytes(param) == data.rstrip(b"\0")
     if isinstance(param.value, str):
         assert check_ext_value(param.value) == param.value
 
@@ -85,11 +80,11 @@ def test_every_custom_value_can_be_set_again(data: bytes) -> None:
         ("5", KINDS.INT32, "'5' is not a number, and the parameter is INT32"),
         (b"5", KINDS.REAL32, "is not a number"),
         (5, KINDS.CUSTOM, "5 is not text or bytes, and the parameter is CUSTOM"),
-        ("5", 77, "'5' is not bytes, and the parameter is EXT_TYPE_77"),
+        ("5", 77, "'5' is not bytes, and the parameter is TYPE_77"),
         (5, 77, "is not bytes"),
     ],
 )
-def test_values_that_do_not_fit(value: ExtValue, number: int, words: str) -> None:
+def test_values_that_do_not_fit(value: Value, number: int, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         encode_ext_value(value, number)
 
@@ -106,19 +101,19 @@ def test_values_that_do_not_fit(value: ExtValue, number: int, words: str) -> Non
         (decimal.Decimal("sNaN"), "number in the range of a float"),
     ],
 )
-def test_invalid_extended_values_are_refused(value: ExtSettable, words: str) -> None:
+def test_invalid_extended_values_are_refused(value: Settable, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         check_ext_value(value)
 
 
 def test_equality_is_that_of_values() -> None:
-    def real(value: float) -> ExtParam:
-        return ExtParam.of("A", struct.pack("<f", value), KINDS.REAL32)
+    def real(value: float) -> Param:
+        return ext_param("A", struct.pack("<f", value), KINDS.REAL32)
 
     assert real(0.0).same_value(real(-0.0))
     assert not real(0.0).same_value(real(1.0))
-    assert ExtParam.of("A", NAN, KINDS.REAL32).same_value(ExtParam.of("A", NAN, KINDS.REAL32))
-    assert not ExtParam.of("A", b"", KINDS.CUSTOM).same_value(ExtParam.of("A", b"\x80", KINDS.CUSTOM))
-    assert not ExtParam.of("A", b"\1", KINDS.UINT8).same_value(ExtParam.of("A", b"\1", KINDS.INT8))
+    assert ext_param("A", NAN, KINDS.REAL32).same_value(ext_param("A", NAN, KINDS.REAL32))
+    assert not ext_param("A", b"", KINDS.CUSTOM).same_value(ext_param("A", b"\x80", KINDS.CUSTOM))
+    assert not ext_param("A", b"\1", KINDS.UINT8).same_value(ext_param("A", b"\1", KINDS.INT8))
     wide = [struct.pack("<d", value) for value in (0.0, -0.0)]
-    assert ExtParam.of("A", wide[0], KINDS.REAL64).same_value(ExtParam.of("A", wide[1], KINDS.REAL64))
+    assert ext_param("A", wide[0], KINDS.REAL64).same_value(ext_param("A", wide[1], KINDS.REAL64))
