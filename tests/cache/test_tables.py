@@ -119,7 +119,7 @@ def test_extended_parameters_are_apart(cache: ParamCache) -> None:
     assert cache.ext_sizes() == {(PX4.key, 100): 2}
     assert [(each.component, each.size) for each in cache.components()] == [(100, 0)]
     other = ext_param("P_0", b"tea", ParamType.CUSTOM, 0)
-    cache.save(update(StoredParam.of(other, NOW + 1, "us"), at=NOW + 1, component=100, extended=True))
+    cache.save(update(StoredParam.of(other, NOW + 1, by="us"), at=NOW + 1, component=100, extended=True))
     [entry] = cache.history("1", extended=True)
     assert (entry.old.value, entry.new and entry.new.value, entry.by) == ("café", "tea", "us")
     assert cache.history("1") == []
