@@ -12,7 +12,7 @@ from functools import partial
 from typing import Final
 
 import anyio
-from paramclient.protocol.vehicle.reboot_command import SAVING_TIME
+from paramclient.protocol.commands import SAVING_TIME
 
 from paramclient import (
     Component,
@@ -206,7 +206,6 @@ async def fetch_warm(session: Session) -> Measured:
 async def fetch(session: Session, vehicle: Component, *, refresh: bool = False) -> Measured:
     """Fetch everything, and compare it with the state before."""
     result = await vehicle.fetch_all(refresh=refresh, timeout=SLOWEST_FETCH)
-    await vehicle.refreshed(timeout=SLOWEST_FETCH)
     await session.check_fetched(vehicle, result)
     return reported(result)
 
