@@ -95,14 +95,16 @@ class CacheWriter:
         """Write all new values, warn of lost ones, and close the cache if it is owned.
 
         Args:
-            nodes: the components. The complete table of one that was not identified yet is written too.
+            nodes: the components. The complete table of one that was not identified yet is written too, and
+                the values of one whose cached table was not loaded yet.
         """
         if self.cache is None:
             return
         is_written = False
         with anyio.move_on_after(CLOSE_WAIT_MAX, shield=True):
             for node in nodes:
-                if node not in self._identities and any(each.table.is_complete for each in node.sessions):
+                is_known = node.identification.is_settled
+                if is_known or any(each.table.is_complete for each in node.sessions):
                     await self.load(node)
             is_written = await self.flush()
         if not is_written:
