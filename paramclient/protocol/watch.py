@@ -74,6 +74,7 @@ class Watch:
         self._policy = policy
         self._is_fetched = False
         self._is_doubted = False
+        self._is_due = False  # a sign of change was seen since the last check began
         self._download_time = math.inf
         self._signal = anyio.Event()
         self._holds = 0
@@ -90,7 +91,7 @@ class Watch:
     def fetched(self, elapsed: float | None) -> None:
         """Take note of a complete fetch; `elapsed` is the time of a download in seconds, or None."""
         self._is_fetched = True
-        self._is_doubted = False
+        self._is_doubted = self._is_due = False
         if elapsed is not None:
             self._download_time = elapsed
         self._signal.set()
@@ -107,23 +108,29 @@ class Watch:
     def doubt(self) -> None:
         """Check the table soon: there is a sign of change."""
         if self._is_fetched:
-            self._is_doubted = True
+            self._is_doubted = self._is_due = True
             self._signal.set()
 
     async def run(self) -> None:
         """Check until cancelled."""
         while True:
             self._signal = anyio.Event()
-            with anyio.move_on_after(None if math.isinf(self._wait) else self._wait):
+            if self._is_due:
+                self._signal.set()
+            with anyio.move_on_after(None if math.isinf(self._wait) else self._wait) as interval:
                 await self._signal.wait()
                 await anyio.sleep(SETTLING_TIME)
+            if not self._is_due and not interval.cancelled_caught:
+                continue
             if not self._may_check:
                 await anyio.sleep(SETTLING_TIME)
                 continue
+            self._is_due = False
             try:
                 await self._check()
             except NoReply:
                 await anyio.sleep(RETRY_INTERVAL)
+                self._is_due = True
 
     @property
     def _wait(self) -> float:
