@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import Final
 
 import anyio
@@ -16,6 +17,7 @@ from paramclient.errors import (
 )
 from paramclient.model.similar_names import did_you_mean, nearest_names
 from paramclient.model.values import Param
+from paramclient.protocol.channel import Inbox
 from paramclient.protocol.dialect import ReportedValue
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK, Message, ParamError
@@ -53,20 +55,25 @@ async def read(session: Session, which: str | int) -> ReportedValue:
         return message if isinstance(message, dialect.value) else None
 
     request = dialect.request_read(channel.target, which)
+
+    async def ask(inbox: Inbox) -> ReportedValue:
+        attempts, wait = channel.timing.attempts_max, _queue_time(session)
+        return await channel.exchange(request, inbox, accept, what=what, attempts=attempts, timeout_min=wait)
+
     async with channel.window:
         with channel.inbox((dialect.value, which)) as inbox:
             try:
-                return await channel.exchange(
-                    request, inbox, accept, what=what, timeout_min=_queue_time(session)
-                )
+                return await ask(inbox)
             except NoReply:
                 if which == HASH_CHECK or channel.is_lost(anyio.current_time()):
                     raise
                 control = await _control_read(session, which)
                 if control is None:
                     raise
-    if control.param_id == which:
-        return control
+            if control.param_id == which:
+                return control
+            with suppress(NoReply):  # it answers by now, and may only have been busy
+                return await ask(inbox)
     raise _unknown(session, which)
 
 
