@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -147,10 +146,3 @@ def test_a_forged_value_blocks_no_export(command: Command, put: Put, tmp_path: P
         saved = command("save", put(vehicle), path := tmp_path / form, "--format", form, "--no-cache")
         assert saved.code == 0, saved.err
         assert [*loads(path.read_bytes()).sets[0]] == ["A", "B"]
-
-
-def test_a_check_names_them(command: Command, put: Put) -> None:
-    vehicle = _Forged({"A": (ParamType.REAL32, 1.0), "B": (ParamType.REAL32, 2.0)})
-    checked: Any = command("check", put(vehicle), "--json").json
-    assert checked["link"]["unusable_names"] > 0
-    assert any("no parameter file can hold" in finding["text"] for finding in checked["findings"])
