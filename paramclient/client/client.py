@@ -392,8 +392,14 @@ class ParamClient:
             NoReply: no message with this id arrived in time.
             LinkError: the link failed, or the client was closed.
         """
-        before = component.identity
-        found = await self.component(system, component.component, timeout=timeout)
+        before, began = component.identity, anyio.current_time()
+
+        def choose() -> Node | None:
+            node = find(self.core.station.nodes.values(), system, component.component, None)
+            return node if node is not None and node.presence.received_at > began else None
+
+        awaited = address_in_words(system, component.component)
+        found = await self._wait_for(choose, awaited, timeout)
         with anyio.move_on_after(timeout), self.core.station.gate.until_closed():
             await found.node.identification.settled()
         if not before.is_same_vehicle(found.identity):

@@ -276,6 +276,8 @@ def value_text(param: WrittenParam) -> str:
     if isinstance(value, bytes):
         raw = format_value(value)
         raise UsageError(f"{param.name} is {raw}, which is not a number; json can keep it")
+    if isinstance(value, str):
+        raise UsageError(f"{param.name} is text, and not a number")
     if isinstance(value, float) and not math.isfinite(value):
         if not is_plain(value):
             raise UsageError(f"{param.name} is a NaN with payload bits; json can keep them")

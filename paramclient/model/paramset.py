@@ -120,7 +120,7 @@ class WrittenParam:
         return same_bits(param.type_number, bits, param.bits)
 
     def __str__(self) -> str:
-        kind = ParamType.REAL32 if self.type_number is None else self.type_number
+        kind = ParamType.REAL32 if self.type is None else self.type
         return f"{self.name} = {format_value(self.settable, kind)}"
 
 

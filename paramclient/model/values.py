@@ -222,7 +222,7 @@ class Param:
         )
 
     def __str__(self) -> str:
-        return f"{self.name} = {format_value(self.settable, self.type_number)}"
+        return f"{self.name} = {format_value(self.settable, self.type)}"
 
 
 def repr_of_param(param: DataclassInstance) -> str:

@@ -237,7 +237,9 @@ class Station:
 
     def _moves(self, node: Node, peer: Peer, message: Message, now: float) -> bool:
         """Return whether a component is at another peer now: its own is silent, or it is the same link."""
-        if now - node.presence.received_at > RIVAL_TIME or node.is_same_vehicle(message):
+        last = node.presence.received_at
+        is_gone = now - last > RIVAL_TIME or last < self.listening_since  # the link was opened again
+        if is_gone or node.is_same_vehicle(message):
             node.peer = peer
             node.rival = None
             return True

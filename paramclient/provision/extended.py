@@ -16,7 +16,8 @@ from paramclient.model.values import Param
 from paramclient.protocol.set_results import SetOutcome
 from paramclient.provision.apply_restore import BEFORE_RESTORE
 from paramclient.provision.callbacks import call_and_wait
-from paramclient.provision.restore_point import choose_restore_point
+from paramclient.provision.inspection import wait_for_identity
+from paramclient.provision.restore_point import load_state_before_apply
 from paramclient.provision.vehicle_params import BEFORE_APPLY, set_maker
 
 __all__ = [
@@ -237,12 +238,12 @@ async def load_extended_state(component: Component, when: float | None = None) -
         raise UsageError("the client keeps no cache")
 
     def load() -> ParamSet:
-        chosen = when
-        if chosen is None:
-            what = f"an apply of extended parameters to {component.system}/{number}"
-            chosen = choose_restore_point(cache.snapshots(key, number, extended=True), what).id
-        return cache.state_at(key, number, chosen, extended=True)
+        if when is None:
+            return load_state_before_apply(cache, key, number, extended=True)
+        return cache.state_at(key, number, when, extended=True)
 
+    await wait_for_identity(component)
+    await component.core.cache_writer.write_all()
     return await component.core.cache_writer.run_in_thread(load)
 
 
@@ -264,6 +265,7 @@ async def _write(
         return None if timeout is None else max(0.0, began + timeout - anyio.current_time())
 
     ext = component.ext
+    await wait_for_identity(component)
     plan = await verify_extended(component, wanted, timeout=timeout)
     if plan.changes and before_writing is not None:
         await call_and_wait(before_writing)
@@ -278,6 +280,7 @@ async def _write(
     cache = component.core.cache
     snapshot = None
     if cache is not None:
+        await component.core.cache_writer.write_all()
         kept = await component.core.cache_writer.run_in_thread(
             lambda: cache.store_snapshot(
                 component.identity, component.component, before, reason=reason, extended=True
