@@ -553,7 +553,7 @@ def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> P
 
 def received_in_words(client: ParamClient) -> str:
     """Return what was received so far on the link."""
-    return hint_of_link(client.core.station, client.link.name)
+    return hint_of_link(client.core.station, client.bytes_received)
 
 
 def _at_full_speed(url: str) -> str:

@@ -352,6 +352,9 @@ class Component:
                 f"{len(pairs)} writes to {self.system}/{self.component}", attempts=0, waited=elapsed
             )
             outcomes = [_ended(outcome, error) for outcome in outcomes]
+        hint = hint_of_node(self.core.station, self.node, anyio.current_time())
+        outcomes = [replace(each, error=_hinted(each.error, hint)) for each in outcomes]
+        error = _hinted(error, hint)
         if durable and any(outcome.is_set for outcome in outcomes):
             try:
                 await self._write_durably(f"{sum(each.is_set for each in outcomes)} values")
@@ -599,3 +602,7 @@ class Component:
 def _ended(outcome: SetOutcome, error: ParamClientError) -> SetOutcome:
     is_open = outcome.status in (SetStatus.NOT_TRIED, SetStatus.UNKNOWN) and outcome.error is None
     return replace(outcome, error=error) if is_open else outcome
+
+
+def _hinted(error: ParamClientError | None, hint: str) -> ParamClientError | None:
+    return error.with_hint(hint) if isinstance(error, NoReply) else error

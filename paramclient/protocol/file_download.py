@@ -16,7 +16,7 @@ __all__ = ["FileUnavailable", "download_file"]
 PARAM_FILE: Final = "@PARAM/param.pck"
 """The path of the file in MAVFTP."""
 WITH_DEFAULTS: Final = "?withdefaults=1"
-"""Requests the defaults too: ArduPilot from 4.4 on."""
+"""Requests the defaults too; a server that does not know it may report that there is no such file."""
 ARDUPILOT_WITH_DEFAULTS: Final = 0x04040000
 """flight_sw_version of the first ArduPilot of which every build adds the defaults: 4.4."""
 OPEN_ATTEMPTS_MIN: Final = 3
@@ -49,17 +49,22 @@ async def download_file(session: Session) -> int:
         LinkError: the link is closed for good.
     """
     identification = session.identification
-    adds_defaults = (
-        identification.is_ardupilot and identification.identity.firmware >= ARDUPILOT_WITH_DEFAULTS
-    )
-    path = PARAM_FILE + (WITH_DEFAULTS if adds_defaults else "")
+    query = WITH_DEFAULTS
+    attempts = 0
     reason = ""
-    for _ in range(ATTEMPTS_MAX):
+    while attempts < ATTEMPTS_MAX:
         requested_at = anyio.current_time()
         try:
-            pack = decode(await _read(session, path))
+            pack = decode(await _read(session, PARAM_FILE + query))
         except FileTransferError as error:
-            if error.code in (FileErrorCode.FILE_NOT_FOUND, FileErrorCode.UNKNOWN_COMMAND):
+            is_missing = error.code == FileErrorCode.FILE_NOT_FOUND
+            adds_defaults = identification.is_ardupilot and (
+                identification.identity.firmware >= ARDUPILOT_WITH_DEFAULTS
+            )
+            if is_missing and query and not adds_defaults:
+                query = ""
+                continue
+            if is_missing or error.code == FileErrorCode.UNKNOWN_COMMAND:
                 session.serves_file = False
             raise FileUnavailable(f"the parameter file was refused: {error.reason}") from None
         except NoReply as error:
@@ -68,9 +73,11 @@ async def download_file(session: Session) -> int:
             raise FileUnavailable("MAVFTP did not answer") from None
         except PackError as error:
             reason = f"the parameter file is not valid: {error}"
+            attempts += 1
             continue
         if not pack.entries or len(pack.entries) != pack.total:
             reason = f"the parameter file has {len(pack.entries)} of {pack.total} parameters"
+            attempts += 1
             continue
         session.serves_file = True
         _store(session, pack, requested_at)

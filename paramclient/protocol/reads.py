@@ -74,7 +74,7 @@ async def read(session: Session, which: str | int) -> ReportedValue:
                 return control
             with suppress(NoReply):  # it answers by now, and may only have been busy
                 return await ask(inbox)
-    raise _unknown(session, which)
+    raise _unknown(session, which, ": it does not respond to reads of this name, but to others")
 
 
 async def read_many(
@@ -154,13 +154,13 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
             return None
 
 
-def _unknown(session: Session, which: str | int) -> UnknownParameter:
+def _unknown(session: Session, which: str | int, reason: str = "") -> UnknownParameter:
     system, component = session.channel.target
     name, index = (which, None) if isinstance(which, str) else (None, which)
     nearest = () if name is None else nearest_names(name, session.table.params)
-    what = f"{'' if name else 'parameter with index '}{which}"
+    what = f"{'' if name else 'parameter with index '}{which}{reason}"
     return UnknownParameter(
-        f"{system}/{component} has no {what}.{did_you_mean(nearest)}",
+        f"{system}/{component} has no {what}{'.' if nearest else ''}{did_you_mean(nearest)}",
         system=system,
         component=component,
         name=name,

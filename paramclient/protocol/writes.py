@@ -145,8 +145,9 @@ async def write_many(
         async with limiter:
             if failures:
                 return
-            outcomes[place] = replace(outcomes[place], status=SetStatus.UNKNOWN)
             try:
+                await _learn_type(session, name)
+                outcomes[place] = replace(outcomes[place], status=SetStatus.UNKNOWN)
                 result = await write(session, name, value, settle=settle, force=force, author=author)
             except (NoReply, LinkError) as error:
                 failures.append(error)
