@@ -11,12 +11,7 @@ from contextlib import ExitStack, suppress
 from typing import Any, Final
 from unittest import mock
 
-from fuzz.draw import Draw
-from paramclient.errors import ContestedAddress, NoReply, ParamClientError, UsageError
-from paramclient.model.values import Encoding, Param, Trust, WireValue, known_type
-from paramclient.protocol import station, wire
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.ftp import FileRead
 from paramclient.protocol.params import change_origin, table
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import Policy
@@ -25,11 +20,17 @@ from paramclient.protocol.params.reads import ValueRead
 from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.station import Station
 from paramclient.protocol.stats import traffic
 from paramclient.protocol.vehicle.metadata_request import MetadataRequest
 from paramclient.protocol.vehicle.reboot_command import Reboot
 from paramclient.protocol.wire import HASH_CHECK, NO_INDEX, Framer, Message
+
+from fuzz.draw import Draw
+from paramclient.errors import ContestedAddress, NoReply, ParamClientError, UsageError
+from paramclient.model.values import Encoding, Param, Trust, WireValue, known_type
+from paramclient.protocol import station, wire
+from paramclient.protocol.ftp import FileRead
+from paramclient.protocol.station import Station
 
 __all__ = ["INPUT_SIZE_MAX", "run"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from paramclient.errors import PackError
-from paramclient.protocol.ftp import param_pck
+from paramclient.protocol import param_pck
 
 __all__ = ["INPUT_SIZE_MAX", "run"]
 

@@ -30,6 +30,7 @@ from paramclient.errors import (
     ParamClientError,
     UsageError,
 )
+from paramclient.links.replay import ReplayLink
 from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.params import ParamMap
 from paramclient.model.values import Encoding, Param, Settable, WireValue
@@ -448,7 +449,8 @@ class Component:
         if refresh and (self.policy is not Policy.AUTO or self.core.station.listens_only):
             raise UsageError("refresh needs a download, and this client may not request one")
         began = anyio.current_time()
-        if timeout is None and self.core.station.listens_only and not self.core.is_over:
+        is_log = isinstance(self.core.link, ReplayLink)
+        if timeout is None and self.core.station.listens_only and not is_log:
             timeout = PASSIVE_TIMEOUT
         with anyio.move_on_after(timeout), self._explained(began):
             if not refresh:
@@ -461,10 +463,15 @@ class Component:
         return result_of(self.session, "stream", began, [TIMEOUT_NOTE])
 
     async def _listen(self, began: float) -> FetchResult:
-        """Wait until the table is complete by what other stations request, or a log has ended."""
-        while not self.session.table.is_complete and not self.core.is_over:
+        """Wait until the table is complete by what other stations request, or until a log has ended."""
+        table, is_log = self.session.table, isinstance(self.core.link, ReplayLink)
+        while not self.core.is_over and (is_log or not table.is_complete):
             await self.core.link_task.activity.wait()
             self.core.check_open()
+        if not table.params:
+            what = f"the parameters of {self.system}/{self.component}"
+            raise NoReply(what, attempts=0, waited=anyio.current_time() - began)
+        self.session.confirm_announced()
         return result_of(self.session, "stream", began, [])
 
     def _fetched(self, result: FetchResult) -> FetchResult:

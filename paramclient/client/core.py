@@ -161,4 +161,7 @@ class ClientCore:
 
     def _link_ended(self) -> None:
         self.is_over = not self.station.gate.is_closed
+        if self.is_over:
+            for node in self.station.nodes.values():
+                node.presence.is_over = True
         self._ended()

@@ -82,6 +82,7 @@ class _Import:
         self._at = 0.0
         self._observed: dict[Session, list[StoredParam]] = {}
         self._removed: dict[Session, dict[str, float]] = {}
+        self._complete_at: dict[Session, float] = {}
         self._station = Station(
             link=name,
             is_stream=False,
@@ -101,8 +102,9 @@ class _Import:
                 await anyio.lowlevel.checkpoint()
         nodes = [node for _, node in sorted(self._station.nodes.items())]
         nodes = [node for node in nodes if node.plain.table.params or node.extended.table.params]
-        updates = [self._update(node, session) for node in nodes for session in node.sessions]
-        updates = [update for update in updates if update.params]
+        updates = [self._sighting(node) for node in nodes]
+        updates += [self._update(node, session) for node in nodes for session in node.sessions]
+        updates = [update for update in updates if update.params or update.table is None]
         await anyio.to_thread.run_sync(partial(self._cache.merge, updates))
         return tuple(_imported_table(node) for node in nodes)
 
@@ -113,6 +115,8 @@ class _Import:
                 self._station.receive(frame, LOG_PEER, self._at)
 
     def _take_change(self, node: Node, session: Session, change: Change) -> None:
+        if session.table.is_complete:
+            self._complete_at.setdefault(session, self._at)
         if change.new is None:
             self._removed.setdefault(session, {})[change.name] = self._at
         else:
@@ -120,10 +124,20 @@ class _Import:
                 StoredParam.of(change.new, self._at, None, change.by)
             )
 
+    def _sighting(self, node: Node) -> TableUpdate:
+        """Return that the vehicle was there at the beginning."""
+        who = node.identification
+        return TableUpdate(
+            identity=who.identity,
+            component=node.component,
+            autopilot=who.autopilot or 0,
+            at=node.since,
+            params=[],
+        )
+
     def _update(self, node: Node, session: Session) -> TableUpdate:
         table, observed = session.table, self._observed.get(session, [])
-        if session.announced is not None and session.announced.count == table.count and table.is_complete:
-            table.confirm(session.announced.hash)
+        session.confirm_announced()
         volatile = table.volatile if table.volatile_is_known else None
         last = [
             StoredParam.of(param, table.moments[name], None if volatile is None else name in volatile)
@@ -133,13 +147,13 @@ class _Import:
             identity=node.identification.identity,
             component=node.component,
             autopilot=node.identification.autopilot or 0,
-            at=self._at,
+            at=node.presence.received_at,
             table=TableState(
                 hash=table.hash if table.is_complete else None,
                 count=table.count,
                 complete=table.is_complete,
                 volatile_known=table.volatile_is_known,
-                synced_at=self._at if table.is_complete else None,
+                synced_at=self._complete_at.get(session) if table.is_complete else None,
             ),
             params=[*observed, *last],
             removed=self._removed.get(session, {}),

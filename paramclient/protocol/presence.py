@@ -39,6 +39,7 @@ class Presence:
         base_mode: of the last heartbeat; None before the first.
         is_booting: whether the last heartbeat has MAV_STATE_BOOT.
         clock_at: when the last time since boot arrived; minus infinity before the first.
+        is_over: whether nothing more can arrive, since a log has ended: silence shows nothing then.
     """
 
     def __init__(self) -> None:
@@ -47,6 +48,7 @@ class Presence:
         self.base_mode: int | None = None
         self.is_booting = False
         self.clock_at = -math.inf
+        self.is_over = False
         self.beat_at = -math.inf
         self._interval = math.inf  # the shortest between two heartbeats
         self._is_high_latency = False
@@ -56,6 +58,8 @@ class Presence:
     @property
     def timeout(self) -> float:
         """Seconds of silence after which the component is lost; infinity before the first heartbeat."""
+        if self.is_over:
+            return math.inf
         if self._is_high_latency:
             return LOST_AFTER_HIGH_LATENCY
         if self.beat_at == -math.inf:

@@ -185,6 +185,12 @@ class Session:
             self._locks = {each: lock for each, lock in self._locks.items() if lock.locked()}
         return self._locks.setdefault(name, anyio.Lock())
 
+    def confirm_announced(self) -> None:
+        """Confirm a complete table by the hash that was received last, if it is of as many parameters."""
+        table, announced = self.table, self.announced
+        if announced is not None and announced.count == table.count and table.is_complete:
+            table.confirm(announced.hash)
+
     def report(self, received: int, total: int | None) -> None:
         """Report the progress of a fetch."""
         for observer in list(self.observers):

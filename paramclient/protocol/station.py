@@ -221,7 +221,8 @@ class Station:
                 boot_ms = int.from_bytes(frame.payload[at : at + 4], "little")
                 node.boot_clock(frame.message_id, boot_ms, now)
             return
-        if (system, component) == self.own_address or system == 0:
+        is_own = (system, component) == self.own_address and not self.listens_only
+        if is_own or system == 0:
             return
         if isinstance(message, ParamSet | ParamExtSet):
             self._take_foreign_set(message, frame, now)
