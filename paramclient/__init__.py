@@ -2,7 +2,8 @@
 
 - `client`: the client over a link.
 - `sync`: the same client for scripts and notebooks, without `await`.
-- `protocol`, `links`: the sans-I/O core, and the bytes in and out.
+- `protocol`, `wire`, `links`: the conversations with a component, messages from and to bytes, the bytes in
+  and out.
 - `cache`, `files`, `metadata`, `logs`, `provision`: cached tables, parameter files, units
   and ranges, telemetry logs, setting up vehicles, the check of a vehicle.
 - `model`, `errors`, `version`: plain data, exceptions, the version.
@@ -17,12 +18,12 @@ from __future__ import annotations
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component, ComponentState
-from paramclient.client.events import Discovered, Event, Found, Lost, Rebooted, Resynced
+from paramclient.client.events import Discovered, Event, Events, Found, Lost, Rebooted, Resynced
 from paramclient.client.files import Ftp
 from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.reset import ResetResult
 from paramclient.client.signing import Signing, read_key
-from paramclient.client.streams import Changes, Events
+from paramclient.client.streams import Changes
 from paramclient.errors import (
     AlreadyRestored,
     AmbiguousVehicle,

@@ -1,14 +1,20 @@
-"""Events of the components of a client."""
+"""Events of the components of a client, and their stream."""
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+from paramclient.client.streams import Stream
 
 if TYPE_CHECKING:
     from paramclient.client.component import Component
 
-__all__ = ["Discovered", "Event", "Found", "Lost", "Rebooted", "Resynced"]
+__all__ = ["Discovered", "Event", "Events", "Found", "Lost", "Rebooted", "Resynced"]
+
+EVENTS_MAX: Final = 1_000
+"""Queued events for a consumer, at most. Above it, the oldest are dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,3 +82,19 @@ class Resynced:
 
 
 Event: TypeAlias = Discovered | Lost | Found | Rebooted | Resynced
+
+
+class Events(Stream[Event]):
+    """Stream of the component events since its creation; see `ParamClient.events`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._waiting: deque[Event] = deque(maxlen=EVENTS_MAX)
+
+    def push(self, item: Event) -> None:
+        """Add an event."""
+        self._waiting.append(item)
+        self._arrived.set()
+
+    def _take(self) -> Event | None:
+        return self._waiting.popleft() if self._waiting else None

@@ -1,27 +1,23 @@
-"""Asynchronous streams: parameter changes of one component, and component events of a client."""
+"""Asynchronous streams of items, and of the parameter changes of one component."""
 
 from __future__ import annotations
 
 import weakref
 from abc import abstractmethod
-from collections import deque
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from typing import Final, Generic, TypeVar
 
 import anyio
 
-from paramclient.client.events import Event
 from paramclient.errors import ParamClientError
 from paramclient.protocol.events import Change
 
-__all__ = ["Changes", "Events", "Stream", "Subscribers"]
+__all__ = ["Changes", "Stream", "Subscribers"]
 
 CHANGES_MAX: Final = 100_000
 """Queued changes for a consumer, one for each name, at most: more than a table holds. Above it, the oldest
 are dropped."""
-EVENTS_MAX: Final = 1_000
-"""Queued events for a consumer, at most. Above it, the oldest are dropped."""
 
 Item = TypeVar("Item")
 
@@ -85,22 +81,6 @@ class Changes(Stream[Change]):
 
     def _take(self) -> Change | None:
         return self._waiting.pop(next(iter(self._waiting))) if self._waiting else None
-
-
-class Events(Stream[Event]):
-    """Stream of the component events since its creation; see `ParamClient.events`."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._waiting: deque[Event] = deque(maxlen=EVENTS_MAX)
-
-    def push(self, item: Event) -> None:
-        """Add an event."""
-        self._waiting.append(item)
-        self._arrived.set()
-
-    def _take(self) -> Event | None:
-        return self._waiting.popleft() if self._waiting else None
 
 
 class Subscribers(Generic[Item]):

@@ -85,8 +85,8 @@ class ParamType(IntEnum):
     REAL32 = 9
     REAL64 = 10
     CUSTOM = 11
-    """Text or bytes, of extended parameters only (MAV_PARAM_EXT_TYPE). A plain parameter of this number has an
-    unknown type."""
+    """Text or bytes, of extended parameters only (MAV_PARAM_EXT_TYPE). A plain parameter of this number has
+    an unknown type."""
 
     @property
     def size(self) -> int:

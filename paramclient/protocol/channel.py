@@ -45,8 +45,6 @@ LATE_GRACE: Final = 0.02
 """Seconds for which a stalled program looks once more for the answer."""
 WINDOW: Final = 12
 """Requests in flight: ArduPilot's queue of reads has 20 places, and its overflow is dropped silently."""
-WINDOW_PX4: Final = 60
-"""Requests in flight to a PX4, which answers each at once."""
 
 
 class Gate:
@@ -125,7 +123,7 @@ class Gate:
             self.check()
 
 
-class Presence(Protocol):
+class Liveness(Protocol):
     """What a channel asks about its component; see `paramclient.protocol.presence`."""
 
     received_at: float
@@ -213,7 +211,7 @@ class Channel:
         component: int,
         transmit: Callable[[Message], None],
         gate: Gate,
-        presence: Presence,
+        presence: Liveness,
     ) -> None:
         self.system = system
         self.component = component

@@ -26,7 +26,7 @@ M = TypeVar("M")
 REBOOT_SILENCE = 0.2
 """Seconds without a message that a rebooting vehicle is off, at least: an ArduPilot is off 0.2 to 0.3 s after
 its acknowledgement (measured)."""
-POLL_INTERVAL = 0.02
+PRESENCE_INTERVAL = 0.02
 """Seconds between two looks at the presence of a vehicle that reboots."""
 SAVING_TIME = 2.5
 """Seconds from a write until a PX4 has saved it: 0.3 s after it, and at most every 2 s (measured)."""
@@ -127,13 +127,13 @@ async def _wait_until_off(node: Node, generation: int) -> None:
     while node.generation == generation:
         if anyio.current_time() - node.presence.received_at >= REBOOT_SILENCE:
             return
-        await anyio.sleep(POLL_INTERVAL)
+        await anyio.sleep(PRESENCE_INTERVAL)
 
 
 async def _wait_until_back(node: Node, generation: int) -> None:
     """Wait until the vehicle is heard again, and does not boot any more."""
     silent_since = node.presence.received_at
     while node.generation == generation and node.presence.received_at == silent_since:  # noqa: ASYNC110 - a state
-        await anyio.sleep(POLL_INTERVAL)
+        await anyio.sleep(PRESENCE_INTERVAL)
     while node.presence.is_booting or node.presence.is_lost:  # noqa: ASYNC110 - a state, without an event
-        await anyio.sleep(POLL_INTERVAL)
+        await anyio.sleep(PRESENCE_INTERVAL)

@@ -22,7 +22,7 @@ ARDUPILOT_WITH_DEFAULTS: Final = 0x04040000
 OPEN_ATTEMPTS_MIN: Final = 3
 OPEN_LOST: Final = 1e-3
 """Probability that all requests to open the file are lost, at which the list is taken instead."""
-ATTEMPTS_MAX: Final = 2
+DOWNLOADS_MAX: Final = 2
 """Downloads of the file: one can be a mixture, if the table changes meanwhile."""
 
 
@@ -52,7 +52,7 @@ async def download_file(session: Session) -> int:
     query = WITH_DEFAULTS
     attempts = 0
     reason = ""
-    while attempts < ATTEMPTS_MAX:
+    while attempts < DOWNLOADS_MAX:
         requested_at = anyio.current_time()
         try:
             pack = decode(await _read(session, PARAM_FILE + query))

@@ -44,7 +44,7 @@ BLOCK_INTERVALS: Final = 8
 """Mean intervals between two blocks after which a burst counts as over."""
 READS_AT_ONCE: Final = 4
 """Reads sent at once: ArduPilot's queue of MAVFTP requests has 5 places, and drops the surplus silently."""
-READ_INTERVAL: Final = 0.006
+BLOCK_INTERVAL: Final = 0.006
 """Seconds in which a vehicle serves one read: ArduPilot sends a block every 5.9 ms (measured)."""
 READS_MAX: Final = 64
 """Reads in flight, at most: what a round trip of 400 ms holds."""
@@ -491,7 +491,7 @@ class _FileReader:
                     continue
                 del in_flight[at]
             copies = max(1, min(timing.copies, READS_AT_ONCE // max(len(waiting) + len(in_flight), 1)))
-            allowed = int(min((now - paced_at) / READ_INTERVAL, READS_AT_ONCE))
+            allowed = int(min((now - paced_at) / BLOCK_INTERVAL, READS_AT_ONCE))
             while waiting and allowed > 0 and len(in_flight) < READS_MAX:
                 at = waiting.popleft()
                 if self._pieces.has(at):
@@ -510,7 +510,7 @@ class _FileReader:
             if in_flight:
                 due = min(due for _, due in in_flight.values())
                 if waiting:
-                    due = min(due, now + READ_INTERVAL * READS_AT_ONCE)
+                    due = min(due, now + BLOCK_INTERVAL * READS_AT_ONCE)
                 with anyio.move_on_after(max(due - now, 0.001)):
                     self._take_read(_answer(await self._inbox.next()))
 

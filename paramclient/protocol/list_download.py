@@ -20,7 +20,7 @@ LIST_TIMEOUT_MIN: Final = 0.2
 """Seconds to wait for the first value of a list, at least: a second request makes the list begin again."""
 PAUSE_PX4: Final = 0.12
 """Seconds without a value after which a PX4's list has ended: it sends 20 values every 20 ms."""
-PAUSE_MAX: Final = 0.6
+PAUSE_OTHERS: Final = 0.6
 """The same for other components: ArduPilot's list pauses for up to 0.5 s while it serves reads."""
 PAUSE_INTERVALS: Final = 8
 """Mean intervals between two values after which a slow list has ended: PX4 sends 8 values a second in its
@@ -31,7 +31,7 @@ READS_PER_SECOND_ARDUPILOT: Final = 49.0
 """Reads that an ArduPilot serves in a second: five in every 100 ms."""
 PASS_OVERHEAD: Final = 0.15
 """Seconds that another pass of the list takes beside its values."""
-POLL_INTERVAL: Final = 0.02
+GAPS_INTERVAL: Final = 0.02
 """Seconds after which gaps are looked at again without a new value."""
 
 
@@ -127,7 +127,7 @@ class _Download:
             await self._read_gaps()
         else:
             while not self._is_over():
-                await self._take_for(POLL_INTERVAL)
+                await self._take_for(GAPS_INTERVAL)
             while (missing := self._missing()) and not self._is_silent():
                 seconds_left = len(self.table.names) / self._rate() + PASS_OVERHEAD
                 if len(missing) / READS_PER_SECOND_ARDUPILOT <= seconds_left:
@@ -146,7 +146,7 @@ class _Download:
         self._last = anyio.current_time()
         with anyio.move_on_after(seconds + self.channel.timing.timeout(0)):
             while self._missing() and not self._is_over():
-                await self._take_for(POLL_INTERVAL)
+                await self._take_for(GAPS_INTERVAL)
 
     async def _read_gaps(self) -> None:
         """Read what is missing, each index again when its time is over; several copies of the last ones."""
@@ -165,7 +165,7 @@ class _Download:
             if self._is_over() and all(self._is_given_up(index, now) for index in gaps):
                 return
             await channel.gate.wait()
-            await self._take_for(POLL_INTERVAL)
+            await self._take_for(GAPS_INTERVAL)
 
     def _request(self, gaps: list[int], now: float) -> None:
         """Send the reads that are due, as many as the window holds."""
@@ -202,7 +202,7 @@ class _Download:
         """Return whether the list has ended: by its last index, or by a pause."""
         if self._count is not None and self._reached >= self._count - TAIL:
             return True
-        pause = PAUSE_PX4 if self.reads_beside else PAUSE_MAX
+        pause = PAUSE_PX4 if self.reads_beside else PAUSE_OTHERS
         if self._received:
             pause = max(pause, PAUSE_INTERVALS * (self._last - self._began) / len(self._received))
         return anyio.current_time() - self._last > min(pause, self.channel.silence_max)

@@ -17,7 +17,7 @@ from paramclient.protocol.events import Change
 from paramclient.protocol.identity import Identification
 from paramclient.protocol.table import Table
 
-__all__ = ["Replaced", "Session", "Shared", "Spawn"]
+__all__ = ["ReplacedValue", "Session", "Shared", "Spawn"]
 
 T = TypeVar("T")
 
@@ -111,7 +111,7 @@ class _Run(Generic[T]):
 
 
 @dataclass(slots=True)
-class Replaced:
+class ReplacedValue:
     """The value before a write, while an answer to an earlier read may still bring it.
 
     Attributes:
@@ -164,7 +164,7 @@ class Session:
         self.serves_file: bool | None = None
         self.announced: Digest | None = None
         self.written_at = -math.inf
-        self.replaced: defaultdict[str, list[Replaced]] = defaultdict(list)
+        self.replaced: defaultdict[str, list[ReplacedValue]] = defaultdict(list)
         self.observers: set[Callable[[int, int | None], None]] = set()
         self._locks: dict[str, anyio.Lock] = {}
         self._foreign_sets: dict[str, tuple[str, float]] = {}

@@ -35,7 +35,7 @@ from paramclient.model.values import (
 )
 from paramclient.protocol.channel import Inbox
 from paramclient.protocol.reads import read, refusal
-from paramclient.protocol.session import Replaced, Session
+from paramclient.protocol.session import ReplacedValue, Session
 from paramclient.protocol.set_results import SetOutcome, SetResult, SetStatus
 from paramclient.wire.messages import Message, ParamError, ParamExtAck, StatusText
 
@@ -98,7 +98,7 @@ async def write(
             before = session.table.params[name]
             result = await _Write(session, name, value).run()
             if session.identification.is_ardupilot and not result.param.same_value(before):
-                late = Replaced(before, anyio.current_time() + LATE_ANSWER_TIME)
+                late = ReplacedValue(before, anyio.current_time() + LATE_ANSWER_TIME)
                 session.replaced[name].append(late)
                 session.spawn(_ignore_late_answers, session, late)
             if settle > 0:
@@ -378,7 +378,7 @@ async def _learn_type(session: Session, name: str) -> None:
         await read(session, name)
 
 
-async def _ignore_late_answers(session: Session, late: Replaced) -> None:
+async def _ignore_late_answers(session: Session, late: ReplacedValue) -> None:
     """Let the value before a write be ignored for its time; read the present one if it was received."""
     name = late.param.name
     await anyio.sleep_until(late.until)

@@ -12,7 +12,6 @@ from functools import partial
 from typing import Final
 
 import anyio
-from paramclient.protocol.commands import SAVING_TIME
 
 from paramclient import (
     Component,
@@ -20,7 +19,7 @@ from paramclient import (
     ParamClient,
     Rebooted,
 )
-from paramclient.client.streams import Events
+from paramclient.client.events import Events
 from paramclient.errors import (
     ParamClientError,
     Refused,
@@ -30,6 +29,7 @@ from paramclient.errors import (
 )
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, type_name
+from paramclient.protocol.commands import SAVING_TIME
 from paramclient.provision import ApplyStatus, apply, restore
 from tests.live.choice import another_value
 from tests.live.journal import check_disarmed
