@@ -123,6 +123,7 @@ class CacheWriter:
         kept = self._identities.get(node)
         if self.cache is None or (kept is not None and kept.key == identity.key):
             self._identities[node] = identity
+            self._wake()
             return
         cache = self.cache
         for session in node.sessions:
@@ -191,7 +192,8 @@ class CacheWriter:
         if cache is None:
             return not durable
         async with self._flushing:
-            taken = [(node, session) for node in self._identities for session in node.sessions]
+            certain = [node for node in self._identities if node.identification.is_confirmed]
+            taken = [(node, session) for node in certain for session in node.sessions]
             taken = [(node, session) for node, session in taken if session in self._pending]
             before = {session: self._pending.pop(session) for _, session in taken}
             updates = [self._update(node, session, before[session]) for node, session in taken]

@@ -447,7 +447,9 @@ class Component:
         """
         self.core.check_open()
         if refresh and (self.policy is not Policy.AUTO or self.core.station.listens_only):
-            raise UsageError("refresh needs a download, and this client may not request one")
+            is_auto = self.policy is Policy.AUTO
+            why = "this client only listens" if is_auto else f"the policy is {self.policy}"
+            raise UsageError(f"refresh needs a download, and {why}")
         began = anyio.current_time()
         is_log = isinstance(self.core.link, ReplayLink)
         if timeout is None and self.core.station.listens_only and not is_log:
@@ -480,7 +482,9 @@ class Component:
             raise CacheError(
                 f"nothing is cached of {self.system}/{self.component}, and nothing may be downloaded"
             )
-        if result.complete and (result.source != "cache" or self.policy is not Policy.CACHE_ONLY):
+        if result.source == "cache" and result.hash is None:
+            self.watch.unconfirmed()
+        elif result.complete:
             self.watch.fetched(None if result.source == "cache" else result.elapsed)
             self.core.cache_writer.fetched(self.session, result)
         return result

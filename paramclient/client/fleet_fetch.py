@@ -9,7 +9,7 @@ from functools import partial
 import anyio
 
 from paramclient.client.component import Component
-from paramclient.errors import CacheError, NoReply
+from paramclient.errors import CacheError, NoReply, ParamClientError
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.fetch import FetchResult, Progress
 
@@ -46,10 +46,12 @@ async def fetch_components(
 
     Raises:
         NoReply: none responded.
+        UsageError: `refresh` is given, and the client may not download.
         LinkError: the link failed, or the client was closed.
     """
     results: dict[Address, FetchResult] = {}
     silent: dict[Address, NoReply | CacheError] = {}
+    failures: list[ParamClientError] = []
     states: dict[Address, Progress] = {}
 
     def report(address: Address, state: Progress) -> None:
@@ -64,10 +66,15 @@ async def fetch_components(
             )
         except (NoReply, CacheError) as error:
             silent[address] = error
+        except ParamClientError as error:
+            failures.append(error)
+            tasks.cancel_scope.cancel()
 
     async with anyio.create_task_group() as tasks:
         for address, component in components.items():
             tasks.start_soon(fetch, address, component)
+    if failures:
+        raise failures[0]
     if silent and not results:
         raise next(iter(silent.values()))
     return FetchedAll(results, silent)

@@ -113,6 +113,8 @@ class Gate:
         Raises:
             LinkError: the link has failed for good; the block was cancelled.
         """
+        if self._is_closed:
+            self.check()
         with anyio.CancelScope() as scope:
             self._waits.add(scope)
             try:

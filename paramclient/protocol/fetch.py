@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final, Literal, TypeAlias
 
@@ -106,7 +106,7 @@ class FetchResult:
     @property
     def complete(self) -> bool:
         """Whether every parameter of the list is known."""
-        return not self.missing
+        return self.count > 0 and not self.missing
 
     def __repr__(self) -> str:
         missing = f", {len(self.missing)} missing" if self.missing else ""
@@ -171,15 +171,16 @@ class _Fetch:
     async def run(self, *, refresh: bool) -> FetchResult:
         """Fetch, and return the result."""
         if self.policy is Policy.CACHE_ONLY:
-            return self._result("cache")
+            return self._unconfirmed()
         can_confirm = self.table.is_complete or self.policy is Policy.HASH_ONLY
         digest = await request_digest(self.session) if can_confirm else None
         if not refresh and is_current(self.session, digest):
             self.table.verify()
-            await self._read_unverified()
+            if self.policy is Policy.AUTO:
+                await self._read_unverified()
             return self._result("cache")
         if self.policy is Policy.HASH_ONLY:
-            return self._result("cache")
+            return self._unconfirmed()
         source = await self._download()
         for _ in range(REPAIRS_MAX):
             if not self.table.is_complete or self.listed.missing or await self._settle(digest):
@@ -236,6 +237,11 @@ class _Fetch:
             await read_many(self.session, self.table.unverified(), lambda name, result: None)
         except* NoReply:
             self.notes.append("Some values outside the vehicle's hash could not be read.")
+
+    def _unconfirmed(self) -> FetchResult:
+        """Return the table as it is cached."""
+        self.notes.append(f"The vehicle has not confirmed the cached table: the policy is {self.policy}.")
+        return replace(self._result("cache"), hash=None)
 
     def _result(self, source: FetchSource) -> FetchResult:
         lost, repeated = self.listed.lost, self.listed.repeated

@@ -84,6 +84,8 @@ class Identification:
         capabilities: of AUTOPILOT_VERSION; None before it.
         encoding, encoding_reason: the parameter encoding and its evidence.
         is_settled: whether `identity` is as complete as it gets: the version was received, or never will be.
+        is_confirmed: whether a vehicle with a hardware id has reported it since it was lost, has rebooted or
+            its link was interrupted; until then, values may be of another vehicle.
     """
 
     def __init__(
@@ -95,6 +97,7 @@ class Identification:
         self.capabilities: int | None = None
         self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
         self.is_settled = False
+        self.is_confirmed = True
         self._chosen = chosen
         self._listens_only = listens_only
         self._changed = anyio.Event()
@@ -178,6 +181,7 @@ class Identification:
         )
         is_another = before.uid is not None and before.key != self.identity.key
         self.capabilities = message.capabilities
+        self.is_confirmed = True
         self.settle()
         return is_another
 
@@ -185,6 +189,10 @@ class Identification:
         """Take the identity as it is: no more of it will be received."""
         self.is_settled = True
         self._derive()
+
+    def doubt(self) -> None:
+        """Take note that another vehicle may use the address."""
+        self.is_confirmed = self.identity.uid is None
 
     def forget(self) -> None:
         """Forget everything: another vehicle uses the address."""

@@ -75,10 +75,6 @@ async def download_list(session: Session) -> ListResult:
     return download.result
 
 
-def _any(message: Message) -> Message:
-    return message
-
-
 class _Read(NamedTuple):
     attempts: int
     sent: float
@@ -110,16 +106,24 @@ class _Download:
         """Request the list until its first value arrives."""
         channel = self.channel
         self._began = anyio.current_time()
-        first = await channel.exchange(
+        first: Message = await channel.exchange(
             self.session.dialect.request_list(channel.target),
             self._inbox,
-            _any,
+            self._first,
             what=f"the list of {channel.system}/{channel.component}",
             attempts=LIST_REQUESTS_MAX,
             timeout_min=LIST_TIMEOUT_MIN,
         )
         channel.is_streaming = True
         self._take(first)
+
+    def _first(self, message: Message) -> Message | None:
+        """Return the first value of the list; PX4's hash comes before it, and says nothing of its end."""
+        assert isinstance(message, self.session.dialect.value)
+        if message.param_index < message.param_count:
+            return message
+        self._take(message)
+        return None
 
     async def run(self) -> None:
         """Receive the list and read its gaps."""

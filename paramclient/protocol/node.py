@@ -171,6 +171,13 @@ class Node:
         self._emit(Rebooted())
         self._spawn(self.identify)
 
+    def resumed(self) -> None:
+        """Doubt all values: the link was interrupted, and may lead to another vehicle."""
+        self._doubt()
+        for session in self.sessions:
+            session.table.recounted()
+        self._spawn(self.identify)
+
     def is_same_vehicle(self, message: Message) -> bool:
         """Return whether a message of another peer proves to be of this vehicle, by its hardware id."""
         if not isinstance(message, AutopilotVersion):
@@ -191,6 +198,7 @@ class Node:
 
     def _doubt(self) -> None:
         self.generation += 1
+        self.identification.doubt()
         for session in self.sessions:
             session.table.doubt()
 
@@ -220,4 +228,4 @@ class Node:
                 presence.is_lost = True
                 self._doubt()
                 self._emit(Lost(silence))
-            await anyio.sleep(min(max(timeout - silence, 0.05), 1.0) if not presence.is_lost else 1.0)
+            await anyio.sleep(min(max(timeout - silence, 0.001), 1.0) if not presence.is_lost else 1.0)

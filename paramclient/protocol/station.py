@@ -189,6 +189,9 @@ class Station:
         """Let requests go on: the link is back."""
         self.listening_since = now
         self.gate.open()
+        for node in self.nodes.values():
+            if not (node.presence.is_lost or self.listens_only):
+                node.resumed()
 
     def fail(self, error: LinkError, *, for_good: bool = False) -> None:
         """End all conversations: the link is down for too long, or for good."""

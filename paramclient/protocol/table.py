@@ -43,7 +43,7 @@ class Table:
         is_exact: whether every integer is exact: read from a file, or small enough for float32.
         volatile: names outside the vehicle's hash, as far as known.
         author_of: returns the author of a change of a name.
-        recounted: called when the count of a complete table changes.
+        recounted: called when the count of a complete table changes, or may have changed.
     """
 
     def __init__(

@@ -74,6 +74,7 @@ class Watch:
         self._policy = policy
         self._is_fetched = False
         self._is_doubted = False
+        self._before: Mapping[str, Param] = {}  # the table at the first sign of change
         self._is_due = False  # a sign of change was seen since the last check began
         self._download_time = math.inf
         self._signal = anyio.Event()
@@ -96,6 +97,10 @@ class Watch:
             self._download_time = elapsed
         self._signal.set()
 
+    def unconfirmed(self) -> None:
+        """Take note that the table is only what the cache has."""
+        self._is_fetched = False
+
     @contextmanager
     def held(self) -> Iterator[None]:
         """Begin no check during the block: its owner reads the table itself."""
@@ -108,6 +113,8 @@ class Watch:
     def doubt(self) -> None:
         """Check the table soon: there is a sign of change."""
         if self._is_fetched:
+            if not self._is_doubted:
+                self._before = self._session.table.view()
             self._is_doubted = self._is_due = True
             self._signal.set()
 
@@ -150,9 +157,11 @@ class Watch:
     async def _check(self) -> None:
         """Ask for the digest, and fetch what it does not confirm."""
         session, table = self._session, self._session.table
-        was_doubted, before = self._is_doubted, table.view()
+        was_doubted = self._is_doubted
+        before = self._before if was_doubted else table.view()
         digest = await request_digest(session)
-        if not is_current(session, digest) or any(p.trust is Trust.CACHED for p in before.values()):
+        has_cached = any(param.trust is Trust.CACHED for param in table.params.values())
+        if has_cached or not is_current(session, digest):
             result = await fetch_all(session, refresh=not is_current(session, digest))
             if not result.complete:
                 return
