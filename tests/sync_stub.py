@@ -17,11 +17,11 @@ from paramclient.provision import fleet
 STUB = Path(__file__).parent.parent / "paramclient" / "sync" / "__init__.pyi"
 
 CLASSES: dict[ModuleType, list[str]] = {
-    streams: ["Changes", "Events"],
+    streams: ["Changes"],
     files: ["Ftp"],
     component: ["Component"],
     fleet: ["Wanted"],
-    events: ["Discovered", "Lost", "Found", "Rebooted", "Resynced", "Event"],
+    events: ["Discovered", "Lost", "Found", "Rebooted", "Resynced", "Event", "Events"],
     client: ["ParamClient"],
 }
 FUNCTIONS: list[Callable[..., object]] = [

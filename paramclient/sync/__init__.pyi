@@ -64,11 +64,6 @@ class Changes(Iterator[Change]):
     def __next__(self) -> Change: ...
     def next(self, timeout: float | None = None) -> Change: ...
 
-class Events(Iterator[Event]):
-    "Stream of the component events since its creation; see `ParamClient.events`."
-    def __next__(self) -> Event: ...
-    def next(self, timeout: float | None = None) -> Event: ...
-
 class Ftp:
     "The files of a component over MAVFTP; see `ParamClient.ftp`."
     def read(
@@ -223,6 +218,11 @@ class Resynced:
     hash: int | None
 
 Event: TypeAlias = Discovered | Lost | Found | Rebooted | Resynced
+
+class Events(Iterator[Event]):
+    "Stream of the component events since its creation; see `ParamClient.events`."
+    def __next__(self) -> Event: ...
+    def next(self, timeout: float | None = None) -> Event: ...
 
 class ParamClient:
     "A ground station for the MAVLink parameter protocol on one link, as an async context manager."

@@ -320,7 +320,7 @@ _PROXIES: dict[type, type[Proxy]] = {
     component.Component: Component,
     files.Ftp: Ftp,
     streams.Changes: Changes,
-    streams.Events: Events,
+    events.Events: Events,
 }
 
 
