@@ -387,8 +387,6 @@ class ParamCache:
 
         return self._read(work)
 
-        return self._read(work)
-
     def state_at(self, vehicle: str, component: int, when: float, *, extended: bool = False) -> ParamSet:
         """Return a table as it was at a given time.
 
