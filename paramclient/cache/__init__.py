@@ -24,7 +24,6 @@ from paramclient.cache.records import (
     StoredParam,
     TableState,
     TableUpdate,
-    by_station,
 )
 from paramclient.cache.snapshots import SNAPSHOTS
 from paramclient.cache.store import ParamCache, default_path, is_database_url
@@ -45,7 +44,6 @@ __all__ = [
     "StoredParam",
     "TableState",
     "TableUpdate",
-    "by_station",
     "default_path",
     "is_database_url",
 ]

@@ -32,7 +32,6 @@ __all__ = [
     "StoredValue",
     "TableState",
     "TableUpdate",
-    "by_station",
 ]
 
 BY_VEHICLE: Final = "vehicle"
@@ -41,11 +40,6 @@ BY_US: Final = "us"
 """Author of a change by a write of this client; `us for NAME` if the write names a user."""
 BITS_SIZE: Final = 8
 """Bytes of a stored plain value: `Param.bits`, little-endian, in the size of the largest type."""
-
-
-def by_station(system: int, component: int) -> str:
-    """Return the author of a change by another ground station: `station 254/190`."""
-    return f"station {system}/{component}"
 
 
 class StoredValue(NamedTuple):
@@ -90,7 +84,7 @@ class StoredParam(NamedTuple):
         volatile: 1 if the vehicle's hash excludes the parameter; None does not change the stored flag.
         heard_at: time of the observation. The later of two observations of a parameter counts.
         default: the firmware's default in the form of the value, or None.
-        by: author, if the value is a change: `BY_US`, `us for NAME`, `BY_VEHICLE` or `by_station(…)`.
+        by: author, if the value is a change: `BY_US`, `us for NAME`, `BY_VEHICLE` or `station 254/190`.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Argument defaults and checks, shared by clients over a link and over a service."""
+"""Argument defaults and checks of the calls of a client."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ from paramclient.wire.messages import HASH_CHECK, PARAMETERS_MAX
 
 __all__ = [
     "COMPONENT_TIMEOUT",
-    "PROGRESS_CALL_INTERVAL",
     "SETTLE_MAX",
     "address_in_words",
-    "check_accepted",
     "check_requested_name",
     "check_portable_name",
     "check_settle",
@@ -24,8 +22,6 @@ __all__ = [
 
 COMPONENT_TIMEOUT: Final = 10.0
 """Default timeout in seconds for the first component on a link."""
-PROGRESS_CALL_INTERVAL: Final = 0.1
-"""Seconds between two calls of a progress callback."""
 AUTHOR_LENGTH_MAX: Final = 128
 """Characters of an author's name: enough for a name with an address, and a program's own description."""
 SETTLE_MAX: Final = 60.0
@@ -89,18 +85,6 @@ def check_writes(
             raise UsageError(f"{HASH_CHECK} is read-only: it is the hash of the parameters, not a parameter")
         checked.append((name, check_ext_value(value) if extended else check_value(value)))
     return checked
-
-
-def check_accepted(accept: str, sample: int) -> None:
-    """Check the arguments `accept` and `sample` of a fetch.
-
-    Raises:
-        UsageError: `accept` is neither "verified" nor "sampled", or `sample` is less than 1.
-    """
-    if accept not in ("verified", "sampled"):
-        raise UsageError(f'accept must be "verified" or "sampled", not {accept!r}')
-    if sample < 1:
-        raise UsageError(f"sample must be at least 1 parameter, not {sample}")
 
 
 def check_settle(settle: float) -> float:

@@ -16,6 +16,7 @@ import anyio.to_thread
 
 from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.errors import CacheError, UsageError
+from paramclient.links.clock_offset import seconds_ahead
 from paramclient.model.identity import Identity
 from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult
@@ -291,7 +292,7 @@ class CacheWriter:
         The two clocks are compared once, and again where the computer's clock was set or was suspended.
         """
         now = anyio.current_time()
-        ahead = time.time() - now
+        ahead = seconds_ahead(time.time, anyio.current_time)
         if abs(ahead - self._ahead) > CLOCK_STEP:
             self._ahead = ahead
         return min(moment, now) + self._ahead

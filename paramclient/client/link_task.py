@@ -67,7 +67,7 @@ class LinkTask:
         station: takes the received data; set before `read`.
         is_disconnected: whether the link is disconnected and being reopened.
         activity: set, and replaced, when data was received, and when the link drops or has failed.
-        bytes_received, bytes_sent, frames_sent: on this link.
+        bytes_received, bytes_sent: on this link.
     """
 
     station: Station
@@ -75,7 +75,7 @@ class LinkTask:
     def __init__(self, link: Link, *, taps: Sequence[Tap] = (), ended: Callable[[], None]) -> None:
         self.is_disconnected = False
         self.activity = anyio.Event()
-        self.bytes_received = self.bytes_sent = self.frames_sent = 0
+        self.bytes_received = self.bytes_sent = 0
         self._link = link
         self._taps = taps
         self._ended = ended
@@ -138,7 +138,6 @@ class LinkTask:
             while self._queue or self._forwarded:
                 data, peer = self._queue.popleft() if self._queue else (self._forwarded.popleft(), None)
                 self.bytes_sent += len(data)
-                self.frames_sent += 1
                 for tap in self._taps:
                     tap.sent(data)
                 with suppress(LinkError):  # the reader reconnects; unanswered requests are repeated

@@ -37,8 +37,6 @@ PATIENCE_MIN: Final = 2.0
 """Seconds until a request is given up, at least: a vehicle that writes to its flash may be silent for one."""
 SILENCE_MAX: Final = 20.0
 """Seconds without a message of a component without heartbeats after which requests are given up."""
-ATTEMPTS_LOST: Final = 5
-"""Attempts to reach a component that counts as lost: it may be back; a batch is to end soon."""
 LATE_WAKE_UP: Final = 0.05
 """Seconds after a deadline from which on the program counts as stalled: the answer may wait in a buffer."""
 LATE_GRACE: Final = 0.02
@@ -300,12 +298,6 @@ class Channel:
     def is_lost(self, now: float) -> bool:
         """Return whether the component sends heartbeats, and was silent for longer than these explain."""
         return now - self._presence.received_at >= self._presence.timeout
-
-    def is_given_up(self, attempts: int, limit: int, began: float, now: float) -> bool:
-        """Return whether a request is not sent again after some attempts without an answer."""
-        if attempts >= limit or self.silence_since(began, now) >= self.silence_max:
-            return True
-        return attempts >= ATTEMPTS_LOST and self.is_lost(now)
 
     async def exchange(
         self,

@@ -24,9 +24,7 @@ __all__ = [
     "PackedParam",
     "decode",
     "decode_prefix",
-    "decode_upload",
     "encode",
-    "encode_upload",
 ]
 
 READ_SIZE_DEFAULT: Final = 239
@@ -108,28 +106,6 @@ def decode_prefix(data: bytes) -> tuple[Pack, int]:
     return Pack(_entries(data, number, with_defaults, may_end=True), total, with_defaults), number
 
 
-def total_of(beginning: bytes) -> int | None:
-    """Return the vehicle's number of parameters by the beginning of its file; None if that is too short."""
-    if len(beginning) < _HEADER.size:
-        return None
-    magic, _, total = _header(beginning)
-    return total if magic in (_MAGIC, _MAGIC_WITH_DEFAULTS) else None
-
-
-def decode_upload(data: bytes) -> tuple[PackedParam, ...]:
-    """Decode a file of the format that is written to a vehicle.
-
-    Raises:
-        PackError: as in `decode`; and its length differs from the header's, or it has defaults.
-    """
-    magic, number, length = _header(data)
-    if magic != _MAGIC:
-        raise PackError(f"a parameter file to be written does not begin with 0x{magic:04x}", offset=0)
-    if length != len(data):
-        raise PackError(f"{len(data)} bytes of a file of {length}", offset=4)
-    return _entries(data, number, False)
-
-
 def encode(
     entries: Iterable[PackedParam],
     *,
@@ -160,21 +136,6 @@ def encode(
     magic = _MAGIC_WITH_DEFAULTS if with_defaults else _MAGIC
     out = bytearray(_HEADER.pack(magic, len(rows), total))
     _append(out, rows, with_defaults, read_size)
-    return bytes(out)
-
-
-def encode_upload(entries: Iterable[PackedParam]) -> bytes:
-    """Encode the file that is written to a vehicle to set parameters; it has no padding and no defaults.
-
-    Raises:
-        UsageError: as in `encode`; or it would be longer than 65535 bytes, the limit of its header.
-    """
-    rows = list(entries)
-    out = bytearray(_HEADER.size)
-    _append(out, rows, False, None)
-    if len(out) > 0xFFFF:
-        raise UsageError(f"a parameter file to be written holds 65535 bytes, and this would have {len(out)}")
-    _HEADER.pack_into(out, 0, _MAGIC, len(rows), len(out))
     return bytes(out)
 
 

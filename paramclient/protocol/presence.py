@@ -38,7 +38,6 @@ class Presence:
         is_lost: whether no message arrived for the timeout.
         base_mode: of the last heartbeat; None before the first.
         is_booting: whether the last heartbeat has MAV_STATE_BOOT.
-        clock_at: when the last time since boot arrived; minus infinity before the first.
         is_over: whether nothing more can arrive, since a log has ended: silence shows nothing then.
     """
 
@@ -47,7 +46,6 @@ class Presence:
         self.is_lost = False
         self.base_mode: int | None = None
         self.is_booting = False
-        self.clock_at = -math.inf
         self.is_over = False
         self.beat_at = -math.inf
         self._interval = math.inf  # the shortest between two heartbeats
@@ -103,7 +101,6 @@ class Presence:
         """
         if boot_ms == 0:
             return False
-        self.clock_at = now
         before, at = self._clocks.get(message_id, (0, now))
         passed = 1000 * (now - at)
         possible = passed + 1000 * PATH_LATENCY_MAX

@@ -28,9 +28,6 @@ COMP_ID_ALL: Final = 0
 """MAV_COMP_ID_ALL: every component of a system."""
 AUTOPILOT_COMPONENT: Final = 1
 """MAV_COMP_ID_AUTOPILOT1: the usual component id of an autopilot."""
-COMP_ID_MISSIONPLANNER: Final = 190
-"""MAV_COMP_ID_MISSIONPLANNER: the usual component id of a ground station."""
-
 MAV_TYPE_GENERIC: Final = 0
 MAV_TYPE_GCS: Final = 6
 MAV_AUTOPILOT_GENERIC: Final = 0
