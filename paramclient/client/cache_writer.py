@@ -239,7 +239,7 @@ class CacheWriter:
         Raises:
             CacheError: they are not.
         """
-        if node not in self._identities:
+        if node not in self._identities or not node.identification.is_confirmed:
             raise CacheError(f"it is not known which vehicle {node.system}/{node.component} is")
 
     def _update(self, node: Node, session: Session, pending: _Pending) -> TableUpdate:

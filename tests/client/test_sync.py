@@ -614,3 +614,18 @@ async def test_a_listener_may_stop_in_the_middle() -> None:
 def test_feeds_are_no_iterators_of_the_other_kind() -> None:
     assert isinstance(Changes().__aiter__(), Changes)
     assert isinstance(Events().__aiter__(), Events)
+
+
+@in_simulated_time
+async def test_a_durable_write_to_a_vehicle_that_does_not_say_who_it_is_is_not_sent(path: Path) -> None:
+    berth = Berth(small_px4(uid=1))
+    async with a_client(berth, cache=path) as client:
+        component = await client.component()
+        await component.fetch_all()
+        await away(berth, 9.0)
+        stranger = small_px4(uid=2)
+        berth.moor(LateVersion(stranger))
+        await until(lambda: component.state != "lost")
+        with pytest.raises(CacheError, match="which vehicle"):
+            await component.set("PARAM_01", 1001, durable=True)
+        assert stranger.param("PARAM_01").value == 1
