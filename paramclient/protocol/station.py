@@ -18,11 +18,14 @@ from paramclient.protocol.node import Node
 from paramclient.protocol.session import Session, Spawn
 from paramclient.wire.frames import BOOT_CLOCK_OFFSETS, Frame, Framer, sign_frame
 from paramclient.wire.messages import (
+    AUTOPILOT_COMPONENT,
     COMP_ID_ALL,
     DECODED_IDS,
     MAV_AUTOPILOT_INVALID,
+    MAV_CMD_REQUEST_MESSAGE,
     MAV_STATE_ACTIVE,
     MAV_TYPE_GCS,
+    CommandLong,
     Heartbeat,
     HighLatency2,
     Message,
@@ -35,11 +38,14 @@ from paramclient.wire.messages import (
     SetupSigning,
     decode,
     encode,
+    message_id,
 )
 from paramclient.wire.signing import Signer, SigningKey, Verifier
 
 __all__ = ["Peer", "Station"]
 
+SEEK_INTERVAL: Final = 0.25
+"""Seconds between two requests for a heartbeat, while no component is known."""
 HEARTBEAT_INTERVAL: Final = 1.0
 """Seconds between two heartbeats of ours, by the standard."""
 COMPONENTS_MAX: Final = 1_000
@@ -115,6 +121,7 @@ class Station:
         self._datagrams = self._new_framer(stream=False)
         self._framers: dict[Peer, Framer] = {}
         self._sequence = 0
+        self._seek_at = -math.inf  # when the next heartbeat may be requested
         self._signer: Signer | None = None
 
     @property
@@ -143,6 +150,21 @@ class Station:
         framer = self._framer_of(peer) if self._is_stream else self._datagrams
         for frame in framer.receive(data):
             self._take(frame, peer, now)
+        if not self.nodes and now >= self._seek_at:
+            self._request_heartbeat(data, peer, now)
+
+    def _request_heartbeat(self, data: bytes, peer: Peer, now: float) -> None:
+        """Request the heartbeat of an autopilot that sends other messages, before any component is known.
+
+        A heartbeat is due once a second only; the command brings it in one round trip (measured on PX4).
+        """
+        for frame in Framer(stream=False).receive(data):
+            address = (frame.system, frame.component)
+            if frame.component == AUTOPILOT_COMPONENT and frame.system != 0 and address != self.own_address:
+                self._seek_at = now + SEEK_INTERVAL
+                request = CommandLong(*address, MAV_CMD_REQUEST_MESSAGE, float(message_id(Heartbeat)))
+                self.transmit(request, peer, frame.version)
+                return
 
     def overhear(self, data: bytes, now: float) -> None:
         """Take a frame that another program sends to the vehicles over this link: it may be a PARAM_SET."""

@@ -1,15 +1,17 @@
-"""Values that arrive before the kind of the vehicle is known."""
+"""What arrives before the first heartbeat: values of a vehicle of unknown kind, and other messages."""
 
 from __future__ import annotations
 
 from functools import partial
 
 import anyio
+from pymavlink.dialects.v20 import common as mavlink
 
 from paramclient.model.values import ParamType
 from paramclient.protocol.events import Change
 from paramclient.protocol.station import Station
 from paramclient.wire import messages
+from paramclient.wire.frames import Framer
 from paramclient.wire.messages import Heartbeat, Message, ParamValue
 from tests.conversations.virtual import run
 
@@ -38,6 +40,33 @@ def test_a_value_before_the_first_heartbeat_is_reported_as_the_vehicle_means_it(
             (change,) = changes
             assert change.new is not None
             assert (change.new.value, change.kind) == (154, "first")
+            tasks.cancel_scope.cancel()
+
+    run(session)
+
+
+def test_the_heartbeat_of_a_vehicle_that_sends_other_messages_is_requested() -> None:
+    async def session() -> None:
+        sent: list[bytes] = []
+        async with anyio.create_task_group() as tasks:
+            station = Station(
+                link="sim:test",
+                is_stream=False,
+                send=lambda data, peer: sent.append(data),
+                spawn=tasks.start_soon,
+                emit=lambda node, event: None,
+                changed=lambda node, session, change: None,
+            )
+            attitude = mavlink.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0)
+            for number in range(5):
+                await anyio.sleep(0.1)
+                sender = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
+                sender.seq = number
+                station.receive(attitude.pack(sender), "peer", anyio.current_time())
+            requests = [
+                messages.decode(frame) for data in sent for frame in Framer(stream=False).receive(data)
+            ]
+            assert requests == [messages.CommandLong(7, 1, messages.MAV_CMD_REQUEST_MESSAGE, 0.0)] * 2
             tasks.cancel_scope.cancel()
 
     run(session)
