@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Awaitable, Callable, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Final
+from typing import Final, TypeAlias
 
 import anyio
 
@@ -50,6 +50,8 @@ __all__ = [
     "write_extended",
 ]
 
+Side: TypeAlias = Param | WrittenParam | None
+"""One side of a comparison: as a vehicle has it, as a file has it, or absent."""
 NAMES_SHOWN_MAX: Final = 20
 """Names that a message lists; it gives the number of further ones."""
 HEX: Final = "hex:"
@@ -238,40 +240,42 @@ def value_of(name: str, text: str, number: int) -> WireValue:
 # Sources, apply, restore
 
 
-async def extended_source(text: str, options: LinkOptions) -> ParamSet:
-    """Return the extended parameters of a file, a cached vehicle or a link.
+async def extended_source(text: str, options: LinkOptions) -> tuple[ParamSet, Mapping[str, Param]]:
+    """Return the extended parameters of a file, a cached vehicle or a link; of vehicles also as received.
 
     Raises:
         NoReply: a table of a link is incomplete, or nothing was received.
         NotInCache: a cached table is incomplete, or there is none.
     """
     if is_file(text):
-        return read_extended_file(text)
+        return read_extended_file(text), {}
     if names_vehicle(text):
         if options.place is False:
             raise UsageError(f"{text!r} is a vehicle in the cache, which --no-cache excludes")
         table = cached_extended(text, options.cache, ChosenVehicle.parse(options.vehicle).component)
         if not table.complete:
             raise NotInCache(f"the table of {table.key}, component {table.component}, is incomplete")
-        return ParamSet.of(
+        content = ParamSet.of(
             in_order(table.params.values()),
             component=table.component,
             at=max(table.heard_at.values(), default=None),
             source=f"cache {table.key}",
         )
+        return content, table.params
     check_link(text)
     async with connect(text, options) as session:
         result = await _fetch(session)
         if not result.complete:
             missing = counted(len(result.missing), "extended parameter")
             raise NoReply(f"{missing} of {session.label}", attempts=0, waited=result.elapsed)
-        return ParamSet.of(
+        content = ParamSet.of(
             in_order(result.params.values()),
             component=session.component.component,
             system=session.component.system,
             at=time.time(),
             source=f"link {session.client.link.name}",
         )
+        return content, result.params
 
 
 def cached_extended(vehicle: str | None, cache: str | None, component: int | None = None) -> CachedComponent:
@@ -306,7 +310,7 @@ async def apply_extended(
     backup: str | None,
 ) -> ExitCode:
     """Write the differing values of a source of extended parameters, and verify them by another download."""
-    content = await extended_source(file, options)
+    content, _ = await extended_source(file, options)
     path = None if backup is None else check_new(backup)
     async with connect(url, options, writes=True) as session:
         write = partial(write_extended_set, session.component, content, durable=durable, backup=path)
@@ -372,7 +376,9 @@ def _report_impossible(session: CommandSession, plan: ExtPlan, content: ParamSet
 
 
 def differences_json(
-    entries: Iterable[tuple[str, Param | WrittenParam | None, WrittenParam | None, str]], *, is_same: bool
+    entries: Iterable[tuple[str, Side, Side, str]],
+    *,
+    is_same: bool,
 ) -> dict[str, object]:
     """Return the JSON of a comparison: name, left, right and comparison of each entry."""
     extended = [

@@ -61,7 +61,7 @@ async def save_extended(
     where: str, file: Path, file_format: FileFormat | None, options: LinkOptions
 ) -> ExitCode:
     """Write extended parameters to a file. An incomplete table is not written."""
-    content = await extended_source(where, options)
+    content, _ = await extended_source(where, options)
     written = await anyio.to_thread.run_sync(
         lambda: write_extended_file(file, content, file_format=file_format)
     )
@@ -86,7 +86,8 @@ async def diff_extended(
     left: str, right: str, options: LinkOptions, *, partial: bool, everything: bool
 ) -> ExitCode:
     """Compare the extended parameters of two sources."""
-    first, second = await extended_source(left, options), await extended_source(right, options)
+    first, known = await extended_source(left, options)
+    second, other = await extended_source(right, options)
     names = list(dict.fromkeys((*first.params, *second.params)))
     if partial:
         names = list(second.params if is_file(right) and not is_file(left) else first.params)
@@ -95,7 +96,8 @@ async def diff_extended(
     different = [entry for entry in entries if entry[3] != "same"]
     shown = entries if everything else different
     if options.json:
-        print_json(differences_json(shown, is_same=not different))
+        sides = ((name, known.get(name, one), other.get(name, two), word) for name, one, two, word in shown)
+        print_json(differences_json(sides, is_same=not different))
     else:
         if shown:
             rows = ((name, ext_text(one), ext_text(two), word) for name, one, two, word in shown)

@@ -27,6 +27,8 @@ FetchSource: TypeAlias = Literal["cache", "ftp", "stream"]
 REPAIRS_MAX: Final = 2
 """Downloads after the first one, while the table changes during them."""
 CHANGED_MEANWHILE: Final = "The parameters changed during the download: the table may be a mixture."
+NOT_REFRESHED: Final = "The values outside the hash were not read again, because the policy is hash-only."
+LEFT_OUT: Final = "Skipped {}: no parameter file can contain this name."
 UNPROVEN: Final = "The vehicle's hash could not be computed from the table; it was equal before and after."
 
 
@@ -178,6 +180,8 @@ class _Fetch:
             self.table.verify()
             if self.policy is Policy.AUTO:
                 await self._read_unverified()
+            elif self.table.unverified():
+                self.notes.append(NOT_REFRESHED)
             return self._result("cache")
         if self.policy is Policy.HASH_ONLY:
             return self._unconfirmed()
@@ -245,6 +249,7 @@ class _Fetch:
 
     def _result(self, source: FetchSource) -> FetchResult:
         lost, repeated = self.listed.lost, self.listed.repeated
+        self.notes += [LEFT_OUT.format(repr(name)) for name in self.table.left_out]
         return result_of(self.session, source, self._began, self.notes, lost=lost, repeated=repeated)
 
 

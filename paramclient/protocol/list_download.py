@@ -106,8 +106,13 @@ class _Download:
         """Request the list until its first value arrives."""
         channel = self.channel
         self._began = anyio.current_time()
+
+        def request(attempt: int) -> Message:
+            self.session.report(0, self.table.count)
+            return self.session.dialect.request_list(channel.target)
+
         first: Message = await channel.exchange(
-            self.session.dialect.request_list(channel.target),
+            request,
             self._inbox,
             self._first,
             what=f"the list of {channel.system}/{channel.component}",

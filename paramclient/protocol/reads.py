@@ -13,6 +13,7 @@ from paramclient.errors import (
     ParamClientError,
     ParamErrorCode,
     Refused,
+    TypeMismatch,
     UnknownParameter,
 )
 from paramclient.model.similar_names import did_you_mean, nearest_names
@@ -104,14 +105,17 @@ async def read_many(
             tasks.start_soon(read_one, name)
 
 
-def refusal(session: Session, which: str | int, code: int) -> UnknownParameter | Refused:
+def refusal(session: Session, which: str | int, code: int) -> UnknownParameter | TypeMismatch | Refused:
     """Return the error for a PARAM_ERROR with this code."""
     if code == ParamErrorCode.DOES_NOT_EXIST:
         return _unknown(session, which)
     system, component = session.channel.target
     name, index = (which, None) if isinstance(which, str) else (None, which)
+    what = f"{system}/{component} refused {which}: {ParamErrorCode.name_of(code)}"
+    if code == ParamErrorCode.TYPE_MISMATCH:
+        return TypeMismatch(what, system=system, component=component, name=name, index=index)
     return Refused(
-        f"{system}/{component} refused {which}: {ParamErrorCode.name_of(code)}",
+        what,
         system=system,
         component=component,
         code=code,

@@ -59,11 +59,8 @@ def autopilots_of(nodes: Iterable[Node]) -> list[Node]:
 
     Lost ones are left out while another autopilot is heard, and so are peripherals that claim to be one.
     """
-    found = [each for each in nodes if each.identification.is_autopilot]
-    found = [each for each in found if not each.presence.is_lost] or found
-    found = [each for each in found if not _is_peripheral(each)] or found
     first: dict[object, Node] = {}
-    for each in found:
+    for each in _autopilots(nodes):
         key = (each.system, each.peer if each.is_split else None)
         if key not in first or each.component == AUTOPILOT_COMPONENT != first[key].component:
             first[key] = each
@@ -90,7 +87,9 @@ def only_vehicle(
     fitting = [each for each in present if system in (None, each.system)]
     vehicles = autopilots_of(fitting)
     if component is None:
-        found = vehicles
+        found = _autopilots(fitting)
+        if system is not None:
+            found = [each for each in found if each.component == AUTOPILOT_COMPONENT] or found
     else:
         found = [each for each in fitting if each.component == component]
         vehicles = (
@@ -153,14 +152,22 @@ def hint_of_node(station: Station, node: Node, now: float) -> str:
     )
 
 
+def _autopilots(nodes: Iterable[Node]) -> list[Node]:
+    """Return all autopilots; lost ones, and peripherals that claim to be one, only if there is no other."""
+    found = [each for each in nodes if each.identification.is_autopilot]
+    found = [each for each in found if not each.presence.is_lost] or found
+    return [each for each in found if not _is_peripheral(each)] or found
+
+
 def _ambiguous(nodes: Sequence[Node]) -> AmbiguousVehicle:
     splits = len({each.system for each in nodes}) < len(nodes)
     words = [
-        node_in_words(each) + (f" at {peer_in_words(each.peer)}" if splits else "")
+        node_in_words(each) + (f" at {peer_in_words(each.peer)}" if each.is_split else "")
         for each in sorted(nodes, key=lambda each: (each.system, each.component))
     ]
     choose_by = "system" if not splits else "peer" if nodes[0].is_split else "component"
-    what = f"{len(nodes)} vehicles on this link: {', '.join(words)}."
+    kind = f"autopilots in system {nodes[0].system}" if choose_by == "component" else "vehicles"
+    what = f"{len(nodes)} {kind} on this link: {', '.join(words)}."
     return AmbiguousVehicle(what, vehicles=words, choose_by=choose_by)
 
 

@@ -27,6 +27,9 @@ NAMES_MAX: Final = 65_535
 """Names in one table: as many as there are indices, and as many again without an index (parameters not in
 use). No real component has more."""
 
+LEFT_OUT_MAX: Final = 10
+"""Names that are not stored, of which the notes tell; so that they stay readable."""
+
 
 class Table:
     """The parameters of one component in one dialect.
@@ -43,6 +46,7 @@ class Table:
         is_exact: whether every integer is exact: read from a file, or small enough for float32.
         volatile: names outside the vehicle's hash, as far as known.
         author_of: returns the author of a change of a name.
+        left_out: received names that no parameter file can contain, and that are not stored.
         recounted: called when the count of a complete table changes, or may have changed.
     """
 
@@ -56,6 +60,7 @@ class Table:
         self.moments: dict[str, float] = {}
         self.volatile: frozenset[str] = frozenset()
         self.volatile_is_known = False
+        self.left_out: set[str] = set()
         self.author_of: Callable[[str], str] = lambda name: "vehicle"
         self.recounted: Callable[[], None] = lambda: None
         self._changed = changed
@@ -119,7 +124,7 @@ class Table:
                 of a known integer.
         """
         name, raw, number, count, index = message
-        if name == HASH_CHECK or not is_portable_name(name):
+        if name == HASH_CHECK or not self._may_store(name):
             return None
         if count != self.count and 0 < count <= PARAMETERS_MAX:
             self.recount(count)
@@ -160,6 +165,8 @@ class Table:
             with_defaults: whether an entry without a default has its default value.
         """
         name = entry.name
+        if not self._may_store(name):
+            return None
         old = self.params.get(name)
         self.names[index] = name
         self._outdated.discard(name)
@@ -177,6 +184,13 @@ class Table:
         self.moments[name] = now
         self._wire[name] = (raw, entry.type)
         return self._put(name, old, new)
+
+    def _may_store(self, name: str) -> bool:
+        if is_portable_name(name):
+            return True
+        if len(self.left_out) < LEFT_OUT_MAX:
+            self.left_out.add(name)
+        return False
 
     def complete(self) -> list[Change]:
         """Drop the parameters that a complete list no longer has, and return their removals."""
@@ -270,7 +284,7 @@ class Table:
 
     def clear(self) -> None:
         """Forget everything: another vehicle uses the address."""
-        for each in (self.params, self.names, self.moments, self._wire, self._outdated):
+        for each in (self.params, self.names, self.moments, self._wire, self._outdated, self.left_out):
             each.clear()
         self.count = None
         self.volatile, self.volatile_is_known = frozenset(), False

@@ -62,6 +62,7 @@ async def write(
     settle: float = 0.0,
     force: bool = False,
     author: str = "us",
+    sending: Callable[[], None] = lambda: None,
 ) -> SetResult:
     """Set one parameter, and prove its value by what the component reports.
 
@@ -77,6 +78,7 @@ async def write(
         settle: seconds after which the value is read once more; a different one is an adjustment.
         force: also send NaN and infinity to a vehicle that cannot store them.
         author: of the change, for the history.
+        sending: called before the first set is sent.
 
     Raises:
         UsageError: the value does not fit the type, or must not be sent.
@@ -96,6 +98,7 @@ async def write(
             _check_finite(session, name, value, force=force)
             await _learn_type(session, name)
             before = session.table.params[name]
+            sending()
             result = await _Write(session, name, value).run()
             if session.identification.is_ardupilot and not result.param.same_value(before):
                 late = ReplacedValue(before, anyio.current_time() + LATE_ANSWER_TIME)
@@ -145,10 +148,14 @@ async def write_many(
         async with limiter:
             if failures:
                 return
-            try:
-                await _learn_type(session, name)
+
+            def sending() -> None:
                 outcomes[place] = replace(outcomes[place], status=SetStatus.UNKNOWN)
-                result = await write(session, name, value, settle=settle, force=force, author=author)
+
+            try:
+                result = await write(
+                    session, name, value, settle=settle, force=force, author=author, sending=sending
+                )
             except (NoReply, LinkError) as error:
                 failures.append(error)
                 outcomes[place] = replace(outcomes[place], error=error)

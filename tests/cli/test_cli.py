@@ -580,12 +580,12 @@ class Modem(PX4Vehicle):
     """A vehicle with a telemetry radio, and with a message that is in no dialect."""
 
     def data_to_send(self) -> list[bytes]:
-        frames = super().data_to_send()
-        if frames:
+        sent = super().data_to_send()
+        if sent:
             status = b"\x03\x00\x02\x00\xc8\xbe\x60\x28\x2a"
-            frames.append(frames.build_frame(109, status, system=51, component=68, sequence=0))
-            frames.append(b"\xfd\x01\x00\x00\x00\x33\x44\xff\xff\x7f" + b"abc")
-        return frames
+            sent.append(frames.build_frame(109, status, system=51, component=68, sequence=0))
+            sent.append(b"\xfd\x01\x00\x00\x00\x33\x44\xff\xff\x7f" + b"abc")
+        return sent
 
 
 def test_link_prints_a_table_of_components(command: Command, put: Callable[[Endpoint], str]) -> None:
@@ -629,7 +629,7 @@ def test_a_silent_link_is_exit_code_3(live_command: Command, put: Callable[..., 
     noisy = live_command("link", put(Noise(PX4Vehicle())), "--seconds", 0.3)
     assert (noisy.code, noisy.out) == (3, "")
     assert re.search(
-        r"a MAVLink frame on sim:custom in [0-9.]+ s\. [1-9][0-9,]* bytes were received on sim:custom, but "
+        r"a MAVLink frame on sim:custom in [0-9.]+ s\. [1-9][0-9,]* bytes arrived on sim:custom, but "
         r"no valid MAVLink frame\.$",
         noisy.err,
     )
