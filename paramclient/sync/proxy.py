@@ -56,6 +56,7 @@ class _Session:
             self.client = self._portal.call(make)
         except BaseException:
             self._portal.call(self._portal.stop)
+            self._thread.join()
             raise
         self.proxies: weakref.WeakValueDictionary[object, Proxy] = weakref.WeakValueDictionary()
         self._process = os.getpid()

@@ -130,6 +130,7 @@ async def test_a_vehicle_without_a_version_is_settled_within_seconds(refuses: bo
         assert {each.command for each in conversation.sent_of(CommandLong)} == {512, 520}
         assert node.identification.capabilities is None
         assert node.identification.encoding is Encoding.BYTEWISE
+        await anyio.sleep(0.01)
         assert len(conversation.of(Identified)) == 1
 
 
