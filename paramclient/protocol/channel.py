@@ -43,6 +43,8 @@ LATE_GRACE: Final = 0.02
 """Seconds for which a stalled program looks once more for the answer."""
 WINDOW: Final = 12
 """Requests in flight: ArduPilot's queue of reads has 20 places, and its overflow is dropped silently."""
+FTP_SEQUENCES_PER_SECOND: Final = 1000
+"""Sequence numbers of MAVFTP that a second skips, more than a program uses in it."""
 
 
 class Gate:
@@ -220,7 +222,7 @@ class Channel:
         self.gate = gate
         self.is_streaming = False
         self.ftp = anyio.Lock()
-        self._ftp_sequence = 0
+        self._ftp_sequence: int | None = None
         self._transmit = transmit
         self._presence = presence
         self._inboxes: dict[Key, list[Inbox]] = {}
@@ -235,7 +237,13 @@ class Channel:
         self.window_size = max(self.window_size, requests)
 
     def next_ftp_sequence(self) -> int:
-        """Return the sequence number of the next MAVFTP request: servers answer a repeated one again."""
+        """Return the sequence number of the next MAVFTP request: servers answer a repeated one again.
+
+        The first one follows from the time, so that it differs from the last one of an earlier program, to
+        which the server would answer again.
+        """
+        if self._ftp_sequence is None:
+            self._ftp_sequence = int(anyio.current_time() * FTP_SEQUENCES_PER_SECOND)
         self._ftp_sequence = (self._ftp_sequence + 2) & 0xFFFF
         return self._ftp_sequence
 

@@ -197,7 +197,7 @@ class Table:
         if not self.is_complete:
             return []
         self._was_complete = True
-        gone = [name for name in self._outdated if name in self.params]
+        gone = [name for name in self.params if name in self._outdated]
         self._outdated.clear()
         changes = [Change(name, self.params[name], None, "vehicle", "removed") for name in gone]
         for change in changes:

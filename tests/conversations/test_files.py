@@ -36,6 +36,21 @@ def packet_in(message: Message) -> Packet | None:
     return Packet.unpack(message.payload) if isinstance(message, FileTransfer) else None
 
 
+@virtual
+@BOTH
+async def test_the_answer_to_the_last_request_of_an_earlier_program_is_not_taken(make: Maker) -> None:
+    vehicle = make()
+    vehicle.files["a.bin"] = CONTENT[:100]
+    for path in ("none.bin", "a.bin"):
+        async with converse(Air([vehicle])) as conversation:
+            channel = (await conversation.node()).channel
+            if path == "a.bin":
+                assert await read_file(channel, path) == CONTENT[:100]
+            else:
+                with pytest.raises(FileTransferError):
+                    await read_file(channel, path)
+
+
 @virtual_on_both
 @BOTH
 @pytest.mark.parametrize("loss", [0.0, 0.2])
