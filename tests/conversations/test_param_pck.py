@@ -26,7 +26,7 @@ from tests.recordings import DATA
 
 PLAIN = (DATA / "ardupilot_param.pck").read_bytes()
 WITH_DEFAULTS = (DATA / "ardupilot_param_withdefaults.pck").read_bytes()
-TABLE = Path(__file__).parents[3] / "paramclient" / "sim" / "tables" / "ardupilot.csv"
+TABLE = Path(__file__).parents[2] / "paramclient" / "sim" / "tables" / "ardupilot.csv"
 KINDS = (ParamType.INT8, ParamType.INT16, ParamType.INT32, ParamType.REAL32)
 
 A = PackedParam("ACRO_OPTIONS", ParamType.INT8, 5)
