@@ -22,7 +22,7 @@ import anyio.lowlevel
 
 from fuzz.draw import Draw
 from paramclient.errors import LinkError, ParamClientError
-from paramclient.model.values import Encoding, Param, Trust, WireValue, known_type
+from paramclient.model.values import Encoding, Param, Trust, WireValue, is_portable_name, known_type
 from paramclient.protocol import session as session_module
 from paramclient.protocol import station as station_module
 from paramclient.protocol import table as table_module
@@ -399,13 +399,16 @@ class _Session:
     def read(self) -> None:
         node, key = self.node(), self.draw.one_of((None, None, HASH_CHECK, 0, 3, 7, 8, 32767))
         if node is not None:
-            self.start(partial(read, self.session(node), self.name(node.system) if key is None else key))
+            key = self.name(node.system) if key is None else key
+            if isinstance(key, int) or is_portable_name(key):
+                self.start(partial(read, self.session(node), key))
 
     def write(self) -> None:
         node = self.node()
         if node is not None:
             name = self.name(node.system)
-            self.start(partial(write, self.session(node), name, self.draw.one_of(VALUES)))
+            if is_portable_name(name):
+                self.start(partial(write, self.session(node), name, self.draw.one_of(VALUES)))
 
     def cancel(self) -> None:
         if self.calls:

@@ -211,6 +211,7 @@ class Node:
     async def identify(self) -> None:
         """Request the identity, unless that is in progress."""
         if not self.identification.has_parameters:
+            self.identification.settle()  # so that nothing waits for what is never requested
             return
         was_settled = self.identification.is_settled
         await self._identifying.join(lambda: self.identification.request(self.channel))
