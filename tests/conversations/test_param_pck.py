@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import struct
-import tracemalloc
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,10 +11,9 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from paramclient.errors import PackError, UsageError
+from paramclient.errors import PackError
 from paramclient.model.values import ParamType
 from paramclient.protocol.param_pck import (
-    PACK_SIZE_MAX,
     Pack,
     PackedParam,
     decode,
@@ -78,21 +76,6 @@ class TestTheRealFiles:
         assert encode(decode(WITH_DEFAULTS).entries) == PLAIN
         assert encode(decode(WITH_DEFAULTS).entries, with_defaults=True) == WITH_DEFAULTS
 
-    @pytest.mark.parametrize("read_size", [7, 48, 110, 200, 238])
-    def test_at_other_read_sizes_no_value_lies_in_two_reads(self, read_size: int) -> None:
-        data = encode(decode(PLAIN).entries, read_size=read_size)
-        assert decode(data).entries == decode(PLAIN).entries
-        at, name_length = 6, {each.name: len(each.name) for each in decode(PLAIN).entries}
-        last = ""
-        for each in decode(PLAIN).entries:
-            while data[at] == 0:
-                at += 1
-            shared = data[at + 1] & 15
-            assert each.name[:shared] == last[:shared]
-            start = at + 2 + name_length[each.name] - shared
-            at, last = start + each.type.size, each.name
-            assert start // read_size == (at - 1) // read_size
-
     @pytest.mark.parametrize("data", [PLAIN, WITH_DEFAULTS], ids=["plain", "with defaults"])
     def test_cut_off_anywhere_it_is_none(self, data: bytes) -> None:
         for length in [*range(40), *range(200, len(data), 61), len(data) - 1]:
@@ -106,31 +89,6 @@ class TestTheFormat:
         assert encode([A, B]) == packed(
             entry("ACRO_OPTIONS", b"\x05"), entry("ACRO_RP_EXPO", b"\x9a\x99\x99\x3e", kind=4, shared=5)
         )
-
-    def test_a_name_that_is_the_beginning_of_the_last_keeps_one_character(self) -> None:
-        long, short = PackedParam("ABC", ParamType.INT8, 1), PackedParam("AB", ParamType.INT8, 2)
-        data = encode([long, short])
-        assert data == packed(entry("ABC", b"\x01"), entry("AB", b"\x02", shared=1))
-        assert decode(data).entries == (long, short)
-
-    def test_names_of_sixteen_that_differ_in_the_last(self) -> None:
-        rows = tuple(PackedParam("ABCDEFGHIJKLMNO" + last, ParamType.INT16, 1) for last in "PQ")
-        data = encode(rows)
-        assert data[-5:] == bytes((2, 15)) + b"Q\x01\x00"
-        assert decode(data).entries == rows
-
-    def test_a_part_of_the_table_says_how_many_there_are(self) -> None:
-        assert decode(encode([A], total=1382)) == Pack((A,), 1382, False)
-
-    def test_no_entries_are_a_table_too(self) -> None:
-        assert decode(encode([])) == Pack((), 0, False)
-
-    def test_padding_may_stand_before_any_entry(self) -> None:
-        assert decode(packed(b"\0\0\0" + entry("A"), b"\0" * 50 + entry("B"))).total == 2
-
-    def test_defaults_are_given_when_requested(self) -> None:
-        assert decode(encode([A, B], with_defaults=True)) == Pack((A, B), 2, True)
-        assert decode(encode([A, B])) == Pack((A, B._replace(default=None)), 2, False)
 
     @pytest.mark.parametrize(
         ("data", "words"),
@@ -164,38 +122,6 @@ class TestTheFormat:
         assert 0 <= caught.value.offset <= len(data)
         assert str(caught.value).endswith(f"(byte {caught.value.offset})")
 
-    def test_a_file_above_the_size_limit_is_refused_unread(self) -> None:
-        with pytest.raises(PackError, match="no packed parameter file has"):
-            decode(packed(bytes(PACK_SIZE_MAX)))
-
-    @pytest.mark.parametrize(
-        ("rows", "words"),
-        [
-            ([A, A], "twice"),
-            ([PackedParam("", ParamType.INT8, 0)], "at least one character"),
-            ([PackedParam("ABCDEFGHIJKLMNOPQ", ParamType.INT8, 0)], "17 bytes"),
-            ([PackedParam("A", ParamType.UINT8, 0)], "has no UINT8"),
-            ([PackedParam("A", ParamType.INT8, 256)], "more bits"),
-            ([PackedParam("A", ParamType.INT8, -1)], "more bits"),
-            ([PackedParam("A", ParamType.INT8, 0, 256)], "more bits"),
-        ],
-    )
-    def test_entries_that_do_not_fit_the_format_are_refused(
-        self, rows: list[PackedParam], words: str
-    ) -> None:
-        with pytest.raises(UsageError, match=words):
-            encode(rows, with_defaults=True)
-
-    @pytest.mark.parametrize("read_size", [0, 240])
-    def test_read_sizes_are_those_of_one_message(self, read_size: int) -> None:
-        with pytest.raises(UsageError, match="1 to 239"):
-            encode([A], read_size=read_size)
-
-    @pytest.mark.parametrize("total", [0, 65536])
-    def test_totals_that_cannot_be(self, total: int) -> None:
-        with pytest.raises(UsageError, match="of a table of"):
-            encode([A], total=total)
-
 
 names = st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=1, max_size=16)
 
@@ -226,27 +152,3 @@ def test_an_encoded_file_decodes_to_the_same_entries(
 def test_any_bytes_are_a_table_or_none(data: bytes) -> None:
     with suppress(PackError):
         decode(data)
-
-
-@given(st.data())
-def test_a_real_file_with_damage_is_a_table_or_none(data: st.DataObject) -> None:
-    damaged = bytearray(WITH_DEFAULTS[: data.draw(st.integers(300, 3000))])
-    damaged[2:4] = struct.pack("<H", data.draw(st.integers(10, 200)))
-    for at in data.draw(st.lists(st.integers(0, len(damaged) - 1), max_size=4)):
-        damaged[at] = data.draw(st.integers(0, 255))
-    try:
-        pack = decode(bytes(damaged))
-    except PackError:
-        return
-    assert len({each.name for each in pack.entries}) == len(pack.entries)
-
-
-def test_a_file_that_claims_much_takes_no_more_memory_than_it_is_long() -> None:
-    claims = packed(entry("A"), bytes(1_000_000), number=65535)
-    tracemalloc.start()
-    try:
-        with pytest.raises(PackError, match="cut off"):
-            decode(claims)
-        assert tracemalloc.get_traced_memory()[1] < 100_000
-    finally:
-        tracemalloc.stop()

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from fastcrc.crc16 import mcrf4xx
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
 from pymavlink.generator.mavcrc import x25crc_slow
 
-from paramclient.wire.frames import BOOT_CLOCK_OFFSETS, Frame, Framer, build_frame, message_name
+from paramclient.wire.frames import BOOT_CLOCK_OFFSETS, Frame, Framer, message_name
 from paramclient.wire.messages import (
     DECODED_IDS,
     AutopilotVersion,
@@ -320,29 +319,11 @@ def test_values_and_sets_of_every_kind_are_pymavlinks(
         assert decode(one_frame(frame)) == ours
 
 
-@thorough
-@given(st.binary(min_size=4, max_size=4) | st.sampled_from([b"\x01\0\x80\x7f", b"\xc0\xb4\xb3\xff"]))
-def test_the_four_value_bytes_are_not_touched(raw: bytes) -> None:
-    for message in (ParamValue("A", raw, 6, 1, 0), ParamSet(1, 1, "A", raw, 6)):
-        for version in (1, 2):
-            frame = encode(message, system=1, component=1, sequence=0, version=version)
-            assert decode(one_frame(frame)) == message
-
-
 def test_a_name_ends_at_its_first_nul_and_keeps_odd_bytes() -> None:
     payload = bytes(4) + b"\x01\0\x02\0" + b"A\xff\0GARBAGE".ljust(16, b"!") + b"\x06"
     value = decode(one_frame(bare_frame(22, payload)))
     assert value == ParamValue("A\xff", bytes(4), 6, 1, 2)
     assert encode(value, system=7, component=8, sequence=0)[18:21] == b"A\xff\0"
-
-
-@pytest.mark.parametrize("version", [1, 2])
-def test_other_messages_are_framed_and_not_decoded(version: int) -> None:
-    attitude = dialect.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.0)
-    payload = struct.pack("<I6f", 1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.0)
-    frame = build_frame(30, payload, system=7, component=8, sequence=3, version=version)
-    assert frame == pack(attitude, version=version, sequence=3)
-    assert decode(one_frame(frame)) is None
 
 
 # Frames
@@ -429,202 +410,6 @@ PV_SIGNED = pack_signed(MESSAGES[7][1])
 HEARTBEAT = pack(MESSAGES[0][1], sequence=1)
 STATUS = pack(dialect.MAVLink_statustext_message(6, b"\xfd\xfe" * 20))
 UNKNOWN = bare_frame(410, b"of a later dialect")
-FORMS = pytest.mark.parametrize("frame", [PV, PV_V1, PV_SIGNED], ids=["v2", "v1", "signed"])
-
-
-def checked_part(frame: bytes) -> int:
-    """Bytes up to the end of the checksum: all but the signature."""
-    return len(frame) - 13 if frame is PV_SIGNED else len(frame)
-
-
-def test_a_signature_is_stepped_over() -> None:
-    framer = Framer()
-    assert len(PV_SIGNED) == len(PV) + 13
-    first, second = framer.receive(PV_SIGNED + HEARTBEAT)
-    assert decode(first) == MESSAGES[7][0]
-    assert decode(second) == MESSAGES[0][0]
-    assert framer.skipped == 0
-
-
-@pytest.mark.parametrize("stream", [True, False])
-def test_only_messages_of_requested_types_are_decoded_and_all_are_counted(stream: bool) -> None:
-    framer = Framer({22, 345}, stream=stream)
-    data = b"noise" + HEARTBEAT + PV + PV_V1 + STATUS + PV_SIGNED + b"\xfd"
-    assert [frame.version for frame in framer.receive(data)] == [2, 1, 2]
-    framer.flush()
-    assert (framer.frames, framer.skipped) == (5, 6)
-
-
-def test_every_chunk_size_gives_the_same_frames() -> None:
-    stream = b"".join(
-        (
-            b"\xfe",
-            PV,
-            b"\xfd\xfd",
-            HEARTBEAT,
-            PV_V1,
-            UNKNOWN,
-            PV_SIGNED,
-            b"\0\xfd\x09",
-            STATUS,
-            PV[:20],
-            PV_V1,
-            PV,
-        )
-    )
-    expected = [one_frame(frame) for frame in (PV, HEARTBEAT, PV_V1, PV_SIGNED, STATUS, PV_V1, PV)]
-    for size in range(1, len(stream) + 1):
-        framer = Framer()
-        chunks = [stream[at : at + size] for at in range(0, len(stream), size)]
-        assert take(framer, chunks) == expected
-        assert framer.frames == len(expected)
-        assert framer.skipped == len(stream) - sum(
-            map(len, (PV, HEARTBEAT, PV_V1, PV_SIGNED, STATUS, PV_V1, PV))
-        )
-
-
-@FORMS
-def test_a_frame_may_be_cut_anywhere_in_a_stream(frame: bytes) -> None:
-    for cut in range(1, len(frame)):
-        framer = Framer()
-        assert framer.receive(frame[:cut]) == []
-        assert framer.receive(frame[cut:]) == [one_frame(frame)]
-        assert framer.flush() == []
-
-
-@pytest.mark.parametrize("version", [1, 2])
-def test_a_header_may_be_cut_anywhere_whatever_its_id(version: int) -> None:
-    for number in dialect.mavlink_map:
-        if number < 256 or version == 2:
-            frame = bare_frame(number, b"\1", version=version)
-            for cut in range(1, len(frame)):
-                framer = Framer()
-                assert framer.receive(frame[:cut]) == []
-                assert framer.receive(frame[cut:]) == [one_frame(frame)]
-
-
-@FORMS
-def test_datagrams_are_never_joined(frame: bytes) -> None:
-    for cut in range(1, len(frame)):
-        framer = Framer(stream=False)
-        assert framer.receive(frame[:cut]) == []
-        assert framer.receive(frame[cut:]) == []
-        assert framer.receive(frame + HEARTBEAT) == [one_frame(frame), one_frame(HEARTBEAT)]
-
-
-@FORMS
-def test_a_cut_off_frame_does_not_hide_the_next_ones(frame: bytes) -> None:
-    for cut in range(1, checked_part(frame)):
-        for stream in (True, False):
-            found = take(Framer(stream=stream), [frame[:cut] + HEARTBEAT + PV])
-            assert found == [one_frame(HEARTBEAT), one_frame(PV)]
-
-
-def test_a_cut_off_signature_is_filled_with_what_follows() -> None:
-    """Without the key nothing distinguishes a signature from other bytes: the frame counts and takes its
-    13."""
-    for cut in range(len(PV_SIGNED) - 13, len(PV_SIGNED)):
-        found = take(Framer(), [PV_SIGNED[:cut] + HEARTBEAT + PV])
-        assert found == [one_frame(PV_SIGNED), one_frame(PV)]
-
-
-@FORMS
-def test_no_damaged_byte_passes_and_none_hides_the_next_frames(frame: bytes) -> None:
-    for at in range(checked_part(frame)):
-        for damage in (0x01, 0x80, 0xFF):
-            damaged = bytearray(frame)
-            damaged[at] ^= damage
-            for stream in (True, False):
-                framer = Framer(stream=stream)
-                found = take(framer, [bytes(damaged) + HEARTBEAT + PV])
-                assert found == [one_frame(HEARTBEAT), one_frame(PV)]
-                assert framer.skipped == len(frame)
-
-
-def test_an_unfinished_candidate_holds_back_and_flush_gives_what_is_inside() -> None:
-    long_candidate = PV[:1] + b"\xff" + PV[2:10]
-    framer = Framer()
-    assert framer.receive(long_candidate + PV + HEARTBEAT) == []
-    assert framer.flush() == [one_frame(PV), one_frame(HEARTBEAT)]
-    assert framer.flush() == []
-    assert framer.receive(PV) == [one_frame(PV)]
-
-    assert framer.receive(long_candidate + PV) == []
-    assert framer.receive(bytes(300)) == [one_frame(PV)]
-
-
-@pytest.mark.parametrize(
-    "head",
-    [
-        pytest.param(b"\xfd\xff\0\0\0\1\1\xff\xff\xff", id="an unknown id"),
-        pytest.param(b"\xfd\xff\x02\0\0\1\1\x16\0\0", id="unknown flags"),
-        pytest.param(b"\xfe\xff\0\1\1\x08", id="an unknown id in MAVLink 1"),
-    ],
-)
-def test_a_head_that_can_be_no_frames_holds_nothing_back(head: bytes) -> None:
-    assert 8 not in dialect.mavlink_map
-    framer = Framer()
-    assert framer.receive(head) == []
-    assert framer.skipped == len(head)
-    assert framer.receive(head + PV) == [one_frame(PV)]
-
-
-@pytest.mark.parametrize("flags", [0x02, 0x03, 0x80])
-def test_a_frame_with_unknown_flags_is_passed_over(flags: int) -> None:
-    frame = bare_frame(22, PV[10:-2], flags=flags)
-    padded = frame + (bytes(13) if flags & 1 else b"")
-    assert take(Framer(), [padded + HEARTBEAT]) == [one_frame(HEARTBEAT)]
-
-
-def test_an_unknown_id_cannot_be_checked_and_is_passed_over() -> None:
-    framer = Framer()
-    assert take(framer, [UNKNOWN + PV]) == [one_frame(PV)]
-    assert framer.skipped == len(UNKNOWN)
-    assert take(framer, [bare_frame(410, PV)]) == [one_frame(PV)]
-
-
-def test_a_frame_inside_a_valid_one_is_payload() -> None:
-    outer = bare_frame(dialect.MAVLINK_MSG_ID_TUNNEL, bytes(5) + PV + HEARTBEAT)
-    assert take(Framer(), [outer]) == [one_frame(outer)]
-    damaged = outer[:-1] + bytes((outer[-1] ^ 1,))
-    assert take(Framer(), [damaged]) == [one_frame(PV), one_frame(HEARTBEAT)]
-
-
-HOSTILE = {
-    "magic 2": b"\xfd",
-    "magic 1": b"\xfe",
-    "both": b"\xfd\xfe",
-    "longest heartbeats": b"\xfd\xff\0\0\0\1\1\0\0\0",
-    "longest signed values": b"\xfd\xff\1\0\0\1\1\x16\0\0",
-    "longest old heartbeats": b"\xfe\xff\0\1\1\0",
-    "a known id at every byte": b"\xfe" * 7 + b"\0",
-    "nothing": b"\0",
-}
-
-
-@pytest.mark.parametrize("pattern", HOSTILE.values(), ids=HOSTILE)
-@pytest.mark.parametrize(("stream", "chunk"), [(False, 20_000), (True, 20_000), (True, 100), (True, 1)])
-def test_work_and_memory_are_bounded_on_hostile_input(
-    pattern: bytes, stream: bool, chunk: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """At most one checksum for each byte, of no more bytes than a frame has."""
-    size = 20_000
-    data = (pattern * size)[:size]
-    checked: list[int] = []
-
-    def counting_checksum(covered: bytes) -> int:
-        checked.append(len(covered))
-        result: int = mcrf4xx(covered)
-        return result
-
-    monkeypatch.setattr("paramclient.wire.frames.mcrf4xx", counting_checksum)
-    framer = Framer(stream=stream)
-    for at in range(0, size, chunk):
-        framer.receive(data[at : at + chunk])
-    framer.flush()
-    assert framer.skipped == size
-    assert len(checked) <= size
-    assert max(checked, default=0) <= FRAME_SIZE_MAX
 
 
 # Any mix of frames and noise
@@ -779,17 +564,3 @@ def test_the_position_of_time_boot_ms_in_each_message(number: int) -> None:
 def test_requests_and_times_of_applications_are_no_clocks() -> None:
     assert {2, 30, 32, 33, 83} <= BOOT_CLOCK_OFFSETS.keys()
     assert BOOT_CLOCK_OFFSETS.keys().isdisjoint({84, 86, 251, 252, 254, 263})
-
-
-def test_occasional_ids_are_decoded_while_they_are_requested() -> None:
-    attitude = build_frame(30, bytes(28), system=1, component=1, sequence=0)
-    heartbeat = encode(Heartbeat(2, 12), system=1, component=1, sequence=1)
-    for guard in (None, lambda frame: True):
-        framer = Framer({0}, occasional={30}, stream=False)
-        framer.guard = guard
-        for takes in (False, True, False):
-            framer.takes_occasional = takes
-            assert framer.takes_occasional is takes
-            seen = [frame.message_id for frame in framer.receive(attitude + heartbeat)]
-            assert seen == ([30, 0] if takes else [0])
-        assert framer.frames == 6
