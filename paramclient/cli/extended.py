@@ -290,7 +290,7 @@ def cached_extended(vehicle: str | None, cache: str | None, component: int | Non
             opened.load(each.key, each.component, extended=True)
             for each in tables_in(opened, vehicle, component)
         ]
-        tables = [table for table in found if table is not None]
+        tables = [table for table in found if table is not None and table.params]
     if not tables:
         raise NotInCache("there are no extended parameters of that vehicle in the cache")
     if len(tables) > 1:

@@ -184,8 +184,7 @@ class _Fetched:
         cached = [param for param in params if param.trust is Trust.CACHED]
         missing = set(result.missing)
         if policy is Policy.AUTO:
-            if result.source == "cache":
-                missing = {param.index for param in cached if param.index is not None}
+            missing |= {param.index for param in cached if param.index is not None}
             params = [param for param in params if param.trust is not Trust.CACHED]
             cached = []
         return cls(

@@ -48,14 +48,12 @@ class _Pending:
         observations: changed values, in order.
         removed: names that the vehicle no longer has, and when that was found.
         is_whole: whether the whole table is to be written, as it is.
-        proven_at: when the table was last confirmed, in unix seconds, or None.
         state: of the table, as written last.
     """
 
     observations: list[StoredParam] = field(default_factory=list)
     removed: dict[str, float] = field(default_factory=dict)
     is_whole: bool = False
-    proven_at: float | None = None
     state: TableState | None = None
 
 
@@ -80,6 +78,7 @@ class CacheWriter:
         self._owned = owned
         self._thread = anyio.CapacityLimiter(1)
         self._identities: dict[Node, Identity] = {}  # under which the tables of a component are written
+        self._synced_at: dict[Session, float] = {}  # when each table was last proven
         self._pending: dict[Session, _Pending] = {}
         self._flushing = anyio.Lock()
         self._something_to_write = anyio.Event()
@@ -132,6 +131,8 @@ class CacheWriter:
             cached = await self._try(partial(cache.load, identity.key, node.component, extended=is_extended))
             if cached is None:
                 continue
+            if cached.synced_at is not None:
+                self._synced_at.setdefault(session, cached.synced_at)
             session.table.load(
                 cached.params.values(),
                 count=cached.count if cached.complete else None,
@@ -149,6 +150,7 @@ class CacheWriter:
         self._identities.pop(node, None)
         for session in node.sessions:
             self._pending.pop(session, None)
+            self._synced_at.pop(session, None)
 
     def changed(self, session: Session, change: Change) -> None:
         """Take a change of a parameter."""
@@ -169,7 +171,7 @@ class CacheWriter:
     def fetched(self, session: Session, result: FetchResult) -> None:
         """Take note of a complete fetch."""
         pending = self._pending.setdefault(session, _Pending())
-        pending.proven_at = time.time()
+        self._synced_at[session] = time.time()
         pending.is_whole = pending.is_whole or result.source != "cache"
         self._wake()
 
@@ -237,8 +239,11 @@ class CacheWriter:
         """Check that the values of a component are written.
 
         Raises:
+            UsageError: there is no cache.
             CacheError: they are not.
         """
+        if self.cache is None:
+            raise UsageError("durable needs a cache, and the client has none; open it with a cache")
         if node not in self._identities or not node.identification.is_confirmed:
             raise CacheError(f"it is not known which vehicle {node.system}/{node.component} is")
 
@@ -262,7 +267,7 @@ class CacheWriter:
             count=table.count,
             complete=table.is_complete,
             volatile_known=table.volatile_is_known,
-            synced_at=pending.proven_at,
+            synced_at=self._synced_at.get(session),
             file_works=session.serves_file,
         )
         return TableUpdate(
@@ -283,7 +288,6 @@ class CacheWriter:
         pending.observations += since.observations
         pending.removed |= since.removed
         pending.is_whole = pending.is_whole or since.is_whole or len(pending.observations) > PENDING_MAX
-        pending.proven_at = since.proven_at or pending.proven_at
         self._pending[session] = pending
 
     def _unix(self, moment: float) -> float:

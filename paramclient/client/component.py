@@ -33,7 +33,7 @@ from paramclient.errors import (
 from paramclient.links.replay import ReplayLink
 from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.params import ParamMap
-from paramclient.model.values import Encoding, Param, Settable, WireValue
+from paramclient.model.values import Encoding, Param, Settable, Trust, WireValue
 from paramclient.protocol import commands
 from paramclient.protocol.addresses import Address, PeerAddress, peer_in_words
 from paramclient.protocol.events import Change
@@ -462,7 +462,8 @@ class Component:
             else:
                 result = await fetch_all(self.session, refresh=refresh, policy=self.policy, progress=progress)
             return self._fetched(replace(result, elapsed=anyio.current_time() - began))
-        return result_of(self.session, "stream", began, [TIMEOUT_NOTE])
+        is_confirmed = any(each.trust is Trust.VERIFIED for each in self.session.table.params.values())
+        return result_of(self.session, "cache" if is_confirmed else "stream", began, [TIMEOUT_NOTE])
 
     async def _listen(self, began: float) -> FetchResult:
         """Wait until the table is complete by what other stations request, or until a log has ended."""

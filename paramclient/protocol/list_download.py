@@ -22,6 +22,8 @@ PAUSE_PX4: Final = 0.12
 """Seconds without a value after which a PX4's list has ended: it sends 20 values every 20 ms."""
 PAUSE_OTHERS: Final = 0.6
 """The same for other components: ArduPilot's list pauses for up to 0.5 s while it serves reads."""
+PAUSE_TAIL: Final = 0.06
+"""The same at the last values of a list, where a pause is rare."""
 PAUSE_INTERVALS: Final = 8
 """Mean intervals between two values after which a slow list has ended: PX4 sends 8 values a second in its
 low-bandwidth mode."""
@@ -209,9 +211,11 @@ class _Download:
 
     def _is_over(self) -> bool:
         """Return whether the list has ended: by its last index, or by a pause."""
-        if self._count is not None and self._reached >= self._count - TAIL:
+        if self._count is not None and self._reached >= self._count - 1:
             return True
         pause = PAUSE_PX4 if self.reads_beside else PAUSE_OTHERS
+        if self._count is not None and self._reached >= self._count - TAIL:
+            pause = PAUSE_TAIL
         if self._received:
             pause = max(pause, PAUSE_INTERVALS * (self._last - self._began) / len(self._received))
         return anyio.current_time() - self._last > min(pause, self.channel.silence_max)

@@ -98,6 +98,7 @@ async def write(
             _check_finite(session, name, value, force=force)
             await _learn_type(session, name)
             before = session.table.params[name]
+            await gate.wait()
             sending()
             result = await _Write(session, name, value).run()
             if session.identification.is_ardupilot and not result.param.same_value(before):
