@@ -21,7 +21,7 @@ __all__ = ["ReplacedValue", "Session", "Shared", "Spawn"]
 
 T = TypeVar("T")
 
-Spawn = Callable[..., None]
+Spawn = Callable[..., object]
 """Starts an async function, with its arguments, in the background."""
 
 FOREIGN_SET_MEMORY: Final = 2.0

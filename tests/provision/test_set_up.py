@@ -130,7 +130,7 @@ def another(*names: str) -> dict[str, WireValue]:
     wanted: dict[str, WireValue] = {}
     for name in names or SETTINGS:
         value = SETTINGS[name]
-        assert not isinstance(value, tuple | bytes)
+        assert isinstance(value, int | float)
         wanted[name] = value + 1
     return wanted
 
@@ -733,7 +733,7 @@ async def run_interrupted(
         else:
             scope.cancel()
         if how == "kill":  # nothing more is written to the disk
-            client.core.cache_writer._cache = None
+            client.core.cache_writer.cache = None
 
     tap = EndpointWithEvent(Air.symmetric([story.vehicle], **faults), frames, end)
     with scope:

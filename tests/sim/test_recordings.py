@@ -206,7 +206,7 @@ def ardupilot_of_file(name: str) -> ArduPilotVehicle:
     for entry in param_pck.decode(b"".join(blocks[at] for at in sorted(blocks))).entries:
         value = from_bits(entry.bits, entry.type)
         default = value if entry.default is None else from_bits(entry.default, entry.type)
-        assert not isinstance(default, bytes)
+        assert isinstance(default, int | float)
         is_shipped = shipped[entry.name].bits == entry.bits
         rows.append(
             shipped[entry.name] if is_shipped else SimParam(entry.name, entry.type, value, default=default)
