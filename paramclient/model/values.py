@@ -133,7 +133,8 @@ class Param:
     Attributes:
         name: param_id, 1 to 16 characters.
         value: int for integer types, float for REAL32 and REAL64, text or bytes for CUSTOM. A REAL32 is the
-            shortest decimal that gives its float32: 6.1, not 6.099999904632568. Where `is_raw`, the unsigned number of the four wire bytes, little-endian.
+            shortest decimal that gives its float32: 6.1, not 6.099999904632568. Where `is_raw`, the unsigned
+            number of the four wire bytes, little-endian.
         type: MAV_PARAM_TYPE; `ParamType.UNKNOWN` for a type that MAVLink does not define.
         index: the component's index of the parameter, or None while unknown (PX4 gives none to parameters
             not in use, ArduPilot none in responses by name).
