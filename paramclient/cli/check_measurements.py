@@ -327,8 +327,6 @@ class Measurements:
             for at, number in arrivals
             if number >= STEADY_SHARE * received and at > first
         )
-        if arrivals and arrivals[-1][0] == first:  # too few for more than one packet
-            rates = (number / (at - began) for at, number in arrivals[-1:] if at > began)
         count = self._component.count
         return ListCheck(
             count=count,
