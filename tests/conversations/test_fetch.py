@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import anyio
 import pytest
@@ -48,15 +49,11 @@ def test_every_value_arrives_on_a_lossy_link(kind: str, loss: float, backend: st
                 node = await conversation.node()
                 result = await fetch_all(node.plain)
                 await node.identification.settled()
-                check_right(vehicle, FetchResult(**{**_fields(result), "params": node.plain.table.params}))
+                check_right(vehicle, replace(result, params=node.plain.table.params))
                 assert result.source == ("ftp" if kind == "ardupilot" else "stream")
                 assert result.elapsed < (60 if loss == 0.4 else 15)
 
     run(main, backend=backend)
-
-
-def _fields(result: FetchResult) -> dict[str, object]:
-    return {name: getattr(result, name) for name in FetchResult.__slots__}
 
 
 @pytest.mark.parametrize("kind", ["px4", "ardupilot"])

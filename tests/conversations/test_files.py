@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from random import Random
 
 import anyio
@@ -114,7 +114,7 @@ async def test_a_refused_read_ends_the_transfer_and_a_server_without_bursts_serv
     async with converse(vehicle) as conversation:
         channel = (await conversation.node()).channel
 
-        def answers(opcode: int, code: int) -> Callable[[], object]:
+        def answers(opcode: int, code: int) -> Callable[[], Awaitable[None]]:
             """Return what answers each request of a kind with a NAK, before the vehicle does."""
 
             async def run() -> None:

@@ -263,7 +263,12 @@ async def test_a_refusal_counts_whether_the_old_value_comes_with_it(
 
     def refuse(message: ParamSet) -> Iterable[Message]:
         value, error = ParamValue("A", *params["A"], 1, 0), ParamError(255, 190, "A", -1, code)
-        return {"alone": [error], "before": [value, error], "after": [error, value]}[order]
+        orders: dict[str, list[Message]] = {
+            "alone": [error],
+            "before": [value, error],
+            "after": [error, value],
+        }
+        return orders[order]
 
     async with converse(table_puppet(params, refuse)) as conversation:
         with pytest.raises(kind):
