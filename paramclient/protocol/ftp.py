@@ -538,7 +538,14 @@ class _FileReader:
 
     def _take(self, packet: Packet) -> None:
         if packet.offset + len(packet.data) > self._size_max:
-            raise _error(self._channel, self._path, FileErrorCode.INVALID_DATA_SIZE)
+            system, component = self._channel.target
+            raise FileTransferError(
+                f"{self._path} of {system}/{component} is longer than {self._size_max} bytes",
+                system=system,
+                component=component,
+                path=self._path,
+                code=FileErrorCode.INVALID_DATA_SIZE,
+            )
         self._pieces.take(packet.offset, packet.data)
         self._blocks += 1
         self._last = anyio.current_time()

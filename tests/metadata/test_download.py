@@ -210,7 +210,7 @@ async def test_files_that_are_not_as_announced(wrong: str, tmp_path: Path) -> No
             MetadataError,
             f"mftp://{METADATA_FILE} of 1/1: cannot be unpacked: the file is truncated",
         ),
-        "long": (MetadataError, r"1/1 announces its metadata at mftp://x*: .* 239 bytes"),
+        "long": (MetadataError, r"1/1 announces its metadata at mftp://x*: .* 1 to 238 bytes"),
     }[wrong]
     async with a_client(vehicle) as client:
         component = await client.component()
@@ -238,10 +238,6 @@ async def test_a_vehicle_that_does_not_respond() -> None:
         tap.is_mute = True
         result = await outcome(metadata_of(component))
         assert isinstance(result, NoReply)
-        assert "lost" in str(result)
-        result = await outcome(metadata_of(component))
-        assert isinstance(result, NoReply)
-        assert result.attempts == 0  # no request was sent
         tap.is_mute = tap.is_deaf = False
         await anyio.sleep(1.5)
         assert await metadata_of(component) is not None
