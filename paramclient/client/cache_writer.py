@@ -7,7 +7,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Final, TypeVar
 
@@ -131,6 +131,9 @@ class CacheWriter:
             cached = await self._try(partial(cache.load, identity.key, node.component, extended=is_extended))
             if cached is None:
                 continue
+            if node.identification.autopilot is None:  # no heartbeat yet
+                known = cached.identity
+                identity = replace(identity, autopilot=known.autopilot, vehicle_type=known.vehicle_type)
             if cached.synced_at is not None:
                 self._synced_at.setdefault(session, cached.synced_at)
             session.table.load(
@@ -249,6 +252,9 @@ class CacheWriter:
 
     def _update(self, node: Node, session: Session, pending: _Pending) -> TableUpdate:
         table = session.table
+        identity, heard = self._identities[node], node.identification
+        if heard.autopilot is not None:
+            identity = replace(identity, autopilot=heard.autopilot, vehicle_type=heard.vehicle_type or 0)
         observations = list(pending.observations)
         if pending.is_whole:
             volatile = table.volatile if table.volatile_is_known else None
@@ -271,9 +277,9 @@ class CacheWriter:
             file_works=session.serves_file,
         )
         return TableUpdate(
-            identity=self._identities[node],
+            identity=identity,
             component=node.component,
-            autopilot=node.identification.autopilot or 0,
+            autopilot=identity.autopilot,
             at=time.time(),
             table=state,
             params=observations,
