@@ -29,6 +29,7 @@ import time
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.synchronize import Event
 
 import anyio
@@ -78,11 +79,20 @@ def main() -> int:
     print(f"Python {sys.version.split()[0]}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}\n")
     download = record_download()
     are_met = [
-        print_rates(download, arguments.rounds),
+        in_event_loop(partial(print_rates, download, arguments.rounds)),
         *(print_load(arguments.seconds, burst) for burst in (1, TELEMETRY // 100)),
-        print_memory(download),
+        in_event_loop(partial(print_memory, download)),
     ]
     return 1 if arguments.check and not all(are_met) else 0
+
+
+def in_event_loop(work: Callable[[], bool]) -> bool:
+    """Run a function in an event loop, which a station needs."""
+
+    async def run() -> bool:
+        return work()
+
+    return anyio.run(run)
 
 
 def print_rates(download: Download, rounds: int) -> bool:
