@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Coroutine
+from functools import partial
 from random import Random
 
 import anyio
@@ -29,6 +30,11 @@ from tests.conversations.virtual import Silence, Tap, converse, virtual, virtual
 BOTH = pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
 Maker = type[PX4Vehicle] | type[ArduPilotVehicle]
 CONTENT = Random(1).randbytes(60_000)
+
+
+def note(received: list[int], number: int, size: int | None) -> None:
+    """Note the progress of a transfer."""
+    received.append(number)
 
 
 def packet_in(message: Message) -> Packet | None:
@@ -62,9 +68,7 @@ async def test_files_of_every_size_arrive_whole_and_are_closed(make: Maker, loss
             vehicle.files["a.bin"] = CONTENT[:size]
             received: list[int] = []
             began = anyio.current_time()
-            content = await read_file(
-                channel, "a.bin", progress=lambda number, of, to=received: to.append(number)
-            )
+            content = await read_file(channel, "a.bin", progress=partial(note, received))
             assert content == CONTENT[:size]
             assert anyio.current_time() - began < (40.0 if loss else 4.0)
             assert received == sorted(received)
@@ -114,7 +118,7 @@ async def test_a_refused_read_ends_the_transfer_and_a_server_without_bursts_serv
     async with converse(vehicle) as conversation:
         channel = (await conversation.node()).channel
 
-        def answers(opcode: int, code: int) -> Callable[[], Awaitable[None]]:
+        def answers(opcode: int, code: int) -> Callable[[], Coroutine[object, object, None]]:
             """Return what answers each request of a kind with a NAK, before the vehicle does."""
 
             async def run() -> None:
@@ -286,7 +290,7 @@ async def test_the_end_of_the_link_ends_a_transfer() -> None:
 
 def pack_of(vehicle: ArduPilotVehicle, number: int | None = None) -> bytes:
     """Return the parameter file of a vehicle, or of some of its parameters."""
-    rows = [PackedParam(each.name, each.type, each.bits) for each in vehicle.listed[:number]]  # type: ignore[arg-type]  # of ArduPilot
+    rows = [PackedParam(each.name, each.type, each.bits) for each in vehicle.listed[:number]]
     return encode(rows, total=len(rows) if number else None)
 
 

@@ -198,9 +198,9 @@ async def test_a_silent_vehicle_is_lost_after_5_s_and_found_again() -> None:
         node = await conversation.node()
         await read(node.plain, "MC_ROLL_P")
         await anyio.sleep_until(14.9)
-        assert not node.presence.is_lost
+        assert not conversation.of(Lost)
         await anyio.sleep_until(16.2)
-        assert node.presence.is_lost
+        assert conversation.of(Lost)
         assert str(node.plain.table.params["MC_ROLL_P"].trust) == "cached"
         began = anyio.current_time()
         with pytest.raises(NoReply):

@@ -165,7 +165,7 @@ async def converse(endpoint: Endpoint, **options: Any) -> AsyncIterator[Conversa
                 link="sim:test",
                 is_stream=False,
                 send=send,
-                spawn=tasks.start_soon,  # type: ignore[arg-type]  # anyio returns a handle since 4.12
+                spawn=tasks.start_soon,
                 emit=emit,
                 changed=changed,
                 **options,
