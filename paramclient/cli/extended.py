@@ -286,10 +286,15 @@ def cached_extended(vehicle: str | None, cache: str | None, component: int | Non
         UsageError: there are several.
     """
     with ParamCache(cache) as opened:
-        found = [
-            opened.load(each.key, each.component, extended=True)
-            for each in tables_in(opened, vehicle, component)
-        ]
+        chosen = []
+        if vehicle is not None and vehicle.isdecimal():  # a camera of the system has its own hardware id
+            chosen = [
+                each
+                for each in opened.components()
+                if each.system == int(vehicle) and component in (None, each.component)
+            ]
+        chosen = chosen or tables_in(opened, vehicle, component)
+        found = [opened.load(each.key, each.component, extended=True) for each in chosen]
         tables = [table for table in found if table is not None and table.params]
     if not tables:
         raise NotInCache("there are no extended parameters of that vehicle in the cache")
