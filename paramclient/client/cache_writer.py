@@ -81,6 +81,9 @@ class CacheWriter:
         self._synced_at: dict[Session, float] = {}  # when each table was last proven
         self._pending: dict[Session, _Pending] = {}
         self._flushing = anyio.Lock()
+        self._is_closing = False
+        self._durable_calls = 0
+        self._durable_until = 0  # the last of these whose values are safe from power loss
         self._something_to_write = anyio.Event()
         self._known: set[tuple[int, int]] = set()
         self._ahead = -math.inf  # of unix time to the time of the event loop, in seconds
@@ -101,17 +104,26 @@ class CacheWriter:
         if self.cache is None:
             return
         is_written = False
+        was_warned, self._is_closing = self.failure is not None, True
         with anyio.move_on_after(CLOSE_WAIT_MAX, shield=True):
             for node in nodes:
                 is_known = node.identification.is_settled
                 if is_known or any(each.table.is_complete for each in node.sessions):
                     await self.load(node)
             is_written = await self.flush()
-        if not is_written:
-            logger.warning("the last values could not be written to the cache: %s", self.failure or "timeout")
+        if not is_written and not was_warned:
+            self._warn_of_lost()
         if self._owned:
             with anyio.move_on_after(CLOSE_WAIT_MAX, shield=True):
                 await self.run_in_thread(self.cache.close)
+
+    def _warn_of_lost(self) -> None:
+        for node, identity in self._identities.items():
+            if any(session in self._pending for session in node.sessions):
+                logger.warning(
+                    "the last values of %d/%d (%s) are not in the cache, and lost: %s",
+                    *(node.system, node.component, identity.key, self.failure or "timeout"),
+                )
 
     def may_have(self, node: Node) -> bool:
         """Return whether the cache had a table for these ids when the client was opened."""
@@ -136,14 +148,16 @@ class CacheWriter:
                 identity = replace(identity, autopilot=known.autopilot, vehicle_type=known.vehicle_type)
             if cached.synced_at is not None:
                 self._synced_at.setdefault(session, cached.synced_at)
+            is_same_firmware = _firmware(cached.identity) == _firmware(identity)
+            params = cached.params.values()
             session.table.load(
-                cached.params.values(),
+                params if is_same_firmware else [replace(each, default=None) for each in params],
                 count=cached.count if cached.complete else None,
                 hash=cached.hash,
                 volatile=cached.volatile,
                 volatile_is_known=cached.volatile_known,
             )
-            if _firmware(cached.identity) == _firmware(identity) and session.serves_file is None:
+            if is_same_firmware and session.serves_file is None:
                 session.serves_file = cached.file_works
         self._identities[node] = identity
         self._wake()
@@ -197,7 +211,12 @@ class CacheWriter:
         cache = self.cache
         if cache is None:
             return not durable
+        self._durable_calls += durable
+        call = self._durable_calls
         async with self._flushing:
+            if durable and self._durable_until >= call:
+                return True
+            last_call = self._durable_calls
             certain = [node for node in self._identities if node.identification.is_confirmed]
             taken = [(node, session) for node in certain for session in node.sessions]
             taken = [(node, session) for node, session in taken if session in self._pending]
@@ -217,6 +236,8 @@ class CacheWriter:
                         self._put_back(session, pending)
         if is_saved:
             self.failure = None
+            if durable:
+                self._durable_until = last_call
         return is_saved
 
     async def write_all(self) -> None:
@@ -319,7 +340,7 @@ class CacheWriter:
         try:
             return await self.run_in_thread(work)
         except CacheError as error:
-            if self.failure is None:
+            if self.failure is None and not self._is_closing:
                 logger.warning("continuing without the cache: %s", error)
             self.failure = error
             return None

@@ -552,15 +552,16 @@ class ParamClient:
         """
         self.core.check_open()
         began = anyio.current_time()
+        node: Node | None = None
         with anyio.move_on_after(timeout):
             while (node := choose()) is None and not self.core.is_over:
                 due = until()
                 with anyio.move_on_after(None if due is None else due - anyio.current_time()):
                     await self._activity()
             if node is not None:
-                component = self._by_session[node.plain]
-                await component.wait_for_cache()
-                return component
+                await self._by_session[node.plain].wait_for_cache()
+        if node is not None:
+            return self._by_session[node.plain]
         refused = refused_in_words(self.signing_report())
         hint = "" if refused else hint_of_link(self.core.station, self.bytes_received)
         if (due := until()) is not None:

@@ -295,7 +295,7 @@ class Component:
         """
         ((name, checked),) = check_writes([(name, value)], extended=self.session.dialect.has_ack)
         settle, by = check_settle(settle), check_author(author)
-        self._check_may_write(durable=durable)
+        await self._check_may_write(durable=durable)
         with self._limited(timeout, f"the acknowledgement of {name} by {self.system}/{self.component}"):
             result = await write(self.session, name, checked, settle=settle, force=force, author=by)
         if durable:
@@ -338,7 +338,7 @@ class Component:
         """
         pairs = check_writes(values, extended=self.session.dialect.has_ack)
         settle, by = check_settle(settle), check_author(author)
-        self._check_may_write(durable=durable)
+        await self._check_may_write(durable=durable)
         began = anyio.current_time()
         outcomes: list[SetOutcome] = []
         error: ParamClientError | None = None
@@ -574,7 +574,7 @@ class Component:
         if self.core.station.listens_only:
             raise UsageError("this client only listens, and sends no requests")
 
-    def _check_may_write(self, *, durable: bool) -> None:
+    async def _check_may_write(self, *, durable: bool) -> None:
         self._check_may_send()
         if self.node.has_rival(anyio.current_time()):
             words = node_in_words(self.node)
@@ -582,6 +582,9 @@ class Component:
                 f"two vehicles use the ids {words}; nothing was written.", vehicles=[words], choose_by="peer"
             )
         if durable:
+            if self.core.cache is not None:
+                with anyio.move_on_after(CACHE_TIMEOUT):
+                    await self.cache_is_read.wait()
             self.core.cache_writer.check_kept(self.node)
 
     async def _write_durably(self, what: str) -> None:
@@ -589,7 +592,7 @@ class Component:
             await self.core.cache_writer.write_durably(self.node)
         except CacheError as error:
             address = f"{self.system}/{self.component}"
-            raise NotDurable(f"{address} has accepted {what}, not on the disk: {error}") from error
+            raise NotDurable(f"{address} has accepted {what}, but it is not on the disk: {error}") from error
 
     @contextmanager
     def _limited(self, timeout: float | None, what: str) -> Iterator[None]:

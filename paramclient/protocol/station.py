@@ -120,6 +120,7 @@ class Station:
         self._changed = changed
         self._datagrams = self._new_framer(stream=False)
         self._framers: dict[Peer, Framer] = {}
+        self._ended_peers: set[Peer] = set()  # of components: another connection may take their ids
         self._sequence = 0
         self._seek_at = -math.inf  # when the next heartbeat may be requested
         self._signer: Signer | None = None
@@ -150,6 +151,8 @@ class Station:
         framer = self._framer_of(peer) if self._is_stream else self._datagrams
         for frame in framer.receive(data):
             self._take(frame, peer, now)
+        if not data:
+            self._ended_peers.update(node.peer for node in self.nodes.values() if node.peer == peer)
         if not self.nodes and now >= self._seek_at:
             self._request_heartbeat(data, peer, now)
 
@@ -259,13 +262,14 @@ class Station:
             node = self._add(address, peer, now)
         if peer != node.peer and not self._moves(node, peer, message, now):
             return
+        self._ended_peers.discard(peer)
         node.receive(message, now, frame.version)
 
     def _moves(self, node: Node, peer: Peer, message: Message, now: float) -> bool:
         """Return whether a component is at another peer now: its own is silent, or it is the same link."""
         last = node.presence.received_at
         is_gone = now - last > RIVAL_TIME or last < self.listening_since  # the link was opened again
-        if is_gone or node.is_same_vehicle(message):
+        if is_gone or node.peer in self._ended_peers or node.is_same_vehicle(message):
             node.peer = peer
             node.rival = None
             return True

@@ -100,7 +100,11 @@ async def write(
             before = session.table.params[name]
             await gate.wait()
             sending()
-            result = await _Write(session, name, value).run()
+            try:
+                result = await _Write(session, name, value).run()
+            except (NoReply, LinkError, anyio.get_cancelled_exc_class()):
+                session.foreign_set(name, author, anyio.current_time())  # it may be acknowledged yet
+                raise
             if session.identification.is_ardupilot and not result.param.same_value(before):
                 late = ReplacedValue(before, anyio.current_time() + LATE_ANSWER_TIME)
                 session.replaced[name].append(late)

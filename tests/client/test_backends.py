@@ -32,10 +32,9 @@ from paramclient import (
     WrittenParam,
 )
 from paramclient.client import client as client_module
-from paramclient.client import reconnect_delays
+from paramclient.client import link_task
 from paramclient.errors import LinkError
 from paramclient.links import Link, create_link, serve_endpoint
-from paramclient.metadata import metadata_of
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.selection import LOOK_TIME
 from paramclient.provision import apply, prepare, restore, verify
@@ -150,7 +149,7 @@ async def test_a_second_vehicle_is_looked_for() -> None:
 
 
 async def test_a_tcp_connection_that_drops_is_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.01)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.01)
     vehicle, scope = generic(stream=True, **QUICK), anyio.CancelScope()
     listening = create_link("tcpin:127.0.0.1:0")
     async with beside() as tasks:
@@ -166,7 +165,7 @@ async def test_a_tcp_connection_that_drops_is_opened_again(monkeypatch: pytest.M
 
 
 async def test_a_serial_port_that_is_unplugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.01)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.01)
     vehicle = generic(stream=True, **QUICK)
     with Cable(tmp_path) as cable:
         async with beside() as tasks, a_client(cable.link) as client:
@@ -206,7 +205,6 @@ async def test_a_table_is_downloaded_by_list_and_then_taken_from_the_cache(tmp_p
             async with ParamClient(vehicle, cache=tmp_path / "cache") as client:
                 component = await client.component()
                 result = await component.fetch_all(progress=reported.append)
-                await component.refreshed()
                 sources.append(result.source)
                 assert bits(component.params) == bits(vehicle.params)
     assert sources == ["stream", "cache"]
@@ -373,8 +371,8 @@ async def test_a_scope_around_a_client_has_the_file_closed_before_it_ends() -> N
 async def test_a_link_that_fails_reaches_everyone(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(reconnect_delays, "LINK_TIMEOUT", 0.05)
-    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.01)
+    monkeypatch.setattr(link_task, "LINK_TIMEOUT", 0.05)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.01)
     link = FlakyLink(generic(**QUICK))
     async with beside(), a_client(link) as client:
         component = await client.component()

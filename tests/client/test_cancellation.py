@@ -227,7 +227,6 @@ async def test_a_whole_session_cancelled_at_each_point(tmp_path: Path, point: st
         async with ParamClient(vehicle, cache=path) as client:
             component = await client.component()
             await component.fetch_all()
-            await component.refreshed()
             await component.set("PARAM_01", number)
             await asyncio.sleep(0.3)
 

@@ -17,7 +17,6 @@ from typing import Any
 import anyio
 import anyio.abc
 import pytest
-from paramclient.client.component_core import IDENTITY_TIMEOUT
 
 from paramclient import (
     Change,
@@ -35,7 +34,8 @@ from paramclient import (
     UsageError,
     ValueNotApplied,
 )
-from paramclient.client import arguments, link_task, reconnect_delays
+from paramclient.client import arguments, link_task
+from paramclient.client.component import CACHE_TIMEOUT
 from paramclient.errors import ParamErrorCode
 from paramclient.links import Peer, create_link, serve_endpoint
 from paramclient.protocol.station import Station
@@ -204,9 +204,6 @@ async def test_calls_on_a_client_that_is_not_open() -> None:
     for call in CALLS.values():
         with pytest.raises(ClientClosed, match="was closed"):
             await call(client, component)
-    for after in (component.refreshed(), component.fetch_all(refresh=True)):
-        with pytest.raises(ClientClosed, match="was closed"):
-            await after
     assert len(component.params) == 25, "what was known stays readable"
     assert not residue(component)
 
@@ -414,7 +411,7 @@ async def test_a_component_that_is_heard_before_its_heartbeat(monkeypatch: pytes
     answer = vehicle._on_command
 
     def without_heartbeat(request: messages.CommandLong, sender: frames.Frame) -> None:
-        if request.params[0] != messages.message_id(messages.Heartbeat):
+        if request.param1 != messages.message_id(messages.Heartbeat):
             answer(request, sender)
 
     monkeypatch.setattr(vehicle, "_on_command", without_heartbeat)
@@ -830,7 +827,7 @@ async def test_a_first_fetch_does_not_wait_for_long_to_hear_that() -> None:
         result = await component.fetch_all()
         # the heartbeat says ArduPilot, so the file is tried whatever it says of itself
         assert (result.complete, result.source) == (True, "ftp")
-        assert anyio.current_time() - began < IDENTITY_TIMEOUT + 2.0  # simulated seconds
+        assert anyio.current_time() - began < CACHE_TIMEOUT + 2.0  # simulated seconds
 
 
 @in_simulated_time
@@ -1148,9 +1145,7 @@ async def test_a_link_that_stays_disconnected_fails_the_calls_and_not_the_client
             error = await task
             assert type(error) is LinkError, name
             assert "refused" in str(error)
-            assert math.isclose(
-                anyio.current_time() - disconnected_at, reconnect_delays.LINK_TIMEOUT, abs_tol=0.1
-            )
+            assert math.isclose(anyio.current_time() - disconnected_at, link_task.LINK_TIMEOUT, abs_tol=0.1)
         for call in ("get", "set", "fetch_all", "client.component", "client.fetch_all"):
             with pytest.raises(LinkError, match="refused"):
                 await CALLS[call](client, component)
@@ -1245,9 +1240,9 @@ async def test_a_tcp_connection_that_breaks_during_a_download() -> None:
 
 @pytest.mark.asyncio
 async def test_a_tcp_server_that_stays_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnect_delays, "LINK_TIMEOUT", 0.3)
-    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.05)
-    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MAX", 0.1)
+    monkeypatch.setattr(link_task, "LINK_TIMEOUT", 0.3)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.05)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MAX", 0.1)
     served = Served(generic(stream=True), "tcpin")
     async with asyncio.timeout(TIMEOUT), served, a_client(f"tcp:127.0.0.1:{served.port}") as client:
         component = await client.component()

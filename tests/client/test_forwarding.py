@@ -278,8 +278,8 @@ async def test_a_program_that_is_not_there_yet_is_waited_for() -> None:
             with anyio.fail_after(20):
                 connection, _ = await loop.sock_accept(listener)
                 with connection:
-                    frames = frames.Framer()
-                    while not frames.receive(await loop.sock_recv(connection, 4096)):
+                    framer = frames.Framer()
+                    while not framer.receive(await loop.sock_recv(connection, 4096)):
                         pass
     assert tasks_beside() == set()
 

@@ -9,7 +9,6 @@ from unittest import mock
 
 import anyio
 import pytest
-from paramclient.protocol.requests.write_window import WRITES_IN_FLIGHT_MAX
 
 from paramclient import (
     CacheError,
@@ -146,26 +145,6 @@ async def test_a_switch_of_a_group_is_a_barrier() -> None:
     assert times["PARAM_2"] - times["PARAM_1"] < 0.01
     assert times["GRP_ENABLE"] - times["PARAM_2"] > 0.1
     assert min(times["GRP_A"], times["PARAM_3"]) - times["GRP_ENABLE"] > 0.1
-
-
-@in_simulated_time
-async def test_as_many_writes_are_in_flight_as_the_vehicle_serves() -> None:
-    tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.2))
-    async with a_client(tap) as client:
-        component = await client.component()
-        await component.fetch_all()
-        result = await component.set_many(NEW)
-        assert result.is_complete
-        assert result.elapsed < 4.5
-    first: dict[str, float] = {}
-    for at, _, each in tap.received:
-        if isinstance(each, messages.ParamSet):
-            first.setdefault(each.param_id, at)  # a few are repeated early
-    times = list(first.values())
-    assert len(times) == 200
-    bursts = [sum(start <= at < start + 0.35 for at in times) for start in times]
-    assert bursts[0] == 10
-    assert max(bursts) == WRITES_IN_FLIGHT_MAX
 
 
 @in_simulated_time

@@ -39,7 +39,7 @@ from paramclient.client.signing_timestamps import (
 from paramclient.links import SimLink
 from paramclient.sim import ArduPilotVehicle, Vehicle
 from paramclient.wire.signing import Refusal
-from tests.shell import VALUES, Tap, in_simulated_time, simulated_time_loop, small_px4
+from tests.shell import VALUES, in_simulated_time, simulated_time_loop, small_px4
 
 SECRET = bytes(range(101, 133))
 KEY = SigningKey(SECRET)
