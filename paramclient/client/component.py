@@ -462,6 +462,10 @@ class Component:
             else:
                 result = await fetch_all(self.session, refresh=refresh, policy=self.policy, progress=progress)
             return self._fetched(replace(result, elapsed=anyio.current_time() - began))
+        if self.session.table.count is None:
+            waited = anyio.current_time() - began
+            with self._explained(began):
+                raise NoReply(f"the parameters of {self.system}/{self.component}", attempts=0, waited=waited)
         is_confirmed = any(each.trust is Trust.VERIFIED for each in self.session.table.params.values())
         return result_of(self.session, "cache" if is_confirmed else "stream", began, [TIMEOUT_NOTE])
 

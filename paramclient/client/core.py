@@ -80,10 +80,12 @@ class ClientCore:
         self.station.gate.check()
         if self._io is None:
             raise ClientClosed("the client is not open; use `async with` or `open`", link=self.link.name)
+        if self._work is None or self._work.cancel_scope.cancel_called:
+            raise ClientClosed("the client was closed", link=self.link.name)
 
     def spawn(self, work: Callable[..., Any], *arguments: Any) -> None:
         """Run a function in the background. Its errors are logged, and never end the link."""
-        if self._work is not None:
+        if self._work is not None and not self._work.cancel_scope.cancel_called:
             self._work.start_soon(self._supervise, work, *arguments)
 
     async def _supervise(self, work: Callable[..., Any], *arguments: Any) -> None:

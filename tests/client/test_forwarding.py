@@ -41,8 +41,8 @@ class Program:
         self._activity = anyio.Event()
         self._is_open = False
 
-    def say(self, *messages: messages.Message, system: int = 255) -> None:
-        for message in messages:
+    def say(self, *said: messages.Message, system: int = 255) -> None:
+        for message in said:
             self.say_bytes(messages.encode(message, system=system, component=190, sequence=0))
 
     def say_bytes(self, data: bytes) -> None:
@@ -170,7 +170,7 @@ async def test_a_program_that_reads_nothing_holds_nothing_up(monkeypatch: pytest
         assert bits((await component.fetch_all()).params) == bits(vehicle.params)
         assert (await component.set("PARAM_01", 8)).status == "accepted"
         assert anyio.current_time() - began < 3.0
-        forwarder = client.core._taps.forwarder
+        forwarder = client.core.taps.forwarder
         assert forwarder is not None
         assert len(forwarder._waiting) == 10
         lost = forwarder.lost

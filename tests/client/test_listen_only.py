@@ -40,8 +40,8 @@ class Channel(Radio):
         self.loses: Callable[[messages.Message], bool] = lambda message: False
         self._sequence = 0
 
-    def ask(self, *messages: messages.Message, system: int = 254) -> None:
-        for message in messages:
+    def ask(self, *said: messages.Message, system: int = 254) -> None:
+        for message in said:
             self._sequence = (self._sequence + 1) % 256
             self.other.append(messages.encode(message, system=system, component=190, sequence=self._sequence))
 
