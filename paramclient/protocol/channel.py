@@ -59,7 +59,7 @@ class Gate:
         self._is_closed = False
         self._open = anyio.Event()
         self._open.set()
-        self._waits: set[anyio.CancelScope] = set()
+        self._waits: dict[anyio.CancelScope, bool] = {}  # and whether they also end at a failure for a time
 
     @property
     def is_closed(self) -> bool:
@@ -88,8 +88,8 @@ class Gate:
             self.error = error
             self._is_closed = for_good
             self._open.set()
-            if for_good:
-                for scope in self._waits:
+            for scope, is_brief in self._waits.items():
+                if for_good or is_brief:
                     scope.cancel()
 
     def check(self) -> None:
@@ -107,8 +107,11 @@ class Gate:
         self.check()
 
     @contextmanager
-    def until_closed(self) -> Iterator[None]:
+    def until_closed(self, *, or_failed: bool = False) -> Iterator[None]:
         """Run a block that waits for something else than a message, such as a pause.
+
+        Args:
+            or_failed: whether the block ends also where the link may come back.
 
         Raises:
             LinkError: the link has failed for good; the block was cancelled.
@@ -116,11 +119,11 @@ class Gate:
         if self._is_closed:
             self.check()
         with anyio.CancelScope() as scope:
-            self._waits.add(scope)
+            self._waits[scope] = or_failed
             try:
                 yield
             finally:
-                self._waits.remove(scope)
+                del self._waits[scope]
         if scope.cancelled_caught:
             self.check()
 

@@ -197,7 +197,8 @@ class _Fetch:
         """Download the file, or the list where there is none."""
         session = self.session
         if session.serves_file is not False and not session.dialect.has_ack:
-            await session.identification.encoding_certain()
+            with session.channel.gate.until_closed(or_failed=True):
+                await session.identification.encoding_certain()
             if session.identification.may_serve_file:
                 try:
                     await download_file(session)

@@ -90,7 +90,7 @@ async def write(
         LinkError: the link is closed for good.
     """
     gate = session.channel.gate
-    with gate.until_closed():
+    with gate.until_closed(or_failed=True):
         await session.identification.encoding_certain()
     async with session.lock(name):
         session.writing[name] = author
