@@ -134,11 +134,10 @@ async def a_session() -> AsyncIterator[tuple[ParamClient, Component]]:
 
 
 def registered(client: ParamClient) -> list[object]:
-    """What is registered in any component, except reads of the hash without a waiting caller."""
+    """What is registered in any component."""
     found: list[object] = []
     for component in client.components.values():
-        hashes = ["1 reads"] if messages.HASH_CHECK in component.core.machine.reads else []
-        found += [each for each in residue(component) if each not in hashes]
+        found += residue(component)
     return found
 
 

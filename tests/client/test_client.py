@@ -37,8 +37,7 @@ from paramclient import (
 from paramclient.client import arguments, link_task
 from paramclient.client.component import CACHE_TIMEOUT
 from paramclient.errors import ParamErrorCode
-from paramclient.links import Peer, create_link, serve_endpoint
-from paramclient.protocol.station import Station
+from paramclient.links import create_link, serve_endpoint
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
 from paramclient.wire import frames, messages
 from tests.shell import (
@@ -429,15 +428,6 @@ async def test_a_component_that_is_heard_before_its_heartbeat(monkeypatch: pytes
         assert [task.result().autopilot for task in waiting] == ["px4", "px4"]
 
 
-@in_simulated_time
-async def test_a_component_that_never_says_what_it_is_is_given_in_the_end() -> None:
-    async with a_client(Mute()) as client:
-        began = anyio.current_time()
-        component = await client.component(component=7)
-        assert 3.0 < anyio.current_time() - began < 5.0
-        assert component.encoding_reason == "the standard's encoding, as nothing says otherwise"
-
-
 class Mute:
     """Sends one PARAM_VALUE at the beginning, and nothing else ever."""
 
@@ -514,39 +504,6 @@ async def test_the_hash_can_be_read_like_a_parameter_and_is_none() -> None:
         assert "_HASH_CHECK" not in component.params
         with pytest.raises(UsageError, match="_HASH_CHECK is read-only"):
             await component.set("_HASH_CHECK", 0)
-
-
-@in_simulated_time
-async def test_equal_reads_share_one_request_and_others_run_beside() -> None:
-    vehicle = generic()
-    air = Air.symmetric([vehicle], delay=0.2)
-    async with a_client(air) as client:
-        component = await client.component()
-        await component.get("PARAM_00")
-        await anyio.sleep(1.0)  # its repeats, sent before the round trip was known, arrive
-        vehicle.requests.clear()
-        began = anyio.current_time()
-        names = ["PARAM_01"] * 5 + ["PARAM_02"] * 5 + [f"PARAM_{number:02}" for number in range(3, 11)]
-        params = await asyncio.gather(*map(component.get, names))
-        assert [param.name for param in params] == names
-        assert vehicle.requests["PARAM_REQUEST_READ"] == 10
-        assert anyio.current_time() - began < 0.45, "all in one round trip"
-
-
-@in_simulated_time
-async def test_a_cancelled_read_leaves_the_others_their_request() -> None:
-    vehicle = generic()
-    async with a_client(Air.symmetric([vehicle], delay=0.2)) as client:
-        component = await client.component()
-        await component.get("PARAM_00")
-        await anyio.sleep(1.0)  # its repeats, sent before the round trip was known, arrive
-        vehicle.requests.clear()
-        first, second = (asyncio.create_task(component.get("PARAM_01")) for _ in range(2))
-        await asyncio.sleep(0.1)
-        first.cancel()
-        assert (await second).value == 1
-        assert vehicle.requests["PARAM_REQUEST_READ"] == 1
-        assert first.cancelled()
 
 
 @in_simulated_time
@@ -891,20 +848,6 @@ async def test_several_vehicles_are_fetched_side_by_side() -> None:
             assert client.components[address].params == result.params
         one_system = await client.fetch_all(1, refresh=True)
         assert one_system.results.keys() == {(1, 1), (1, 100)}
-
-
-@in_simulated_time
-async def test_one_request_is_enough_for_all_components_of_a_system() -> None:
-    camera = generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
-    tap = Tap(Air([generic(), camera]))
-    async with a_client(tap) as client:
-        await client.component()
-        both = await client.fetch_all(1)
-        assert both.results.keys() == {(1, 1), (1, 100)}
-        assert both.complete
-    assert [
-        (each.target_system, each.target_component) for each in tap.messages(messages.ParamRequestList)
-    ] == [(1, 0)]
 
 
 @in_simulated_time
@@ -1320,33 +1263,6 @@ async def test_nothing_rests_while_an_answer_is_awaited() -> None:
         assert not call.done()
         assert len(vehicle.portions) >= 190
         call.cancel()
-
-
-@in_simulated_time
-async def test_datagrams_that_arrive_during_a_pause_are_processed_in_order(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    taken: list[bytes] = []
-    receive = Station.receive
-
-    def record(station: Station, data: bytes, peer: Peer, now: float, moment: float) -> bool:
-        taken.append(data)
-        return receive(station, data, peer, now, moment)
-
-    monkeypatch.setattr(Station, "receive", record)
-    vehicle = small_px4()
-    chatter = Chatter(vehicle, 1 / 2000)
-    async with a_client(chatter) as client:
-        component = await known_component(client)
-        for value in range(50, 70):
-            vehicle.set_param("PARAM_04", value)
-            vehicle.set_param("PARAM_01", value + 100)
-            await asyncio.sleep(0.025)
-        await asyncio.sleep(0.1)
-        assert component.params["PARAM_01"].value == vehicle.param("PARAM_01").value
-        given = [data for portion in chatter.portions for data in portion]
-        assert len(taken) >= 1000
-        assert taken == given
 
 
 @in_simulated_time

@@ -11,11 +11,8 @@ from pathlib import Path
 import anyio
 import pytest
 
-from paramclient import UnknownParameter
 from paramclient.cli import run
-from paramclient.protocol.station import Station
-from paramclient.wire import messages
-from tests.shell import FlakyLink, Tap, a_client, generic, in_simulated_time, small_px4
+from tests.shell import FlakyLink, a_client, generic, in_simulated_time, small_px4
 
 WATCHED = "paramclient"
 
@@ -58,22 +55,6 @@ async def test_each_step_is_reported_in_one_line(caplog: pytest.LogCaptureFixtur
     assert any(
         "<CachedComponent 1/1 px4 25 params" in each for each in reported(caplog, "client.cache_writer")
     )
-
-
-@in_simulated_time
-async def test_unanswered_requests_are_logged(caplog: pytest.LogCaptureFixture) -> None:
-    vehicle = Tap(generic())
-    with caplog.at_level(logging.DEBUG, WATCHED):
-        async with a_client(vehicle) as client:
-            component = await client.component()
-            with pytest.raises(UnknownParameter):
-                await component.get("NO_SUCH")
-            await anyio.sleep(1.0)
-            stats = client.stats
-    steps = reported(caplog)
-    assert any(re.fullmatch(r"1/1 NO_SUCH: no answer to try 1 in [0-9.]+ s", each) for each in steps)
-    assert any(re.fullmatch(r"1/1 NO_SUCH: given up after try [0-9]+", each) for each in steps)
-    assert stats.retries > 0
 
 
 @in_simulated_time
@@ -126,16 +107,3 @@ def test_control_characters_are_not_printed(capsys: pytest.CaptureFixture[str]) 
 
 
 # numbers
-
-
-def test_damage_is_counted_over_all_peers_that_ever_were() -> None:
-    station = Station(link="test", is_stream=True)
-    beat = messages.Heartbeat(2, messages.MAV_AUTOPILOT_PX4, system_status=4)
-    good = messages.encode(beat, system=1, component=1, sequence=0)
-    bad = good[:-1] + bytes((good[-1] ^ 1,))
-    for peer in range(300):
-        station.receive(b"no" + bad + good, peer, 0.0)
-    station.receive(b"", 299, 0.0)
-    assert station.framing == (300, 300 * (2 + len(bad)), 300)
-    station.pause()
-    assert station.framing == (300, 300 * (2 + len(bad)), 300)

@@ -76,7 +76,7 @@ class NotReceived(Tap):
 
     def data_to_send(self) -> list[bytes]:
         is_requested = any(
-            message.params[0] == messages.message_id(messages.Heartbeat)
+            message.param1 == messages.message_id(messages.Heartbeat)
             for message in self.messages(messages.CommandLong)
         )
         framer = frames.Framer(messages.DECODED_IDS, stream=False)
