@@ -366,8 +366,12 @@ def bits(params: Mapping[str, Param]) -> dict[str, int]:
 
 
 def residue(component: Component) -> list[object]:
-    """What is still under way with a component: messages that a call waits for, and a fetch."""
-    left: list[object] = [key for key, waiting in component.node.channel._inboxes.items() if waiting]
+    """What is still under way with a component: messages that a call waits for, and a fetch.
+
+    The request for its identity, which the client sends by itself, is none of them."""
+    identity = (messages.AutopilotVersion, (messages.CommandAck, 512), (messages.CommandAck, 520))
+    waits = component.node.channel._inboxes.items()
+    left: list[object] = [key for key, waiting in waits if waiting and key not in identity]
     return [*left, "fetch"] if component.session.fetching.is_running else left
 
 
