@@ -1,7 +1,4 @@
-"""Reconnection of a link, and of the connection to a service: delays between attempts, and the timeout.
-
-`LinkTask._reconnect` in `link_task` makes the attempts of a link, `remote.connection` those of a service.
-"""
+"""Reconnection of a link: delays between attempts, and the timeout. `link_task` makes the attempts."""
 
 from __future__ import annotations
 

@@ -1366,8 +1366,6 @@ PEER_REQUESTS: Final = Schedule((0.5, 1.0, 1.5, 2.0), later=5.0)
 """Identity requests to a further peer: 5 s in all, in which a radio with a round trip of 1 s and a packet
 loss of one half responds in three of four cases. A peer that contests the address without a known difference
 receives further ones, as its radio may have received nothing; not more often, as it may also be unrelated."""
-PEER_REQUESTS_MAX: Final = PEER_REQUESTS.count
-"""Identity requests to a further peer that shows a difference: a bound of what a stranger can cause."""
 PEER_RECHECKS: Final = Schedule(later=1.0)
 """Requests for the hardware id of a peer that has just sent two different ones."""
 REBOOT_IDENTITY_REQUESTS: Final = Schedule(later=1.0)
