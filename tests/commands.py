@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NoReturn, TypeAlias
@@ -87,8 +88,19 @@ def behind(monkeypatch: pytest.MonkeyPatch, url: str) -> Put:
 
 
 def leaping(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run commands on an event loop with simulated time, on which waits take no time."""
-    in_thread = anyio.to_thread.run_sync
+    """Run commands on an event loop with simulated time, on which waits take no time.
+
+    The time of day follows it, and goes on from one command to the next.
+    """
+    in_thread, loops, began = anyio.to_thread.run_sync, [SimulatedTimeLoop()], time.time()
+    loops[0].close()
+    began -= loops[0].now
+
+    def next_loop() -> SimulatedTimeLoop:
+        loop = SimulatedTimeLoop()
+        loop.now = loops[-1].now
+        loops.append(loop)
+        return loop
 
     def waits(call: Callable[..., Any]) -> Callable[..., Any]:
         async def counted(*arguments: Any, **options: Any) -> Any:
@@ -101,7 +113,8 @@ def leaping(monkeypatch: pytest.MonkeyPatch) -> None:
         return counted
 
     really_run = anyio.run
+    monkeypatch.setattr(time, "time", lambda: began + loops[-1].now)
     monkeypatch.setattr(anyio.to_thread, "run_sync", waits(in_thread))
     monkeypatch.setattr(
-        anyio, "run", lambda *call: really_run(*call, backend_options={"loop_factory": SimulatedTimeLoop})
+        anyio, "run", lambda *call: really_run(*call, backend_options={"loop_factory": next_loop})
     )

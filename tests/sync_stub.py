@@ -109,7 +109,7 @@ def imports_of(module: ModuleType) -> dict[str, str]:
 
 
 def stub() -> str:
-    """The whole stub, as `ruff format` leaves it."""
+    """The whole stub, before it is formatted."""
     parts: list[str] = []
     known: dict[str, str] = {}
     for module, names in CLASSES.items():
@@ -135,13 +135,30 @@ def stub() -> str:
     imports = sorted({known[name] for name in used & known.keys() - OWN})
     listed = ", ".join(f'"{name}"' for name in sorted(OWN))
     head = ['"""The types of the blocking client. `make sync` writes this file."""', *imports]
-    text = "\n".join([*head, f"__all__ = [{listed}]", text]) + "\n"
+    return "\n".join([*head, f"__all__ = [{listed}]", text]) + "\n"
+
+
+def meaning(text: str) -> tuple[set[str], list[str]]:
+    """What a stub imports, and its other statements in order, whatever its form."""
+    body = ast.parse(text).body
+    imports = [node for node in body if isinstance(node, ast.Import | ast.ImportFrom)]
+    names = {
+        f"{getattr(node, 'module', '')}.{alias.name} as {alias.asname}"
+        for node in imports
+        for alias in node.names
+    }
+    return names, [ast.dump(node) for node in body if node not in imports]
+
+
+def write() -> None:
+    """Write the stub in the form of the project's code."""
+    text = stub()
     steps: list[list[str]] = [["check", "--fix", "--select", "I"], ["format"]]
     for step in steps:
         command = [sys.executable, "-m", "ruff", *step, "--quiet", "--stdin-filename", str(STUB), "-"]
         text = subprocess.run(command, input=text, capture_output=True, text=True, check=True).stdout
-    return text
+    STUB.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":
-    STUB.write_text(stub(), encoding="utf-8")
+    write()

@@ -156,6 +156,3 @@ def test_a_comparison_with_the_defaults_takes_those_of_the_metadata(
     assert "2 of 2 from the metadata" in found["base"]["source"]
     shown = command(*words)
     assert "base: 2 parameters from the firmware's defaults, 2 of 2 from the metadata" in shown.err
-
-
-# over a service, and reset

@@ -341,6 +341,3 @@ def test_a_short_timeout_reports_the_remaining_wait(command: Command, put: Put) 
     assert (done.code, done.out) == (3, "")
     assert "an autopilot, then 1.2 s without another vehicle" in done.err
     assert untouched(one)
-
-
-# over a service
