@@ -17,11 +17,12 @@ from paramclient.client.cache_writer import CacheWriter, choose_cache
 from paramclient.client.client_task import ClientTask
 from paramclient.client.component import Component
 from paramclient.client.core import ClientCore
+from paramclient.client.events import Events
 from paramclient.client.files import Ftp
 from paramclient.client.fleet_fetch import FetchedAll, fetch_components
 from paramclient.client.signing import Signing, refused_in_words
 from paramclient.client.signing_timestamps import TimestampKeeper
-from paramclient.client.streams import Events, Subscribers
+from paramclient.client.streams import Subscribers
 from paramclient.client.taps import LinkTaps
 from paramclient.client.traffic import TrafficReport
 from paramclient.errors import AnotherVehicle, NoReply, ParamClientError, UsageError
