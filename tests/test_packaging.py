@@ -21,7 +21,11 @@ import paramclient
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parent.parent
-SOURCES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient").rglob("*.py")}
+SOURCES = {
+    path.relative_to(ROOT).as_posix()
+    for path in (ROOT / "paramclient").rglob("*.py*")
+    if path.suffix != ".pyc"
+}
 PLUGIN = "pytest_paramclient.py"
 SERVED = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient/service/page").glob("*.*")}
 TABLES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient/sim/tables").glob("*.csv")}
