@@ -6,24 +6,19 @@ import errno
 import os
 import stat
 import sys
-from pathlib import Path
 from typing import BinaryIO, Final
 
 __all__ = [
     "GROUP_READS",
     "OF_OTHERS",
-    "OTHERS_WRITE",
     "has_trusted_owner",
     "is_own",
-    "make_private",
     "mode_of",
     "open_regular",
 ]
 
 OF_OTHERS: Final = 0o077
 """Mode bits that give access to other users than the owner."""
-OTHERS_WRITE: Final = 0o022
-"""Mode bits that give write access to other users than the owner."""
 GROUP_READS: Final = 0o040
 """Mode bit that gives read access to the group."""
 _NO_WAIT: Final = getattr(os, "O_NONBLOCK", 0)  # Windows has neither the flag nor such pipes
@@ -55,18 +50,6 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
         file.close()
         raise OSError(errno.EINVAL, "Not a regular file", os.fspath(path))
     return file
-
-
-def make_private(path: Path) -> int:
-    """Restrict a file that other users can write to its owner. Return its previous mode.
-
-    Raises:
-        OSError: the mode cannot be read or changed.
-    """
-    mode = mode_of(path.stat())
-    if mode & OTHERS_WRITE:
-        path.chmod(mode & ~OF_OTHERS)
-    return mode
 
 
 def _open_at_once(path: str, flags: int) -> int:
