@@ -84,8 +84,8 @@ class Bench:
             return json.loads(answer.read())
 
     def set(self, name: str, value: float) -> None:
-        """Another program sets a value of the PX4."""
-        self.ask("PATCH", "/vehicles/1/1/params?link=px4", {"values": {name: value}})
+        """Another program sets a value of the PX4, which is in the history then."""
+        self.ask("PATCH", "/vehicles/1/1/params?link=px4", {"values": {name: value}, "durable": True})
 
     def is_ready(self) -> bool:
         """Whether the tables of all vehicles are here, and the metadata of the PX4."""
