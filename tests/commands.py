@@ -17,7 +17,7 @@ from paramclient.cli import run
 from paramclient.cli import session as cli_session
 from paramclient.links import SimLink
 from paramclient.sim import Endpoint
-from tests.shell import PeersLink, SimulatedTimeLoop, simulated_time_loop
+from tests.shell import PeersLink, SimulatedTimeLoop, while_the_clock_stands
 
 
 def strict(text: str) -> Any:
@@ -102,19 +102,9 @@ def leaping(monkeypatch: pytest.MonkeyPatch) -> None:
         loops.append(loop)
         return loop
 
-    def waits(call: Callable[..., Any]) -> Callable[..., Any]:
-        async def counted(*arguments: Any, **options: Any) -> Any:
-            simulated_time_loop().threads += 1
-            try:
-                return await call(*arguments, **options)
-            finally:
-                simulated_time_loop().threads -= 1
-
-        return counted
-
     really_run = anyio.run
     monkeypatch.setattr(time, "time", lambda: began + loops[-1].now)
-    monkeypatch.setattr(anyio.to_thread, "run_sync", waits(in_thread))
+    monkeypatch.setattr(anyio.to_thread, "run_sync", while_the_clock_stands(in_thread))
     monkeypatch.setattr(
         anyio, "run", lambda *call: really_run(*call, backend_options={"loop_factory": next_loop})
     )

@@ -128,22 +128,26 @@ def simulated_time_loop() -> SimulatedTimeLoop:
     return loop
 
 
+def while_the_clock_stands(in_thread: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[Any]]:
+    """Wrap a call that runs in a worker thread: the clock of the loop stands still meanwhile."""
+
+    async def call(*arguments: Any, **options: Any) -> Any:
+        loop = simulated_time_loop()
+        loop.threads += 1
+        try:
+            return await in_thread(*arguments, **options)
+        finally:
+            loop.threads -= 1
+
+    return call
+
+
 def in_simulated_time(test: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
     """Run an asynchronous test on a `SimulatedTimeLoop`."""
 
     @functools.wraps(test)
     def run(*args: P.args, **kwargs: P.kwargs) -> T:
-        def counted(in_thread: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[Any]]:
-            async def run_in_thread(*args: Any, **kwargs: Any) -> Any:
-                simulated_time_loop().threads += 1
-                try:
-                    return await in_thread(*args, **kwargs)
-                finally:
-                    simulated_time_loop().threads -= 1
-
-            return run_in_thread
-
-        in_thread = counted(anyio.to_thread.run_sync)
+        in_thread = while_the_clock_stands(anyio.to_thread.run_sync)
         with asyncio.Runner(loop_factory=SimulatedTimeLoop) as runner:
             loop = runner.get_loop()
             assert isinstance(loop, SimulatedTimeLoop)

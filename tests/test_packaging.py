@@ -24,7 +24,7 @@ ROOT = Path(__file__).parent.parent
 SOURCES = {
     path.relative_to(ROOT).as_posix()
     for path in (ROOT / "paramclient").rglob("*.py*")
-    if "__pycache__" not in path.parts
+    if path.suffix != ".pyc"
 }
 PLUGIN = "pytest_paramclient.py"
 SERVED = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient/service/page").glob("*.*")}

@@ -117,10 +117,12 @@ def find_table(tx: Transaction, key: str, component: int, *, extended: bool = Fa
 
 def load_vehicles(tx: Transaction, key: str | None = None) -> list[CachedVehicle]:
     """Return all vehicles, the last seen first; or the one with this key."""
+    of_key, where, values = ("", "", ()) if key is None else (" AND vehicle = ?", " WHERE key = ?", (key,))
     components: dict[str, list[int]] = defaultdict(list)
-    for table in load_tables(tx, key):
-        components[table.key].append(table.component)
-    where, values = ("", ()) if key is None else (" WHERE key = ?", (key,))
+    for vehicle, component in tx.all(
+        f"SELECT vehicle, component FROM component WHERE extended = 0{of_key} ORDER BY component", values
+    ):
+        components[vehicle].append(component)
     rows = tx.all(f"SELECT key, first_seen, last_seen, {IDENTITY} FROM vehicle{where}", values)
     found = [
         CachedVehicle(vehicle, read_identity(cells), first, last, tuple(components[vehicle]))

@@ -19,7 +19,7 @@ from paramclient.cli.signals import on_end_signal
 from paramclient.errors import CacheError, ParamClientError
 from paramclient.version import __version__
 
-__all__ = ["command_line", "run"]
+__all__ = ["run"]
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -58,11 +58,6 @@ def run(arguments: Sequence[str]) -> int:
             report(f"cannot write the output: {error.strerror}")
             return ExitCode.INCOMPLETE
     return code or ExitCode.DONE
-
-
-def command_line() -> App:
-    """Return the command line, of which a subcommand is imported when it is looked up."""
-    return _app
 
 
 def _shows_help(arguments: Sequence[str]) -> bool:

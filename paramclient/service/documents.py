@@ -80,9 +80,9 @@ def vehicle(target: Target) -> dict[str, Any]:
     }
 
 
-def vehicle_state(target: Target) -> dict[str, Any]:
+def lasting_members(found: dict[str, Any]) -> dict[str, Any]:
     """Return the members of a vehicle whose changes are events."""
-    return {name: value for name, value in vehicle(target).items() if name not in CHANGING_MEMBERS}
+    return {name: value for name, value in found.items() if name not in CHANGING_MEMBERS}
 
 
 def cached_vehicles(

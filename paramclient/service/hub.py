@@ -265,10 +265,11 @@ class Hub:
         """Publish the state of a component if it has changed, or the progress of its fetch."""
         if target.progress is not None:
             self.feed.publish("progress", **target.address, **documents.progress(target.progress))
-        state = documents.vehicle_state(target)
+        vehicle = documents.vehicle(target)
+        state = documents.lasting_members(vehicle)
         if state != target.published:
             target.published = state
-            self.feed.publish("vehicle", **target.address, vehicle=documents.vehicle(target))
+            self.feed.publish("vehicle", **target.address, vehicle=vehicle)
 
     def _forget(self, target: Target) -> None:
         component, targets = target.component, target.link.targets

@@ -30,27 +30,11 @@ from tests.shell import (
     in_simulated_time,
     outcome,
     residue,
-    simulated_time_loop,
     small_px4,
     tasks_beside,
 )
 
 IDENTITY = Identity(1, "link", "abcd", 12, 2, 0x01110000, "0123abcd", 1)
-
-
-@pytest.fixture(autouse=True)
-def _threads_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stop the clock of a `SimulatedTimeLoop` while a worker thread reads files."""
-    in_thread = download._in_thread
-
-    async def counted(*args: Any, **kwargs: Any) -> Any:
-        simulated_time_loop().threads += 1
-        try:
-            return await in_thread(*args, **kwargs)
-        finally:
-            simulated_time_loop().threads -= 1
-
-    monkeypatch.setattr(download, "_in_thread", counted)
 
 
 def describing(**options: Any) -> PX4Vehicle:

@@ -6,14 +6,11 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
-from unittest import mock
 
-import anyio.to_thread
 import httpx
 
 from paramclient.service import Hub, create_app
 from tests.service.asgi import a_browser
-from tests.shell import simulated_time_loop
 
 V = "/api/vehicles/1/1"
 
@@ -23,21 +20,11 @@ async def service(
     *links: Any, app: dict[str, Any] | None = None, **options: Any
 ) -> AsyncIterator[tuple[Hub, httpx.AsyncClient]]:
     """An open hub and a client of it; without a cache, unless one is given. `app`: for `create_app`."""
-    run_sync = anyio.to_thread.run_sync
-
-    async def counted(*arguments: Any, **more: Any) -> Any:
-        simulated_time_loop().threads += 1
-        try:
-            return await run_sync(*arguments, **more)
-        finally:
-            simulated_time_loop().threads -= 1
-
-    with mock.patch.object(anyio.to_thread, "run_sync", counted):
-        async with (
-            Hub(links, **{"cache": False} | options) as hub,
-            a_browser(create_app(hub, **(app or {}))) as browser,
-        ):
-            yield hub, browser
+    async with (
+        Hub(links, **{"cache": False} | options) as hub,
+        a_browser(create_app(hub, **(app or {}))) as browser,
+    ):
+        yield hub, browser
 
 
 async def synced(browser: httpx.AsyncClient, address: str = V) -> dict[str, Any]:
