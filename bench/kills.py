@@ -37,7 +37,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 import anyio
 
 from paramclient import NotDurable, ParamCache, ParamClient
-from paramclient.client.cache_writer import CACHE_FLUSH_INTERVAL
+from paramclient.client.cache_writer import FLUSH_INTERVAL
 from paramclient.sim import PX4Vehicle
 from tests.postgres import PROGRAMS, Server, database_on, server
 
@@ -175,7 +175,7 @@ def missing(
         is_there = (each.name, each.value) in lines and (
             each.value < last[each.name] or values.get(each.name, 0) >= each.value
         )
-        if not is_there and (each.durable or killed_at - each.at > CACHE_FLUSH_INTERVAL + slack):
+        if not is_there and (each.durable or killed_at - each.at > FLUSH_INTERVAL + slack):
             found.append(each)
     return found
 

@@ -17,18 +17,22 @@ import itertools
 import math
 import statistics
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
+import anyio
 from oracle import FILE_FRAME, TellingLink, file_oracle_time, oracle_time
+from trio.testing import MockClock
 
 from paramclient.model.values import Param, ParamType
-from paramclient.protocol.params.fetch import Fetch
-from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.params.write_batch import SetStatus
+from paramclient.protocol.fetch import FetchResult, fetch_all
+from paramclient.protocol.node import Node
+from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.protocol.station import Station
+from paramclient.protocol.writes import write_many
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
 
 LIMIT = 600.0
@@ -197,72 +201,86 @@ def set_rows() -> Iterator[Row]:
             )
 
 
-class Session:
-    """A station and the vehicle of a row, with its table fetched.
+@asynccontextmanager
+async def station_on(air: Air) -> AsyncIterator[tuple[Station, Traffic]]:
+    """Open a station on simulated vehicles, whose time is that of the event loop."""
+    traffic = Traffic()
+    activity = anyio.Event()
 
-    Attributes:
-        now: simulated seconds.
-        machine: the vehicle's component.
-    """
+    def send(data: bytes, peer: object) -> None:
+        traffic.up += len(data)
+        air.receive(data, anyio.current_time())
+        activity.set()
 
-    def __init__(self, row: Row, seed: int) -> None:
-        self.vehicle = row.make()
-        links = (FaultyLink(**row.faults, seed=2 * seed), FaultyLink(**row.faults, seed=2 * seed + 1))
-        self._air = Air([self.vehicle], uplink=links[0], downlink=links[1])
-        self.station = Station(link="bench", is_stream=False)
-        self.now = 0.0
-        self._air.tick(self.now)
-        self.until(lambda: (1, 1) in self.station.components)
-        self.machine = self.station.components[1, 1]
-        fetch = self.machine.begin_fetch(self.now)
-        self.until(lambda: fetch.done)
-        self.machine.end_fetch(fetch, self.now)
+    async def run() -> None:
+        nonlocal activity
+        while True:
+            now = anyio.current_time()
+            air.tick(now)
+            for data in air.data_to_send():
+                traffic.down += len(data)
+                station.receive(data, None, now)
+            due, activity = air.next_deadline(), anyio.Event()
+            with anyio.move_on_after(None if due is None else max(due - now, 1e-7)):
+                await activity.wait()
 
-    def step(self) -> None:
-        """Go on to the next event."""
-        for data, _ in self.station.data_to_send():
-            self._air.receive(data, self.now)
-        deadline = self._air.next_deadline()
-        next_at = min(self.station.next_deadline(), math.inf if deadline is None else deadline)
-        self.now = max(next_at, self.now + 1e-7)
-        self._air.tick(self.now)
-        for data in self._air.data_to_send():
-            self.station.receive(data, None, self.now)
-        self.station.tick(self.now)
-
-    def until(self, condition: Callable[[], bool]) -> None:
-        """Go on until a condition holds, for `LIMIT` at most."""
-        while not condition() and self.now < LIMIT:
-            self.step()
-
-    def count(self) -> tuple[int, int, int]:
-        """Return the bytes sent and received so far, and the requests received by the vehicle."""
-        station = self.station
-        return station.bytes_sent, station.bytes_received, self.vehicle.requests.total()
-
-    def run_since(self, began: float, before: tuple[int, int, int], ended: float, *, is_right: bool) -> Run:
-        """Return the run from a time and a `count` on; there is no oracle."""
-        up, down, requests = (since - then for since, then in zip(self.count(), before, strict=True))
-        return Run(ended - began, is_right, up, down, requests, math.nan)
+    async with anyio.create_task_group() as tasks:
+        station = Station(link="bench", is_stream=False, send=send, spawn=tasks.start_soon)
+        tasks.start_soon(run)
+        tasks.start_soon(station.send_heartbeats)
+        yield station, traffic
+        tasks.cancel_scope.cancel()
 
 
-def set_values(row: Row, seed: int) -> Run:
+@dataclass
+class Traffic:
+    """Bytes that were sent and received."""
+
+    up: int = 0
+    down: int = 0
+
+
+def in_simulated_time(work: Callable[[], Awaitable[Run]]) -> Run:
+    """Run an async function on a clock that jumps to the next deadline."""
+
+    async def limited() -> Run:
+        with anyio.move_on_after(LIMIT):
+            return await work()
+        return Run(math.inf, False, 0, 0, 0, math.nan)
+
+    clock = MockClock(autojump_threshold=0)
+    return anyio.run(limited, backend="trio", backend_options={"clock": clock})
+
+
+async def appear(station: Station, system: int) -> Node:
+    """Wait for the vehicle."""
+    while (system, 1) not in station.nodes:  # noqa: ASYNC110 - the next event of the vehicle
+        await anyio.sleep(0.0005)
+    return station.nodes[system, 1]
+
+
+async def set_values(row: Row, seed: int) -> Run:
     """Set values of the vehicle of a row, whose table is known."""
-    session = Session(row, seed)
-    machine, vehicle = session.machine, session.vehicle
-    began, before = session.now, session.count()
-    names = [name for name, param in machine.table.params.items() if may_be_set(param)]
-    step_size = len(names) / row.values
-    chosen = [names[int(number * step_size)] for number in range(row.values)]
-    wanted = {name: number + 0.5 for number, name in enumerate(chosen)}
-    batch = machine.write_many(list(wanted.items()), began)
-    session.until(lambda: batch.done)
-    machine.write_batches.end(batch, session.now)
+    vehicle = row.make()
+    links = (FaultyLink(**row.faults, seed=2 * seed), FaultyLink(**row.faults, seed=2 * seed + 1))
+    async with station_on(Air([vehicle], uplink=links[0], downlink=links[1])) as (station, traffic):
+        session = (await appear(station, 1)).plain
+        await fetch_all(session)
+        began, up, down = anyio.current_time(), traffic.up, traffic.down
+        requests = vehicle.requests.total()
+        names = [name for name, param in session.table.params.items() if may_be_set(param)]
+        step_size = len(names) / row.values
+        chosen = [names[int(number * step_size)] for number in range(row.values)]
+        wanted = {name: number + 0.5 for number, name in enumerate(chosen)}
+        outcomes: list[SetOutcome] = []
+        await write_many(session, list(wanted.items()), outcomes, lambda outcome: None)
+        ended = anyio.current_time()
     true = vehicle.params
-    is_right = all(outcome.status is SetStatus.ACCEPTED for outcome in batch.ended) and all(
+    is_right = all(outcome.status is SetStatus.ACCEPTED for outcome in outcomes) and all(
         true[name].value == value for name, value in wanted.items()
     )
-    return session.run_since(began, before, batch.ended_at, is_right=is_right)
+    sent = vehicle.requests.total() - requests
+    return Run(ended - began, is_right, traffic.up - up, traffic.down - down, sent, math.nan)
 
 
 def may_be_set(param: Param) -> bool:
@@ -273,50 +291,37 @@ def may_be_set(param: Param) -> bool:
 def download(row: Row, seed: int) -> Run:
     """Run a row with this library; return the run with the oracle's time."""
     if row.sets:
-        return set_values(row, seed)
+        return in_simulated_time(partial(set_values, row, seed))
     if row.vehicles == 1:
-        return fetch(row, seed, oracle(row, seed))
-    alone = replace(row, vehicles=1)
-    return fetch(row, seed, row.vehicles * fetch(alone, seed, math.nan).seconds)
+        return in_simulated_time(partial(fetch, row, seed, oracle(row, seed)))
+    alone = in_simulated_time(partial(fetch, replace(row, vehicles=1), seed, math.nan))
+    return in_simulated_time(partial(fetch, row, seed, row.vehicles * alone.seconds))
 
 
-def fetch(row: Row, seed: int, measure: float) -> Run:
+async def fetch(row: Row, seed: int, measure: float) -> Run:
     """Download from all vehicles of a row concurrently; `measure` is the oracle's time."""
     vehicles = [row.make(system=system) for system in range(1, row.vehicles + 1)]
     uplink = FaultyLink(**row.faults, seed=2 * seed)
     downlink = FaultyLink(**row.faults, seed=2 * seed + 1)
-    air = Air(vehicles, uplink=uplink, downlink=downlink)
-    station = Station(link="bench", is_stream=False)
-    now = 0.0
+    results: dict[int, FetchResult] = {}
     began = math.inf
-    down = 0
-    fetches: dict[tuple[int, int], Fetch] = {}
-    air.tick(now)
-    while now < LIMIT and not (
-        len(fetches) == len(vehicles) and all(fetch.done for fetch in fetches.values())
-    ):
-        station.tick(now)
-        for address, machine in list(station.components.items()):
-            if began == math.inf:
-                began, down = now, station.bytes_received
-            if address not in fetches:
-                fetches[address] = machine.begin_fetch(now)
-        for data, _ in station.data_to_send():
-            air.receive(data, now)
-        deadline = air.next_deadline()
-        now = max(min(station.next_deadline(), math.inf if deadline is None else deadline), now + 1e-7)
-        air.tick(now)
-        for data in air.data_to_send():
-            station.receive(data, None, now)
-    ordered = [fetches.get((vehicle.system, 1)) for vehicle in vehicles]
-    results = [fetch.result for fetch in ordered if fetch is not None and fetch.result is not None]
-    if len(results) < len(vehicles):
-        return Run(math.inf, False, 0, 0, 0, measure)
+
+    async def fetch_one(system: int) -> None:
+        nonlocal began
+        node = await appear(station, system)
+        began = min(began, node.since)
+        results[system] = await fetch_all(node.plain)
+
+    async with station_on(Air(vehicles, uplink=uplink, downlink=downlink)) as (station, traffic):
+        async with anyio.create_task_group() as tasks:
+            for vehicle in vehicles:
+                tasks.start_soon(fetch_one, vehicle.system)
+        ended = anyio.current_time()
     return Run(
-        max(fetch.ended_at for fetch in fetches.values()) - began,
-        all(is_right(result, vehicle) for result, vehicle in zip(results, vehicles, strict=True)),
-        station.bytes_sent,
-        station.bytes_received - down,
+        ended - began,
+        all(is_right(results[vehicle.system], vehicle) for vehicle in vehicles),
+        traffic.up,
+        traffic.down,
         sum(vehicle.requests.total() for vehicle in vehicles),
         measure,
     )

@@ -38,9 +38,10 @@ from peers import TITLES, firmware, machine
 from paramclient import Component, FetchResult, ParamClient, ParamSet, WrittenParam
 from paramclient.errors import LinkError, NoReply, ParamClientError, UsageError, VehicleArmed
 from paramclient.model.values import Param
-from paramclient.protocol.wire import AUTOPILOT_COMPONENT, CommandAck, CommandLong, Framer, decode, encode
 from paramclient.provision import apply
 from paramclient.version import __version__
+from paramclient.wire.frames import Framer
+from paramclient.wire.messages import AUTOPILOT_COMPONENT, CommandAck, CommandLong, decode, encode
 from tests.live.choice import another_value
 from tests.live.journal import Journal, check_disarmed
 from tests.live.relay import CLEAN, Conditions, Relay
@@ -252,8 +253,8 @@ async def time_command(vehicle: Vehicle, seed: int) -> float:
 def set_attitude_interval(vehicle: Vehicle, seconds: float) -> None:
     """Set the interval of ATTITUDE in seconds by MAV_CMD_SET_MESSAGE_INTERVAL; 0 restores the default."""
     host, port = vehicle.relay.link.removeprefix("udpout:").split(":")
-    params = (float(ATTITUDE_ID), seconds * 1e6, *[0.0] * 5)
-    command = CommandLong(vehicle.system, AUTOPILOT_COMPONENT, MAV_CMD_SET_MESSAGE_INTERVAL, params)
+    target = vehicle.system, AUTOPILOT_COMPONENT
+    command = CommandLong(*target, MAV_CMD_SET_MESSAGE_INTERVAL, float(ATTITUDE_ID), seconds * 1e6)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
         station.settimeout(COMMAND_TIMEOUT)
         framer = Framer(stream=False)

@@ -23,10 +23,11 @@ from collections.abc import Callable
 from heapq import heappop, heappush
 from typing import Any, Final
 
-from paramclient.protocol import wire
-from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
-from paramclient.protocol.params.file_download import PARAMETER_FILE, WITH_DEFAULTS
+from paramclient.protocol.file_download import PARAM_FILE, WITH_DEFAULTS
+from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.sim import Air, Endpoint, FaultyLink
+from paramclient.wire import messages
+from paramclient.wire.frames import Framer
 
 __all__ = ["FILE_FRAME", "TellingLink", "file_oracle_time", "oracle_time"]
 
@@ -36,9 +37,8 @@ FILE_FRAME: Final = 27 + DATA_SIZE_MAX
 """Bytes of a frame with a full block of a file."""
 SESSION: Final = 1
 ROUNDING: Final = 1e-9
-VERSION_REQUEST: Final = wire.CommandLong(
-    1, 1, wire.MAV_CMD_REQUEST_MESSAGE, (float(wire.AUTOPILOT_VERSION_ID),) + (0.0,) * 6
-)
+VERSION_ID: Final = messages.message_id(messages.AutopilotVersion)
+VERSION_REQUEST: Final = messages.CommandLong(1, 1, messages.MAV_CMD_REQUEST_MESSAGE, float(VERSION_ID))
 
 
 class TellingLink(FaultyLink):
@@ -82,7 +82,7 @@ class _Oracle(ABC):
         self.air = air
         self.uplink, self.downlink = air.uplink, air.downlink
         self.next_send = 0.0
-        self._known: list[tuple[float, int, wire.Message]] = []  # future reports, in order
+        self._known: list[tuple[float, int, messages.Message]] = []  # future reports, in order
         self._sequence = 0
 
     def run(self) -> float:
@@ -97,7 +97,7 @@ class _Oracle(ABC):
             self.air.tick(now)
             for data in self.air.data_to_send():
                 for message in self._read(data):
-                    if not isinstance(message, wire.Heartbeat):
+                    if not isinstance(message, messages.Heartbeat):
                         self.take(message, now)
                     elif began == math.inf:
                         began = now
@@ -109,11 +109,11 @@ class _Oracle(ABC):
         """Request the parameters."""
 
     @abstractmethod
-    def take(self, message: wire.Message, now: float) -> None:
+    def take(self, message: messages.Message, now: float) -> None:
         """Process a message of the vehicle."""
 
     @abstractmethod
-    def reported(self, message: wire.Message, now: float) -> None:
+    def reported(self, message: messages.Message, now: float) -> None:
         """Process the loss of a message that, or whose response, would have arrived now."""
 
     @abstractmethod
@@ -128,13 +128,13 @@ class _Oracle(ABC):
     def is_done(self) -> bool:
         """Whether all parameters were received."""
 
-    def send(self, message: wire.Message, now: float) -> None:
+    def send(self, message: messages.Message, now: float) -> None:
         self._sequence += 1
-        self.air.receive(wire.encode(message, **GROUND, sequence=self._sequence & 0xFF), now)
+        self.air.receive(messages.encode(message, **GROUND, sequence=self._sequence & 0xFF), now)
 
-    def _read(self, data: bytes) -> list[wire.Message]:
-        messages = map(wire.decode, wire.Framer({0, *self.understood}, stream=False).receive(data))
-        return [message for message in messages if message is not None]
+    def _read(self, data: bytes) -> list[messages.Message]:
+        found = map(messages.decode, Framer({0, *self.understood}, stream=False).receive(data))
+        return [message for message in found if message is not None]
 
     def _next_event(self, now: float) -> float:
         deadline = self.air.next_deadline()
@@ -155,14 +155,14 @@ class _Oracle(ABC):
             losses.clear()
         while self._known and self._known[0][0] <= now:
             message = heappop(self._known)[2]
-            if not isinstance(message, wire.Heartbeat):
+            if not isinstance(message, messages.Heartbeat):
                 self.reported(message, now)
 
 
 class _ListOracle(_Oracle):
     """The oracle for list downloads: reads for the gaps immediately, or after the last pass."""
 
-    understood = frozenset({20, 21, 22, 76, wire.AUTOPILOT_VERSION_ID})
+    understood = frozenset({20, 21, 22, 76, VERSION_ID})
 
     def __init__(
         self,
@@ -185,25 +185,25 @@ class _ListOracle(_Oracle):
         self.is_over = False
 
     def begin(self, now: float) -> None:
-        self.send(VERSION_REQUEST if self.asks_version else wire.ParamRequestList(1, 1), now)
+        self.send(VERSION_REQUEST if self.asks_version else messages.ParamRequestList(1, 1), now)
 
-    def take(self, message: wire.Message, now: float) -> None:
-        if isinstance(message, wire.AutopilotVersion):
+    def take(self, message: messages.Message, now: float) -> None:
+        if isinstance(message, messages.AutopilotVersion):
             if self.asks_version:
                 self.asks_version = False
                 self.begin(now)
-        elif isinstance(message, wire.ParamValue):
+        elif isinstance(message, messages.ParamValue):
             self.missing.discard(message.param_index)
             if message.param_index == self.count - 1:
                 self._end_pass(now)
 
-    def reported(self, message: wire.Message, now: float) -> None:
-        if isinstance(message, wire.ParamRequestList | wire.CommandLong | wire.AutopilotVersion):
+    def reported(self, message: messages.Message, now: float) -> None:
+        if isinstance(message, messages.ParamRequestList | messages.CommandLong | messages.AutopilotVersion):
             self.begin(now)
-        elif isinstance(message, wire.ParamValue | wire.ParamRequestRead):
+        elif isinstance(message, messages.ParamValue | messages.ParamRequestRead):
             if message.param_index in self.missing:
                 self.to_ask.append(message.param_index)
-            if message.param_index == self.count - 1 and isinstance(message, wire.ParamValue):
+            if message.param_index == self.count - 1 and isinstance(message, messages.ParamValue):
                 self._end_pass(now)
 
     def _end_pass(self, now: float) -> None:
@@ -224,7 +224,7 @@ class _ListOracle(_Oracle):
         while self.wants() and self.next_send <= now:
             index = self.to_ask.popleft()
             if index in self.missing:
-                self.send(wire.ParamRequestRead(1, 1, "", index), now)
+                self.send(messages.ParamRequestRead(1, 1, "", index), now)
                 self.next_send = max(self.next_send, now - 4 * self.per_read) + self.per_read
                 self.next_send = max(self.next_send, self.uplink.is_free_at)
 
@@ -256,11 +256,11 @@ class _FileOracle(_Oracle):
         self.is_closing = self.is_closed = False
 
     def begin(self, now: float) -> None:
-        self._request(Packet(0, SESSION, Opcode.OPEN_FILE_RO, (PARAMETER_FILE + WITH_DEFAULTS).encode()), now)
+        self._request(Packet(0, SESSION, Opcode.OPEN_FILE_RO, (PARAM_FILE + WITH_DEFAULTS).encode()), now)
         self._burst(now)
 
-    def take(self, message: wire.Message, now: float) -> None:
-        assert isinstance(message, wire.FileTransfer)
+    def take(self, message: messages.Message, now: float) -> None:
+        assert isinstance(message, messages.FileTransfer)
         packet = Packet.unpack(message.payload)
         if packet.requested == Opcode.TERMINATE_SESSION:
             self.is_closed = True
@@ -270,8 +270,8 @@ class _FileOracle(_Oracle):
             self.end = packet.offset
         self._close_when_whole(now)
 
-    def reported(self, message: wire.Message, now: float) -> None:
-        assert isinstance(message, wire.FileTransfer)
+    def reported(self, message: messages.Message, now: float) -> None:
+        assert isinstance(message, messages.FileTransfer)
         packet = Packet.unpack(message.payload)
         match packet.opcode:
             case Opcode.OPEN_FILE_RO:
@@ -318,7 +318,7 @@ class _FileOracle(_Oracle):
 
     def _request(self, packet: Packet, now: float) -> None:
         self.number += 1
-        self.send(wire.FileTransfer(0, 1, 1, packet._replace(sequence=self.number).pack()), now)
+        self.send(messages.FileTransfer(0, 1, 1, packet._replace(sequence=self.number).pack()), now)
 
 
 def oracle_time(

@@ -22,8 +22,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common
 
-from paramclient.protocol import wire
-from paramclient.protocol.station import HANDLED_IDS
+from paramclient.wire.frames import Framer
+from paramclient.wire.messages import DECODED_IDS, ParamValue, decode
 
 FRAMES = 30_000
 ROUNDS = 7
@@ -70,7 +70,7 @@ def main() -> None:
         for m in parse_with_pymavlink(stream)
         if m.get_type() == "PARAM_VALUE"
     ]
-    ours = [tuple(m) for m in parse_with_paramclient(stream) if isinstance(m, wire.ParamValue)]
+    ours = [tuple(m) for m in parse_with_paramclient(stream) if isinstance(m, ParamValue)]
     if ours != theirs or not ours:
         sys.exit(f"the PARAM_VALUEs are not the same: pymavlink {len(theirs):,}, paramclient {len(ours):,}")
     print(f"both found the same {len(ours):,} PARAM_VALUEs\n")
@@ -94,7 +94,7 @@ def parse_with_pymavlink(stream: bytes) -> Messages:
 
 
 def parse_with_paramclient(stream: bytes) -> Messages:
-    return [wire.decode(frame) for frame in wire.Framer(HANDLED_IDS).receive(stream)]
+    return [decode(frame) for frame in Framer(DECODED_IDS).receive(stream)]
 
 
 def passes_per_second(parse: Callable[[bytes], Messages], stream: bytes, seconds: float) -> float:

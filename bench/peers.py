@@ -48,9 +48,10 @@ import anyio
 from paramclient import Identity, ParamClient
 from paramclient.links import create_link, serve_endpoint
 from paramclient.model.identity import autopilot_name
-from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.version import __version__
+from paramclient.wire.frames import Framer
+from paramclient.wire.messages import MAV_AUTOPILOT_ARDUPILOTMEGA
 from tests.live.journal import Journal
 from tests.live.relay import Conditions, Relay
 
@@ -406,7 +407,7 @@ class Watched:
     def __init__(self, air: Air, requested_at: Any) -> None:
         self._air = air
         self._requested_at = requested_at
-        self._framer = wire.Framer({21, 110}, stream=False)
+        self._framer = Framer({21, 110}, stream=False)
         self.tick = air.tick
         self.next_deadline = air.next_deadline
         self.data_to_send = air.data_to_send
@@ -505,7 +506,7 @@ def fetch_with_pymavlink(port: int, limit: float) -> tuple[float, Values]:
 
     master = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}")
     master.wait_heartbeat(timeout=START_TIMEOUT)
-    is_cast = master.messages["HEARTBEAT"].autopilot == wire.MAV_AUTOPILOT_ARDUPILOTMEGA
+    is_cast = master.messages["HEARTBEAT"].autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
     values: dict[str, float] = {}
     missing: set[int] | None = None
     began = received = time.monotonic()

@@ -8,9 +8,10 @@ from pymavlink.dialects.v20 import all as dialect
 from pymavlink.generator.mavcrc import x25crc
 
 from fuzz.draw import Draw
-from paramclient.protocol import wire
-from paramclient.protocol.stats.sniffer import UNPROVEN_BYTES_MAX, Sniffer
-from paramclient.protocol.wire import Frame, Framer, Signer, SigningKey, SigningPolicy, Verifier
+from paramclient.client.frame_cutter import UNPROVEN_BYTES_MAX, Sniffer
+from paramclient.wire import messages
+from paramclient.wire.frames import Frame, Framer, build_frame, checksum
+from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier
 
 __all__ = ["INPUT_SIZE_MAX", "run"]
 
@@ -41,7 +42,7 @@ def run(data: bytes) -> None:
 
 
 def _check_datagrams(chunks: list[bytes]) -> None:
-    framer, chosen, guarded = (Framer(ids, stream=False) for ids in (None, wire.DECODED_IDS, None))
+    framer, chosen, guarded = (Framer(ids, stream=False) for ids in (None, messages.DECODED_IDS, None))
     guarded.guard = Verifier(Signer(KEY, timestamp=0), SigningPolicy.ACCEPT_ALL).accepts
     for chunk in chunks:
         frames = _frames_of(chunk)
@@ -49,7 +50,7 @@ def _check_datagrams(chunks: list[bytes]) -> None:
         assert framer.receive(chunk) == [frame for frame, _ in frames]
         assert framer.skipped - before == len(chunk) - sum(size for _, size in frames)
         assert guarded.receive(chunk) == [frame for frame, _ in frames]
-        understood = [frame for frame, _ in frames if frame.message_id in wire.DECODED_IDS]
+        understood = [frame for frame, _ in frames if frame.message_id in messages.DECODED_IDS]
         assert chosen.receive(chunk) == understood
         for frame in understood:
             _check_codec(frame)
@@ -83,14 +84,14 @@ def _check_sniffer(chunks: list[bytes]) -> None:
 
 
 def _check_codec(frame: Frame) -> None:
-    message = wire.decode(frame)
+    message = messages.decode(frame)
     assert message is not None
     options = {"system": frame.system, "component": frame.component, "sequence": frame.sequence}
-    data = wire.encode(message, **options)
+    data = messages.encode(message, **options)
     (again,) = Framer(stream=False).receive(data)
-    reported = wire.decode(again)
+    reported = messages.decode(again)
     assert reported is not None
-    assert wire.encode(reported, **options) == data
+    assert messages.encode(reported, **options) == data
 
 
 def _frames_of(data: bytes) -> list[tuple[Frame, int]]:
@@ -147,7 +148,7 @@ def _frame(draw: Draw) -> bytes:
     version = 1 if number < 256 and draw.number() % 4 == 0 else 2
     payload = draw.take(draw.number() % 60)
     system, component, sequence = draw.take(3)
-    return wire.build_frame(
+    return build_frame(
         number, payload, system=system, component=component, sequence=sequence, version=version
     )
 
@@ -158,7 +159,7 @@ def _damaged(frame: bytes, much: int, draw: Draw) -> bytes:
         case 5 if frame[0] == 0xFD:
             body = frame[1:2] + b"\x01" + frame[3:-2]
             number = int.from_bytes(frame[7:10], "little")
-            crc = wire.checksum(number, body)
+            crc = checksum(number, body)
             assert crc is not None
             return b"\xfd" + body + crc.to_bytes(2, "little") + draw.take(13)
         case 6:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from paramclient.errors import PackError
-from paramclient.protocol.ftp import param_pck
+from paramclient.protocol import param_pck
 
 __all__ = ["INPUT_SIZE_MAX", "run"]
 
@@ -17,7 +17,6 @@ READ_SIZE_MAX = 239
 
 def run(data: bytes) -> None:
     """Read and write a file."""
-    assert param_pck.total_of(data) in (None, int.from_bytes(data[4:6], "little"))
     try:
         held = param_pck.decode(data)
     except PackError as error:

@@ -9,9 +9,16 @@ from typing import Final
 
 from fuzz.draw import Draw
 from paramclient.errors import UsageError
-from paramclient.protocol import wire
-from paramclient.protocol.wire import Framer, Refusal, Signer, SigningKey, SigningPolicy, Verifier
-from paramclient.protocol.wire.signing import ADOPTED_TIMESTAMP_MAX, LAST_TIMESTAMP
+from paramclient.wire.frames import Framer, build_frame, sign_frame, unsign_frame
+from paramclient.wire.signing import (
+    ADOPTED_TIMESTAMP_MAX,
+    LAST_TIMESTAMP,
+    Refusal,
+    Signer,
+    SigningKey,
+    SigningPolicy,
+    Verifier,
+)
 
 __all__ = ["INPUT_SIZE_MAX", "run"]
 
@@ -68,15 +75,13 @@ class _Session:
     def speak(self) -> None:
         if self.time == LAST_TIMESTAMP:
             return
-        frame = wire.sign_frame(self._unsigned(), self.signer)
+        frame = sign_frame(self._unsigned(), self.signer)
         if frame[0] == 0xFD:
             self.time += 1
             assert frame[-12:-6] == self.time.to_bytes(6, "little")
             assert frame[-6:] == hashlib.sha256(SECRET + frame[:-6]).digest()[:6]
             assert len(Framer(stream=False).receive(frame)) == 1
-            assert Framer(stream=False).receive(wire.unsign_frame(frame)) == Framer(stream=False).receive(
-                frame
-            )
+            assert Framer(stream=False).receive(unsign_frame(frame)) == Framer(stream=False).receive(frame)
         assert self.signer.timestamp == self.time
 
     def wait(self) -> None:
@@ -129,9 +134,7 @@ class _Session:
         number, system, component = draw.one_of(IDS), draw.one_of((1, 2, 255)), draw.one_of((1, 190))
         version = 1 if number < 256 and draw.number() % 8 == 0 else 2
         payload = draw.take(draw.number() % 12)
-        return wire.build_frame(
-            number, payload, system=system, component=component, sequence=0, version=version
-        )
+        return build_frame(number, payload, system=system, component=component, sequence=0, version=version)
 
     def _frame(self) -> bytes:
         """Return a frame with a valid checksum."""
@@ -145,7 +148,7 @@ class _Session:
         timestamp = min(max(self.time + draw.one_of(LEAPS), 0), LAST_TIMESTAMP)
         secret = OTHER_SECRET if way == 2 else SECRET
         signer = Signer(SigningKey(secret), link_id=draw.number() % 3, timestamp=timestamp - 1)
-        frame = wire.sign_frame(frame, signer)
+        frame = sign_frame(frame, signer)
         self.received.append(frame)
         if way == 3:
             return frame[: -1 - draw.number() % 13]

@@ -23,8 +23,9 @@ from paramclient.links.tlog import Record, open_log, read_records
 from paramclient.logs.imported_table import ImportedTable
 from paramclient.logs.telemetry import import_log
 from paramclient.model.values import Encoding, bits_of, decode_value
-from paramclient.protocol import wire
-from paramclient.protocol.wire import NO_INDEX, Framer, Message
+from paramclient.wire import messages
+from paramclient.wire.frames import Framer
+from paramclient.wire.messages import NO_INDEX, Message
 
 __all__ = ["INPUT_SIZE_MAX", "run"]
 
@@ -126,8 +127,12 @@ def _said(records: Sequence[Record]) -> dict[tuple[int, int], set[tuple[str, int
     said: dict[tuple[int, int], set[tuple[str, int, bytes]]] = {}
     for record in records:
         for frame in framer.receive(record.data):
-            message = wire.decode(frame)
-            if isinstance(message, wire.ParamValue) and frame.system and message.param_id != "_HASH_CHECK":
+            message = messages.decode(frame)
+            if (
+                isinstance(message, messages.ParamValue)
+                and frame.system
+                and message.param_id != "_HASH_CHECK"
+            ):
                 words = said.setdefault((frame.system, frame.component), set())
                 words.add((message.param_id, message.param_type, message.raw))
     return said
@@ -187,7 +192,7 @@ def _log(draw: Draw) -> bytes:
 
 def _frame(draw: Draw) -> bytes:
     system, component = draw.one_of((1, 1, 1, 2, 255, 0)), draw.one_of((1, 1, 100))
-    return wire.encode(
+    return messages.encode(
         _message(draw), system=system, component=component, sequence=0, version=draw.one_of((2, 2, 2, 1))
     )
 
@@ -196,14 +201,14 @@ def _message(draw: Draw) -> Message:
     name, raw = draw.one_of(NAMES), draw.one_of(VALUES).to_bytes(4, "little")
     match draw.number() % 8:
         case 0:
-            return wire.Heartbeat(2, draw.one_of((12, 3, 0)))
+            return messages.Heartbeat(2, draw.one_of((12, 3, 0)))
         case 1:
-            return wire.AutopilotVersion(0, 0x01110000, bytes(8), uid=draw.number() % 3)
+            return messages.AutopilotVersion(0, 0x01110000, bytes(8), uid=draw.number() % 3)
         case 2:
-            return wire.ParamSetMessage(1, 1, name, raw, draw.one_of(KINDS))
+            return messages.ParamSet(1, 1, name, raw, draw.one_of(KINDS))
         case 3:
-            return wire.SystemTime(0, draw.one_of((0, 1000, 1_000_000)))
+            return messages.SystemTime(0, draw.one_of((0, 1000, 1_000_000)))
         case 4:
-            return wire.ParamRequestList(1, 1)
+            return messages.ParamRequestList(1, 1)
     count, index = draw.one_of((4, 4, 3, 0, 65535)), draw.one_of((0, 1, 2, 3, NO_INDEX))
-    return wire.ParamValue(name, raw, draw.one_of(KINDS), count, index)
+    return messages.ParamValue(name, raw, draw.one_of(KINDS), count, index)

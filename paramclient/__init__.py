@@ -2,7 +2,8 @@
 
 - `client`: the client over a link.
 - `sync`: the same client for scripts and notebooks, without `await`.
-- `protocol`, `links`: the sans-I/O core, and the bytes in and out.
+- `protocol`, `wire`, `links`: the conversations with a component, messages from and to bytes, the bytes in
+  and out.
 - `cache`, `files`, `metadata`, `logs`, `provision`: cached tables, parameter files, units
   and ranges, telemetry logs, setting up vehicles, the check of a vehicle.
 - `model`, `errors`, `version`: plain data, exceptions, the version.
@@ -16,25 +17,13 @@ from __future__ import annotations
 
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.client.client import ParamClient
-from paramclient.client.component import Component
-from paramclient.client.events import (
-    Contested,
-    Discovered,
-    Event,
-    Events,
-    Found,
-    Lost,
-    Rebooted,
-    Resynced,
-    Uncontested,
-)
-from paramclient.client.extended_params import ExtParams
-from paramclient.client.fetch_all import FetchedAll
+from paramclient.client.component import Component, ComponentState
+from paramclient.client.events import Discovered, Event, Events, Found, Lost, Rebooted, Resynced
 from paramclient.client.files import Ftp
+from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.reset import ResetResult
 from paramclient.client.signing import Signing, read_key
-from paramclient.client.stats import ClientStats
-from paramclient.client.subscription import Changes
+from paramclient.client.streams import Changes
 from paramclient.errors import (
     AlreadyRestored,
     AmbiguousVehicle,
@@ -42,7 +31,6 @@ from paramclient.errors import (
     CacheError,
     ClientClosed,
     CommandRefused,
-    ContestedAddress,
     FileError,
     FileTransferError,
     InvalidParameters,
@@ -63,23 +51,19 @@ from paramclient.errors import (
 )
 from paramclient.files import ParamFile, read_file, write_file
 from paramclient.model.comparison import Comparison, compare
-from paramclient.model.ext_params import ExtParam
-from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Encoding, Param, ParamType, Settable, Trust, Value
 from paramclient.protocol.addresses import Address
-from paramclient.protocol.params.change import Added, Change, Changed, FirstValue, Removed
-from paramclient.protocol.params.fetch_result import FetchResult, Policy, Progress
-from paramclient.protocol.params.sync import ComponentState, SyncState
-from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, SetStatus
-from paramclient.protocol.params.writes import SetResult
-from paramclient.protocol.wire import SigningKey, SigningPolicy
+from paramclient.protocol.events import Change
+from paramclient.protocol.fetch import FetchResult, Policy, Progress
+from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
+from paramclient.protocol.watch import SyncState
 from paramclient.version import __version__
+from paramclient.wire.signing import SigningKey, SigningPolicy
 
 __all__ = [
-    "Added",
     "Address",
     "AlreadyRestored",
     "AmbiguousVehicle",
@@ -87,28 +71,20 @@ __all__ = [
     "CacheError",
     "CachedComponent",
     "Change",
-    "Changed",
     "Changes",
     "ClientClosed",
-    "ClientStats",
     "CommandRefused",
     "Comparison",
     "Component",
     "ComponentState",
-    "Contested",
-    "ContestedAddress",
     "Discovered",
     "Encoding",
     "Event",
     "Events",
-    "ExtParam",
-    "ExtParamSet",
-    "ExtParams",
     "FetchResult",
     "FetchedAll",
     "FileError",
     "FileTransferError",
-    "FirstValue",
     "Found",
     "Ftp",
     "Identity",
@@ -131,7 +107,6 @@ __all__ = [
     "Progress",
     "Rebooted",
     "Refused",
-    "Removed",
     "ResetResult",
     "Resynced",
     "SetManyResult",
@@ -145,7 +120,6 @@ __all__ = [
     "SyncState",
     "Trust",
     "TypeMismatch",
-    "Uncontested",
     "UnknownParameter",
     "UnknownVehicle",
     "UsageError",

@@ -21,8 +21,7 @@ The tree shows the cause of each error::
     │   ├── ValueNotApplied           the vehicle kept another value and gave no reason
     │   ├── VehicleArmed              the vehicle is armed, and setting while armed was not allowed
     │   ├── FileTransferError         the vehicle refused an operation on a file
-    │   ├── AnotherVehicle            another vehicle than the expected one responded
-    │   └── ContestedAddress          several vehicles have the same address; no requests are sent to them
+    │   └── AnotherVehicle            another vehicle than the expected one responded
     ├── NoReply(TimeoutError)         no response before the deadline
     ├── LinkError(OSError)            the socket or the device failed
     │   └── ClientClosed              the client was closed during a call, or is not open
@@ -47,7 +46,6 @@ __all__ = [
     "ClientClosed",
     "CommandRefused",
     "CommandResult",
-    "ContestedAddress",
     "ExtAckResult",
     "ExtSetRefused",
     "FileError",
@@ -464,28 +462,6 @@ class AnotherVehicle(VehicleError):
         super().__init__(message, system=system, component=component)
         self.expected = expected
         self.found = found
-
-
-class ContestedAddress(VehicleError):
-    """Several vehicles have the same system and component id, so a request has no definite receiver.
-
-    The client neither reads from them nor writes to them until all but one have been silent for the heartbeat
-    timeout. Whether earlier writes took effect is unknown.
-
-    Attributes:
-        claimants: the peers with the address, each with its description, in words.
-        difference: the difference between them, in words.
-    """
-
-    def __init__(self, system: int, component: int, claimants: Sequence[str], difference: str) -> None:
-        message = (
-            f"{system}/{component} is contested, so nothing is read, written or cached. Several vehicles "
-            f"have the address: {'; '.join(claimants)}. Reason: {difference}. Give each "
-            "its own system id, or switch one off."
-        )
-        super().__init__(message, system=system, component=component)
-        self.claimants = tuple(claimants)
-        self.difference = difference
 
 
 class NoReply(ParamClientError, TimeoutError):

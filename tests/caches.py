@@ -16,7 +16,7 @@ from typing import Any
 import paramclient
 from paramclient.cache import (
     BY_VEHICLE,
-    CachedExtTable,
+    CachedComponent,
     HistoryEntry,
     ParamCache,
     StoredParam,
@@ -97,10 +97,10 @@ def changes(cache: ParamCache, name: str | None = None) -> list[HistoryEntry]:
     return cache.history(table.key, table.component, name)
 
 
-def extended(cache: ParamCache, key: str | None = None) -> CachedExtTable:
+def extended(cache: ParamCache, key: str | None = None) -> CachedComponent:
     """The only table of extended parameters, or that of a vehicle."""
     [table] = [each for each in cache.ext_sizes() if key in (None, each[0])]
-    found = cache.load_ext(*table)
+    found = cache.load(*table, extended=True)
     assert found is not None
     return found
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from paramclient.model.values import Encoding, ParamType, WireValue, encode_value
-from paramclient.protocol import wire
 from paramclient.sim import Endpoint
+from paramclient.wire import frames, messages
 
 __all__ = ["LIST", "PERIODIC_MESSAGES", "SMALL", "Station", "cast", "indices", "names", "read", "write"]
 
@@ -18,27 +18,29 @@ SMALL: dict[str, WireValue | tuple[ParamType | int, WireValue]] = {
     "C_BYTE": (ParamType.UINT8, 200),
     "D_SHORT": (ParamType.INT16, -3),
 }
-LIST = wire.ParamRequestList(1, 1)
-PERIODIC_MESSAGES = (wire.Heartbeat, wire.SystemTime)
+LIST = messages.ParamRequestList(1, 1)
+PERIODIC_MESSAGES = (messages.Heartbeat, messages.SystemTime)
 """Messages that a generic vehicle sends each second from the first call on."""
 
 M = TypeVar("M")
 
 
-def read(name: str = "", index: int = -1, *, system: int = 1, component: int = 1) -> wire.ParamRequestRead:
-    return wire.ParamRequestRead(system, component, name, index)
+def read(
+    name: str = "", index: int = -1, *, system: int = 1, component: int = 1
+) -> messages.ParamRequestRead:
+    return messages.ParamRequestRead(system, component, name, index)
 
 
 def write(
     name: str, value: float, kind: int, *, cast: bool = False, system: int = 1, component: int = 1
-) -> wire.ParamSetMessage:
+) -> messages.ParamSet:
     raw = encode_value(value, kind, Encoding.C_CAST if cast else Encoding.BYTEWISE)
-    return wire.ParamSetMessage(system, component, name, raw, kind)
+    return messages.ParamSet(system, component, name, raw, kind)
 
 
-def cast(name: str, value: float, kind: int = ParamType.REAL32) -> wire.ParamSetMessage:
+def cast(name: str, value: float, kind: int = ParamType.REAL32) -> messages.ParamSet:
     """Return a PARAM_SET in ArduPilot's encoding, for every value."""
-    return wire.ParamSetMessage(1, 1, name, struct.pack("<f", value), kind)
+    return messages.ParamSet(1, 1, name, struct.pack("<f", value), kind)
 
 
 class Station:
@@ -47,13 +49,13 @@ class Station:
     def __init__(self, endpoint: Endpoint, *, start: float = 0.0) -> None:
         self.endpoint = endpoint
         self.now = start
-        self.log: list[tuple[float, wire.Frame, wire.Message]] = []
+        self.log: list[tuple[float, frames.Frame, messages.Message]] = []
         endpoint.tick(start)
         self._collect()
 
-    def send(self, *messages: wire.Message) -> Station:
-        for message in messages:
-            self.send_bytes(wire.encode(message, system=255, component=190, sequence=0))
+    def send(self, *requests: messages.Message) -> Station:
+        for message in requests:
+            self.send_bytes(messages.encode(message, system=255, component=190, sequence=0))
         return self
 
     def send_bytes(self, data: bytes) -> None:
@@ -78,29 +80,29 @@ class Station:
         self.log.clear()
         return found
 
-    def values(self) -> list[wire.ParamValue]:
-        return self.receive(wire.ParamValue)
+    def values(self) -> list[messages.ParamValue]:
+        return self.receive(messages.ParamValue)
 
     def times(self) -> list[float]:
         """Return the times of the received PARAM_VALUEs."""
-        return [time for time, _, message in self.log if isinstance(message, wire.ParamValue)]
+        return [time for time, _, message in self.log if isinstance(message, messages.ParamValue)]
 
-    def ask(self, *messages: wire.Message, seconds: float = 0.2) -> list[wire.ParamValue]:
+    def ask(self, *requests: messages.Message, seconds: float = 0.2) -> list[messages.ParamValue]:
         """Send messages; return the PARAM_VALUEs received within this time."""
         self.log.clear()
-        return self.send(*messages).wait(seconds).values()
+        return self.send(*requests).wait(seconds).values()
 
     def _collect(self) -> None:
         for data in self.endpoint.data_to_send():
-            (frame,) = wire.Framer(stream=False).receive(data)
-            message = wire.decode(frame)
+            (frame,) = frames.Framer(stream=False).receive(data)
+            message = messages.decode(frame)
             if message is not None:
                 self.log.append((self.now, frame, message))
 
 
-def names(values: Sequence[wire.ParamValue]) -> list[str]:
+def names(values: Sequence[messages.ParamValue]) -> list[str]:
     return [value.param_id for value in values]
 
 
-def indices(values: Sequence[wire.ParamValue]) -> list[int]:
+def indices(values: Sequence[messages.ParamValue]) -> list[int]:
     return [value.param_index for value in values]

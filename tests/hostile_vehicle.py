@@ -8,8 +8,9 @@ from itertools import count
 from random import Random
 from typing import Final
 
-from paramclient.protocol import wire
-from paramclient.protocol.wire import (
+from paramclient.wire import messages
+from paramclient.wire.frames import Framer
+from paramclient.wire.messages import (
     CAPABILITY_FTP,
     HASH_CHECK,
     NO_INDEX,
@@ -17,13 +18,12 @@ from paramclient.protocol.wire import (
     CommandAck,
     CommandLong,
     FileTransfer,
-    Framer,
     Heartbeat,
     Message,
     ParamError,
     ParamRequestList,
     ParamRequestRead,
-    ParamSetMessage,
+    ParamSet,
     ParamValue,
     StatusText,
     SystemTime,
@@ -53,7 +53,7 @@ class HostileVehicle:
         self._rate = rate
         self.random = Random(1)
         self.numbers = count()
-        self._framer = Framer(wire.DECODED_IDS, stream=False)
+        self._framer = Framer(messages.DECODED_IDS, stream=False)
         self._outbox: list[bytes] = []
         self._next_at = 0.0
         self._beat_at = 0.0
@@ -61,7 +61,7 @@ class HostileVehicle:
     def receive(self, data: bytes, now: float) -> None:
         """Hear the ground station; answer everything that is for us."""
         for frame in self._framer.receive(data):
-            message = wire.decode(frame)
+            message = messages.decode(frame)
             if message is not None and getattr(message, "target_system", None) in (0, self._system):
                 for lie in self._lies:
                     self.say_all(lie(self, message))
@@ -92,7 +92,7 @@ class HostileVehicle:
         """Say something, in the name of any sender."""
         self.sent += 1
         self._outbox.append(
-            wire.encode(
+            messages.encode(
                 message,
                 system=self._system if system is None else system,
                 component=component,
@@ -136,7 +136,7 @@ def _escape_codes(liar: HostileVehicle, requested: Message | None) -> Iterable[M
 
 def _others_answers(liar: HostileVehicle, requested: Message | None) -> Iterable[Message]:
     """Answers for system 1, under our own address."""
-    if isinstance(requested, ParamRequestRead | ParamSetMessage):
+    if isinstance(requested, ParamRequestRead | ParamSet):
         yield _value(requested.param_id or "P0", 0x7FFFFFFF, 4, NO_INDEX)
         yield ParamError(1, 1, requested.param_id, -1, 1)
     yield FileTransfer(0, *OWN, bytes((next(liar.numbers) % 256, 0, 1, 128, 4, 15, 1, 0)).ljust(251, b"\0"))

@@ -40,11 +40,11 @@ from typing import NamedTuple, TypeAlias
 
 from paramclient.model.identity import Identity
 from paramclient.model.values import WireValue
-from paramclient.protocol import wire
-from paramclient.protocol.ftp.packets import Opcode, Packet
+from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.sim import Vehicle
+from paramclient.wire import frames, messages
 
-Messages: TypeAlias = list[tuple[float, wire.Message]]
+Messages: TypeAlias = list[tuple[float, messages.Message]]
 """Messages, each with the time since the log's first frame in seconds."""
 
 DATA = Path(__file__).parent / "data"
@@ -65,18 +65,18 @@ class Record(NamedTuple):
     time: float
     data: bytes
     system: int
-    frame: wire.Frame | None
+    frame: frames.Frame | None
 
     @property
-    def message(self) -> wire.Message | None:
-        return None if self.frame is None else wire.decode(self.frame)
+    def message(self) -> messages.Message | None:
+        return None if self.frame is None else messages.decode(self.frame)
 
 
 @cache
 def read(name: str) -> tuple[Record, ...]:
     """Return all frames of `tests/data/{name}.tlog`: 8 bytes of time (big-endian µs) before each frame."""
     content = (DATA / f"{name}.tlog").read_bytes()
-    framer = wire.Framer(stream=False)
+    framer = frames.Framer(stream=False)
     records: list[Record] = []
     at = 0
     start = None
@@ -92,14 +92,16 @@ def read(name: str) -> tuple[Record, ...]:
             system = content[at + 3]
         data = content[at : at + length]
         at += length
-        frames = framer.receive(data)
-        records.append(Record((time - start) / 1e6, data, system, frames[0] if frames else None))
+        found = framer.receive(data)
+        records.append(Record((time - start) / 1e6, data, system, found[0] if found else None))
     return tuple(records)
 
 
 def identity_in(name: str, autopilot: int) -> Identity:
     """Return the identity of the vehicle of a log, as the client makes it of AUTOPILOT_VERSION."""
-    version = next(message for _, message in from_vehicle(name) if isinstance(message, wire.AutopilotVersion))
+    version = next(
+        message for _, message in from_vehicle(name) if isinstance(message, messages.AutopilotVersion)
+    )
     return Identity.from_version(
         system=1,
         link="udpin:0.0.0.0:14550",
@@ -130,9 +132,9 @@ def from_vehicle(name: str) -> Messages:
     ]
 
 
-def param_values(messages: Iterable[tuple[float, wire.Message]]) -> list[wire.ParamValue]:
+def param_values(items: Iterable[tuple[float, messages.Message]]) -> list[messages.ParamValue]:
     """Return the PARAM_VALUEs among the messages, in order."""
-    return [message for _, message in messages if isinstance(message, wire.ParamValue)]
+    return [message for _, message in items if isinstance(message, messages.ParamValue)]
 
 
 def replay(
@@ -154,13 +156,13 @@ def replay(
         *((time, (param, value)) for time, param, value in on_board),
         (read(name)[-1].time + 0.05, b""),
     ]
-    framer = wire.Framer(stream=False)
+    framer = frames.Framer(stream=False)
     sent: Messages = []
 
     def collect(now: float) -> None:
         for data in vehicle.data_to_send():
             (frame,) = framer.receive(data)
-            if (message := wire.decode(frame)) is not None:
+            if (message := messages.decode(frame)) is not None:
                 sent.append((now, message))
 
     vehicle.tick(phase - 1.0)
@@ -220,7 +222,7 @@ def differences(
     return found + _order(pairs)
 
 
-def last_list(name: str) -> list[wire.ParamValue]:
+def last_list(name: str) -> list[messages.ParamValue]:
     """Return the values of the last list of a log, in order."""
     return param_values(_passes(_series(name, from_vehicle(name), ())["list"])[-1])
 
@@ -233,24 +235,26 @@ class _Pair(NamedTuple):
     sent: float
 
 
-def _series(name: str, messages: Messages, unasked: Collection[str]) -> defaultdict[str, Messages]:
+def _series(name: str, log: Messages, unasked: Collection[str]) -> defaultdict[str, Messages]:
     """Return the messages by series; index 0 starts a pass if a list was requested since the last pass."""
-    lists = [time for time, request in _requests(name) if isinstance(request, wire.ParamRequestList)]
+    lists = [time for time, request in _requests(name) if isinstance(request, messages.ParamRequestList)]
     series: defaultdict[str, Messages] = defaultdict(list)
     last, passes = None, 0
-    for time, message in messages:
+    for time, message in log:
         key = type(message).__name__
-        if isinstance(message, wire.ParamValue):
+        if isinstance(message, messages.ParamValue):
             index = message.param_index
-            key = f"value {message.param_id.upper() if index == wire.NO_INDEX else index}"
+            key = f"value {message.param_id.upper() if index == messages.NO_INDEX else index}"
             is_first = index == 0 and passes < sum(requested <= time for requested in lists)
             if is_first or (last is not None and index == last + 1):
                 key, last = "list", index
                 passes += is_first
             elif message.param_id in unasked:
                 continue
-        elif isinstance(message, wire.StatusText):
-            message = wire.StatusText(message.severity, re.sub(r"\([0-9a-f]{8}\)", "(hash)", message.text))
+        elif isinstance(message, messages.StatusText):
+            message = messages.StatusText(
+                message.severity, re.sub(r"\([0-9a-f]{8}\)", "(hash)", message.text)
+            )
         series[key].append((time, message))
     return series
 
@@ -258,44 +262,44 @@ def _series(name: str, messages: Messages, unasked: Collection[str]) -> defaultd
 def _passes(values: Messages) -> list[Messages]:
     passes: list[Messages] = []
     for time, message in values:
-        assert isinstance(message, wire.ParamValue)
+        assert isinstance(message, messages.ParamValue)
         if message.param_index == 0:
             passes.append([])
         passes[-1].append((time, message))
     return passes
 
 
-def _requests(name: str) -> list[tuple[float, wire.Message]]:
+def _requests(name: str) -> list[tuple[float, messages.Message]]:
     return [(record.time, message) for record in from_ground(name) if (message := record.message) is not None]
 
 
-def _request_of(answer: tuple[float, wire.Message], requests: Messages) -> float:
+def _request_of(answer: tuple[float, messages.Message], requests: Messages) -> float:
     """Return the time of the request that a message answers; without a request, the message's own time."""
     received, message = answer
     times = [time for time, request in requests if time <= received and _answers(message, request)]
     return max(times, default=received)
 
 
-def _answers(message: wire.Message, request: wire.Message) -> bool:
+def _answers(message: messages.Message, request: messages.Message) -> bool:
     match request:
-        case wire.ParamRequestList():
-            return isinstance(message, wire.StatusText) or (
-                isinstance(message, wire.ParamValue) and message.param_index in (0, wire.NO_INDEX)
+        case messages.ParamRequestList():
+            return isinstance(message, messages.StatusText) or (
+                isinstance(message, messages.ParamValue) and message.param_index in (0, messages.NO_INDEX)
             )
-        case wire.ParamRequestRead(param_index=index) if index >= 0:
-            return isinstance(message, wire.ParamValue) and message.param_index == index
-        case wire.ParamRequestRead(param_id=wanted) | wire.ParamSetMessage(param_id=wanted):
-            return isinstance(message, wire.ParamValue) and message.param_id.upper() == wanted.upper()
-        case wire.FileTransfer():
+        case messages.ParamRequestRead(param_index=index) if index >= 0:
+            return isinstance(message, messages.ParamValue) and message.param_index == index
+        case messages.ParamRequestRead(param_id=wanted) | messages.ParamSet(param_id=wanted):
+            return isinstance(message, messages.ParamValue) and message.param_id.upper() == wanted.upper()
+        case messages.FileTransfer():
             packet = Packet.unpack(request.payload)
-            if isinstance(message, wire.StatusText):
+            if isinstance(message, messages.StatusText):
                 return packet.opcode == Opcode.OPEN_FILE_RO
-            if not isinstance(message, wire.FileTransfer):
+            if not isinstance(message, messages.FileTransfer):
                 return False
             answer = Packet.unpack(message.payload)
             return answer.requested == packet.opcode and answer.sequence > packet.sequence
-        case wire.CommandLong():
-            return isinstance(message, wire.CommandAck | wire.AutopilotVersion)
+        case messages.CommandLong():
+            return isinstance(message, messages.CommandAck | messages.AutopilotVersion)
     return False
 
 

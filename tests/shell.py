@@ -19,9 +19,8 @@ from paramclient import Component, Param, ParamClient, ParamType
 from paramclient.client import cache_writer
 from paramclient.errors import LinkError
 from paramclient.links import Peer, SimLink
-from paramclient.protocol import wire
-from paramclient.protocol.component import ComponentMachine
 from paramclient.sim import Endpoint, GenericVehicle, PX4Vehicle, SimParam
+from paramclient.wire import frames, messages
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -188,11 +187,11 @@ class Tap:
     """
 
     def __init__(self, endpoint: Endpoint) -> None:
-        self.received: list[tuple[float, wire.Frame, wire.Message]] = []
+        self.received: list[tuple[float, frames.Frame, messages.Message]] = []
         self.is_deaf = False
         self.is_mute = False
         self._endpoint = endpoint
-        self._framer = wire.Framer(wire.DECODED_IDS, stream=False)
+        self._framer = frames.Framer(messages.DECODED_IDS, stream=False)
 
     def messages(self, kind: type[T]) -> list[T]:
         """What the station has sent, of one kind."""
@@ -200,7 +199,7 @@ class Tap:
 
     def receive(self, data: bytes, now: float) -> None:
         for frame in self._framer.receive(data):
-            message = wire.decode(frame)
+            message = messages.decode(frame)
             assert message is not None
             self.received.append((now, frame, message))
         if not self.is_deaf:
@@ -370,20 +369,14 @@ def bits(params: Mapping[str, Param]) -> dict[str, int]:
     return {name: param.bits for name, param in params.items()}
 
 
-def machine_of(component: Component) -> ComponentMachine:
-    """What stands behind a component, wherever its link is."""
-    return component.core.machine
-
-
 def residue(component: Component) -> list[object]:
-    """What is still registered with a component: reads, writes, a fetch, waiters."""
-    machine = machine_of(component)
-    left: list[object] = [f"{len(machine.reads)} reads"] if len(machine.reads) else []
-    left += [f"{len(machine.writes)} writes"] if len(machine.writes) else []
-    left += [f"{len(machine.write_batches)} batches of writes"] if len(machine.write_batches) else []
-    left += [machine.fetch] if machine.fetch is not None else []
-    left += [machine.refresh] if machine.refresh is not None else []
-    return left
+    """What is still under way with a component: messages that a call waits for, and a fetch.
+
+    The request for its identity, which the client sends by itself, is none of them."""
+    identity = (messages.AutopilotVersion, (messages.CommandAck, 512), (messages.CommandAck, 520))
+    waits = component.node.channel._inboxes.items()
+    left: list[object] = [key for key, waiting in waits if waiting and key not in identity]
+    return [*left, "fetch"] if component.session.fetching.is_running else left
 
 
 async def outcome(call: Awaitable[T]) -> T | Exception:

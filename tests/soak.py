@@ -1,4 +1,4 @@
-"""Thousands of the sessions of `test_machine.py`, seeded, on all cores: what `make soak` runs.
+"""Thousands of the sessions of `test_sessions.py`, seeded, on all cores: what `make soak` runs.
 
 Hypothesis draws the sessions of one seed, always the same ones, and the next seed draws others. A failure is
 reported with its seed; `python -m tests.soak --seed N` runs just those sessions again and looks for the
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from hypothesis import Phase, seed, settings
 from hypothesis.stateful import run_state_machine_as_test
 
-from tests.protocol.test_state_machine import SETTINGS, Sessions
+from tests.conversations.test_sessions import SETTINGS, Sessions
 
 PER_SEED = 100
 """Sessions that one seed stands for."""

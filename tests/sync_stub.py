@@ -11,21 +11,17 @@ from pathlib import Path
 from types import ModuleType
 
 from paramclient import metadata, provision
-from paramclient.client import client, component, events, extended_params, files, subscription
+from paramclient.client import client, component, events, files, streams
 from paramclient.provision import fleet
 
 STUB = Path(__file__).parent.parent / "paramclient" / "sync" / "__init__.pyi"
 
 CLASSES: dict[ModuleType, list[str]] = {
-    subscription: ["Changes", "ExtChanges"],
-    extended_params: ["ExtParams"],
+    streams: ["Changes"],
     files: ["Ftp"],
     component: ["Component"],
     fleet: ["Wanted"],
-    events: [
-        *("Discovered", "Lost", "Found", "Rebooted", "Resynced", "Contested", "Uncontested"),
-        *("Event", "Events"),
-    ],
+    events: ["Discovered", "Lost", "Found", "Rebooted", "Resynced", "Event", "Events"],
     client: ["ParamClient"],
 }
 FUNCTIONS: list[Callable[..., object]] = [
@@ -34,14 +30,15 @@ FUNCTIONS: list[Callable[..., object]] = [
     *(provision.apply_extended, provision.verify_extended, provision.restore_extended),
     *(provision.load_extended_state, metadata.metadata_of),
 ]
-STREAMS = {"Changes": "Change", "ExtChanges": "ExtChange", "Events": "Event"}
+STREAMS = {"Changes": "Change", "Events": "Event"}
 OWN = {name for names in CLASSES.values() for name in names} | {each.__name__ for each in FUNCTIONS}
 ATTRIBUTES = {
     "Component": ("system: int", "component: int", "params: ParamMap"),
-    "ExtParams": ("params: Mapping[str, ExtParam]",),
     "ParamClient": ("cache: ParamCache | None",),
 }
 """The public attributes that `__init__` sets."""
+INTERNAL = {"is_extended_by", "wait_for_cache", "wait_until_identified"}
+"""Methods for other modules of the asynchronous client."""
 
 
 def without_await(node: ast.FunctionDef | ast.AsyncFunctionDef) -> ast.FunctionDef:
@@ -60,7 +57,7 @@ def public_methods(node: ast.ClassDef) -> list[ast.stmt]:
         for each in node.body
         if isinstance(each, ast.FunctionDef | ast.AsyncFunctionDef)
         and (not each.name.startswith("_") or (each.name == "__init__" and node.name == "ParamClient"))
-        and each.name not in ("aclose", "open", "push")
+        and each.name not in {"aclose", "open", "push"} | INTERNAL
     ]
 
 

@@ -7,7 +7,7 @@ from typing import Self
 
 from paramclient.links.tlog import packed_time
 from paramclient.model.values import Encoding, ParamType, encode_value
-from paramclient.protocol import wire
+from paramclient.wire import messages
 from tests.simulation import param_value
 
 NOW = 1_700_000_000.0
@@ -27,18 +27,18 @@ class Log:
         self.values: dict[str, int] = {}
         self.data = b""
 
-    def say(self, *messages: wire.Message, system: int = 1, component: int = 1) -> Self:
-        for message in messages:
-            self.data += packed_time(self.at) + wire.encode(
+    def say(self, *sent: messages.Message, system: int = 1, component: int = 1) -> Self:
+        for message in sent:
+            self.data += packed_time(self.at) + messages.encode(
                 message, system=system, component=component, sequence=0
             )
         return self
 
     def beat(self) -> Self:
-        return self.say(wire.Heartbeat(2, wire.MAV_AUTOPILOT_GENERIC, system_status=4))
+        return self.say(messages.Heartbeat(2, messages.MAV_AUTOPILOT_GENERIC, system_status=4))
 
     def identify(self) -> Self:
-        return self.say(wire.AutopilotVersion(0, uid=0xDEADBEEF, flight_sw_version=7))
+        return self.say(messages.AutopilotVersion(0, uid=0xDEADBEEF, flight_sw_version=7))
 
     def wait(self, seconds: float) -> Self:
         self.at += seconds
@@ -61,7 +61,7 @@ class Log:
 
     def set(self, name: str, value: int) -> Self:
         raw = encode_value(value, ParamType.INT32, Encoding.BYTEWISE)
-        self.say(wire.ParamSetMessage(1, 1, name, raw, ParamType.INT32), system=255, component=190)
+        self.say(messages.ParamSet(1, 1, name, raw, ParamType.INT32), system=255, component=190)
         return self.change(name, value)
 
     def write(self, path: Path) -> Path:

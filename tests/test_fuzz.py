@@ -10,8 +10,7 @@ from unittest import mock
 
 import pytest
 
-from paramclient.protocol import component
-from paramclient.protocol.params import reads, table
+from fuzz import component
 
 ROOT = Path(__file__).parent.parent
 FUZZ = ROOT / "fuzz"
@@ -60,20 +59,10 @@ def test_any_input_will_do(name: str) -> None:
 
 
 def test_a_fault_is_found() -> None:
-    """Without what mends them, the faults of old show again: the harness looks at what it should."""
-    found = FUZZ / "findings" / "component"
-    with (
-        mock.patch.object(component, "_in_capitals", str.upper),
-        pytest.raises(UnicodeEncodeError),
-    ):
-        target("component")((found / "capital-beyond-latin-1").read_bytes())
-    with (
-        mock.patch.object(component, "PARAMETERS_MAX", 65535),
-        mock.patch.object(table, "PARAMETERS_MAX", 65535),
-        mock.patch.object(reads, "PARAMETERS_MAX", 65535),
-        pytest.raises(Exception, match="short format requires"),
-    ):
-        target("component")((found / "index-beyond-32767").read_bytes())
+    """Without a limit of the library, an input of the corpus fails: the harness looks at what it should."""
+    inputs_of_corpus = [path.read_bytes() for path in inputs("corpus", "component")]
+    with mock.patch.object(component, "BOUNDS", component.BOUNDS[1:]), pytest.raises(ExceptionGroup):
+        any(target("component")(data) for data in inputs_of_corpus)
 
 
 def test_every_target_is_tested_and_its_corpus_is_small() -> None:

@@ -15,7 +15,6 @@ from pathlib import Path
 import pytest
 
 from paramclient import (
-    Changed,
     ClientClosed,
     FileTransferError,
     LinkError,
@@ -25,6 +24,7 @@ from paramclient import (
     Progress,
     UnknownParameter,
     UsageError,
+    Value,
     WrittenParam,
 )
 from paramclient.sync import Component, Discovered, ParamClient, apply, apply_all, restore, verify
@@ -51,12 +51,12 @@ def test_a_whole_session(tmp_path: Path) -> None:
         progress: list[int | None] = []
         result = vehicle.fetch_all(progress=lambda each: progress.append(vehicle.count))
         assert (result.received, result.missing) == (903, ())
-        assert set(progress) == {903}
+        assert progress[-1] == 903
         changes = vehicle.changes()
         assert vehicle.set(NAME, 6.0).actual == 6.0
         change = next(changes)
-        assert isinstance(change, Changed)
-        assert (change.name, change.new.value) == (NAME, 6.0)
+        assert change.new is not None
+        assert (change.kind, change.name, change.new.value) == ("changed", NAME, 6.0)
         with pytest.raises(TimeoutError):
             changes.next(timeout=0.01)
         done = vehicle.set_many((name, 7.0) for name in [NAME] if vehicle.get(name).value == 6.0)
@@ -66,8 +66,8 @@ def test_a_whole_session(tmp_path: Path) -> None:
         assert vehicle.silence < 5.0
         with pytest.raises(UnknownParameter):
             vehicle.get("NO_SUCH_NAME")
-        with pytest.raises(NoReply):
-            vehicle.ext.fetch_all(timeout=0.05)
+        nothing = vehicle.ext.fetch_all(timeout=0.05)
+        assert (nothing.params, nothing.complete) == ({}, False)
         with pytest.raises(FileTransferError):
             client.ftp(vehicle).read("/no/such/file")
     assert next(changes).name == NAME, "what was queued"
@@ -83,7 +83,7 @@ def test_a_whole_session(tmp_path: Path) -> None:
 
 def test_a_vehicle_is_set_up_and_restored() -> None:
     wanted = ParamSet({NAME: WrittenParam(NAME, 6.5)})
-    asked: list[float | int | bytes] = []
+    asked: list[Value] = []
     with ParamClient("sim:px4", cache=False) as client:
         vehicle = client.only_component()
         result = apply(vehicle, wanted, before_writing=lambda: asked.append(vehicle.get(NAME).value))

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from operator import attrgetter, itemgetter
 from typing import Any, Final, NamedTuple
 
-from paramclient.cache.records import BY_VEHICLE, ExtHistoryEntry, HistoryEntry, StoredParam, StoredValue
+from paramclient.cache.records import BY_VEHICLE, HistoryEntry, StoredParam, StoredValue
 from paramclient.cache.schema import Transaction
 
 __all__ = [
@@ -111,18 +111,11 @@ def load_history(
     return [(component, _line(row)) for *row, component in reversed(found)]
 
 
-def plain_entry(component: int, line: Line) -> HistoryEntry:
-    """Return a line of a plain parameter as users see it."""
+def entry_of(component: int, line: Line) -> HistoryEntry:
+    """Return a line as users see it."""
     assert line.old is not None
     new = None if line.new is None else line.new.param(line.name)
     return HistoryEntry(line.at, component, line.name, line.old.param(line.name), new, line.by)
-
-
-def extended_entry(component: int, line: Line) -> ExtHistoryEntry:
-    """Return a line of an extended parameter as users see it."""
-    assert line.old is not None
-    new = None if line.new is None else line.new.ext_param(line.name)
-    return ExtHistoryEntry(line.at, component, line.name, line.old.ext_param(line.name), new, line.by)
 
 
 def last_removal(tx: Transaction, owner: int, name: str) -> float:

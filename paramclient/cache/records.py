@@ -7,26 +7,31 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
-from paramclient.model.ext_params import ExtParam
 from paramclient.model.identity import Identity, autopilot_name
-from paramclient.model.params import CACHED, COMPACT_NO_INDEX, CompactParam, ParamMap, Params, compact_param
-from paramclient.model.values import Param, ParamType, Trust, WireValue, bits_of, from_bits, same_bits
+from paramclient.model.params import ParamMap
+from paramclient.model.values import (
+    Param,
+    ParamType,
+    Trust,
+    WireValue,
+    bits_of,
+    byte_length,
+    from_bits,
+    same_bits,
+)
 
 __all__ = [
     "BY_US",
     "BY_VEHICLE",
     "CachedComponent",
-    "CachedExtTable",
     "CachedSummary",
     "CachedVehicle",
-    "ExtHistoryEntry",
     "HistoryEntry",
     "SnapshotSummary",
     "StoredParam",
     "StoredValue",
     "TableState",
     "TableUpdate",
-    "by_station",
 ]
 
 BY_VEHICLE: Final = "vehicle"
@@ -37,17 +42,12 @@ BITS_SIZE: Final = 8
 """Bytes of a stored plain value: `Param.bits`, little-endian, in the size of the largest type."""
 
 
-def by_station(system: int, component: int) -> str:
-    """Return the author of a change by another ground station: `station 254/190`."""
-    return f"station {system}/{component}"
-
-
 class StoredValue(NamedTuple):
     """A value as it is stored, plain or extended.
 
     Attributes:
         type: number of the type.
-        value: `Param.bits` in 8 bytes, little-endian; or `ExtParam.raw`.
+        value: `Param.bits`, little-endian, in 8 bytes; in more for text and bytes.
         is_raw: 1 if a plain value is only known as the four bytes of the message.
     """
 
@@ -66,18 +66,16 @@ class StoredValue(NamedTuple):
         )
 
     def param(self, name: str, index: int | None = None, default: bytes | None = None) -> Param:
-        """Return it as a plain parameter, with trust CACHED."""
+        """Return it as a parameter, with trust CACHED."""
         bits = int.from_bytes(self.value, "little")
-        value = from_bits(bits, self.type, is_raw=bool(self.is_raw))
-        return Param(name, value, self.type, index, bits, Trust.CACHED, default_value(default, self.type))
-
-    def ext_param(self, name: str, index: int | None = None) -> ExtParam:
-        """Return it as an extended parameter, with trust CACHED."""
-        return ExtParam.of(name, self.value, self.type, index, Trust.CACHED)
+        is_raw = bool(self.is_raw)
+        value = from_bits(bits, self.type, is_raw=is_raw)
+        given = default_value(default, self.type)
+        return Param(name, value, self.type, index, bits, Trust.CACHED, given, is_raw)
 
 
 class StoredParam(NamedTuple):
-    """One observation of a parameter to store, or one stored parameter. Create it by `of` or `of_ext`.
+    """One observation of a parameter to store, or one stored parameter. Create it by `of`.
 
     Attributes:
         name: param_id.
@@ -86,7 +84,7 @@ class StoredParam(NamedTuple):
         volatile: 1 if the vehicle's hash excludes the parameter; None does not change the stored flag.
         heard_at: time of the observation. The later of two observations of a parameter counts.
         default: the firmware's default in the form of the value, or None.
-        by: author, if the value is a change: `BY_US`, `us for NAME`, `BY_VEHICLE` or `by_station(…)`.
+        by: author, if the value is a change: `BY_US`, `us for NAME`, `BY_VEHICLE` or `station 254/190`.
     """
 
     name: str
@@ -101,37 +99,17 @@ class StoredParam(NamedTuple):
     def of(
         cls, param: Param, heard_at: float, volatile: bool | None = None, by: str = BY_VEHICLE
     ) -> StoredParam:
-        """Return an observation of a plain parameter; its trust is not stored."""
-        flag = None if volatile is None else int(volatile)
-        return cls.of_compact(param.name, compact_param(param), param.default, flag, heard_at, by)
-
-    @classmethod
-    def of_compact(
-        cls,
-        name: str,
-        compact: CompactParam,
-        default: WireValue | None,
-        volatile: int | None,
-        heard_at: float,
-        by: str,
-    ) -> StoredParam:
-        """Return an observation of a live table's parameter, without creating a `Param`."""
-        number, is_raw, index = compact[8], compact[9], int.from_bytes(compact[11:], "little", signed=True)
+        """Return an observation of a parameter; its trust is not stored."""
+        number = int(param.type_number)
         return cls(
-            name,
-            StoredValue(number, compact[:BITS_SIZE], is_raw),
-            None if index == COMPACT_NO_INDEX else index,
-            volatile,
+            param.name,
+            StoredValue(number, _bits_cell(param.bits), int(param.is_raw)),
+            param.index,
+            None if volatile is None else int(volatile),
             heard_at,
-            None if default is None else _bits_cell(bits_of(default, number)),
+            None if param.default is None else _bits_cell(bits_of(param.default, number)),
             by,
         )
-
-    @classmethod
-    def of_ext(cls, param: ExtParam, heard_at: float, by: str = BY_VEHICLE) -> StoredParam:
-        """Return an observation of an extended parameter."""
-        value = StoredValue(int(param.type), param.raw, 0)
-        return cls(param.name, value, param.index, None, heard_at, None, by)
 
     @property
     def hashed(self) -> StoredValue | None:
@@ -208,18 +186,6 @@ class HistoryEntry:
     name: str
     old: Param
     new: Param | None
-    by: str
-
-
-@dataclass(frozen=True, slots=True)
-class ExtHistoryEntry:
-    """One change of an extended value, with the attributes of `HistoryEntry`."""
-
-    at: float
-    component: int
-    name: str
-    old: ExtParam
-    new: ExtParam | None
     by: str
 
 
@@ -335,40 +301,9 @@ class CachedComponent(CachedSummary):
     heard_at: Mapping[str, float] = field(hash=False)
 
 
-@dataclass(frozen=True, slots=True)
-class CachedExtTable:
-    """The cached extended parameters of one component.
-
-    Attributes:
-        key: key of the vehicle in the cache.
-        component: component id.
-        params: the parameters by name, with trust CACHED, in the order of their indices.
-        heard_at: time of the last observation of each value, by name.
-        count: param_count of the component, or None.
-        complete: whether the table has every index below the count.
-    """
-
-    key: str
-    component: int
-    params: Mapping[str, ExtParam]
-    heard_at: Mapping[str, float]
-    count: int | None
-    complete: bool
-
-
-def plain_params(rows: Mapping[str, StoredParam]) -> Params:
-    """Return stored parameters as plain ones, with trust CACHED."""
-    params = Params()
-    for name, row in rows.items():
-        index = COMPACT_NO_INDEX if row.param_index is None else row.param_index
-        number, value, is_raw = row.stored
-        params.compact[name] = (
-            value + bytes((number, is_raw, CACHED)) + index.to_bytes(4, "little", signed=True)
-        )
-        default = default_value(row.default, number)
-        if default is not None:
-            params.defaults[name] = default
-    return params
+def stored_params(rows: Mapping[str, StoredParam]) -> dict[str, Param]:
+    """Return stored parameters, with trust CACHED."""
+    return {name: row.stored.param(name, row.param_index, row.default) for name, row in rows.items()}
 
 
 def default_value(default: bytes | None, number: int) -> WireValue | None:
@@ -382,7 +317,7 @@ def written_value(number: ParamType | int, bits: int, *, is_raw: bool) -> Stored
 
 
 def _bits_cell(bits: int) -> bytes:
-    return bits.to_bytes(BITS_SIZE, "little")
+    return bits.to_bytes(max(BITS_SIZE, byte_length(bits)), "little")
 
 
 def _minute(at: float) -> str:

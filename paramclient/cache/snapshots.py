@@ -20,7 +20,6 @@ from paramclient.cache.tables import (
     time_cell,
 )
 from paramclient.errors import NotInCache, UsageError
-from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import bits_of, from_bits
@@ -63,19 +62,14 @@ class EarlierState(NamedTuple):
     source: str
 
     @property
-    def plain(self) -> ParamSet:
-        """The state of a table of plain parameters."""
+    def params(self) -> ParamSet:
+        """The state as a set."""
         params = {}
         for name, (number, bits, is_raw), default in self.rows:
             value = from_bits(int.from_bytes(bits, "little"), number, is_raw=bool(is_raw))
-            params[name] = WrittenParam(name, value, number, default_value(default, number))
+            given = default_value(default, number)
+            params[name] = WrittenParam(name, value, number, given, is_raw=bool(is_raw))
         return ParamSet(params, self.component, self.identity.system, self.identity, self.at, self.source)
-
-    @property
-    def extended(self) -> ExtParamSet:
-        """The state of a table of extended parameters."""
-        params = {name: value.ext_param(name) for name, value, _ in self.rows}
-        return ExtParamSet(params, self.identity.system, self.component, self.at, self.source, self.identity)
 
 
 def store_snapshot(
@@ -179,16 +173,12 @@ def rows_of_table(rows: Mapping[str, StoredParam]) -> list[SnapshotRow]:
     return [(name, row.stored, row.default) for name, row in rows.items()]
 
 
-def rows_of(params: ParamSet | ExtParamSet) -> list[SnapshotRow]:
+def rows_of(params: ParamSet) -> list[SnapshotRow]:
     """Return the parameters of a set as those of a snapshot.
 
     Raises:
         UsageError: the type of a parameter is unknown, or does not hold its value.
     """
-    if isinstance(params, ExtParamSet):
-        return [
-            (name, StoredValue(int(each.type), each.raw, 0), None) for name, each in params.params.items()
-        ]
     rows: list[SnapshotRow] = []
     for name, each in params.items():
         number = each.type_number

@@ -16,10 +16,8 @@ from paramclient.cache import history, snapshots, tables
 from paramclient.cache.lookup import find_vehicle
 from paramclient.cache.records import (
     CachedComponent,
-    CachedExtTable,
     CachedSummary,
     CachedVehicle,
-    ExtHistoryEntry,
     HistoryEntry,
     SnapshotSummary,
     StoredParam,
@@ -29,7 +27,6 @@ from paramclient.cache.schema import Transaction
 from paramclient.cache.sqlite import SqliteStore
 from paramclient.cache.updates import ensure_table, save_table
 from paramclient.errors import NotInCache, UsageError
-from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 
@@ -182,23 +179,14 @@ class ParamCache:
         if updates:
             self._store.run(work, writing=True)
 
-    def load(self, key: str, component: int) -> CachedComponent | None:
+    def load(self, key: str, component: int, *, extended: bool = False) -> CachedComponent | None:
         """Return the table of a vehicle's component; None if there is none.
 
         Args:
             key: `Identity.key`.
             component: component id.
         """
-        return self._read(lambda tx: tables.load_component(tx, key, component))
-
-    def load_ext(self, key: str, component: int) -> CachedExtTable | None:
-        """Return the extended parameters of a vehicle's component; None if there are none.
-
-        Args:
-            key: `Identity.key`.
-            component: component id.
-        """
-        return self._read(lambda tx: tables.load_extended(tx, key, component))
+        return self._read(lambda tx: tables.load_component(tx, key, component, extended=extended))
 
     def vehicles(self) -> list[CachedVehicle]:
         """Return all vehicles, the last seen first."""
@@ -221,24 +209,32 @@ class ParamCache:
         )
 
     def component(
-        self, vehicle: str | None = None, *, system: int | None = None, component: int = 1
+        self,
+        vehicle: str | None = None,
+        *,
+        system: int | None = None,
+        component: int = 1,
+        extended: bool = False,
     ) -> CachedComponent:
         """Return the only table that matches.
 
         Args:
             vehicle: as for `components`.
             system: its system id.
-            component: component id; the autopilot's is 1.
+            component: component id; the autopilot's is 1, that of a camera 100.
+            extended: the extended parameters of the component, instead of the plain ones.
 
         Raises:
             UnknownVehicle: no table matches. `vehicles` and the message list the existing ones.
             AmbiguousVehicle: tables of several vehicles match. `vehicles` and the message list them.
+            NotInCache: the component has no extended parameters in the cache.
         """
 
         def work(tx: Transaction) -> CachedComponent:
             key = self._choose(tx, vehicle, system=system, component=component)
-            found = tables.load_component(tx, key, component)
-            assert found is not None, "what was chosen exists for the whole transaction"
+            found = tables.load_component(tx, key, component, extended=extended)
+            if found is None:  # only of extended parameters: a component has a plain table
+                raise NotInCache(f"{key}, component {component}, has no extended parameters in the cache")
             return found
 
         return self._read(work)
@@ -276,6 +272,8 @@ class ParamCache:
         name: str | None = None,
         limit: int | None = None,
         since: float | None = None,
+        *,
+        extended: bool = False,
     ) -> list[HistoryEntry]:
         """Return the changes of a vehicle's values, newest last.
 
@@ -287,39 +285,28 @@ class ParamCache:
             name: only changes of this parameter.
             limit: maximum number of changes, the newest.
             since: only changes from this time on, in unix seconds.
+            extended: those of extended parameters, instead of the plain ones.
 
         Raises:
             UnknownVehicle: no vehicle in the cache has this name.
             AmbiguousVehicle: several vehicles have this name.
         """
-        which = (component, name, limit, since, False)
+        which = (component, name, limit, since, extended)
         found = self._read(lambda tx: history.load_history(tx, self._choose(tx, vehicle), *which))
-        return [history.plain_entry(number, line) for number, line in found]
-
-    def ext_history(
-        self,
-        vehicle: str,
-        component: int | None = None,
-        name: str | None = None,
-        limit: int | None = None,
-        since: float | None = None,
-    ) -> list[ExtHistoryEntry]:
-        """Return the changes of a vehicle's extended parameters; as `history`."""
-        which = (component, name, limit, since, True)
-        found = self._read(lambda tx: history.load_history(tx, self._choose(tx, vehicle), *which))
-        return [history.extended_entry(number, line) for number, line in found]
+        return [history.entry_of(number, line) for number, line in found]
 
     def store_snapshot(
         self,
         vehicle: Identity | str,
         component: int,
-        params: ParamSet | ExtParamSet | None = None,
+        params: ParamSet | None = None,
         *,
         reason: str,
         at: float | None = None,
         hash: int | None = None,  # noqa: A002  # the word of the record
         complete: bool = True,
         is_of_operation: bool = False,
+        extended: bool = False,
     ) -> SnapshotSummary:
         """Store a snapshot of a table as a restore point, and return it.
 
@@ -337,6 +324,7 @@ class ParamCache:
             complete: whether these are all parameters of the vehicle.
             is_of_operation: whether an `apply` or `restore` is about to write; it calls `end_operation` at
                 its end.
+            extended: whether these are extended parameters.
 
         Raises:
             UsageError: the type of a parameter is unknown.
@@ -344,7 +332,6 @@ class ParamCache:
             AmbiguousVehicle: several vehicles have this name.
         """
         moment = time.time() if at is None else at
-        extended = isinstance(params, ExtParamSet)
         rows = None if params is None else snapshots.rows_of(params)
 
         def work(tx: Transaction) -> SnapshotSummary:
@@ -400,7 +387,7 @@ class ParamCache:
 
         return self._read(work)
 
-    def state_at(self, vehicle: str, component: int, when: float) -> ParamSet:
+    def state_at(self, vehicle: str, component: int, when: float, *, extended: bool = False) -> ParamSet:
         """Return a table as it was at a given time.
 
         It is computed backwards from the current table with the history lines, and has the last values
@@ -412,6 +399,7 @@ class ParamCache:
             vehicle: as for `components`.
             component: component id.
             when: a float is a time, in unix seconds; an int is the id of a snapshot.
+            extended: that of extended parameters, instead of the plain ones.
 
         Raises:
             UsageError: the time is not in unix seconds.
@@ -422,15 +410,8 @@ class ParamCache:
         """
 
         return self._read(
-            lambda tx: snapshots.load_state(tx, self._table(tx, vehicle, component), when).plain
-        )
-
-    def ext_state_at(self, vehicle: str, component: int, when: float) -> ExtParamSet:
-        """Return the extended parameters of a component as they were at a given time; as `state_at`."""
-
-        return self._read(
             lambda tx: (
-                snapshots.load_state(tx, self._table(tx, vehicle, component, extended=True), when).extended
+                snapshots.load_state(tx, self._table(tx, vehicle, component, extended=extended), when).params
             )
         )
 

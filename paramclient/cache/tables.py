@@ -9,18 +9,17 @@ from typing import Any, Final
 
 from paramclient.cache.records import (
     CachedComponent,
-    CachedExtTable,
     CachedSummary,
     CachedVehicle,
     StoredParam,
     StoredValue,
     TableState,
-    plain_params,
+    stored_params,
 )
 from paramclient.cache.schema import IDENTITY, Transaction
 from paramclient.errors import UsageError
 from paramclient.model.identity import Identity
-from paramclient.model.params import ParamMap, unpack_fields
+from paramclient.model.params import ParamMap
 from paramclient.model.px4_hash import hash_bits
 
 __all__ = [
@@ -28,7 +27,6 @@ __all__ = [
     "find_table",
     "identity_cells",
     "load_component",
-    "load_extended",
     "load_rows",
     "load_summaries",
     "load_tables",
@@ -134,11 +132,11 @@ def load_vehicles(tx: Transaction, key: str | None = None) -> list[CachedVehicle
 
 
 def load_summaries(
-    tx: Transaction, key: str | None = None, component: int | None = None
+    tx: Transaction, key: str | None = None, component: int | None = None, *, extended: bool = False
 ) -> list[CachedSummary]:
-    """Return tables of plain parameters without their parameters, optionally of one vehicle or component."""
+    """Return tables without their parameters, optionally of one vehicle or component."""
     of_vehicle: dict[str, list[StoredTable]] = defaultdict(list)
-    for table in load_tables(tx, key, component):
+    for table in load_tables(tx, key, component, extended=extended):
         of_vehicle[table.key].append(table)
     return [
         CachedSummary(
@@ -180,22 +178,23 @@ def load_rows(tx: Transaction, owner: int, names: Collection[str] | None = None)
     return {row.name: row for row in rows}
 
 
-def load_component(tx: Transaction, key: str, component: int) -> CachedComponent | None:
-    """Return a table of plain parameters; None if there is none.
+def load_component(
+    tx: Transaction, key: str, component: int, *, extended: bool = False
+) -> CachedComponent | None:
+    """Return a table; None if there is none.
 
     A hash that the stored values do not have is left out: it cannot confirm them.
     """
-    table = find_table(tx, key, component)
+    table = find_table(tx, key, component, extended=extended)
     if table is None:
         return None
     rows = load_rows(tx, table.owner)
-    params = plain_params(rows)
+    params = stored_params(rows)
     volatile = frozenset(name for name, row in rows.items() if row.volatile)
-    [summary] = load_summaries(tx, key, component)
+    [summary] = load_summaries(tx, key, component, extended=extended)
     described = {name: getattr(summary, name) for name in CachedSummary.__slots__}
     if summary.hash is not None and summary.volatile_known:
-        listed = [name for name, row in rows.items() if row.param_index is not None]
-        bits = {name: unpack_fields(params.compact[name])[0] for name in listed}
+        bits = {name: param.bits for name, param in params.items() if param.index is not None}
         if hash_bits(bits, leave_out=volatile) != summary.hash:
             described["hash"] = None
     return CachedComponent(
@@ -204,17 +203,6 @@ def load_component(tx: Transaction, key: str, component: int) -> CachedComponent
         volatile=volatile,
         heard_at={name: row.heard_at for name, row in rows.items()},
     )
-
-
-def load_extended(tx: Transaction, key: str, component: int) -> CachedExtTable | None:
-    """Return a table of extended parameters; None if there is none."""
-    table = find_table(tx, key, component, extended=True)
-    if table is None:
-        return None
-    rows = load_rows(tx, table.owner)
-    params = {name: row.stored.ext_param(name, row.param_index) for name, row in rows.items()}
-    heard_at = {name: row.heard_at for name, row in rows.items()}
-    return CachedExtTable(key, component, params, heard_at, table.state.count, table.state.complete)
 
 
 def remove_tables(tx: Transaction, key: str, component: int | None) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from statistics import median
 from typing import Any, Final, TypeVar
@@ -14,7 +15,6 @@ from paramclient.cli.session import Deadline
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import (
-    CommandRefused,
     FileTransferError,
     LinkError,
     NoReply,
@@ -23,17 +23,19 @@ from paramclient.errors import (
     VehicleError,
 )
 from paramclient.model.notation import hash_text, rounded
-from paramclient.protocol.ftp import param_pck
-from paramclient.protocol.params.fetch_result import Progress
-from paramclient.protocol.params.file_download import PARAMETER_FILE, WITH_DEFAULTS
-from paramclient.protocol.wire import (
-    AUTOPILOT_VERSION_ID,
+from paramclient.protocol import param_pck
+from paramclient.protocol.file_download import PARAM_FILE, WITH_DEFAULTS
+from paramclient.protocol.list_download import ListResult, download_list
+from paramclient.wire.frames import enum_word
+from paramclient.wire.messages import (
     HASH_CHECK,
-    MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_INVALID,
     MAV_CMD_REQUEST_MESSAGE,
     MAV_TYPE_GCS,
-    enum_word,
+    AutopilotVersion,
+    CommandAck,
+    CommandLong,
+    message_id,
 )
 
 __all__ = ["HashMeasurement", "ListCheck", "Measurements", "Report"]
@@ -172,7 +174,8 @@ class Measurements:
         self._deadline = deadline
         self._progress = progress
         self._began = anyio.current_time()
-        self._core = component.core
+        self._channel = component.node.channel
+        self._identification = component.node.identification
 
     async def take(self) -> Report:
         """Take all measurements.
@@ -180,9 +183,8 @@ class Measurements:
         Raises:
             LinkError: the link failed.
         """
-        component, machine = self._component, self._core.machine
-        self._client.traffic_report()
-        listened = anyio.current_time() - self._core.client.opened_at
+        component = self._component
+        listened = self._client.traffic_report().seconds
         await self._step("listening", lambda: anyio.sleep(max(0.0, CHECK_LISTENING_TIME - listened)))
         await self._step("identification", self._wait_for_identity)
         trips = await self._step("round trip", self._measure_round_trips)
@@ -190,14 +192,14 @@ class Measurements:
         reads = await self._step("single reads", self._measure_reads)
         listed = await self._step("list download", self._measure_list)
         files = await self._step("MAVFTP", self._check_files)
-        kind = machine.identification.vehicle_type
+        kind = self._identification.vehicle_type
         return Report(
             system=component.system,
             component=component.component,
             autopilot=component.autopilot,
             vehicle_type=None if kind is None else enum_word("MAV_TYPE", kind),
             identity=IdentityJson.of(component.identity),
-            has_version=machine.identification.firmware is not None,
+            has_version=self._identification.capabilities is not None,
             encoding=component.encoding.value,
             encoding_reason=component.encoding_reason,
             is_armed=component.is_armed,
@@ -223,36 +225,38 @@ class Measurements:
 
     async def _wait_for_identity(self) -> None:
         """Wait until AUTOPILOT_VERSION was received or finally refused, at most `VERSION_TIMEOUT`."""
-        with anyio.move_on_after(self._deadline.left(VERSION_TIMEOUT)):
-            while not self._core.machine.identification.settled:
-                await self._core.client.link_task.activity.wait()
+        await self._component.wait_until_identified(self._deadline.left(VERSION_TIMEOUT) or 0.0)
 
     async def _measure_round_trips(self) -> RoundTrips | None:
         """Measure the time from command to acknowledgement, of commands that were sent once."""
-        machine = self._core.machine
-        what = f"COMMAND_ACK of {self._component.system}/{self._component.component}"
+        channel, what = self._channel, f"COMMAND_ACK of {self._component.system}/{self._component.component}"
+        command = CommandLong(*channel.target, MAV_CMD_REQUEST_MESSAGE, float(message_id(AutopilotVersion)))
         found: list[float] = []
         for _ in range(ROUND_TRIP_COUNT):
             began = anyio.current_time()
-            command = machine.commands.begin(MAV_CMD_REQUEST_MESSAGE, (float(AUTOPILOT_VERSION_ID),), began)
-            try:
-                await self._core.wait(command, self._left(), lambda: (what, 0))
-            except CommandRefused:
-                pass  # a refusal is an acknowledgement too
-            except NoReply:
-                if not found:
-                    break  # the vehicle acknowledges no commands
+            sent: list[int] = []
+
+            def request(attempt: int, sent: list[int] = sent) -> CommandLong:
+                sent.append(attempt)
+                return command
+
+            with (
+                anyio.move_on_after(self._left()) as scope,
+                channel.inbox((CommandAck, MAV_CMD_REQUEST_MESSAGE)) as inbox,
+                suppress(NoReply),
+            ):
+                await channel.exchange(request, inbox, lambda ack: ack, what=what)
+                if len(sent) == 1:
+                    found.append(anyio.current_time() - began)
                 continue
-            finally:
-                machine.commands.cancel(command, anyio.current_time())
-            if command.attempts == 1:
-                found.append(anyio.current_time() - began)
+            if scope.cancelled_caught and not found:
+                break  # the vehicle acknowledges no commands
         if not found:
             return None
         return RoundTrips(len(found), round(min(found), 4), round(median(found), 4), round(max(found), 4))
 
     async def _read_hash(self) -> HashMeasurement:
-        if self._core.machine.identification.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
+        if self._identification.is_ardupilot:
             return HashMeasurement(None, "ArduPilot has no parameter hash")
         try:
             param = await self._component.get(HASH_CHECK, timeout=self._left())
@@ -294,43 +298,44 @@ class Measurements:
 
     async def _measure_list(self) -> ListCheck:
         """Measure one list download, also if a file download would be faster."""
-        machine = self._core.machine
+        session = self._component.session
         began = anyio.current_time()
         arrivals: list[tuple[float, int]] = []
+        found: ListResult | None = None
 
-        def progress(state: Progress) -> None:
-            if state.received and (not arrivals or state.received > arrivals[-1][1]):
-                arrivals.append((anyio.current_time(), state.received))
+        def progress(received: int, total: int | None) -> None:
+            if received and (not arrivals or received > arrivals[-1][1]):
+                arrivals.append((anyio.current_time(), received))
 
-        # the vehicle sends the whole list even if later measurements have begun
-        deadline = began + max(0.0, (self._deadline.left() or 0.0) - MEASURE_TIMEOUT)
+        session.observers.add(progress)
         try:
-            fetch = machine.begin_fetch(began, refresh=True, by_list=True)
-            try:
-                result = await self._core.wait_for_fetch(fetch, deadline, progress)
-            finally:
-                machine.end_fetch(fetch, anyio.current_time())
-                self._core.client.wake()
+            # the vehicle sends the whole list even if later measurements have begun
+            with anyio.move_on_after(max(0.0, (self._deadline.left() or 0.0) - MEASURE_TIMEOUT)):
+                found = await download_list(session)
         except LinkError:
             raise
         except ParamClientError as error:
             elapsed = round(anyio.current_time() - began, 4)
             return ListCheck(None, 0, elapsed, None, 0, 0, is_cut_short=False, error=str(error))
+        finally:
+            session.observers.discard(progress)
         now = anyio.current_time()
-        first, steady = fetch.first_value_at, STEADY_SHARE * result.received
+        received = arrivals[-1][1] if arrivals else 0
+        first = arrivals[0][0] if arrivals else now
         rates = (
             number / (at - first)
-            for at, number in [*arrivals, (now, result.received)]
-            if number >= steady and at > first
+            for at, number in arrivals
+            if number >= STEADY_SHARE * received and at > first
         )
+        count = self._component.count
         return ListCheck(
-            count=result.count,
-            received=result.received,
+            count=count,
+            received=received,
             elapsed_s=round(now - began, 4),
             per_s=rounded(next(rates, None)),
-            lost=result.lost,
-            missing=len(result.missing),
-            is_cut_short=not fetch.done,
+            lost=0 if found is None else found.lost,
+            missing=(count or 0) - received if found is None else len(found.missing),
+            is_cut_short=found is None,
             error=None,
         )
 
@@ -338,7 +343,7 @@ class Measurements:
         began = anyio.current_time()
         try:
             ftp = self._client.ftp(self._component)
-            data = await ftp.read(PARAMETER_FILE + WITH_DEFAULTS, timeout=self._deadline.left())
+            data = await ftp.read(PARAM_FILE + WITH_DEFAULTS, timeout=self._deadline.left())
             elapsed = rounded(anyio.current_time() - began)
             content = param_pck.decode(data)
         except (FileTransferError, NoReply, PackError) as error:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Awaitable, Callable, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Final
+from typing import Final, TypeAlias
 
 import anyio
 
-from paramclient.cache import CachedExtTable, ParamCache
+from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.json_output import ExtParamJson, ext_value_json
@@ -21,21 +21,13 @@ from paramclient.cli.sources import check_link, check_new, is_file, names_vehicl
 from paramclient.cli.write_outcomes import status_in_words
 from paramclient.errors import NoReply, NotInCache, ParamClientError, UnknownParameter, UsageError
 from paramclient.files.disk import is_extended_file, read_extended_file
-from paramclient.model.ext_params import (
-    ExtParam,
-    ExtParamType,
-    ExtValue,
-    check_ext_value,
-    encode_ext_value,
-    ext_type_name,
-    format_ext_value,
-)
-from paramclient.model.ext_paramset import ExtParamSet
+from paramclient.model.ext_values import check_ext_value, encode_ext_value, ext_bytes
+from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.patterns import NameChoice, is_pattern
+from paramclient.model.values import Param, ParamType, WireValue, format_value, type_name
 from paramclient.model.wording import counted, first_of
-from paramclient.protocol.ext.fetch import ExtFetchResult
-from paramclient.protocol.ext.write_batch import ExtSetOutcome
-from paramclient.protocol.params.write_batch import SetStatus
+from paramclient.protocol.fetch import FetchResult
+from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision import ExtApplyResult, ExtPlan
 from paramclient.provision import apply_extended as write_extended_set
 from paramclient.provision import verify_extended as verify_extended_set
@@ -58,6 +50,8 @@ __all__ = [
     "write_extended",
 ]
 
+Side: TypeAlias = Param | WrittenParam | None
+"""One side of a comparison: as a vehicle has it, as a file has it, or absent."""
 NAMES_SHOWN_MAX: Final = 20
 """Names that a message lists; it gives the number of further ones."""
 HEX: Final = "hex:"
@@ -71,22 +65,22 @@ def is_extended_source(text: str) -> bool:
     return is_file(text) and is_extended_file(text)
 
 
-def ext_value_text(value: ExtValue, number: int) -> str:
+def ext_value_text(value: WireValue, number: int) -> str:
     """Return the text of an extended value, as subcommands print and take it."""
-    return f"{HEX}{value.hex()}" if isinstance(value, bytes) else format_ext_value(value, number)
+    return f"{HEX}{value.hex()}" if isinstance(value, bytes) else format_value(value, number)
 
 
-def ext_text(param: ExtParam | None) -> str | None:
+def ext_text(param: Param | WrittenParam | None) -> str | None:
     """Return the text of the value of a parameter; None for None."""
-    return None if param is None else ext_value_text(param.value, param.type)
+    return None if param is None else ext_value_text(param.settable, param.type_number or 0)
 
 
-def ext_cells(param: ExtParam) -> tuple[object, ...]:
+def ext_cells(param: Param) -> tuple[object, ...]:
     """Return the cells of `EXT_COLUMNS`."""
-    return param.name, ext_text(param), ext_type_name(param.type), param.index
+    return param.name, ext_text(param), type_name(param.type_number), param.index
 
 
-def in_order(params: Iterable[ExtParam]) -> list[ExtParam]:
+def in_order(params: Iterable[Param]) -> list[Param]:
     """Return parameters in the order of their indices."""
     return sorted(params, key=lambda param: (param.index is None, param.index or 0, param.name))
 
@@ -112,8 +106,8 @@ async def fetch_extended(session: CommandSession, only: Sequence[str] = ()) -> E
     if session.options.json:
         print_json(
             {
-                "system": result.system,
-                "component": result.component,
+                "system": session.component.system,
+                "component": session.component.component,
                 "count": result.count,
                 "source": result.source,
                 "missing": list(result.missing),
@@ -138,7 +132,7 @@ async def fetch_extended(session: CommandSession, only: Sequence[str] = ()) -> E
     return ExitCode.DONE
 
 
-async def _fetch(session: CommandSession) -> ExtFetchResult:
+async def _fetch(session: CommandSession) -> FetchResult:
     with progress_bar(f"fetching {session.label}") as progress:
         return await session.component.ext.fetch_all(timeout=session.deadline.left(), progress=progress)
 
@@ -174,9 +168,9 @@ async def get_extended(session: CommandSession, given: Sequence[str]) -> ExitCod
 
 async def read_extended(
     session: CommandSession, names: Sequence[str]
-) -> tuple[dict[str, ExtParam], list[ParamClientError]]:
+) -> tuple[dict[str, Param], list[ParamClientError]]:
     """Read several extended parameters concurrently; return them by name, and the errors."""
-    found: dict[str, ExtParam] = {}
+    found: dict[str, Param] = {}
     errors: list[ParamClientError] = []
 
     async def read(name: str) -> None:
@@ -204,8 +198,8 @@ async def set_extended(
         if not isinstance(error, UnknownParameter):
             raise error
     unknown = {error.name: error for error in errors if isinstance(error, UnknownParameter)}
-    values = [(name, value_of(name, text, found[name].type)) for name, text in pairs if name in found]
-    written: Iterable[ExtSetOutcome] = ()
+    values = [(name, value_of(name, text, found[name].type_number)) for name, text in pairs if name in found]
+    written: Iterable[SetOutcome] = ()
     if values:
         result = await session.component.ext.set_many(
             values, timeout=session.deadline.left(), durable=durable
@@ -213,29 +207,29 @@ async def set_extended(
         written = result.outcomes
     left = iter(written)
     outcomes = [
-        next(left) if name in found else ExtSetOutcome(name, text, SetStatus.REFUSED, error=unknown[name])
+        next(left) if name in found else SetOutcome(name, text, SetStatus.REFUSED, error=unknown[name])
         for name, text in pairs
     ]
     _print_outcomes(session, outcomes)
     return _code_of_outcomes(outcomes)
 
 
-def value_of(name: str, text: str, number: int) -> ExtValue:
+def value_of(name: str, text: str, number: int) -> WireValue:
     """Return the value that a text gives in a type: a number, text, or bytes after `hex:`.
 
     Raises:
         UsageError: the text is no value of this type.
     """
-    value: ExtValue = text
+    value: WireValue = text
     try:
         if text.startswith(HEX):
             value = bytes.fromhex(text.removeprefix(HEX))
-        elif number in (ExtParamType.REAL32, ExtParamType.REAL64):
+        elif number in (ParamType.REAL32, ParamType.REAL64):
             value = float(text)
-        elif ExtParamType.UINT8 <= number <= ExtParamType.INT64:
+        elif ParamType.UINT8 <= number <= ParamType.INT64:
             value = int(text, 0)
     except ValueError:
-        raise UsageError(f"{name}: {text!r} is not a value of type {ext_type_name(number)}") from None
+        raise UsageError(f"{name}: {text!r} is not a value of type {type_name(number)}") from None
     try:
         encode_ext_value(check_ext_value(value), number)
     except UsageError as error:
@@ -246,37 +240,45 @@ def value_of(name: str, text: str, number: int) -> ExtValue:
 # Sources, apply, restore
 
 
-async def extended_source(text: str, options: LinkOptions) -> ExtParamSet:
-    """Return the extended parameters of a file, a cached vehicle or a link.
+async def extended_source(text: str, options: LinkOptions) -> tuple[ParamSet, Mapping[str, Param]]:
+    """Return the extended parameters of a file, a cached vehicle or a link; of vehicles also as received.
 
     Raises:
         NoReply: a table of a link is incomplete, or nothing was received.
         NotInCache: a cached table is incomplete, or there is none.
     """
     if is_file(text):
-        return read_extended_file(text)
+        return read_extended_file(text), {}
     if names_vehicle(text):
         if options.place is False:
             raise UsageError(f"{text!r} is a vehicle in the cache, which --no-cache excludes")
         table = cached_extended(text, options.cache, ChosenVehicle.parse(options.vehicle).component)
         if not table.complete:
             raise NotInCache(f"the table of {table.key}, component {table.component}, is incomplete")
-        params = {param.name: param for param in in_order(table.params.values())}
-        at = max(table.heard_at.values(), default=None)
-        return ExtParamSet(params, None, table.component, at, f"cache {table.key}")
+        content = ParamSet.of(
+            in_order(table.params.values()),
+            component=table.component,
+            at=max(table.heard_at.values(), default=None),
+            source=f"cache {table.key}",
+        )
+        return content, table.params
     check_link(text)
     async with connect(text, options) as session:
         result = await _fetch(session)
         if not result.complete:
             missing = counted(len(result.missing), "extended parameter")
             raise NoReply(f"{missing} of {session.label}", attempts=0, waited=result.elapsed)
-        params = {param.name: param for param in in_order(result.params.values())}
-        return ExtParamSet(
-            params, result.system, result.component, time.time(), f"link {session.client.link.name}"
+        content = ParamSet.of(
+            in_order(result.params.values()),
+            component=session.component.component,
+            system=session.component.system,
+            at=time.time(),
+            source=f"link {session.client.link.name}",
         )
+        return content, result.params
 
 
-def cached_extended(vehicle: str | None, cache: str | None, component: int | None = None) -> CachedExtTable:
+def cached_extended(vehicle: str | None, cache: str | None, component: int | None = None) -> CachedComponent:
     """Return the only cached table of extended parameters that fits.
 
     Raises:
@@ -284,8 +286,16 @@ def cached_extended(vehicle: str | None, cache: str | None, component: int | Non
         UsageError: there are several.
     """
     with ParamCache(cache) as opened:
-        found = [opened.load_ext(each.key, each.component) for each in tables_in(opened, vehicle, component)]
-        tables = [table for table in found if table is not None]
+        chosen = []
+        if vehicle is not None and vehicle.isdecimal():  # a camera of the system has its own hardware id
+            chosen = [
+                each
+                for each in opened.components()
+                if each.system == int(vehicle) and component in (None, each.component)
+            ]
+        chosen = chosen or tables_in(opened, vehicle, component)
+        found = [opened.load(each.key, each.component, extended=True) for each in chosen]
+        tables = [table for table in found if table is not None and table.params]
     if not tables:
         raise NotInCache("there are no extended parameters of that vehicle in the cache")
     if len(tables) > 1:
@@ -305,7 +315,7 @@ async def apply_extended(
     backup: str | None,
 ) -> ExitCode:
     """Write the differing values of a source of extended parameters, and verify them by another download."""
-    content = await extended_source(file, options)
+    content, _ = await extended_source(file, options)
     path = None if backup is None else check_new(backup)
     async with connect(url, options, writes=True) as session:
         write = partial(write_extended_set, session.component, content, durable=durable, backup=path)
@@ -314,7 +324,7 @@ async def apply_extended(
 
 async def write_extended(
     session: CommandSession,
-    content: ExtParamSet,
+    content: ParamSet,
     write: Callable[..., Awaitable[ExtApplyResult]],
     *,
     dry_run: bool,
@@ -361,29 +371,35 @@ async def write_extended(
     return code if result.complete else max(code, ExitCode.INCOMPLETE)
 
 
-def _report_impossible(session: CommandSession, plan: ExtPlan, content: ExtParamSet) -> None:
+def _report_impossible(session: CommandSession, plan: ExtPlan, content: ParamSet) -> None:
     """Report the wanted parameters that the component lacks, or has in another type."""
     if plan.missing:
         report(f"{session.label} does not have {first_of(plan.missing, NAMES_SHOWN_MAX)}")
     for name in plan.mistyped:
-        types = ext_type_name(plan.current[name].type), ext_type_name(content.params[name].type)
+        types = type_name(plan.current[name].type_number), type_name(content.params[name].type_number or 0)
         report(f"{name} is {types[0]} on {session.label}, and {types[1]} in {content.source}")
 
 
 def differences_json(
-    entries: Iterable[tuple[str, ExtParam | None, ExtParam | None, str]], *, is_same: bool
+    entries: Iterable[tuple[str, Side, Side, str]],
+    *,
+    is_same: bool,
 ) -> dict[str, object]:
     """Return the JSON of a comparison: name, left, right and comparison of each entry."""
     extended = [
         {
             "name": name,
-            "left": None if left is None else ExtParamJson.of(left),
-            "right": None if right is None else ExtParamJson.of(right),
+            "left": None if left is None else _side_json(left),
+            "right": None if right is None else _side_json(right),
             "is": comparison,
         }
         for name, left, right, comparison in entries
     ]
     return {"is_same": is_same, "extended": extended}
+
+
+def _side_json(param: Param | WrittenParam) -> ExtParamJson:
+    return ExtParamJson.of(param) if isinstance(param, Param) else ExtParamJson.written(param)
 
 
 def _print_plan(session: CommandSession, plan: ExtPlan, *, is_dry: bool) -> None:
@@ -398,14 +414,14 @@ def _print_plan(session: CommandSession, plan: ExtPlan, *, is_dry: bool) -> None
     say(printable(f"{len(plan.changes)} of {session.label} {verb}"))
 
 
-def _print_outcomes(session: CommandSession, outcomes: Sequence[ExtSetOutcome]) -> None:
+def _print_outcomes(session: CommandSession, outcomes: Sequence[SetOutcome]) -> None:
     if session.options.json:
         print_json({"results": [_outcome_json(each) for each in outcomes]})
     else:
         rows = (
             (
                 each.name,
-                ext_value_text(each.requested, ExtParamType.REAL64),
+                ext_value_text(each.requested, ParamType.REAL64),
                 None if each.result is None else ext_text(each.result.param),
                 status_in_words(each.status, each.error),
             )
@@ -418,24 +434,24 @@ def _print_outcomes(session: CommandSession, outcomes: Sequence[ExtSetOutcome]) 
             report(f"{each.name}: {each.error}")
 
 
-def _outcome_json(outcome: ExtSetOutcome) -> dict[str, object]:
+def _outcome_json(outcome: SetOutcome) -> dict[str, object]:
     """Return the JSON of an outcome; values that are no text are null, and `…_hex` has their bytes."""
     result, requested = outcome.result, outcome.requested
     written: dict[str, object] = {
         "name": outcome.name,
-        "requested": ext_value_json(requested, ExtParamType.REAL64),
-        "actual": None if result is None else ext_value_json(result.actual, result.param.type),
+        "requested": ext_value_json(requested, ParamType.REAL64),
+        "actual": None if result is None else ext_value_json(result.actual, result.param.type_number),
         "status": outcome.status.value,
     }
     if isinstance(requested, bytes):
         written["requested_hex"] = requested.hex()
     if result is not None:
-        written["actual_hex"] = result.param.raw.hex()
+        written["actual_hex"] = ext_bytes(result.param).hex()
     if outcome.error is not None:
         written["reason"] = str(outcome.error)
     return written
 
 
-def _code_of_outcomes(outcomes: Iterable[ExtSetOutcome]) -> ExitCode:
+def _code_of_outcomes(outcomes: Iterable[SetOutcome]) -> ExitCode:
     errors = [each.error for each in outcomes if each.error is not None]
     return max((code_of(error) for error in errors), default=ExitCode.DONE)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import anyio.to_thread
 
-from paramclient.cache import ExtHistoryEntry, ParamCache
+from paramclient.cache import HistoryEntry, ParamCache
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import (
     EXT_COLUMNS,
@@ -25,9 +25,12 @@ from paramclient.cli.sources import component_of, is_file, tables_in
 from paramclient.errors import NotInCache
 from paramclient.files import FileFormat
 from paramclient.files.disk import read_extended_file, write_extended_file
-from paramclient.model.ext_params import ExtParam
+from paramclient.model.comparison import same_value
+from paramclient.model.ext_values import encode_ext_value, ext_param
 from paramclient.model.notation import time_text
+from paramclient.model.paramset import WrittenParam
 from paramclient.model.patterns import NameChoice
+from paramclient.model.values import Param, ParamType, Trust
 
 __all__ = ["diff_extended", "history_extended", "save_extended", "show_extended"]
 
@@ -35,7 +38,7 @@ __all__ = ["diff_extended", "history_extended", "save_extended", "show_extended"
 def show_extended(vehicle: str | None, names: Sequence[str], options: CacheOptions) -> ExitCode:
     """Print extended parameters of a file, or cached ones."""
     if vehicle is not None and is_file(vehicle):
-        params = [*read_extended_file(vehicle).params.values()]
+        params = [_param_of(each) for each in read_extended_file(vehicle).values()]
         description = f"{len(params)} extended parameters from {vehicle}"
     else:
         table = cached_extended(vehicle, options.cache)
@@ -58,7 +61,7 @@ async def save_extended(
     where: str, file: Path, file_format: FileFormat | None, options: LinkOptions
 ) -> ExitCode:
     """Write extended parameters to a file. An incomplete table is not written."""
-    content = await extended_source(where, options)
+    content, _ = await extended_source(where, options)
     written = await anyio.to_thread.run_sync(
         lambda: write_extended_file(file, content, file_format=file_format)
     )
@@ -83,7 +86,8 @@ async def diff_extended(
     left: str, right: str, options: LinkOptions, *, partial: bool, everything: bool
 ) -> ExitCode:
     """Compare the extended parameters of two sources."""
-    first, second = await extended_source(left, options), await extended_source(right, options)
+    first, known = await extended_source(left, options)
+    second, other = await extended_source(right, options)
     names = list(dict.fromkeys((*first.params, *second.params)))
     if partial:
         names = list(second.params if is_file(right) and not is_file(left) else first.params)
@@ -92,7 +96,8 @@ async def diff_extended(
     different = [entry for entry in entries if entry[3] != "same"]
     shown = entries if everything else different
     if options.json:
-        print_json(differences_json(shown, is_same=not different))
+        sides = ((name, known.get(name, one), other.get(name, two), word) for name, one, two, word in shown)
+        print_json(differences_json(sides, is_same=not different))
     else:
         if shown:
             rows = ((name, ext_text(one), ext_text(two), word) for name, one, two, word in shown)
@@ -109,7 +114,7 @@ def history_extended(
     """Print the changes of a vehicle's extended parameters, the newest last."""
     with ParamCache(options.cache) as cache:
         key, component = tables_in(cache, vehicle)[0].key, component_of(vehicle)
-        entries = cache.ext_history(key, component, None, None if names else limit, since)
+        entries = cache.history(key, component, None, None if names else limit, since, extended=True)
     if names:
         choice = NameChoice(names)
         entries = [each for each in entries if choice.has(each.name)]
@@ -125,7 +130,7 @@ def history_extended(
     return ExitCode.DONE
 
 
-def _entry_json(entry: ExtHistoryEntry) -> dict[str, object]:
+def _entry_json(entry: HistoryEntry) -> dict[str, object]:
     return {
         "time": time_text(entry.at),
         "at": entry.at,
@@ -137,7 +142,12 @@ def _entry_json(entry: ExtHistoryEntry) -> dict[str, object]:
     }
 
 
-def _comparison(left: ExtParam | None, right: ExtParam | None) -> str:
+def _param_of(written: WrittenParam) -> Param:
+    number = written.type_number or ParamType.UNKNOWN
+    return ext_param(written.name, encode_ext_value(written.settable, number), number, None, Trust.CACHED)
+
+
+def _comparison(left: WrittenParam | None, right: WrittenParam | None) -> str:
     if left is None or right is None:
         return "only right" if left is None else "only left"
-    return "same" if left.same_value(right) else "different"
+    return "same" if same_value(left, right) and left.type_number == right.type_number else "different"

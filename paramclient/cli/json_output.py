@@ -12,7 +12,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from paramclient.model.defaults import add_default, default_of
-from paramclient.model.ext_params import ExtParam, ExtParamType, ExtValue, ext_type_name
+from paramclient.model.ext_values import encode_ext_value, ext_bytes
 from paramclient.model.identity import Identity, autopilot_name, version_text
 from paramclient.model.notation import (
     Scalar,
@@ -24,8 +24,8 @@ from paramclient.model.notation import (
     value_json,
     value_written,
 )
-from paramclient.model.values import Param, ParamType, format_value, type_name
-from paramclient.protocol.vehicle.kinds import kind_in_words
+from paramclient.model.values import Param, ParamType, WireValue, format_value, type_name
+from paramclient.protocol.kinds import kind_in_words
 
 if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler, TypeAdapter
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from paramclient.client.component import Component
     from paramclient.metadata import Metadata, ParamInfo
     from paramclient.model.paramset import ParamSet, WrittenParam
-    from paramclient.protocol.params.fetch_result import FetchResult
-    from paramclient.protocol.params.write_batch import SetOutcome
+    from paramclient.protocol.fetch import FetchResult
+    from paramclient.protocol.set_results import SetOutcome
 
 __all__ = [
     "ExtParamJson",
@@ -270,26 +270,37 @@ class ExtParamJson(Json):
     heard_at: float | None = None
 
     @classmethod
-    def of(cls, param: ExtParam) -> ExtParamJson:
+    def of(cls, param: Param) -> ExtParamJson:
         """Return a parameter without its name."""
         return cls(
-            value=ext_value_json(param.value, param.type),
-            type=ext_type_name(param.type),
+            value=ext_value_json(param.value, param.type_number),
+            type=type_name(param.type_number),
             index=param.index,
-            hex=param.raw.hex(),
+            hex=ext_bytes(param).hex(),
         )
 
     @classmethod
-    def of_table(cls, param: ExtParam, *, heard_at: float | None = None) -> ExtParamJson:
+    def written(cls, param: WrittenParam) -> ExtParamJson:
+        """Return a parameter of a set."""
+        number = param.type_number or ParamType.UNKNOWN
+        return cls(
+            value=ext_value_json(param.settable, number),
+            type=type_name(number),
+            index=None,
+            hex=encode_ext_value(param.settable, number).hex(),
+        )
+
+    @classmethod
+    def of_table(cls, param: Param, *, heard_at: float | None = None) -> ExtParamJson:
         """Return a parameter with its name, its trust, and the unix time in seconds of its reception."""
         return replace(cls.of(param), name=param.name, trust=param.trust.value, heard_at=heard_at)
 
 
-def ext_value_json(value: ExtValue, number: int) -> Scalar | None:
+def ext_value_json(value: WireValue, number: int) -> Scalar | None:
     """Return an extended value in strict JSON; None for bytes."""
     if isinstance(value, bytes | str):
         return value if isinstance(value, str) else None
-    return value_json(value, ParamType.REAL32 if number == ExtParamType.REAL32 else ParamType.REAL64)
+    return value_json(value, ParamType.REAL32 if number == ParamType.REAL32 else ParamType.REAL64)
 
 
 # Vehicles and sets

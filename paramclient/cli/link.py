@@ -16,11 +16,13 @@ from paramclient.cli.output import live_view, milliseconds, print_json, print_li
 from paramclient.cli.session import Deadline, listen, received_in_words
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
+from paramclient.client.traffic import ComponentTraffic, TrafficReport
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import rounded
-from paramclient.protocol.stats.traffic import ComponentTraffic, TrafficReport
-from paramclient.protocol.wire import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, SigningReport, enum_word
+from paramclient.wire.frames import enum_word
+from paramclient.wire.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS
+from paramclient.wire.signing import SigningReport
 
 __all__ = ["link"]
 

@@ -17,7 +17,7 @@ from cyclopts.validators import Number
 from paramclient.client.signing import Signing, key_from_environment, read_key
 from paramclient.errors import UsageError
 from paramclient.model.values import Encoding
-from paramclient.protocol.wire import SigningKey, SigningPolicy
+from paramclient.wire.signing import SigningKey, SigningPolicy
 
 __all__ = [
     "CONNECTION",

@@ -21,7 +21,7 @@ import anyio
 
 from paramclient.cli.json_output import as_json
 from paramclient.model.values import Param, format_value
-from paramclient.protocol.params.fetch_result import Progress
+from paramclient.protocol.fetch import Progress
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Final
 
@@ -46,19 +46,17 @@ from paramclient.cli.session import (
     sessions,
 )
 from paramclient.cli.waiting import while_waiting
-from paramclient.errors import NoReply, ParamClientError, UsageError
+from paramclient.errors import ParamClientError, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import Default, add_default, default_of
 from paramclient.model.notation import hash_text
 from paramclient.model.patterns import NameChoice, is_pattern
 from paramclient.model.values import Param, Trust, format_value, type_name
 from paramclient.model.wording import first_of
-from paramclient.protocol.params.fetch_result import FetchResult, Policy
+from paramclient.protocol.fetch import FetchResult, Policy
 
 __all__ = ["fetch", "fetch_table", "get", "get_chosen", "report_all"]
 
-REFRESH_TIMEOUT: Final = 10.0
-"""Seconds to wait for the values that the vehicle's hash does not cover, without --timeout."""
 AWAITED_NAMES_MAX: Final = 3
 """Parameters that the line about awaited values names."""
 INDICES_SHOWN_MAX: Final = 20
@@ -154,15 +152,12 @@ async def get(
 
 
 async def fetch_table(session: CommandSession, *, refresh: bool = False) -> FetchResult:
-    """Fetch the table of a session, and the values that the vehicle's hash does not cover."""
+    """Fetch the table of a session."""
     is_one = not session.choice.is_all
     with progress_bar(f"fetching {session.label}") if is_one else nullcontext() as progress:
-        result = await session.component.fetch_all(
+        return await session.component.fetch_all(
             refresh=refresh, timeout=session.deadline.left(), progress=progress
         )
-    with suppress(NoReply):
-        await session.component.refreshed(timeout=session.deadline.left(REFRESH_TIMEOUT))
-    return result
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,8 +184,7 @@ class _Fetched:
         cached = [param for param in params if param.trust is Trust.CACHED]
         missing = set(result.missing)
         if policy is Policy.AUTO:
-            if result.source == "cache":
-                missing = {param.index for param in cached if param.index is not None}
+            missing |= {param.index for param in cached if param.index is not None}
             params = [param for param in params if param.trust is not Trust.CACHED]
             cached = []
         return cls(

@@ -51,7 +51,7 @@ from paramclient.model.notation import typed, value_json
 from paramclient.model.patterns import is_pattern
 from paramclient.model.values import Param, format_value
 from paramclient.model.wording import counted, first_of
-from paramclient.protocol.params.write_batch import SetOutcome
+from paramclient.protocol.set_results import SetOutcome
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
 
 __all__ = ["reset"]

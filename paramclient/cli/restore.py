@@ -41,7 +41,6 @@ from paramclient.errors import (
 )
 from paramclient.files import ParamFile
 from paramclient.files.disk import read_extended_file
-from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.paramset import ParamSet, RestorePoint
 from paramclient.model.wording import age_in_words, first_of
 from paramclient.provision import (
@@ -272,7 +271,7 @@ class _Loader:
             raise NotInCache("earlier states are in the cache, which cannot be used")
         vehicle = session.component
         await wait_for_identity(vehicle)
-        await vehicle.core.client.cache_writer.write_all()
+        await vehicle.core.cache_writer.write_all()
         key, component = vehicle.identity.key, vehicle.component
         moment = self.moment
         if moment is not None:
@@ -287,7 +286,7 @@ class _Loader:
         return _State.before_apply(point)
 
 
-async def _extended_state(session: CommandSession, url: str, when: str | None) -> ExtParamSet:
+async def _extended_state(session: CommandSession, url: str, when: str | None) -> ParamSet:
     """Return the earlier state of the extended parameters of a component, and print what it is."""
     if when is not None and is_file(when):
         state = read_extended_file(when)

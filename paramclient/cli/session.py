@@ -25,11 +25,10 @@ from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, ParamClien
 from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.model.identity import version_text
 from paramclient.model.wording import counted, first_of
-from paramclient.protocol.no_reply_hint import hint_of_link
-from paramclient.protocol.params.fetch_result import Policy
-from paramclient.protocol.vehicle.kinds import kind_in_words
-from paramclient.protocol.vehicle_selection import LOOK_TIME
-from paramclient.protocol.wire import MAV_AUTOPILOT_INVALID
+from paramclient.protocol.fetch import Policy
+from paramclient.protocol.kinds import expects_extended, kind_in_words
+from paramclient.protocol.selection import LOOK_TIME, hint_of_link
+from paramclient.wire.messages import MAV_AUTOPILOT_INVALID
 
 __all__ = [
     "CommandSession",
@@ -253,7 +252,7 @@ async def sessions(
         if writes:
             await wait_for_firmware(found, deadline)
         for each in found if is_plain else ():
-            if each.ext.is_expected:
+            if expects_extended(each.identity.vehicle_type, each.component):
                 label = f"{each.system}/{each.component}"
                 say(f"{label} usually has extended parameters: --extended uses them")
         yield [CommandSession(client, each, deadline, options, choice) for each in found]
@@ -554,7 +553,7 @@ def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> P
 
 def received_in_words(client: ParamClient) -> str:
     """Return what was received so far on the link."""
-    return hint_of_link(client.core.station, client.link.name)
+    return hint_of_link(client.core.station, client.bytes_received)
 
 
 def _at_full_speed(url: str) -> str:

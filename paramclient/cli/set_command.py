@@ -51,7 +51,7 @@ from paramclient.client.arguments import SETTLE_MAX
 from paramclient.errors import ParamClientError, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.values import ParamType, format_value
-from paramclient.protocol.params.write_batch import SetOutcome
+from paramclient.protocol.set_results import SetOutcome
 
 __all__ = ["set_"]
 

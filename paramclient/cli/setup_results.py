@@ -18,7 +18,7 @@ from paramclient.errors import ParamClientError
 from paramclient.model.notation import typed
 from paramclient.model.values import WireValue, format_value
 from paramclient.model.wording import counted, first_of
-from paramclient.protocol.params.fetch_result import Progress
+from paramclient.protocol.fetch import Progress
 from paramclient.provision import (
     MISSING,
     ApplyProgress,

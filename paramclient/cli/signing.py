@@ -20,7 +20,7 @@ from paramclient.client.component import Component
 from paramclient.client.signing import Signing, read_key
 from paramclient.errors import NoReply, UsageError, VehicleError
 from paramclient.links import Link, create_link
-from paramclient.protocol.wire import SigningKey, SigningPolicy
+from paramclient.wire.signing import SigningKey, SigningPolicy
 
 __all__ = ["disable", "setup"]
 

@@ -140,7 +140,7 @@ async def whole_table(session: CommandSession, *, draws: bool, refresh: bool = F
         result = await component.fetch_all(refresh=refresh, timeout=deadline.left(), progress=progress)
     for note in result.notes:
         report(f"{session.label} on {link}: {note}")
-    found = await collect_set(component, result, source=f"link {link}", timeout=deadline.left())
+    found = await collect_set(component, result, source=f"link {link}")
     if found.missing:
         raise incomplete_error(component, found.missing)
     return found.set

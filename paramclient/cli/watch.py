@@ -3,46 +3,34 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Sequence
+from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import aclosing, suppress
 from typing import Final, TypeAlias
 
 import anyio
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import ext_value_text, read_extended
+from paramclient.cli.extended import ext_text, read_extended
 from paramclient.cli.json_output import ExtParamJson
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import local_time, print_json, print_line, printable, say
 from paramclient.cli.param_names import ChosenNames, check_given, may_appear
 from paramclient.cli.read_commands import fetch_table, get_chosen, report_all
 from paramclient.cli.session import CommandSession, connect, report_others
-from paramclient.client.events import (
-    Contested,
-    Discovered,
-    Event,
-    Events,
-    Found,
-    Lost,
-    Rebooted,
-    Resynced,
-    Uncontested,
-)
-from paramclient.client.subscription import Changes, ExtChanges
+from paramclient.client.events import Discovered, Event, Events, Found, Lost, Rebooted, Resynced
+from paramclient.client.streams import Changes
 from paramclient.errors import CacheError, ParamClientError
-from paramclient.model.ext_params import ExtParam
 from paramclient.model.notation import hash_text, time_text, value_json
 from paramclient.model.patterns import NameChoice, is_pattern
 from paramclient.model.values import Param, format_value
 from paramclient.model.wording import counted
-from paramclient.protocol.ext.change import ExtChange
-from paramclient.protocol.params.change import Added, Change
+from paramclient.protocol.events import Change
 
 __all__ = ["watch"]
 
 _DEFAULTS: Final = LinkOptions()
 
-_ComponentEvent: TypeAlias = Lost | Found | Rebooted | Resynced | Contested | Uncontested
+_ComponentEvent: TypeAlias = Lost | Found | Rebooted | Resynced
 
 
 async def watch(url: str, /, *names: str, extended: bool = False, options: LinkOptions = _DEFAULTS) -> int:
@@ -78,7 +66,7 @@ async def watch(url: str, /, *names: str, extended: bool = False, options: LinkO
             with anyio.move_on_after(session.deadline.left()):
                 try:
                     choice = NameChoice(given) if given else None
-                    await _print_changes_and_events(session, feed, events, known, choice)
+                    await _print_changes_and_events(session, feed, events, known, choice, extended=extended)
                 except Exception as error:  # raised here, the task group would wrap it in a group
                     failure = error
             tasks.cancel_scope.cancel()
@@ -123,10 +111,12 @@ async def _follow_groups(session: CommandSession) -> None:
 
 async def _print_changes_and_events(
     session: CommandSession,
-    changes: Changes | ExtChanges,
+    changes: Changes,
     events: Events,
     known: set[str] | None,
     choice: NameChoice | None,
+    *,
+    extended: bool,
 ) -> None:
     """Print changes and events of the component until cancelled.
 
@@ -137,35 +127,33 @@ async def _print_changes_and_events(
         known: names of the table at the start. The first value of any other parameter is not a change. None:
             the first value of every parameter is not a change.
         choice: the names to watch; None for all.
+        extended: whether the changes are those of extended parameters.
     """
     async with aclosing(_merged(changes, events)) as merged:
         async for each in merged:
-            if isinstance(each, Change | ExtChange):
-                is_first = each.old is None and not _is_added(each)
-                if is_first and (known is None or each.name in known):
+            if isinstance(each, Change):
+                if each.kind == "first" and (known is None or each.name in known):
                     known = known and known - {each.name}
                     continue
                 if choice is not None and not choice.has(each.name):
                     continue
-                text = _change_text(each)
+                text = _change_text(each, ext_text if extended else _plain_text)
             elif isinstance(each, Discovered) or each.component is not session.component:
                 continue
             else:
                 text = _event_text(each)
             at = session.now
             if session.options.json:
-                print_json(_line(each, at))
+                print_json(_line(each, at, ExtParamJson.of if extended else _plain_json))
             else:
                 print_line(f"{local_time(at)}  {text}")
 
 
-async def _merged(
-    changes: Changes | ExtChanges, events: Events
-) -> AsyncGenerator[Change | ExtChange | Event]:
+async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | Event]:
     """Yield changes and events in the order of their arrival."""
-    waiting: dict[asyncio.Future[Change | ExtChange | Event], Changes | ExtChanges | Events] = {}
+    waiting: dict[asyncio.Future[Change | Event], Changes | Events] = {}
 
-    def wait(feed: Changes | ExtChanges | Events) -> None:
+    def wait(feed: Changes | Events) -> None:
         waiting[asyncio.ensure_future(anext(feed))] = feed
 
     try:
@@ -184,12 +172,18 @@ async def _merged(
                 each.exception()  # both end with the link; one error is reported
 
 
-def _line(item: Change | ExtChange | _ComponentEvent, at: float) -> dict[str, object]:
+def _line(item: Change | _ComponentEvent, at: float, shown: Callable[[Param], object]) -> dict[str, object]:
     """Return the JSON of a change or an event."""
-    if isinstance(item, Change | ExtChange):
-        old, new = (None if param is None else _value_json(param) for param in (item.old, item.new))
-        kind = "removed" if item.new is None else "added" if _is_added(item) else "changed"
-        return {"time": time_text(at), "name": item.name, "old": old, "new": new, "by": item.by, "kind": kind}
+    if isinstance(item, Change):
+        old, new = (None if param is None else shown(param) for param in (item.old, item.new))
+        return {
+            "time": time_text(at),
+            "name": item.name,
+            "old": old,
+            "new": new,
+            "by": item.by,
+            "kind": item.kind,
+        }
     event: dict[str, object] = {
         "time": time_text(at),
         "event": type(item).__name__.lower(),
@@ -198,40 +192,28 @@ def _line(item: Change | ExtChange | _ComponentEvent, at: float) -> dict[str, ob
     }
     if isinstance(item, Lost | Found):
         event["silence_s"] = round(item.silence, 4)
-    if isinstance(item, Contested):
-        contest = item.contest
-        event["contest"] = {"claimants": list(contest.claimants), "difference": contest.difference}
     if isinstance(item, Resynced):
         event |= {"changed": list(item.changed), "hash": hash_text(item.hash)}
     return event
 
 
-def _value_json(param: Param | ExtParam) -> object:
-    if isinstance(param, ExtParam):
-        return ExtParamJson.of(param)
+def _plain_json(param: Param) -> object:
     return value_json(param.settable, param.type_number)
 
 
-def _change_text(change: Change | ExtChange) -> str:
-    if isinstance(change, Change):
-        old, new = (
-            "none" if param is None else format_value(param.settable, param.type_number)
-            for param in (change.old, change.new)
-        )
-    else:
-        old, new = (
-            "none" if param is None else printable(ext_value_text(param.value, param.type))
-            for param in (change.old, change.new)
-        )
-    if _is_added(change):
+def _plain_text(param: Param) -> str:
+    return format_value(param.settable, param.type_number)
+
+
+def _change_text(change: Change, shown: Callable[[Param], str | None]) -> str:
+    old, new = (
+        "none" if param is None else printable(shown(param) or "") for param in (change.old, change.new)
+    )
+    if change.kind == "added":
         return f"{change.name}  added: {new}  ({change.by})"
-    if change.new is None:
+    if change.kind == "removed":
         return f"{change.name}  removed, was {old}  ({change.by})"
     return f"{change.name}  {old} -> {new}  ({change.by})"
-
-
-def _is_added(change: Change | ExtChange) -> bool:
-    return change.is_added if isinstance(change, ExtChange) else isinstance(change, Added)
 
 
 def _event_text(event: _ComponentEvent) -> str:
@@ -242,10 +224,6 @@ def _event_text(event: _ComponentEvent) -> str:
             text = f"found after {event.silence:.1f} s"
         case Rebooted():
             text = "rebooted"
-        case Contested():
-            text = f"contested: {'; '.join(event.contest.claimants)}"
-        case Uncontested():
-            text = "no longer contested"
         case Resynced():
             count = len(event.changed)
             text = f"resynced: {count or 'no'} {'value' if count == 1 else 'values'} had changed"

@@ -21,8 +21,8 @@ from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.values import ParamType, WireValue, format_value
 from paramclient.model.wording import counted, first_of
-from paramclient.protocol.params.fetch_result import Progress
-from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, SetStatus
+from paramclient.protocol.fetch import Progress
+from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetStatus
 
 __all__ = [
     "OUTCOME_COLUMNS",

@@ -1,31 +1,15 @@
 """The client over one link.
 
+- `client`, `component`: `ParamClient`, `Component`.
 - `arguments`: argument defaults and checks.
-- `batch_wait`: waiting for the end of a batch of writes.
-- `cache_writer`: writes parameter tables to the cache, and waits for the disk if a write is durable.
-- `client`: `ParamClient`.
-- `client_task`: the task that keeps a client open from `open` to `aclose`.
-- `component`: `Component`.
-- `component_core`: the state of a component, and the waiting of its calls.
-- `core`: the running parts of a client, and opening and closing.
-- `event_dispatch`: passes the events of the protocol core on.
-- `loop_scheduler`: CPU time and list downloads shared among the links of one event loop.
-- `extended_params`: `ExtParams`.
-- `events`: public events and their stream.
-- `file_ownership`: owner and access rights of files with secrets.
-- `fetch_all`: fetches of several components in parallel.
-- `files`: MAVFTP calls.
-- `forwarding`: frames to and from one other program.
-- `link_task`: link reader and sender; reopens the link.
-- `recording`: telemetry log of a link.
-- `reconnect_delays`: delays between attempts to reopen a link, and the timeout of calls; `link_task` makes
-  the attempts.
-- `reset`: resets of parameters to the firmware's defaults.
-- `signing`: signing keys and options.
-- `signing_timestamps`: persistent signature timestamps.
-- `stats`: counters of a client.
-- `subscription`: streams of items, and of parameter changes.
-- `vehicle_search`: all vehicles on a link, or an expected number of them.
-- `suspend_detection`: detection of suspend and of a stopped process.
-- `taps`: the telemetry log and the forwarder of a client.
+- `core`, `client_task`: the tasks of a client, opening and closing; the task of a client that `open` opens.
+- `link_task`: reads, sends, and reopens the link.
+- `cache_writer`: loads cached tables, writes new values in batches, and waits for the disk
+  if a write is durable.
+- `streams`, `events`: streams of items and of parameter changes; events of components and their stream.
+- `fleet_fetch`, `files`, `reset`: fetches of several components, MAVFTP calls, resets to defaults.
+- `signing`, `signing_timestamps`: keys and options, persistent timestamps. `file_ownership`: files with
+  secrets.
+- `taps`, `recording`, `forwarding`, `traffic`, `frame_cutter`: the receivers of all frames of a link: the
+  telemetry log, one other program, counts; the cut of a link's bytes into frames.
 """

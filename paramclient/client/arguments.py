@@ -1,4 +1,4 @@
-"""Argument defaults and checks."""
+"""Argument defaults and checks of the calls of a client."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Iterable, Mapping
 from typing import Final
 
 from paramclient.errors import UsageError
+from paramclient.model.ext_values import check_ext_value
 from paramclient.model.values import Settable, WireValue, check_name, check_value, is_portable_name
-from paramclient.protocol.wire import HASH_CHECK, PARAMETERS_MAX
+from paramclient.wire.messages import HASH_CHECK, PARAMETERS_MAX
 
 __all__ = [
     "COMPONENT_TIMEOUT",
-    "PROGRESS_CALL_INTERVAL",
     "SETTLE_MAX",
     "address_in_words",
     "check_requested_name",
@@ -22,8 +22,8 @@ __all__ = [
 
 COMPONENT_TIMEOUT: Final = 10.0
 """Default timeout in seconds for the first component on a link."""
-PROGRESS_CALL_INTERVAL: Final = 0.1
-"""Seconds between two calls of a progress callback."""
+AUTHOR_LENGTH_MAX: Final = 128
+"""Characters of an author's name: enough for a name with an address, and a program's own description."""
 SETTLE_MAX: Final = 60.0
 """Maximum `settle` in seconds: further writes to the same name wait for it."""
 
@@ -55,8 +55,23 @@ def check_portable_name(name: str) -> str:
     return name
 
 
+def check_author(author: str | None) -> str:
+    """Check the author of a change, and return how the history names it.
+
+    Raises:
+        UsageError: it is empty, too long, or contains more than printable ASCII.
+    """
+    if author is None:
+        return "us"
+    if not 1 <= len(author) <= AUTHOR_LENGTH_MAX or not (author.isascii() and author.isprintable()):
+        raise UsageError(
+            f"author must have 1 to {AUTHOR_LENGTH_MAX} printable ASCII characters, not {author!r:.200}"
+        )
+    return f"us for {author}"
+
+
 def check_writes(
-    values: Mapping[str, Settable] | Iterable[tuple[str, Settable]],
+    values: Mapping[str, Settable] | Iterable[tuple[str, Settable]], *, extended: bool = False
 ) -> list[tuple[str, WireValue]]:
     """Check names and values to write, and return them as pairs.
 
@@ -68,7 +83,7 @@ def check_writes(
     for name, value in pairs:
         if check_portable_name(name) == HASH_CHECK:
             raise UsageError(f"{HASH_CHECK} is read-only: it is the hash of the parameters, not a parameter")
-        checked.append((name, check_value(value)))
+        checked.append((name, check_ext_value(value) if extended else check_value(value)))
     return checked
 
 

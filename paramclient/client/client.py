@@ -1,53 +1,61 @@
-"""ParamClient: the public client for the components on a link."""
+"""ParamClient: the ground station for the components on one link."""
 
 from __future__ import annotations
 
-import logging
-import math
 import os
 from collections.abc import Callable, Mapping
+from functools import partial
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
 import anyio
 
 from paramclient.cache import ParamCache
+from paramclient.client import events
 from paramclient.client.arguments import COMPONENT_TIMEOUT, address_in_words
-from paramclient.client.cache_writer import choose_cache
+from paramclient.client.cache_writer import CacheWriter, choose_cache
 from paramclient.client.client_task import ClientTask
-from paramclient.client.component import Component, fetch_timeout, successor_of
+from paramclient.client.component import Component
 from paramclient.client.core import ClientCore
-from paramclient.client.event_dispatch import EventDispatch
 from paramclient.client.events import Events
-from paramclient.client.fetch_all import FetchedAll, FleetFetch
 from paramclient.client.files import Ftp
+from paramclient.client.fleet_fetch import FetchedAll, fetch_components
 from paramclient.client.signing import Signing, refused_in_words
 from paramclient.client.signing_timestamps import TimestampKeeper
-from paramclient.client.stats import ClientStats
+from paramclient.client.streams import Subscribers
 from paramclient.client.taps import LinkTaps
-from paramclient.client.vehicle_search import VEHICLES_LISTENING_TIME, listen_for_vehicles
-from paramclient.errors import NoReply, UsageError
+from paramclient.client.traffic import TrafficReport
+from paramclient.errors import AnotherVehicle, NoReply, ParamClientError, UsageError
 from paramclient.links import Link, ReplayLink, SimLink, create_link
 from paramclient.model.values import Encoding
 from paramclient.model.wording import counted
+from paramclient.protocol import events as protocol
 from paramclient.protocol.addresses import Address
-from paramclient.protocol.no_reply_hint import hint_of_link
-from paramclient.protocol.params.fetch_result import Policy, Progress
-from paramclient.protocol.params.sync import SyncSettings
+from paramclient.protocol.fetch import Policy, Progress
+from paramclient.protocol.node import Node
+from paramclient.protocol.selection import (
+    LOOK_TIME,
+    autopilots_of,
+    find,
+    hint_of_link,
+    node_in_words,
+    only_vehicle,
+)
+from paramclient.protocol.session import Session
 from paramclient.protocol.station import Station
-from paramclient.protocol.stats.traffic import TrafficReport
-from paramclient.protocol.vehicle_selection import LOOK_TIME, VehicleChoice
-from paramclient.protocol.wire import SigningKey, SigningReport
+from paramclient.protocol.watch import INTERVAL_MIN, Watch
+from paramclient.wire.signing import SigningKey, SigningReport
 
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint
 
 __all__ = ["ParamClient"]
 
+VEHICLES_LISTENING_TIME: Final = 3.0
+"""Seconds after the first autopilot in which further ones are looked for: three heartbeats, two of which may
+be lost."""
 LISTENING_TIME: Final = 1.2
-"""Seconds after opening in which every component has sent a message: each sends a heartbeat once a second."""
-
-protocol_logger = logging.getLogger("paramclient.protocol")
+"""Seconds after the client was opened in which components are waited for, by a fetch of all."""
 
 
 class ParamClient:
@@ -55,16 +63,13 @@ class ParamClient:
 
     Inside the `async with`, the client sends a heartbeat once a second, follows every component on the link,
     and keeps their tables in the cache. On exit, waiting calls in other tasks raise ClientClosed, new values
-    are written to the cache, and no task, socket or thread remains. Exceptions of the body propagate
-    unchanged. Before that, open file sessions are closed on board, also if the body is cancelled. If a
-    vehicle does not acknowledge, this takes at most `SESSION_CLOSE_TIMEOUT` (2 s).
+    are written to the cache, open file sessions are closed on board, and no task, socket or thread remains.
 
     Where an `async with` does not fit, such as in `python -m asyncio`, call `open` and `aclose`.
 
     A dropped TCP connection, an unplugged serial port or a failed UDP socket is reopened with backoff while
-    the client is open. Waiting calls continue after the reconnection, and unacknowledged requests are sent
-    again. After `LINK_TIMEOUT` seconds (10) without a link, waiting calls and new ones raise LinkError. If a
-    link cannot reconnect (`tcpin` when it can no longer accept connections), every call raises its LinkError.
+    the client is open. Waiting calls continue after the reconnection. After `LINK_TIMEOUT` (10 s) without a
+    link, waiting calls and new ones raise LinkError.
 
     Args:
         link: name of a link, such as `udpin:0.0.0.0:14550` (all forms are in `paramclient.links.FORMS`), a
@@ -73,29 +78,20 @@ class ParamClient:
             close it), or False for none. A replayed log neither reads nor writes a cache.
         system, component: MAVLink ids of this client, 1 to 255.
         encoding: parameter encoding of all components; None detects it for each component.
-        watch_interval: seconds between two checks of each fetched table against the vehicle, while the link
-            is idle. A vehicle sends PARAM_VALUE once after a change, without acknowledgement; a check finds a
-            lost one within an interval. None: every 30 s for a vehicle with a hash (two small messages, and
-            the values outside the hash) or with a parameter file over MAVFTP, less often if that takes more
-            than 1.5 s, and never for other vehicles. A number applies to every vehicle, with a full download
-            from those without a hash. 0 disables the checks. See `Component.sync_state`.
+        watch_interval: seconds between two checks of each fetched table against the vehicle, at least 1.
+            None: every 30 s for a vehicle with a hash, and for others if a download takes no more than 1.5 s.
+            0 disables the checks. See `Component.sync_state`.
         policy: which requests may update tables, see `Policy`: "auto", "hash-only" or "cache-only". Any value
-            but "auto" also disables the checks of `watch_interval`. Single reads and writes are not affected.
-        traffic: whether to count all frames for `traffic_report`. This takes time for each frame, also for
-            frames that the client otherwise skips.
-        listen_only: send nothing, not even a heartbeat. Tables fill from responses to other stations;
-            `fetch_all` waits for a list that another station requests; `get`, `set` and other requests
-            raise UsageError.
+            but "auto" also disables the checks of `watch_interval`.
+        traffic: whether to count all frames for `traffic_report`. This takes time for each frame.
+        listen_only: send nothing, not even a heartbeat. Tables fill from responses to other stations.
         forward: link to one other program, by name or as an object, such as `udpout:127.0.0.1:14551`. The
-            program receives every received frame, and its frames are sent to the vehicles, except with
-            `listen_only`. A slow or absent program does not delay the client.
-        tlog: path of a telemetry log to create, with every frame of both directions. An existing file is not
-            overwritten. A full disk ends the log with a warning and has no other effect.
+            program receives every received frame, and its frames are sent to the vehicles.
+        tlog: path of a telemetry log to create, with every frame of both directions.
         signing: key to sign sent frames and to check received ones, or a `Signing` with more options. None:
             frames are not signed, and signatures are not checked.
         split_peers: whether equal ids at different UDP addresses or TCP connections are different components,
-            for vehicles that share a system id. A vehicle with two connections to this computer then appears
-            twice, and so does a vehicle that was restarted with another port.
+            for vehicles that share a system id.
 
     Attributes:
         cache: cache of the tables, or None.
@@ -105,9 +101,6 @@ class ParamClient:
             entered before, or the telemetry log exists or cannot be created.
         LinkError: on entering: the link, or the link to the other program, cannot be opened.
     """
-
-    _task: ClientTask | None = None
-    _is_entered = False
 
     def __init__(
         self,
@@ -129,34 +122,45 @@ class ParamClient:
         for number in (system, component):
             if not 1 <= number <= 255:
                 raise UsageError(f"the client's system and component ids must be 1 to 255, not {number}")
+        if watch_interval is not None and watch_interval != 0 and not watch_interval >= INTERVAL_MIN:
+            raise UsageError(f"watch_interval must be 0 or at least {INTERVAL_MIN:g} s, not {watch_interval}")
+        try:
+            self._policy = Policy(policy)
+        except ValueError:
+            raise UsageError(f"policy must be one of {', '.join(Policy)}, not {policy!r}") from None
         opened = create_link(link)
         is_log = isinstance(opened, ReplayLink)
         self.cache = choose_cache(cache, is_log=is_log)
-        station = Station(
-            link=opened.name,
-            is_stream=opened.is_stream,
-            system=system,
-            component=component,
-            encoding=encoding,
-            sync_settings=SyncSettings.chosen(watch_interval, policy, listen_only=listen_only, is_log=is_log),
-            split_peers=split_peers,
-            counts_traffic=traffic,
-            trace=protocol_logger.debug,
-        )
+        self._interval = watch_interval
+        self._components: dict[Address, Component] = {}
+        self._by_session: dict[Session, Component] = {}
+        self._events: Subscribers[events.Event] = Subscribers()
+        self._task: ClientTask | None = None
+        self._is_entered = False
         signing = Signing(signing) if isinstance(signing, SigningKey) else signing
         self.core = ClientCore(
             opened,
-            station,
-            self.cache,
-            owns_cache=self.cache is not cache,
-            taps=LinkTaps(tlog, forward, is_stream=opened.is_stream),
-            keeper=None if signing is None else TimestampKeeper(signing),
+            CacheWriter(self.cache, owned=self.cache is not cache),
+            LinkTaps(tlog, forward, is_stream=opened.is_stream, counts_traffic=traffic),
+            None if signing is None else TimestampKeeper(signing),
+            partial(
+                Station,
+                link=opened.name,
+                is_stream=opened.is_stream,
+                system=system,
+                component=component,
+                encoding=encoding,
+                listens_only=listen_only or is_log,
+                split_peers=split_peers,
+                discovered=self._meet,
+                emit=self._emit,
+                changed=self._changed,
+            ),
+            self._end_streams,
         )
-        self.dispatch = EventDispatch(self.core, splits_peers=split_peers)
-        self._splits_peers = split_peers
 
     def __repr__(self) -> str:
-        count = counted(len(self.dispatch.components), "component")
+        count = counted(len(self._components), "component")
         return f"<ParamClient {self.link.name} {self.core.state}, {count}>"
 
     async def __aenter__(self) -> Self:
@@ -168,7 +172,7 @@ class ParamClient:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            await self.core.close(failed=kind is not None)
+            await self.core.close()
         finally:
             self._is_entered = False
 
@@ -176,12 +180,8 @@ class ParamClient:
         """Open the client without an `async with`, until `aclose`. Return the client.
 
         For a REPL, and for frameworks that start and stop their parts in different tasks. The client runs in
-        a task of its own, which ends with `aclose`, or with the event loop if `aclose` is not called; if the
-        loop does not cancel its tasks, as when `python -m asyncio` is left, values of the last 0.25 s may be
-        missing in the cache. An unexpected error in a task of the client ends the client: it is logged,
-        waiting calls and new ones raise ClientClosed with the error as the cause, and `aclose` raises it.
-
-        Cancellation closes the client again.
+        a task of its own, which ends with `aclose`, or with the event loop. Cancellation closes the client
+        again.
 
         Raises:
             UsageError: the client was opened before, or the telemetry log exists or cannot be created.
@@ -195,18 +195,14 @@ class ParamClient:
         return self
 
     async def aclose(self) -> None:
-        """Close a client that `open` has opened, as on exit from an `async with`.
-
-        Any task may call it, also while `open` or another `aclose` is running. It has no effect on a client
-        that is not open, or closed already. Cancellation skips no step except waiting for a hash.
+        """Close a client that `open` has opened, as on exit from an `async with`. Any task may call it.
 
         Raises:
             UsageError: the client was entered with `async with`, which closes it on exit.
         """
         if self._is_entered:
             raise UsageError(
-                "the client was opened by `async with`, which closes it: leave its body instead of calling"
-                " aclose"
+                "the client was opened by `async with`, which closes it at its end; do not call aclose"
             )
         if self._task is not None:
             await self._task.close()
@@ -218,16 +214,13 @@ class ParamClient:
         With `split_peers`, ids may occur several times. The keys are then the values of `Component.address`,
         which include the peer; the ids alone are not keys.
         """
-        return MappingProxyType(self.dispatch.components)
+        return MappingProxyType(self._components)
 
     @property
     def autopilots(self) -> list[Component]:
         """The autopilot of each system, sorted by system id, without cameras, gimbals and the like."""
-        station = self.core.station
-        machines = dict.fromkeys(machine.vehicle for machine in station.components.values())
-        vehicles = sorted(machines, key=lambda vehicle: vehicle[0])
-        found = [station.autopilot_of(*vehicle) for vehicle in vehicles]
-        return [self.components[machine.address] for machine in found if machine is not None]
+        found = autopilots_of(self.core.station.nodes.values())
+        return [self._by_session[each.plain] for each in sorted(found, key=lambda node: node.system)]
 
     @property
     def link(self) -> Link:
@@ -242,37 +235,30 @@ class ParamClient:
     @property
     def bytes_received(self) -> int:
         """Bytes received over the link."""
-        return self.core.station.bytes_received
+        return self.core.link_task.bytes_received
 
     @property
     def bytes_sent(self) -> int:
         """Bytes of all sent frames, including heartbeats."""
-        return self.core.station.bytes_sent
-
-    @property
-    def stats(self) -> ClientStats:
-        """Counters of the client since its creation, also after it is closed."""
-        counts = self.dispatch
-        return ClientStats.of(self.core.station, downloads=counts.downloads, cache_hits=counts.cache_hits)
+        return self.core.link_task.bytes_sent
 
     def events(self) -> Events:
         """Return a stream of component events from now on: `async for event in client.events()`.
 
-        The events are Discovered, Lost, Found, Rebooted, Resynced, Contested and Uncontested. The stream
-        continues across a reconnection of the link. It is released with its last reference, and ends with a
-        replayed log. It queues at most 1,000 events for a slow consumer and then drops the oldest.
-        Cancelling the iteration loses no event.
+        The events are Discovered, Lost, Found, Rebooted and Resynced. The stream continues across a
+        reconnection of the link, and ends with a replayed log. It queues at most 1,000 events for a slow
+        consumer and then drops the oldest. Cancelling the iteration loses no event.
 
         Raises:
             LinkError: while iterating, after the queued events: the link failed permanently, or the client
                 was closed.
         """
-        self.dispatch.events.add(events := Events())
-        return events
+        self._events.add(stream := Events())
+        return stream
 
     def ftp(self, component: Component) -> Ftp:
         """Return the MAVFTP file calls of a component."""
-        return Ftp(component.core)
+        return Ftp(component)
 
     async def component(
         self,
@@ -286,9 +272,8 @@ class ParamClient:
 
         Without arguments, this is the autopilot whose heartbeat was received first; with only a system, the
         autopilot of that system; with only a component, the first component with that id. On a link with
-        several vehicles, the result may be a different vehicle at the next start, and the call does not
-        report the other vehicles. Use it in programs that only read, or if the link has only one vehicle.
-        Programs that write use `only_component`, which raises AmbiguousVehicle instead.
+        several vehicles, the result may be a different vehicle at the next start. Use it in programs that
+        only read, or if the link has only one vehicle. Programs that write use `only_component`.
 
         On return, a cached table is in `params`, unless the vehicle does not report its identity.
 
@@ -302,29 +287,20 @@ class ParamClient:
             NoReply: no message of the component arrived in time.
             LinkError: the link failed, or the client was closed.
         """
-        self.core.check_open()
-        began = anyio.current_time()
-        with anyio.move_on_after(timeout):
-            while (found := self._find(system, component, peer)) is None and not self.core.station.is_over:
-                await self.core.link_task.activity.wait()
-                self.core.check_open()
-            if found is not None:
-                await found.core.wait_for_cache()
-        if found is None:
-            raise self._not_received(address_in_words(system, component, peer), began)
-        return found
+        return await self._wait_for(
+            lambda: find(self.core.station.nodes.values(), system, component, peer),
+            address_in_words(system, component, peer),
+            timeout,
+        )
 
     async def find_autopilots(
         self, *, expect: int | None = None, timeout: float | None = COMPONENT_TIMEOUT
     ) -> list[Component]:
         """Return the autopilot of every vehicle on the link, sorted by system id; for programs for fleets.
 
-        With `expect`, the call returns as soon as this number of autopilots has been heard, and raises
-        NoReply if fewer were heard in time. A program that sets up vehicles names the number, so that no
-        vehicle is missing. Without `expect`, the call waits for the first autopilot, then listens for
-        further ones for `VEHICLES_LISTENING_TIME` (3 s), and returns all that were heard.
-
-        The result is that of `autopilots`, and includes autopilots that were heard and are lost now.
+        With `expect`, the call returns as soon as this number of autopilots has been heard, so that no
+        vehicle is missing. Without it, the call waits for the first autopilot, then listens for further ones
+        for 3 s.
 
         Args:
             expect: the number of autopilots to wait for.
@@ -340,19 +316,19 @@ class ParamClient:
             raise UsageError(f"expect must be a number of vehicles from 1 up, not {expect}")
         began = anyio.current_time()
         await self.component(timeout=timeout)
-        listening: float | None = VEHICLES_LISTENING_TIME
-        if expect is not None:
-            listening = None if timeout is None else began + timeout - anyio.current_time()
-        found = await listen_for_vehicles(
-            lambda: self.autopilots,
-            expect=expect,
-            timeout=listening,
-            began=began,
-            check_open=self.core.check_open,
-        )
-        for each in found:
-            await each.core.wait_for_cache()
-        return found
+        if expect is None:
+            await anyio.sleep(VEHICLES_LISTENING_TIME)
+        else:
+            with anyio.move_on_after(None if timeout is None else began + timeout - anyio.current_time()):
+                while len(self.autopilots) < expect:
+                    await self._activity()
+            if len(self.autopilots) < expect:
+                heard = ", ".join(node_in_words(each.node) for each in self.autopilots)
+                waited = anyio.current_time() - began
+                raise NoReply(f"{expect} vehicles; heard only {heard}", attempts=0, waited=waited)
+        for each in self.autopilots:
+            await each.wait_for_cache()
+        return self.autopilots
 
     async def only_component(
         self,
@@ -365,14 +341,9 @@ class ParamClient:
         """Return the component with this address if the choice is unambiguous; for programs that write.
 
         Without arguments, this is the only autopilot on the link; with only a component, the component with
-        that id of the only vehicle. The call waits `LOOK_TIME` (1.2 s) after the first autopilot for a second
-        one, as every autopilot sends a heartbeat once a second. With only a system, it is the autopilot of
-        that system: component 1 after its first message, or another one if it is the only one for 1.2 s. With
-        both ids, it is that component after its first message. Lost vehicles are ignored. The call sends only
-        identity requests.
-
-        The call returns immediately if the client has already listened long enough. A program can therefore
-        repeat it directly before it writes.
+        that id of the only vehicle. The call waits 1.2 s after the first autopilot for a second one, as every
+        autopilot sends a heartbeat once a second. With a system, component 1 of that system is certain after
+        its first message. Lost vehicles are ignored.
 
         Args:
             system: system id.
@@ -386,40 +357,22 @@ class ParamClient:
             NoReply: no message of the component arrived in time, or too late to exclude a second vehicle.
             LinkError: the link failed, or the client was closed.
         """
-        if self._has_one_vehicle:
+        link = self.link
+        if self.listens_only or (isinstance(link, SimLink) and link.has_one_vehicle) or peer is not None:
             return await self.component(system, component, peer=peer, timeout=timeout)
-        self.core.check_open()
-        began = anyio.current_time()
-        choice = VehicleChoice(system, component, splits_peers=self._splits_peers)
         station = self.core.station
-        machine = None
-        with anyio.move_on_after(timeout), station.looking_for_others():
-            while True:
-                activity, now = self.core.link_task.activity, anyio.current_time()
-                since = station.listening_since
-                machine = choice.look(station.at_peer(peer), now, listening_since=since)
-                if machine is not None or station.is_over:
-                    break
-                with anyio.move_on_after(None if choice.due == math.inf else choice.due - now):
-                    await activity.wait()
-                await self.core.link_task.wait_for_reader(choice.due)
-                self.core.check_open()
-            if machine is not None:
-                await self.components[machine.address].core.wait_for_cache()
-        if machine is not None:
-            return self.components[machine.address]
-        awaited = address_in_words(system, component, peer)
-        if choice.due < math.inf:
-            awaited += f", then {LOOK_TIME} s without another vehicle"
-            raise NoReply(awaited, attempts=0, waited=anyio.current_time() - began)
-        raise self._not_received(awaited, began)
+        due: float | None = None
 
-    def _not_received(self, awaited: str, began: float) -> NoReply:
-        """Return the error of a component that was not received, with what was received instead."""
-        refused = refused_in_words(self.signing_report())
-        hint = "" if refused else hint_of_link(self.core.station, self.link.name)
-        waited = anyio.current_time() - began
-        return NoReply(f"{awaited}{refused}", attempts=0, waited=waited, hint=hint)
+        def choose() -> Node | None:
+            nonlocal due
+            since = station.listening_since
+            node, due = only_vehicle(
+                station.nodes.values(), system, component, anyio.current_time(), listening_since=since
+            )
+            return node
+
+        awaited = address_in_words(system, component)
+        return await self._wait_for(choose, awaited, timeout, until=lambda: due)
 
     async def successor(
         self, component: Component, system: int, *, timeout: float | None = COMPONENT_TIMEOUT
@@ -427,9 +380,8 @@ class ParamClient:
         """Return the component of the same vehicle under its new system id, after its first message there.
 
         For a vehicle whose system id was changed. On ArduPlane and Rover, the new id (SYSID_THISMAV) takes
-        effect immediately; on ArduCopter and PX4 (MAV_SYS_ID) after a reboot (see `Component.reboot`). The
-        vehicle is recognized by its hardware id, or without one, by its autopilot and type and by its silence
-        under the old id.
+        effect immediately; on ArduCopter and PX4 (MAV_SYS_ID) after a reboot. The vehicle is recognized by
+        its hardware id, or without one, by its autopilot and type.
 
         Args:
             component: the component under the old system id.
@@ -438,10 +390,22 @@ class ParamClient:
 
         Raises:
             AnotherVehicle: another vehicle has this system id.
-            NoReply: no message with this id arrived in time, or the vehicle did not report its identity.
+            NoReply: no message with this id arrived in time.
             LinkError: the link failed, or the client was closed.
         """
-        return await successor_of(component, system, timeout=timeout)
+        before, began = component.identity, anyio.current_time()
+
+        def choose() -> Node | None:
+            node = find(self.core.station.nodes.values(), system, component.component, None)
+            return node if node is not None and node.presence.received_at > began else None
+
+        awaited = address_in_words(system, component.component)
+        found = await self._wait_for(choose, awaited, timeout)
+        with anyio.move_on_after(timeout), self.core.station.gate.until_closed():
+            await found.node.identification.settled()
+        if not before.is_same_vehicle(found.identity):
+            raise AnotherVehicle(system, found.component, str(before), str(found.identity))
+        return found
 
     async def fetch_all(
         self,
@@ -453,40 +417,34 @@ class ParamClient:
     ) -> FetchedAll:
         """Update the tables of all components of one system, or of every system on the link.
 
-        The fetches run in parallel. Components that appear during the call are included, and the call waits
-        for components until `LISTENING_TIME` (1.2 s) after the client was opened. A component that does not
-        respond is given up when another fetch has ended: after 1 s, or 4 times the longest response time of
-        another component.
-
-        Cancellation keeps the received values in the tables.
+        The fetches run in parallel. Components that appear within 1.2 s after the client was opened are
+        included. A component that does not respond is given up; it may have no parameters.
 
         Args:
-            system: fetch only this system, with one list request for all of its components; None for all.
+            system: fetch only this system; None for all.
             refresh: as in `Component.fetch_all`.
-            timeout: seconds after which partial results are returned; None: no limit, except 20 s if the
-                client only listens.
-            progress: called about ten times a second with the progress by (system, component), from this
-                task.
+            timeout: seconds after which partial results are returned; None: no limit.
+            progress: called with the progress by (system, component), as values arrive.
 
         Returns:
             The results by (system, component), and the errors of the components that did not respond.
 
         Raises:
-            UsageError: `refresh` is given, and the policy allows no download.
-            CacheError: nothing is cached for any component, and the policy allows no download.
             NoReply: no component was found, or none responded.
             LinkError: the link failed, or the client was closed.
         """
-        self.core.station.check_refresh(refresh)
-        timeout = fetch_timeout(self.core.station, timeout)
-        began = anyio.current_time()
-        together = FleetFetch(self.core, self.components, system, refresh=refresh)
-        return await together.run(
-            until=math.inf if timeout is None else began + timeout,
-            hear_until=began + (COMPONENT_TIMEOUT if timeout is None else timeout),
-            listen_until=self.core.opened_at + LISTENING_TIME,
-            progress=progress,
+        await self._wait_for(
+            lambda: next((n for n in self.core.station.nodes.values() if system in (None, n.system)), None),
+            "a component" if system is None else f"a component of system {system}",
+            COMPONENT_TIMEOUT if timeout is None else timeout,
         )
+        await anyio.sleep_until(self.core.station.listening_since + LISTENING_TIME)
+        chosen = {
+            address: each
+            for address, each in self._components.items()
+            if system in (None, each.system) and each.node.identification.has_parameters
+        }
+        return await fetch_components(chosen, refresh=refresh, timeout=timeout, progress=progress)
 
     def traffic_report(self) -> TrafficReport:
         """Return the traffic statistics of the link: components, message rates, packet loss.
@@ -495,23 +453,118 @@ class ParamClient:
             UsageError: the client was made without `traffic=True`.
             LinkError: the link failed, or the client was closed.
         """
-        if self.core.station.traffic is None:
+        traffic = self.core.taps.traffic
+        if traffic is None:
             raise UsageError("this client does not count traffic; use ParamClient(..., traffic=True)")
         self.core.check_open()
-        return self.core.station.traffic.report(anyio.current_time())
+        return traffic.report(anyio.current_time())
 
     def signing_report(self) -> SigningReport | None:
         """Return the signing statistics of the link: signed frames, and refused frames with the reasons.
 
         None if the client has no key.
         """
-        return None if self.core.station.verifier is None else self.core.station.verifier.report()
+        verifier = self.core.station.verifier
+        return None if verifier is None else verifier.report()
 
-    @property
-    def _has_one_vehicle(self) -> bool:
-        """Whether the choice of a vehicle cannot be wrong: there is only one, or nothing is sent."""
-        return self.listens_only or (isinstance(self.link, SimLink) and self.link.has_one_vehicle)
+    # what happens on the link
 
-    def _find(self, system: int | None, component: int | None, peer: str | None) -> Component | None:
-        found = self.core.station.find(system, component, peer)
-        return None if found is None else self.components[found.address]
+    def _meet(self, node: Node) -> None:
+        """Follow a new component."""
+        ways = [self._new_component(node, session) for session in node.sessions]
+        component, ext = ways
+        component.is_extended_by(ext)
+        self._components[component.address] = component
+        self._events.push(events.Discovered(component))
+
+    def _new_component(self, node: Node, session: Session) -> Component:
+        def emit(event: protocol.Resynced) -> None:
+            self._emit(node, event)
+
+        watch = Watch(session, node.presence, emit, interval=self._interval, policy=self._policy)
+        session.table.recounted = watch.doubt
+        component = self._by_session[session] = Component(
+            self.core, node, session, watch, self._components, self.successor
+        )
+        component.policy = self._policy
+        if not self.listens_only:
+            self.core.spawn(watch.run)
+        return component
+
+    def _emit(self, node: Node, event: protocol.ComponentEvent) -> None:
+        component = self._by_session[node.plain]
+        match event:
+            case protocol.Identified():
+                self.core.spawn(self._load, node)
+                return
+            case protocol.Replaced():
+                self.core.cache_writer.forget(node)
+                return
+            case protocol.Lost(silence=silence):
+                self._events.push(events.Lost(component, silence))
+            case protocol.Found(silence=silence):
+                self._events.push(events.Found(component, silence))
+            case protocol.Rebooted():
+                self._events.push(events.Rebooted(component))
+            case protocol.Resynced(changed=changed, hash=confirmed):
+                self._events.push(events.Resynced(component, changed, confirmed))
+        if isinstance(event, protocol.Found | protocol.Rebooted):
+            for session in node.sessions:
+                self._by_session[session].watch.doubt()
+        self.core.link_task.notify()
+
+    def _changed(self, node: Node, session: Session, change: protocol.Change) -> None:
+        self._by_session[session].subscribers.push(change)
+        self.core.cache_writer.changed(session, change)
+
+    async def _load(self, node: Node) -> None:
+        """Load the cached tables of an identified component."""
+        await self.core.cache_writer.load(node)
+        for session in node.sessions:
+            self._by_session[session].cache_is_read.set()
+
+    def _end_streams(self) -> None:
+        error: ParamClientError | None = None if self.core.is_over else self.core.station.gate.error
+        for component in self._by_session.values():
+            component.subscribers.end(error)
+            component.cache_is_read.set()
+        self._events.end(error)
+
+    async def _activity(self) -> None:
+        await self.core.link_task.activity.wait()
+        self.core.check_open()
+
+    async def _wait_for(
+        self,
+        choose: Callable[[], Node | None],
+        awaited: str,
+        timeout: float | None,
+        *,
+        until: Callable[[], float | None] = lambda: None,
+    ) -> Component:
+        """Wait until a choice is made, and its cached table is loaded.
+
+        Args:
+            choose: called after each message, and at the time of `until`.
+            awaited: for the error.
+            timeout: seconds; None waits without limit.
+            until: returns when the choice may change without a message, or None.
+        """
+        self.core.check_open()
+        began = anyio.current_time()
+        node: Node | None = None
+        with anyio.move_on_after(timeout):
+            while (node := choose()) is None and not self.core.is_over:
+                due = until()
+                with anyio.move_on_after(None if due is None else due - anyio.current_time()):
+                    await self._activity()
+            if node is not None:
+                await self._by_session[node.plain].wait_for_cache()
+        if node is not None:
+            return self._by_session[node.plain]
+        refused = refused_in_words(self.signing_report())
+        hint = "" if refused else hint_of_link(self.core.station, self.bytes_received)
+        if (due := until()) is not None:
+            hint, awaited = "", f"{awaited}, then {LOOK_TIME} s without another vehicle"
+        waited = anyio.current_time() - began
+        raise NoReply(f"{awaited}{refused}", attempts=0, waited=waited, hint=hint)

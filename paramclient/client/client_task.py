@@ -95,13 +95,11 @@ class ClientTask:
 
     async def _stay_open(self) -> None:
         """Keep the client open until it is to be closed, the task is cancelled or a task of it fails."""
-        is_cut_off = True
         try:
             self._opened.set()
             await self._is_to_close.wait()
-            is_cut_off = False
         finally:
-            await self._client.close(failed=is_cut_off)
+            await self._client.close()
 
     def _keep(self, error: Exception) -> None:
         """Keep an error for the caller of `open` or `close`, and make it the cause of ClientClosed."""

@@ -1,31 +1,20 @@
-"""Public component events, and the stream that delivers them."""
+"""Events of the components of a client, and their stream."""
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
-from paramclient.client.component import Component
-from paramclient.client.subscription import Subscription
-from paramclient.protocol import events as protocol
-from paramclient.protocol.vehicle.address_contest import Contest
+from paramclient.client.streams import Stream
 
-__all__ = [
-    "Contested",
-    "Event",
-    "Events",
-    "Found",
-    "Discovered",
-    "Lost",
-    "Rebooted",
-    "Resynced",
-    "Uncontested",
-    "public_event",
-]
+if TYPE_CHECKING:
+    from paramclient.client.component import Component
+
+__all__ = ["Discovered", "Event", "Events", "Found", "Lost", "Rebooted", "Resynced"]
 
 EVENTS_MAX: Final = 1_000
-"""Maximum number of events queued for a consumer. Above it, the oldest are dropped."""
+"""Queued events for a consumer, at most. Above it, the oldest are dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +44,7 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A lost component sends again. The client requests its identity and its hash.
+    """A lost component sends again. The client requests its identity and checks its table.
 
     Attributes:
         component: the component.
@@ -70,8 +59,6 @@ class Found:
 class Rebooted:
     """A vehicle has rebooted: its clock has jumped back, or its heartbeat reports MAV_STATE_BOOT.
 
-    During `Component.reboot`, silence may indicate the reboot too.
-
     Attributes:
         component: the component that has rebooted.
     """
@@ -85,7 +72,7 @@ class Resynced:
 
     Attributes:
         component: the component of the table.
-        changed: names of the parameters that had changed; empty if the hash showed that none had.
+        changed: names of the parameters that had changed.
         hash: the vehicle's hash that confirms the table; None for a vehicle without a hash.
     """
 
@@ -94,61 +81,11 @@ class Resynced:
     hash: int | None
 
 
-@dataclass(frozen=True, slots=True)
-class Contested:
-    """Several vehicles use the address of a component.
-
-    Until `Uncontested`, its calls raise ContestedAddress, and the cache receives nothing from it.
-
-    Attributes:
-        component: the component with the shared address.
-        contest: the vehicles, and the differences between them.
-    """
-
-    component: Component
-    contest: Contest
+Event: TypeAlias = Discovered | Lost | Found | Rebooted | Resynced
 
 
-@dataclass(frozen=True, slots=True)
-class Uncontested:
-    """Only one vehicle uses the address of a component again. The client requests its identity and its hash.
-
-    Attributes:
-        component: the component.
-    """
-
-    component: Component
-
-
-Event: TypeAlias = Discovered | Lost | Found | Rebooted | Resynced | Contested | Uncontested
-
-
-def public_event(event: protocol.Event, component: Component) -> Event | None:
-    """Return the public event for a protocol event; None for internal events."""
-    match event:
-        case protocol.ComponentDiscovered():
-            return Discovered(component)
-        case protocol.ComponentLost():
-            return Lost(component, event.silence)
-        case protocol.ComponentFound():
-            return Found(component, event.silence)
-        case protocol.ComponentRebooted():
-            return Rebooted(component)
-        case protocol.ComponentContested(contest=contest):
-            return Contested(component, contest)
-        case protocol.ComponentUncontested():
-            return Uncontested(component)
-        case protocol.TableResynced():
-            return Resynced(component, event.changed, event.hash)
-        case _:
-            return None
-
-
-class Events(Subscription[Event]):
-    """Stream of the component events since its creation; see `ParamClient.events`.
-
-    It queues at most `EVENTS_MAX` events and then drops the oldest.
-    """
+class Events(Stream[Event]):
+    """Stream of the component events since its creation; see `ParamClient.events`."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,145 +1,102 @@
-"""Ftp: MAVFTP file calls of one component."""
+"""MAVFTP calls: read and list files of a component."""
 
 from __future__ import annotations
 
-import builtins
 from collections.abc import Callable
-from typing import TypeVar
+from typing import TYPE_CHECKING
 
 import anyio
 
-from paramclient.client.component_core import ComponentCore
-from paramclient.protocol.ftp import FILE_SIZE_MAX, DirectoryEntry, FileTransfers
-from paramclient.protocol.ftp.transfer_job import FileTransferJob
+from paramclient.errors import NoReply
+from paramclient.protocol import ftp
+
+if TYPE_CHECKING:
+    from paramclient.client.component import Component
 
 __all__ = ["Ftp"]
 
-Result = TypeVar("Result")
-
 
 class Ftp:
-    """Reads and writes files of one component over MAVFTP; see `ParamClient.ftp`.
+    """The files of a component over MAVFTP; see `ParamClient.ftp`.
 
-    A vehicle serves one file at a time, so calls run in order, including the file download of `fetch_all`.
-    After each call, also after an error or cancellation, the client closes the file session on board.
-
-    Raises:
-        FileTransferError: the vehicle reports an error.
-        NoReply: the vehicle does not respond in time, or it is lost.
-        LinkError: the link failed, or the client was closed.
+    A vehicle serves one file at a time: calls run one after the other.
     """
 
-    def __init__(self, core: ComponentCore) -> None:
-        self._core = core
+    def __init__(self, component: Component) -> None:
+        self._component = component
 
     def __repr__(self) -> str:
-        return f"<Ftp {self._core.label}>"
+        return f"<Ftp {self._component.system}/{self._component.component}>"
 
     async def read(
         self,
         path: str,
         *,
-        timeout: float | None = None,
+        read_size: int = ftp.DATA_SIZE_MAX,
+        size_max: int = ftp.FILE_SIZE_MAX,
         progress: Callable[[int, int | None], None] | None = None,
-        limit: int = FILE_SIZE_MAX,
+        timeout: float | None = None,
     ) -> bytes:
-        """Read a file and return its content.
+        """Read a file. Its session on board is closed, also on cancellation.
 
         Args:
-            path: path on the vehicle, such as `@PARAM/param.pck` or `/fs/microsd/log.txt`.
-            timeout: seconds; None: the number of attempts, which follows the link quality, limits the time.
-            progress: called about ten times a second, from this task, with the received bytes and the file
-                size that the vehicle reports (None before the report; an estimate for files that ArduPilot
-                generates).
-            limit: maximum file size in bytes; a larger file is not read.
+            path: of the file, as the component names it.
+            read_size: bytes of each read, 1 to 239.
+            size_max: bytes, at most.
+            progress: called with the bytes received and the size, which is an estimate for generated files.
+            timeout: seconds; None waits as long as the component answers.
 
         Raises:
             UsageError: the path is not valid.
-            FileTransferError, NoReply, LinkError: as for every call, see `Ftp`.
+            FileTransferError: the component refused it, or the file is larger than `size_max`.
+            NoReply: it does not answer.
+            LinkError: the link failed, or the client was closed.
         """
-        what = f"the file {path}"
-        files, now = self._begin(what)
-        job = files.read(path, now, limit=limit)
-        report = None if progress is None else lambda: progress(job.received, job.size)
-        return await self._wait(job, what, timeout, report)
+        self._component.core.check_open()
+        channel = self._component.node.channel
+        with self._limit(path, timeout):
+            return await ftp.read_file(
+                channel, path, read_size=read_size, size_max=size_max, progress=progress
+            )
 
-    async def write(self, path: str, data: bytes, *, timeout: float | None = None) -> None:
-        """Write a file, replacing an existing one.
-
-        After an error or cancellation, the data written so far stays on board.
-
-        Args:
-            path: path on the vehicle.
-            data: content of the file.
-            timeout: as in `read`.
-
-        Raises:
-            UsageError: the path is not valid.
-            FileTransferError, NoReply, LinkError: as for every call, see `Ftp`.
-        """
-        what = f"the writing of {path}"
-        files, now = self._begin(what)
-        job = files.write(path, data, now)
-        await self._wait(job, what, timeout)
-
-    async def list(
-        self, path: str = "/", *, timeout: float | None = None
-    ) -> builtins.tuple[DirectoryEntry, ...]:
+    async def list(self, path: str, *, timeout: float | None = None) -> list[ftp.DirectoryEntry]:
         """Return the entries of a directory.
 
-        Args:
-            path: path on the vehicle.
-            timeout: as in `read`.
-
         Raises:
-            UsageError: the path is not valid.
-            FileTransferError, NoReply, LinkError: as for every call, see `Ftp`.
+            UsageError, FileTransferError, NoReply, LinkError: as from `read`.
         """
-        what = f"the directory {path}"
-        files, now = self._begin(what)
-        job = files.list(path, now)
-        return await self._wait(job, what, timeout)
+        self._component.core.check_open()
+        with self._limit(path, timeout):
+            return await ftp.list_directory(self._component.node.channel, path)
 
     async def checksum(self, path: str, *, timeout: float | None = None) -> int:
-        """Return the CRC-32 of a file, computed on board: initial value 0, no final xor, as in PX4's hash.
-
-        Args:
-            path: path on the vehicle.
-            timeout: as in `read`.
+        """Return the CRC-32 of a file, computed by the component; see `crc32_px4`.
 
         Raises:
-            UsageError: the path is not valid.
-            FileTransferError, NoReply, LinkError: as for every call, see `Ftp`.
+            UsageError, FileTransferError, NoReply, LinkError: as from `read`.
         """
-        what = f"the checksum of {path}"
-        files, now = self._begin(what)
-        job = files.checksum(path, now)
-        return await self._wait(job, what, timeout)
+        self._component.core.check_open()
+        with self._limit(path, timeout):
+            return await ftp.checksum(self._component.node.channel, path)
 
-    def _begin(self, what: str) -> builtins.tuple[FileTransfers, float]:
-        """Return the file transfers of the component and the time.
+    def _limit(self, path: str, timeout: float | None) -> _Limit:
+        return _Limit(f"{path} of {self._component.system}/{self._component.component}", timeout)
 
-        Raises:
-            NoReply: the component is lost.
-            LinkError: the link failed, or the client is not open.
-        """
-        core, now = self._core, anyio.current_time()
-        core.client.check_open()
-        core.machine.check_present(f"{what} of {core.label}", now)
-        return core.machine.files, now
 
-    async def _wait(
-        self,
-        job: FileTransferJob[Result],
-        what: str,
-        timeout: float | None,
-        report: Callable[[], None] | None = None,
-    ) -> Result:
-        core = self._core
-        job.is_of_caller = True
-        try:
-            return await core.wait(job, timeout, lambda: (f"{what} of {core.label}", 0), report)
-        finally:
-            core.machine.files.release(job, anyio.current_time())
-            core.client.wake()
-            await core.wait_until_files_closed()
+class _Limit:
+    """Raises NoReply at a timeout."""
+
+    def __init__(self, what: str, timeout: float | None) -> None:
+        self._what = what
+        self._scope = anyio.move_on_after(timeout)
+        self._began = 0.0
+
+    def __enter__(self) -> None:
+        self._began = anyio.current_time()
+        self._scope.__enter__()
+
+    def __exit__(self, *error: object) -> bool | None:
+        handled = self._scope.__exit__(*error)  # type: ignore[arg-type]  # the three parts of an exception
+        if self._scope.cancelled_caught:
+            raise NoReply(self._what, attempts=0, waited=anyio.current_time() - self._began)
+        return handled

@@ -10,9 +10,9 @@ from typing import Final
 
 import anyio
 
+from paramclient.client.frame_cutter import FrameCutter
 from paramclient.errors import LinkError
 from paramclient.links import Link, Peer
-from paramclient.protocol.stats.sniffer import FrameCutter
 
 __all__ = ["Forwarder"]
 

@@ -12,11 +12,11 @@ from typing import Final, NamedTuple
 import anyio
 import anyio.to_thread
 
+from paramclient.client.frame_cutter import FrameCutter
 from paramclient.errors import UsageError
 from paramclient.links import Peer
 from paramclient.links.tlog import packed_time
-from paramclient.protocol.stats.sniffer import FrameCutter
-from paramclient.protocol.wire import bears_key, unsign_frame
+from paramclient.wire.frames import bears_key, unsign_frame
 
 __all__ = ["Capture"]
 

@@ -9,7 +9,7 @@ import anyio
 
 from paramclient.errors import UsageError
 from paramclient.model.values import Param, Trust, WireValue, bits_of, same_bits
-from paramclient.protocol.params.write_batch import SetManyResult
+from paramclient.protocol.set_results import SetManyResult
 
 __all__ = ["ResetChoice", "ResetResult", "read_unconfirmed"]
 

@@ -17,7 +17,7 @@ from paramclient.client.file_ownership import (
     open_regular,
 )
 from paramclient.errors import UsageError
-from paramclient.protocol.wire import SigningKey, SigningPolicy, SigningReport, timestamp_of
+from paramclient.wire.signing import SigningKey, SigningPolicy, SigningReport, timestamp_of
 
 __all__ = ["Signing", "key_from_environment", "read_key", "read_private", "refused_in_words", "timestamp_now"]
 

@@ -18,8 +18,7 @@ import platformdirs
 
 from paramclient.client.signing import Signing, timestamp_now
 from paramclient.errors import UsageError
-from paramclient.protocol.wire import Signer, SigningPolicy, Verifier
-from paramclient.protocol.wire.signing import ADOPTED_TIMESTAMP_MAX, UNITS_PER_SECOND
+from paramclient.wire.signing import ADOPTED_TIMESTAMP_MAX, UNITS_PER_SECOND, Signer, SigningPolicy, Verifier
 
 __all__ = ["TimestampFile", "TimestampKeeper"]
 

@@ -10,6 +10,7 @@ import anyio.abc
 from paramclient.client.forwarding import Forwarder
 from paramclient.client.link_task import Tap
 from paramclient.client.recording import Capture
+from paramclient.client.traffic import Traffic
 from paramclient.links import Link, create_link
 
 __all__ = ["LinkTaps"]
@@ -22,9 +23,11 @@ class LinkTaps:
         tlog: path of the log to create, or None.
         forward: link to the other program, or None.
         is_stream: whether the vehicle link delivers a byte stream.
+        counts_traffic: whether all traffic is counted.
 
     Attributes:
         forwarder: the forwarder, or None.
+        traffic: the counts of all traffic, or None.
         taps: the receivers of all data on the link.
     """
 
@@ -34,9 +37,11 @@ class LinkTaps:
         forward: str | Link | None,
         *,
         is_stream: bool,
+        counts_traffic: bool,
     ) -> None:
         self.forwarder: Forwarder | None = None
         self._capture: Capture | None = None
+        self.traffic: Traffic | None = None
         self.taps: list[Tap] = []
         if tlog is not None:
             self._capture = Capture(tlog, is_stream=is_stream)
@@ -44,6 +49,9 @@ class LinkTaps:
         if forward is not None:
             self.forwarder = Forwarder(create_link(forward), is_stream=is_stream)
             self.taps.append(self.forwarder)
+        if counts_traffic:
+            self.traffic = Traffic(is_stream=is_stream)
+            self.taps.append(self.traffic)
 
     def share(self, to_vehicle: Callable[[bytes], None]) -> None:
         """Pass the frames of the program to this function, which sends them to the vehicles."""

@@ -19,7 +19,6 @@ from paramclient.files.includes import Includes
 from paramclient.files.json_format import read_ext_json, write_ext_json
 from paramclient.files.param_file import ParamFile
 from paramclient.files.text import decode_text
-from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.paramset import ParamSet
 
 __all__ = [
@@ -77,7 +76,7 @@ def is_extended_file(path: str | os.PathLike[str]) -> bool:
     return _extended_start(read_bytes(os.fspath(path))[:200]) is not None
 
 
-def read_extended_file(path: str | os.PathLike[str]) -> ExtParamSet:
+def read_extended_file(path: str | os.PathLike[str]) -> ParamSet:
     """Read a file of extended parameters. Blocks until the disk has delivered it.
 
     Raises:
@@ -91,7 +90,7 @@ def read_extended_file(path: str | os.PathLike[str]) -> ExtParamSet:
 
 
 def write_extended_file(
-    path: str | os.PathLike[str], content: ExtParamSet, *, file_format: FileFormat | None = None
+    path: str | os.PathLike[str], content: ParamSet, *, file_format: FileFormat | None = None
 ) -> FileFormat:
     """Write a file of extended parameters, and replace an existing one atomically.
 

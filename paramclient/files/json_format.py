@@ -30,29 +30,23 @@ from paramclient.files.formats import FileFormat
 from paramclient.files.json_reader import Checks, Place, Reader, between, found, read_json_text, typed
 from paramclient.files.param_file import ParamFile, TooManyParams
 from paramclient.files.text import as_type, is_plain, time_of
-from paramclient.model.ext_params import (
+from paramclient.model.ext_values import (
     EXT_VALUE_SIZE,
-    ExtParam,
-    ExtParamType,
-    ExtValue,
     check_ext_value,
     encode_ext_value,
-    ext_type_name,
-    ext_type_number,
+    ext_param,
+    own_bytes,
 )
-from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.notation import value_json, value_written
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import (
     TYPES_BY_NAME,
     ParamType,
-    Trust,
     WireValue,
     check_name,
     from_bits,
     is_portable_name,
-    known_type,
     type_name,
 )
 
@@ -71,6 +65,9 @@ _KEY: Final = "paramclient"
 _EXT_KEY: Final = "paramclient_extended"
 """The key with the version of a document of extended parameters."""
 _NUMBER_EXPECTED: Final = "expected a number (or NaN, Infinity, 0x and 8 digits for raw bytes)"
+_CUSTOM: Final = ParamType.CUSTOM
+_EXT_PREFIX: Final = "EXT_"
+"""Begins the name of an unknown type of extended parameters: EXT_TYPE_77."""
 _WORDS: Final = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 _raw: Final = re.compile(r"0x([0-9a-fA-F]{8})").fullmatch
 _type_number: Final = re.compile(r"TYPE_([0-9]{1,3})").fullmatch
@@ -103,7 +100,7 @@ def read_json(text: str, source: str, params_max: int | None = None) -> ParamFil
     return ParamFile(sets, FileFormat.JSON, source, tuple(document.get("header", [])))
 
 
-def read_ext_json(text: str, source: str) -> ExtParamSet:
+def read_ext_json(text: str, source: str) -> ParamSet:
     """Read a document of extended parameters.
 
     Raises:
@@ -124,7 +121,8 @@ def read_ext_json(text: str, source: str) -> ExtParamSet:
     reader.problems.raise_if_any()
     if not params:
         raise FileError("the file contains no parameters", source=source)
-    return ExtParamSet(params, head.get("system"), head.get("component"), head.get("at"), source)
+    ids = head.get("component"), head.get("system")
+    return ParamSet(params, *ids, None, head.get("at"), source)
 
 
 def _set(reader: Reader, content: object, place: Place) -> ParamSet:
@@ -155,13 +153,14 @@ def _param(reader: Reader, name: str, content: object, place: Place) -> WrittenP
             default = None if default is None else as_type(default, kind)
         if "bits" in fields:
             value = _with_bits(value, kind, fields["bits"])
-        return WrittenParam(check_name(name), value, kind, default, fields.get("comment", ""))
+        comment, is_raw = fields.get("comment", ""), isinstance(value, bytes)
+        return WrittenParam(check_name(name), value, kind, default, comment, is_raw=is_raw)
     except UsageError as error:
         reader.problem(place, str(error))
         return None
 
 
-def ext_param_of_fields(name: str, fields: object) -> ExtParam:
+def ext_param_of_fields(name: str, fields: object) -> WrittenParam:
     """Return the parameter that a document has under a name: `value` or `hex`, and `type`.
 
     Raises:
@@ -169,24 +168,23 @@ def ext_param_of_fields(name: str, fields: object) -> ExtParam:
     """
     if not isinstance(name, str) or not is_portable_name(name):
         raise ValueError(f"{name!r:.40} is no name of a parameter")
-    if not isinstance(fields, dict) or not fields.keys() <= {"value", "hex", "type"}:
+    if not isinstance(fields, dict) or not {"type"} <= fields.keys() <= {"value", "hex", "type"}:
         raise ValueError("expected value or hex, and type")
     written = fields.get("type")
-    number = ext_type_number(written if isinstance(written, str) else repr(written))
+    number = _CUSTOM if written == _CUSTOM.name else _type(written, _EXT_PREFIX)
     if ("value" in fields) == ("hex" in fields):
         raise ValueError("expected either value or hex")
     if "hex" in fields:
         raw = bytes.fromhex(_text(fields["hex"]))
-        param = ExtParam.of(name, raw, number, None, Trust.CACHED)
-        if len(raw) > EXT_VALUE_SIZE or param.raw != raw:
-            raise ValueError(f"hex is not a value of type {ext_type_name(number)}")
-        return param
+        if len(raw) > EXT_VALUE_SIZE or own_bytes(raw, number) != raw:
+            raise ValueError(f"hex is not a value of type {type_name(number)}")
+        return WrittenParam.of(ext_param(name, raw, number))
     value = fields["value"]
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise ValueError("the value must be a number or text")
-    if number != ExtParamType.CUSTOM and isinstance(value, str):
+    if number != _CUSTOM and isinstance(value, str):
         value = _WORDS.get(value, value)
-    return ExtParam.of(name, encode_ext_value(check_ext_value(value), number), number, None, Trust.CACHED)
+    return WrittenParam.of(ext_param(name, encode_ext_value(check_ext_value(value), number), number))
 
 
 _text: Final = typed(str, "text")
@@ -213,13 +211,13 @@ def _time(content: object) -> float:
     return moment.timestamp()
 
 
-def _type(content: object) -> ParamType | int:
+def _type(content: object, prefix: str = "") -> ParamType | int:
     text = _text(content)
     if text in TYPES_BY_NAME:
         return TYPES_BY_NAME[text]
-    if match := _type_number(text):
+    if text.startswith(prefix) and (match := _type_number(text.removeprefix(prefix))):
         number = int(match[1])
-        if number <= 255 and not isinstance(known_type(number), ParamType):
+        if number <= 255 and number not in TYPES_BY_NAME.values():
             return number
     raise UsageError(f"unknown type {text!r}; the types are {', '.join(TYPES_BY_NAME)}")
 
@@ -315,19 +313,19 @@ def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
     yield "}"
 
 
-def write_ext_json(content: ExtParamSet) -> Iterator[str]:
+def write_ext_json(content: ParamSet) -> Iterator[str]:
     """Generate the lines of a document of extended parameters."""
     yield "{"
     for key, each in {_EXT_KEY: VERSION, **_about(content)}.items():
         if each is not None:
             yield f"  {_json(key)}: {_json(each)},"
     yield '  "params": {'
-    yield from _rows({param.name: _ext_fields(param) for param in content.params.values()}, "    ")
+    yield from _rows({param.name: _ext_fields(param) for param in content.values()}, "    ")
     yield "  }"
     yield "}"
 
 
-def _about(params: ParamSet | ExtParamSet) -> dict[str, object]:
+def _about(params: ParamSet) -> dict[str, object]:
     return {
         "system": params.system,
         "component": params.component,
@@ -346,7 +344,7 @@ def _fields(param: WrittenParam) -> dict[str, object]:
     fields: dict[str, object] = {"value": value_written(param.settable, param)}
     if param.type_number is not None:
         is_wide = param.type is not None and param.type.size == 8
-        fields["type"] = type_name(param.type_number)
+        fields["type"] = _type_text(param)
         fields["bits"] = f"{param.bits_as(param.type_number):0{16 if is_wide else 8}x}"
     elif isinstance(param.value, float) and not is_plain(param.value):
         raise UsageError(f"{param.name} is a NaN with payload bits, and has no type for them")
@@ -357,17 +355,25 @@ def _fields(param: WrittenParam) -> dict[str, object]:
     return fields
 
 
-def _ext_fields(param: ExtParam) -> dict[str, object]:
+def _type_text(param: WrittenParam) -> str:
+    number = param.type_number or ParamType.UNKNOWN
+    return f"TYPE_{number}" if param.type is ParamType.UNKNOWN else type_name(number)
+
+
+def _ext_fields(param: WrittenParam) -> dict[str, object]:
     """Return the fields of an extended parameter; reading them gives the same bytes."""
-    value: ExtValue = param.value
-    kind = ext_type_name(param.type)
-    if isinstance(value, bytes):
-        return {"hex": param.raw.hex(), "type": kind}
+    number = param.type_number or ParamType.UNKNOWN
+    value, raw = param.settable, encode_ext_value(param.settable, number)
+    kind = type_name(number)
+    if param.type is ParamType.UNKNOWN:
+        kind = _EXT_PREFIX + kind
     if isinstance(value, float):
-        value = value_json(value, ParamType(param.type))
-        if isinstance(value, str) and encode_ext_value(_WORDS[value], param.type) != param.raw:
-            return {"hex": param.raw.hex(), "type": kind}  # a NaN with payload bits
-    return {"value": value, "type": kind}
+        written = value_json(value, ParamType(number))
+        if not isinstance(written, str) or encode_ext_value(_WORDS[written], number) == raw:
+            return {"value": written, "type": kind}  # else a NaN with payload bits
+    elif not isinstance(value, bytes):
+        return {"value": value, "type": kind}
+    return {"hex": raw.hex(), "type": kind}
 
 
 def _encodable(text: str) -> str:

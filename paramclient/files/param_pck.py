@@ -7,7 +7,7 @@ from paramclient.files.formats import FileFormat
 from paramclient.files.param_file import ParamFile
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, bits_of, from_bits, same_bits, type_name
-from paramclient.protocol.ftp import param_pck
+from paramclient.protocol import param_pck
 
 __all__ = ["is_packed", "read_packed", "write_packed"]
 

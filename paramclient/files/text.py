@@ -276,6 +276,8 @@ def value_text(param: WrittenParam) -> str:
     if isinstance(value, bytes):
         raw = format_value(value)
         raise UsageError(f"{param.name} is {raw}, which is not a number; json can keep it")
+    if isinstance(value, str):
+        raise UsageError(f"{param.name} is text, and not a number")
     if isinstance(value, float) and not math.isfinite(value):
         if not is_plain(value):
             raise UsageError(f"{param.name} is a NaN with payload bits; json can keep them")
@@ -323,6 +325,8 @@ def _same(a: WrittenParam, b: WrittenParam) -> bool:
     """Return whether two values are equal as written: 1 and 1.0 are, −0.0 and 0.0 are not."""
     if a.type_number != b.type_number or a.is_raw or b.is_raw:
         return a.type_number == b.type_number and a.settable == b.settable
+    if not (isinstance(a.value, int | float) and isinstance(b.value, int | float)):
+        return a.value == b.value
     if math.isnan(a.value) or math.isnan(b.value):
         return math.isnan(a.value) and math.isnan(b.value)
     return a.value == b.value and math.copysign(1, a.value) == math.copysign(1, b.value)

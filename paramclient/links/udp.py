@@ -36,7 +36,7 @@ from paramclient.errors import LinkError
 from paramclient.links.link import OPEN_TIMEOUT, Address, Peer, SocketLink, claim
 from paramclient.links.names import LinkSpec
 from paramclient.links.refusals import reason
-from paramclient.protocol.wire import Framer
+from paramclient.wire.frames import Framer
 
 __all__ = ["UdpIn", "UdpOut"]
 

@@ -21,7 +21,7 @@ from paramclient.logs.logged_params import LoggedChange, OnboardLog, log_link
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import WireValue, check_name, shortest_float
-from paramclient.protocol.wire import MAV_AUTOPILOT_ARDUPILOTMEGA
+from paramclient.wire.messages import MAV_AUTOPILOT_ARDUPILOTMEGA
 
 __all__ = ["read_dataflash"]
 

@@ -3,31 +3,26 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from functools import partial
 from typing import Final
 
 import anyio
 import anyio.lowlevel
+import anyio.to_thread
 
-from paramclient.cache import CachedComponent, CachedExtTable, ParamCache, TableUpdate
-from paramclient.client.cache_writer import CACHE_FLUSH_INTERVAL, CacheWriter
+from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.links.replay import LOG_PEER
 from paramclient.links.tlog import Record, open_log, read_records
 from paramclient.logs.imported_table import ImportedTable
-from paramclient.model.identity import Identity
-from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import (
-    ComponentDiscovered,
-    ComponentForgotten,
-    ComponentIdentified,
-    ComponentReplaced,
-    Fetched,
-)
-from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.station import Address, Station
-from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, HEARTBEAT_ID, Framer
+from paramclient.protocol.addresses import Address
+from paramclient.protocol.events import Change
+from paramclient.protocol.node import Node
+from paramclient.protocol.session import Session
+from paramclient.protocol.station import Station
+from paramclient.wire.frames import Framer
+from paramclient.wire.messages import AutopilotVersion, Heartbeat, message_id
 
 __all__ = ["import_log"]
 
@@ -59,7 +54,7 @@ async def import_log(path: str | os.PathLike[str], cache: ParamCache) -> tuple[I
 
 async def _first_introductions(records: Iterator[Record]) -> dict[int, dict[Address, bytes]]:
     """Return the first HEARTBEAT and AUTOPILOT_VERSION of each component, by message, as in the log."""
-    found: dict[int, dict[Address, bytes]] = {HEARTBEAT_ID: {}, AUTOPILOT_VERSION_ID: {}}
+    found: dict[int, dict[Address, bytes]] = {message_id(Heartbeat): {}, message_id(AutopilotVersion): {}}
     framer = Framer(set(found), stream=False)
     for number, record in enumerate(records):
         for frame in framer.receive(record.data):
@@ -82,145 +77,102 @@ class _Import:
     def __init__(
         self, name: str, introductions: Mapping[int, Mapping[Address, bytes]], cache: ParamCache
     ) -> None:
-        self._heartbeats = introductions[HEARTBEAT_ID]
-        self._versions = introductions[AUTOPILOT_VERSION_ID]
+        self._introductions = introductions
+        self._cache = cache
         self._at = 0.0
+        self._observed: dict[Session, list[StoredParam]] = {}
+        self._removed: dict[Session, dict[str, float]] = {}
+        self._complete_at: dict[Session, float] = {}
         self._station = Station(
-            link=name, is_stream=False, sync_settings=SyncSettings.chosen(None, "auto", is_log=True)
-        )
-        self._writer = _LogWriter(
-            cache,
-            identity_of=self._identity_of,
-            is_doubted=lambda machine: False,  # a log cannot be queried: the last identity applies
-            clock=lambda: self._at,
+            link=name,
+            is_stream=False,
+            send=_ignore,
+            spawn=_ignore,
+            listens_only=True,
+            discovered=self._introduce,
+            changed=self._take_change,
         )
 
     async def read(self, records: Iterator[Record]) -> tuple[ImportedTable, ...]:
-        station, writer = self._station, self._writer
-        machines = station.components
-        try:
-            flush_at = 0.0
-            for number, record in enumerate(records):
-                if record.at >= flush_at and number:
-                    station.tick(record.at)  # operations that time out in a pause end before it
-                    await self._follow()
-                    await writer.flush()
-                    flush_at = record.at + CACHE_FLUSH_INTERVAL
-                self._at = max(self._at, record.at)  # a clock that was set back does not turn back the time
-                station.receive(record.data, LOG_PEER, self._at)
-                await self._follow()
-                if not number % RECORDS_PER_CHECKPOINT:
-                    await anyio.lowlevel.checkpoint()
-            station.over(self._at)
-            await self._follow()
-            await writer.flush()
-            await writer.merge()
-        finally:
-            await writer.close()
-        machines_in_order = (machines[address] for address in sorted(machines))
-        return tuple(self._imported_table(each) for each in machines_in_order if _has_content(each))
+        """Take all frames, and write the tables."""
+        for number, record in enumerate(records):
+            self._at = max(self._at, record.at)  # a clock that was set back does not turn back the time
+            self._station.receive(record.data, LOG_PEER, self._at)
+            if not number % RECORDS_PER_CHECKPOINT:
+                await anyio.lowlevel.checkpoint()
+        nodes = [node for _, node in sorted(self._station.nodes.items())]
+        nodes = [node for node in nodes if node.plain.table.params or node.extended.table.params]
+        updates = [self._sighting(node) for node in nodes]
+        updates += [self._update(node, session) for node in nodes for session in node.sessions]
+        updates = [update for update in updates if update.params or update.table is None]
+        await anyio.to_thread.run_sync(partial(self._cache.merge, updates))
+        return tuple(_imported_table(node) for node in nodes)
 
-    async def _follow(self) -> None:
-        """Handle the station's events, as the client does."""
-        station, writer = self._station, self._writer
-        while events := station.events():
-            for event in events:
-                machine = event.machine
-                if isinstance(event, ComponentDiscovered):
-                    address = (machine.system, machine.component)
-                    for introductions in (self._heartbeats, self._versions):
-                        if (
-                            address in introductions
-                        ):  # frames before the first introduction are of the same vehicle
-                            station.receive(introductions[address], LOG_PEER, self._at)
-                    await self._bring(machine)
-                elif isinstance(event, ComponentIdentified):
-                    for each in station.components.values():
-                        if each.system == machine.system:
-                            await self._bring(each)
-                elif isinstance(event, ComponentReplaced):
-                    writer.discard_queued(machine)
-                elif isinstance(event, ComponentForgotten):
-                    writer.remove_component(machine)
-                elif isinstance(event, Fetched) and event.result.complete:
-                    writer.synced(machine, is_whole=event.result.source != "cache")
+    def _introduce(self, node: Node) -> None:
+        """Take the first HEARTBEAT and AUTOPILOT_VERSION: frames before them are of the same vehicle."""
+        for introductions in self._introductions.values():
+            if (frame := introductions.get((node.system, node.component))) is not None:
+                self._station.receive(frame, LOG_PEER, self._at)
 
-    async def _bring(self, machine: ComponentMachine) -> None:
-        identity = self._identity_of(machine)
-        if identity is not None and not self._writer.follow(machine, identity):
-            await self._writer.load_cached(machine, identity)
+    def _take_change(self, node: Node, session: Session, change: Change) -> None:
+        if session.table.is_complete:
+            self._complete_at.setdefault(session, self._at)
+        if change.new is None:
+            self._removed.setdefault(session, {})[change.name] = self._at
+        else:
+            self._observed.setdefault(session, []).append(
+                StoredParam.of(change.new, self._at, None, change.by)
+            )
 
-    def _identity_of(self, machine: ComponentMachine) -> Identity | None:
-        """Return the vehicle's identity; without one in the log, an identity that is unique to the log."""
-        identity = self._station.identity_of(machine)
-        is_silent = all(system != machine.system for system, _ in self._versions)
-        return machine.identity if identity is None and is_silent else identity
+    def _sighting(self, node: Node) -> TableUpdate:
+        """Return that the vehicle was there at the beginning."""
+        who = node.identification
+        return TableUpdate(
+            identity=who.identity,
+            component=node.component,
+            autopilot=who.autopilot or 0,
+            at=node.since,
+            params=[],
+        )
 
-    def _imported_table(self, machine: ComponentMachine) -> ImportedTable:
-        identity = self._identity_of(machine) or machine.identity
-        complete = machine.table.complete if machine.table.params else machine.ext.table.complete
-        return ImportedTable(
-            identity.key,
-            machine.system,
-            machine.component,
-            machine.identification.autopilot,
-            params=len(machine.table.params) + len(machine.ext.table.params),
-            complete=complete,
-            hash=machine.table.hash if machine.table.complete else None,
+    def _update(self, node: Node, session: Session) -> TableUpdate:
+        table, observed = session.table, self._observed.get(session, [])
+        session.confirm_announced()
+        volatile = table.volatile if table.volatile_is_known else None
+        last = [
+            StoredParam.of(param, table.moments[name], None if volatile is None else name in volatile)
+            for name, param in table.params.items()
+        ]
+        return TableUpdate(
+            identity=node.identification.identity,
+            component=node.component,
+            autopilot=node.identification.autopilot or 0,
+            at=node.presence.received_at,
+            table=TableState(
+                hash=table.hash if table.is_complete else None,
+                count=table.count,
+                complete=table.is_complete,
+                volatile_known=table.volatile_is_known,
+                synced_at=self._complete_at.get(session) if table.is_complete else None,
+            ),
+            params=[*observed, *last],
+            removed=self._removed.get(session, {}),
+            extended=session is node.extended,
         )
 
 
-def _has_content(machine: ComponentMachine) -> bool:
-    """Return whether the log has parameters of a component, or something to say of them."""
-    return bool(machine.table.params or machine.ext.table.params)
+def _imported_table(node: Node) -> ImportedTable:
+    plain, extended = node.plain.table, node.extended.table
+    return ImportedTable(
+        node.identification.identity.key,
+        node.system,
+        node.component,
+        node.identification.autopilot,
+        params=len(plain.params) + len(extended.params),
+        complete=plain.is_complete if plain.params else extended.is_complete,
+        hash=plain.hash if plain.is_complete else None,
+    )
 
 
-class _LogWriter(CacheWriter):
-    """Collects the updates of the tables, with the times of the log, until `merge`."""
-
-    def __init__(
-        self,
-        cache: ParamCache,
-        *,
-        identity_of: Callable[[ComponentMachine], Identity | None],
-        is_doubted: Callable[[ComponentMachine], bool],
-        clock: Callable[[], float],
-    ) -> None:
-        super().__init__(
-            cache, owned=False, identity_of=identity_of, is_doubted=is_doubted, clock=clock, now=clock
-        )
-        self._tables_in = cache
-        self._log_time = clock
-        self._updates: list[TableUpdate] = []
-        self._based_on: dict[tuple[str, int], float] = {}
-        self._loaded: set[tuple[str, int]] = set()
-        self._has_values: set[tuple[str, int]] = set()
-
-    async def merge(self) -> None:
-        """Write all collected updates."""
-        await self.run_in_thread(partial(self._tables_in.merge, self._updates, based_on=self._based_on))
-
-    async def load_tables(
-        self, identity: Identity, component: int
-    ) -> tuple[CachedComponent | None, CachedExtTable | None]:
-        """Return the cached table if it is older; only once, as later updates are not written yet.
-
-        Extended parameters need no cached table: they are compared with it when they are written.
-        """
-        key = (identity.key, component)
-        if key in self._loaded:
-            return None, None
-        self._loaded.add(key)
-        cached = await self.run_in_thread(partial(self._tables_in.load, *key))
-        if cached is None or cached.updated_at >= self._log_time():
-            return None, None
-        self._based_on[key] = cached.updated_at
-        return cached, None
-
-    def save_updates(self, cache: ParamCache, updates: Sequence[TableUpdate], *, durable: bool) -> None:
-        """Collect updates, but not of a table of which the log has no value."""
-        for update in updates:
-            key = (update.identity.key, update.component)
-            if update.params or key in self._based_on or key in self._has_values:
-                self._updates.append(update)
-                self._has_values.add(key)
+def _ignore(*_: object) -> None:
+    """Send nothing, and start nothing: a log is only read."""

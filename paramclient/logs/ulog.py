@@ -20,7 +20,7 @@ from paramclient.logs.logged_params import LoggedChange, OnboardLog, log_link
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import ParamType, check_name
-from paramclient.protocol.wire import MAV_AUTOPILOT_PX4
+from paramclient.wire.messages import MAV_AUTOPILOT_PX4
 
 __all__ = ["read_ulog"]
 

@@ -17,11 +17,12 @@ import anyio.to_thread
 
 from paramclient.client.component import Component
 from paramclient.client.files import Ftp
-from paramclient.errors import MetadataError, UsageError
+from paramclient.errors import MetadataError, NoReply, UsageError
 from paramclient.metadata.formats import PACKED_SIZE_MAX, json_of, read_content, unpacked
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.metadata_cache import MetadataStore, has_checksum
-from paramclient.protocol.wire import ComponentMetadata
+from paramclient.protocol.commands import request_message
+from paramclient.wire.messages import ComponentMetadata
 
 __all__ = ["announced_metadata", "metadata_of"]
 
@@ -59,7 +60,7 @@ async def metadata_of(
         LinkError: the link failed, or the client was closed.
     """
     if isinstance(store, bool):
-        cache = component.core.client.cache
+        cache = component.core.cache
         kept = MetadataStore.beside(cache.path) if store and cache is not None else None
     else:
         kept = store
@@ -120,7 +121,7 @@ class _Files:
         files, path = self._on_board(uri)
         try:
             content = await files.read(
-                path, timeout=self.left(), progress=self.progress, limit=PACKED_SIZE_MAX
+                path, timeout=self.left(), progress=self.progress, size_max=PACKED_SIZE_MAX
             )
         except UsageError as error:
             raise MetadataError(
@@ -153,7 +154,7 @@ class _Files:
                 f"{self.label} announces its metadata at {uri}, but component {number} has not been heard",
                 source=uri,
             )
-        return Ftp(other.core), path
+        return Ftp(other), path
 
 
 async def announced_metadata(component: Component, timeout: float | None) -> ComponentMetadata | None:
@@ -167,16 +168,14 @@ async def announced_metadata(component: Component, timeout: float | None) -> Com
         NoReply: no response in time.
         LinkError: the link failed, or the client was closed.
     """
-    core = component.core
-    core.client.check_open()
-    what = f"COMPONENT_METADATA of {component.system}/{component.component}"
-    machine, now = core.machine, anyio.current_time()
-    machine.check_present(what, now)
-    ask = machine.metadata_requests.ask(now)
-    try:
-        return await core.wait(ask, timeout, lambda: (what, ask.attempts))
-    finally:
-        machine.metadata_requests.release(ask)
+    component.core.check_open()
+    found = None
+    with anyio.move_on_after(timeout) as scope:
+        found = await request_message(component.node.channel, ComponentMetadata)
+    if scope.cancelled_caught:
+        what = f"COMPONENT_METADATA of {component.system}/{component.component}"
+        raise NoReply(what, attempts=0, waited=timeout or 0.0)
+    return found if found is not None and found.uri else None
 
 
 def _places_of_parameters(general: bytes, source: str) -> list[tuple[str, int | None]]:

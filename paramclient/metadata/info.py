@@ -83,7 +83,7 @@ class ParamInfo:
         Bits without a name, or with a number as name, are appended as one hexadecimal number. `parse`
         accepts the text, unless the name of a value is a number.
         """
-        if isinstance(value, bytes) or not math.isfinite(value):
+        if isinstance(value, bytes | str) or not math.isfinite(value):
             return None
         number = shortest_float(value) if isinstance(value, float) else value
         named = self.values.get(number)
@@ -123,7 +123,7 @@ class ParamInfo:
 
         Fractions are compared as float32, the precision of vehicles.
         """
-        if isinstance(value, bytes):
+        if isinstance(value, bytes | str):
             return None
         if math.isnan(value):
             is_bounded = self.minimum is not None or self.maximum is not None

@@ -3,7 +3,7 @@ words.
 
 - `values`, `params`, `paramset`, `identity`: types and encodings, tables, sets without a vehicle, vehicle
   identity.
-- `ext_params`, `ext_paramset`: extended parameters, with text and 64-bit values, and sets of them.
+- `ext_values`: values of extended parameters, with text and bytes.
 - `defaults`: the firmware's default of a parameter, of the vehicle or its metadata.
 - `comparison`, `patterns`, `notation`: comparison of sets, selection of names, JSON notation.
 - `group_switches`: parameters that others depend on.

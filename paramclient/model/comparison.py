@@ -14,7 +14,7 @@ from paramclient.errors import UsageError
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.patterns import NameChoice
 from paramclient.model.renames import Renames
-from paramclient.model.values import ParamType, WireValue, bits_of, from_bits, same_bits
+from paramclient.model.values import ParamType, Value, WireValue, bits_of, from_bits, same_bits
 
 __all__ = [
     "Comparison",
@@ -324,9 +324,9 @@ def _bits(value: WireValue, number: ParamType | int) -> int | None:
         return None
 
 
-def _same_number(left: int | float, right: int | float) -> bool:
+def _same_number(left: Value, right: Value) -> bool:
     """Return whether two numbers are equal as written; NaN by its bits."""
     if isinstance(left, float) and isinstance(right, float):
         kind = ParamType.REAL64
         return same_bits(kind, bits_of(left, kind), bits_of(right, kind))
-    return left == right
+    return bool(left == right)

@@ -34,7 +34,7 @@ def value_json(value: WireValue, number: ParamType | int) -> Scalar:
     """
     if isinstance(value, bytes):
         return format_value(value, number)
-    if isinstance(value, int):
+    if isinstance(value, int | str):
         return value
     if math.isfinite(value):
         return shortest_float(value) if number == ParamType.REAL32 else value

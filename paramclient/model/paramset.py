@@ -17,6 +17,7 @@ from paramclient.model.values import (
     Value,
     WireValue,
     bits_of,
+    byte_length,
     format_value,
     known_type,
     repr_of_param,
@@ -69,10 +70,11 @@ class WrittenParam:
         is_raw: bool = False,
         type_number: int | None = None,
     ) -> None:
-        if isinstance(value, bytes):
-            value, is_raw = int.from_bytes(value, "little"), True
         number = None if type is None else known_type(type or type_number or 0)
-        kind = number if number is None or isinstance(number, ParamType) else ParamType.UNKNOWN
+        if isinstance(value, bytes) and (is_raw or number != ParamType.CUSTOM):
+            value, is_raw = int.from_bytes(value, "little"), True
+        is_known = isinstance(number, ParamType) and not (is_raw and number == ParamType.CUSTOM)
+        kind = ParamType(number) if number is not None and is_known else number and ParamType.UNKNOWN
         default = None if isinstance(default, bytes) else default
         given = (name, value, kind, default, comment, line, is_raw, number)
         for attribute, each in zip(self.__slots__, given, strict=True):
@@ -84,12 +86,15 @@ class WrittenParam:
     @property
     def settable(self) -> WireValue:
         """The value as `set` takes it: the number, or the four raw bytes where `is_raw`."""
-        return int(self.value).to_bytes(WIRE_SIZE, "little") if self.is_raw else self.value
+        if not self.is_raw:
+            return self.value
+        bits = int(self.value)
+        return bits.to_bytes(max(WIRE_SIZE, byte_length(bits)), "little")
 
     @classmethod
     def of(cls, param: Param) -> WrittenParam:
         """Return the value, type and default of a table's parameter, without index and trust."""
-        return cls(param.name, param.settable, param.type_number, param.default)
+        return cls(param.name, param.settable, param.type_number, param.default, is_raw=param.is_raw)
 
     def bits_as(self, number: ParamType | int) -> int:
         """Return the bits (see `Param.bits`) of a parameter of this type with this value.
@@ -115,7 +120,7 @@ class WrittenParam:
         return same_bits(param.type_number, bits, param.bits)
 
     def __str__(self) -> str:
-        kind = ParamType.REAL32 if self.type_number is None else self.type_number
+        kind = ParamType.REAL32 if self.type is None else self.type
         return f"{self.name} = {format_value(self.settable, kind)}"
 
 

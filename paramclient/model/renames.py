@@ -214,10 +214,10 @@ def _multiplied(value: WireValue, kind: ParamType | int | None, ratio: Fraction)
     """Return the product, as an int if it is a whole number.
 
     Raises:
-        UsageError: the value is raw bytes.
+        UsageError: the value is no number.
     """
-    if isinstance(value, bytes):
-        raise UsageError("its value is raw bytes, which cannot be multiplied")
+    if isinstance(value, bytes | str):
+        raise UsageError("its value is no number, and cannot be multiplied")
     if isinstance(value, float) and not math.isfinite(value):
         return math.copysign(value, value * (1 if ratio > 0 else -1))
     if isinstance(value, float) and kind != ParamType.REAL64:

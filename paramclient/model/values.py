@@ -47,14 +47,14 @@ __all__ = [
     "type_name",
 ]
 
-Value: TypeAlias = int | float
-"""The value of a parameter as a number."""
+Value: TypeAlias = int | float | str | bytes
+"""The value of a parameter: a number; text or bytes for an extended parameter of the type CUSTOM."""
 
-WireValue: TypeAlias = int | float | bytes
-"""A value to write: a number, or the four bytes of the message where they cannot be decoded as a number of
-the type (see `Param.is_raw`)."""
+WireValue: TypeAlias = int | float | str | bytes
+"""A value to write: a number, text, or bytes: the four bytes of the message where they cannot be decoded as a
+number of the type (see `Param.is_raw`)."""
 
-Settable: TypeAlias = SupportsIndex | SupportsFloat | bytes
+Settable: TypeAlias = SupportsIndex | SupportsFloat | str | bytes
 """A value that can be set: a number, also of another library, or the four wire bytes."""
 
 WIRE_SIZE: Final = 4
@@ -63,6 +63,9 @@ NAME_LENGTH = 16
 """Bytes in param_id. Shorter names end with a NUL, names of 16 bytes have none."""
 PORTABLE_NAMES_CACHED: Final = 4096
 """Names in the cache of `is_portable_name`: as many as a few autopilots have."""
+FLOATS_CACHED: Final = 16_384
+"""Float32 values whose shortest decimal is remembered: those of a few autopilots, 100 bytes each. Finding one
+takes 3 µs."""
 _portable: Final = re.compile(r"(?=[^A-Za-z]*[A-Za-z])(?![@/])(?:(?![#,;=])[!-~]){1,16}(?<!:)").fullmatch
 
 
@@ -81,11 +84,14 @@ class ParamType(IntEnum):
     INT64 = 8
     REAL32 = 9
     REAL64 = 10
+    CUSTOM = 11
+    """Text or bytes, of extended parameters only (MAV_PARAM_EXT_TYPE). A plain parameter of this number has
+    an unknown type."""
 
     @property
     def size(self) -> int:
-        """Size of a value of this type, in bytes; 4, the size in the message, for UNKNOWN."""
-        return _LAYOUT[self].size if self else WIRE_SIZE
+        """Size of a value of this type, in bytes; 4, the size in the message, for UNKNOWN and CUSTOM."""
+        return _LAYOUT[self].size if self in _LAYOUT else WIRE_SIZE
 
     @property
     def is_integer(self) -> bool:
@@ -126,8 +132,9 @@ class Param:
 
     Attributes:
         name: param_id, 1 to 16 characters.
-        value: int for integer types, float for REAL32 and REAL64. A REAL32 is the exact float32 value as a
-            Python float. Where `is_raw`, the unsigned number of the four wire bytes, little-endian.
+        value: int for integer types, float for REAL32 and REAL64, text or bytes for CUSTOM. A REAL32 is the
+            shortest decimal that gives its float32: 6.1, not 6.099999904632568. Where `is_raw`, the unsigned
+            number of the four wire bytes, little-endian.
         type: MAV_PARAM_TYPE; `ParamType.UNKNOWN` for a type that MAVLink does not define.
         index: the component's index of the parameter, or None while unknown (PX4 gives none to parameters
             not in use, ArduPilot none in responses by name).
@@ -169,10 +176,10 @@ class Param:
         type_number: int = 0,
     ) -> None:
         # The generated __init__ takes twice as long, and every PARAM_VALUE makes a Param.
-        if isinstance(value, bytes):
-            value, is_raw = int.from_bytes(value, "little"), True
         number = known_type(type or type_number)
-        is_known = isinstance(number, ParamType)
+        if isinstance(value, bytes) and (is_raw or number != _CUSTOM):
+            value, is_raw = int.from_bytes(value, "little"), True
+        is_known = isinstance(number, ParamType) and not (is_raw and number == _CUSTOM)
         _set_name(self, name)
         _set_value(self, value)
         _set_type(self, number if is_known else _UNKNOWN)
@@ -189,7 +196,9 @@ class Param:
     @property
     def settable(self) -> WireValue:
         """The value as `set` takes it to write it to another vehicle: the four wire bytes where `is_raw`."""
-        return self.bits.to_bytes(WIRE_SIZE, "little") if self.is_raw else self.value
+        if not self.is_raw:
+            return self.value
+        return self.bits.to_bytes(max(WIRE_SIZE, byte_length(self.bits)), "little")
 
     @property
     def is_changed(self) -> bool | None:
@@ -214,7 +223,7 @@ class Param:
         )
 
     def __str__(self) -> str:
-        return f"{self.name} = {format_value(self.settable, self.type_number)}"
+        return f"{self.name} = {format_value(self.settable, self.type)}"
 
 
 def repr_of_param(param: DataclassInstance) -> str:
@@ -227,6 +236,7 @@ def repr_of_param(param: DataclassInstance) -> str:
 
 
 _UNKNOWN: Final = ParamType.UNKNOWN
+_CUSTOM: Final = int(ParamType.CUSTOM)
 _set_name, _set_value, _set_type, _set_index, _set_bits, *_set_rest = (
     vars(Param)[each.name].__set__ for each in fields(Param)
 )
@@ -240,8 +250,8 @@ _BYTEWISE = Encoding.BYTEWISE
 _LAYOUTS = {int(kind): layout for kind, layout in _LAYOUT.items()}
 _FITTING = {number: (1 << 8 * each.size) - 1 for number, each in _LAYOUTS.items() if each.size <= 4}
 _BOUNDS = {int(kind): kind.bounds for kind in ParamType if kind.is_integer}
-TYPES_BY_NAME: Final = {kind.name: kind for kind in ParamType if kind}
-"""The types that MAVLink defines, by name."""
+TYPES_BY_NAME: Final = {kind.name: kind for kind in _LAYOUT}
+"""The types of numbers, by name."""
 
 
 def known_type(number: int) -> ParamType | int:
@@ -249,12 +259,12 @@ def known_type(number: int) -> ParamType | int:
     return _TYPES[number] if number < len(_TYPES) else number
 
 
-_TYPES: tuple[ParamType | int, ...] = (0, *TYPES_BY_NAME.values())
+_TYPES: tuple[ParamType | int, ...] = (0, *TYPES_BY_NAME.values(), ParamType.CUSTOM)
 
 
 def type_name(number: ParamType | int) -> str:
     """Return the name of a type, `INT32`, `REAL32`, …, or `TYPE_77` for an unknown type."""
-    return ParamType(number).name if 1 <= number <= ParamType.REAL64 else f"TYPE_{number}"
+    return ParamType(number).name if 1 <= number <= ParamType.CUSTOM else f"TYPE_{number}"
 
 
 def check_name(name: str) -> str:
@@ -354,6 +364,8 @@ def encode_value(value: WireValue, number: int, encoding: Encoding) -> bytes:
     """
     if isinstance(value, bytes):
         return value
+    if isinstance(value, str):
+        raise UsageError(f"{value!r} is text, and the parameter is a number")
     if not 1 <= number <= ParamType.REAL64:
         raise UsageError(f"{type_name(number)} is not a type that MAVLink defines; give the 4 raw bytes")
     kind = ParamType(number)
@@ -404,11 +416,36 @@ def from_bits(bits: int, number: int, *, is_raw: bool = False) -> WireValue:
         number: param_type.
         is_raw: `Param.is_raw` of the parameter.
     """
+    if number == _REAL32:
+        return _shortest_of_bits(bits)
+    if number == _CUSTOM and not is_raw:
+        return _text_or_bytes(bits)
     layout = None if is_raw else _LAYOUTS.get(number)
     if layout is None:
-        return bits.to_bytes(4, "little")
+        return bits.to_bytes(max(WIRE_SIZE, byte_length(bits)), "little")
     value: int | float = layout.unpack(bits.to_bytes(layout.size, "little"))[0]
     return value
+
+
+@lru_cache(maxsize=FLOATS_CACHED)
+def _shortest_of_bits(bits: int) -> float:
+    number: float = _FLOAT32.unpack(bits.to_bytes(4, "little"))[0]
+    return shortest_float(number)
+
+
+def byte_length(bits: int) -> int:
+    """Return the number of bytes of a number without leading zeros."""
+    return -(-bits.bit_length() // 8)
+
+
+def _text_or_bytes(bits: int) -> str | bytes:
+    """Return a CUSTOM value: text where its bytes are UTF-8 without control characters, else the bytes."""
+    raw = bits.to_bytes(byte_length(bits), "little")
+    try:
+        text = raw.decode()
+    except UnicodeDecodeError:
+        return raw
+    return text if all(each.isprintable() or each in "\t\r\n" for each in text) else raw
 
 
 def bits_of(value: WireValue, number: int) -> int:
@@ -417,7 +454,13 @@ def bits_of(value: WireValue, number: int) -> int:
     Raises:
         UsageError: the value does not fit the type.
     """
+    if number == ParamType.CUSTOM:
+        if not isinstance(value, str | bytes):
+            raise UsageError(f"{value!r} is a number, and the parameter is CUSTOM")
+        return int.from_bytes(value.encode() if isinstance(value, str) else value, "little")
     value = check_value(value)
+    if isinstance(value, str):
+        raise UsageError(f"{value!r} is text, and the parameter is a number")
     if number in (ParamType.UINT64, ParamType.INT64) and not isinstance(value, bytes):
         kind = ParamType(number)
         low, high = kind.bounds
@@ -449,8 +492,10 @@ def same_bits(number: int, a: int, b: int) -> bool:
 def format_value(value: WireValue, number: int = ParamType.REAL32) -> str:
     """Return the shortest text that parses to the same value: floats as float32, raw bytes as hexadecimal."""
     if isinstance(value, bytes):
-        return f"0x{int.from_bytes(value, 'little'):08x}"
-    if isinstance(value, int):
+        return (
+            f"0x{value.hex()}" if number == ParamType.CUSTOM else f"0x{int.from_bytes(value, 'little'):08x}"
+        )
+    if isinstance(value, int | str):
         return str(value)
     return repr(shortest_float(value) if number == ParamType.REAL32 else value)
 

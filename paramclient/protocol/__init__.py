@@ -1,18 +1,15 @@
-"""The sans-I/O core: no socket, no clock, no disk; bytes and the time are arguments.
+"""The conversations with the components on one link, as async functions without input and output.
 
-`station`: one link: components, our heartbeat, routing of messages.
-`component`: one component: its state and its machines.
-`events`: events of the components.
-`scheduler`: many components on one link: which are due, and whose lists run.
-`addresses`: addresses of components and peers.
-`vehicle_selection`: the only vehicle that an incomplete address fits.
-`no_reply_hint`: the hint of a `NoReply`: what was heard on a link instead of the awaited response.
-`system_id_change`: the search for a vehicle under a new system id.
-`wire`: frames, messages, signatures.
-`params`: the parameter protocol.
-`ext`: the extended parameter protocol.
-`requests`: timeouts, retries and pacing.
-`vehicle`: identification, presence, commands, reboot.
-`ftp`: MAVFTP.
-`stats`: traffic and packet loss.
+- `station`, `node`, `session`: all components of a link; one component; its plain or extended parameters.
+- `channel`, `timing`: requests of one component, and the messages that answer them; round trip and loss.
+- `dialect`: the messages of the plain and of the extended protocol.
+- `table`: the values of a component with their trust, the count, the hash.
+- `reads`, `writes`, `set_results`: single reads; writes, and their results.
+- `fetch`, `list_download`, `file_download`: all parameters: from the cache, by list, as a file.
+- `ftp`, `param_pck`: MAVFTP; the packed parameter file.
+- `digest`, `watch`: whether the table is current; checks that keep it in sync.
+- `identity`, `presence`, `kinds`: who the vehicle is; lost, found, rebooted; names of kinds.
+- `commands`: COMMAND_LONG, requested messages, reboots.
+- `selection`: the vehicle that a call without an address means.
+- `addresses`, `events`: addresses and peers; changes of parameters, events of components.
 """

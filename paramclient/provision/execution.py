@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
 import anyio
 
-from paramclient.client.component import Component, successor_of
+from paramclient.client.arguments import check_author
+from paramclient.client.component import Component
 from paramclient.errors import (
     AnotherVehicle,
     CacheError,
@@ -28,9 +29,7 @@ from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
 from paramclient.model.values import WireValue
-from paramclient.protocol.params.change_origin import check_author
-from paramclient.protocol.params.write_batch import SetOutcome, SetStatus
-from paramclient.protocol.requests.write_window import WRITES_IN_FLIGHT_MAX
+from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
 from paramclient.provision.callbacks import call_and_wait
 from paramclient.provision.inspection import (
@@ -159,7 +158,7 @@ class ApplyRun:
 
     async def prepare(self) -> None:
         """Inspect the vehicle, plan, and store its state. A failure is raised before the first write."""
-        if self._options.durable and self._component.core.client.cache is None:
+        if self._options.durable and self._component.core.cache is None:
             raise UsageError("durable needs a cache, and the client keeps none")
         check_component(self._wanted, self._component.component)
         plan({}, self._wanted, include=self._options.include, autopilot=self._component.autopilot)
@@ -168,7 +167,7 @@ class ApplyRun:
         planned, own = self._plan_identity, self._component.identity
         if planned is not None and not planned.is_same_vehicle(own):
             raise UsageError(f"the plan is for another vehicle: {planned}; this vehicle is {own}")
-        with self._without_checks():
+        with self._component.watch.held():
             await self._check_armed()
             await self._inspect()
             self._first, self._first_plan = self.inspection, self.plan
@@ -187,21 +186,9 @@ class ApplyRun:
             raise InvalidParameters(invalid)
         self._check_resets()
 
-    @contextmanager
-    def _without_checks(self) -> Iterator[None]:
-        """Let no check of the table begin: the run reads the table itself, and each download takes time."""
-        sync = self._component.core.machine.sync
-        sync.hold()
-        try:
-            yield
-        finally:
-            sync.release()
-
     async def write_and_verify(self) -> None:
         """Write and verify until no stage is pending. `result` reports a failure after the first write."""
-        with self._without_checks():  # a changed count starts no download besides those of the run
-            if self._pending_stages():
-                self._component.core.machine.sync.drop_check(anyio.current_time())
+        with self._component.watch.held():  # a changed count starts no download besides those of the run
             await self._write_and_verify()
         await self._record_end()
 
@@ -225,8 +212,7 @@ class ApplyRun:
                 else:
                     break
             if self._options.durable and self.sent:
-                core = self._component.core
-                await core.client.cache_writer.write_durably(core.machine)
+                await self._component.core.cache_writer.write_durably(self._component.node)
         except ParamClientError as error:
             if not self.sent:
                 raise
@@ -384,25 +370,15 @@ class ApplyRun:
             ParamClientError: not all values were tried.
         """
         self._is_verified = False
-        # ArduPilot may get all of them at once, as a file
-        in_flight = len(steps) if self._component.autopilot == "ardupilot" else WRITES_IN_FLIGHT_MAX
         by_name = {step.name: step for step in steps}
         before = frozenset(self.sent)
-        ended = 0
-
-        def take(outcome: SetOutcome) -> None:
-            nonlocal ended
-            ended += 1
-            self.sent.update(step.name for step in steps[: ended + in_flight])
-            self._take(by_name[outcome.name], outcome)
-
-        self.sent.update(step.name for step in steps[:in_flight])
+        self.sent.update(by_name)
         try:
             done = await self._component.set_many(
                 [(step.name, step.value) for step in steps],
                 force=self._options.force,
                 author=self._options.author,
-                progress=take,
+                progress=lambda outcome: self._take(by_name[outcome.name], outcome),
             )
         except ParamClientError:
             self.sent &= before
@@ -463,7 +439,9 @@ class ApplyRun:
         async with anyio.create_task_group() as sending:
             sending.start_soon(cancel_if_id_is_kept)
             try:
-                self._component = await successor_of(self._component, system, timeout=SYSTEM_CHANGE_TIMEOUT)
+                self._component = await self._component.successor(
+                    self._component, system, timeout=SYSTEM_CHANGE_TIMEOUT
+                )
             except ParamClientError as error:  # raised here, the task group would wrap it in a group
                 failure = error
             sending.cancel_scope.cancel()
@@ -498,7 +476,7 @@ class ApplyRun:
         with suppress(ParamClientError):
             await component.set(step.name, step.value, author=self._options.author)
             acknowledged_at = anyio.current_time()
-            while component.core.machine.presence.beat_at < acknowledged_at + SYSTEM_CHANGE_DELAY:  # noqa: ASYNC110 - no event
+            while component.node.presence.beat_at < acknowledged_at + SYSTEM_CHANGE_DELAY:  # noqa: ASYNC110 - no event
                 await anyio.sleep(POLL_INTERVAL)
             return
         await anyio.sleep_forever()
@@ -575,7 +553,7 @@ class ApplyRun:
 
     async def _store_state(self) -> None:
         """Store the vehicle's state: in the backup file, and in the cache if the plan has steps."""
-        client, component, inspection = self._component.core.client, self._component, self.inspection
+        client, component, inspection = self._component.core, self._component, self.inspection
         if (path := self._options.backup) is not None:
             from paramclient.files import write_file
 
@@ -605,7 +583,7 @@ class ApplyRun:
 
     async def _record_end(self) -> None:
         """Record in the cache that the run was not interrupted."""
-        client, number = self._component.core.client, self._snapshot
+        client, number = self._component.core, self._snapshot
         cache = client.cache
         if cache is not None and number is not None:
             with suppress(CacheError):  # the warning of the cache writer says so

@@ -11,13 +11,14 @@ import anyio.to_thread
 
 from paramclient.client.component import Component
 from paramclient.errors import NoReply, ParamClientError, UsageError
-from paramclient.model.ext_params import ExtParam
-from paramclient.model.ext_paramset import ExtParamSet
-from paramclient.protocol.ext.write_batch import ExtSetOutcome
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import Param
+from paramclient.protocol.set_results import SetOutcome
 from paramclient.provision.apply_restore import BEFORE_RESTORE
 from paramclient.provision.callbacks import call_and_wait
-from paramclient.provision.restore_point import choose_restore_point
-from paramclient.provision.vehicle_params import BEFORE_APPLY, extended_set
+from paramclient.provision.inspection import wait_for_identity
+from paramclient.provision.restore_point import load_state_before_apply
+from paramclient.provision.vehicle_params import BEFORE_APPLY, set_maker
 
 __all__ = [
     "ExtApplyResult",
@@ -45,9 +46,9 @@ class ExtPlan:
 
     system: int
     component: int
-    wanted: Mapping[str, ExtParam]
-    current: Mapping[str, ExtParam]
-    changes: Mapping[str, ExtParam]
+    wanted: Mapping[str, WrittenParam]
+    current: Mapping[str, Param]
+    changes: Mapping[str, WrittenParam]
     missing: tuple[str, ...]
     mistyped: tuple[str, ...]
     elapsed: float
@@ -79,10 +80,10 @@ class ExtApplyResult:
     """
 
     plan: ExtPlan
-    outcomes: tuple[ExtSetOutcome, ...]
-    before: ExtParamSet
+    outcomes: tuple[SetOutcome, ...]
+    before: ParamSet
     snapshot: int | None
-    current: Mapping[str, ExtParam] | None
+    current: Mapping[str, Param] | None
     error: ParamClientError | None
     elapsed: float
 
@@ -91,7 +92,7 @@ class ExtApplyResult:
         """Names of `plan.changes` that do not have the wanted value, or of which this is unknown."""
         now = {} if self.current is None else self.current
         changes = self.plan.changes.items()
-        return tuple(name for name, param in changes if name not in now or not param.same_value(now[name]))
+        return tuple(name for name, param in changes if name not in now or not param.is_held_by(now[name]))
 
     @property
     def complete(self) -> bool:
@@ -99,9 +100,7 @@ class ExtApplyResult:
         return self.error is None and self.plan.is_possible and not self.different
 
 
-async def verify_extended(
-    component: Component, wanted: ExtParamSet, *, timeout: float | None = None
-) -> ExtPlan:
+async def verify_extended(component: Component, wanted: ParamSet, *, timeout: float | None = None) -> ExtPlan:
     """Compare wanted extended parameters with those of a component, after a download. Writes nothing.
 
     Args:
@@ -112,7 +111,7 @@ async def verify_extended(
     Raises:
         UsageError: the wanted parameters are of another component.
         NoReply: the table is not complete.
-        ParamClientError: as from `ExtParams.fetch_all`.
+        ParamClientError: as from `Component.fetch_all`.
     """
     address = f"{component.system}/{component.component}"
     if wanted.component not in (None, component.component):
@@ -123,12 +122,14 @@ async def verify_extended(
         raise NoReply(f"all extended parameters of {address}", attempts=0, waited=result.elapsed)
     now = dict(result.params)
     mistyped = tuple(
-        name for name, each in wanted.params.items() if name in now and now[name].type != each.type
+        name
+        for name, each in wanted.params.items()
+        if name in now and now[name].type_number != each.type_number
     )
     changes = {
         name: each
         for name, each in wanted.params.items()
-        if name in now and name not in mistyped and not now[name].same_value(each)
+        if name in now and name not in mistyped and not each.is_held_by(now[name])
     }
     missing = tuple(name for name in wanted.params if name not in now)
     ids = component.system, component.component
@@ -137,13 +138,13 @@ async def verify_extended(
 
 async def apply_extended(
     component: Component,
-    wanted: ExtParamSet,
+    wanted: ParamSet,
     *,
     durable: bool = False,
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
     author: str | None = None,
-    progress: Callable[[ExtSetOutcome], None] | None = None,
+    progress: Callable[[SetOutcome], None] | None = None,
     before_writing: Callable[[], object] | None = None,
 ) -> ExtApplyResult:
     """Write the wanted values that differ to a component, and verify them by another download.
@@ -158,7 +159,7 @@ async def apply_extended(
     Args:
         component: the component.
         wanted: the wanted parameters.
-        durable: return only when the values and their history are on the disk, see `ExtParams.set`.
+        durable: return only when the values and their history are on the disk, see `Component.set`.
         backup: a file for the state before the first write, a JSON file.
         timeout: seconds for the whole call; None: no limit.
         author: the author of the changes, as in `Component.set`.
@@ -170,7 +171,7 @@ async def apply_extended(
         UsageError: as from `verify_extended`; or `durable` without a cache.
         FileError, CacheError: the state before the first write could not be stored.
         NoReply: the component did not answer before the first write.
-        ParamClientError: as from `ExtParams.fetch_all` and `ExtParams.set_many`, before the first write.
+        ParamClientError: as from `Component.fetch_all` and `Component.set_many`, before the first write.
     """
     return await _write(
         component,
@@ -187,13 +188,13 @@ async def apply_extended(
 
 async def restore_extended(
     component: Component,
-    state: ExtParamSet,
+    state: ParamSet,
     *,
     durable: bool = False,
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
     author: str | None = None,
-    progress: Callable[[ExtSetOutcome], None] | None = None,
+    progress: Callable[[SetOutcome], None] | None = None,
     before_writing: Callable[[], object] | None = None,
 ) -> ExtApplyResult:
     """Restore an earlier state of a component: `apply_extended` with a snapshot *before restore*.
@@ -219,7 +220,7 @@ async def restore_extended(
     )
 
 
-async def load_extended_state(component: Component, when: float | None = None) -> ExtParamSet:
+async def load_extended_state(component: Component, when: float | None = None) -> ParamSet:
     """Return an earlier state of the extended parameters of a component, from the cache.
 
     Args:
@@ -229,26 +230,33 @@ async def load_extended_state(component: Component, when: float | None = None) -
 
     Raises:
         AlreadyRestored: a restore ran since that `apply_extended`, and `when` is None.
-        CacheError: there is no such state, see `ParamCache.ext_state_at`; or the cache cannot be read.
+        CacheError: there is no such state, see `ParamCache.state_at`; or the cache cannot be read.
         UsageError: the client has no cache.
     """
-    if when is None:
-        address = f"{component.system}/{component.component}"
-        what = f"an apply of extended parameters to {address}"
-        when = choose_restore_point(await component.ext.snapshots(), what).id
-    return await component.ext.load_state(when)
+    cache, key, number = component.core.cache, component.identity.key, component.component
+    if cache is None:
+        raise UsageError("the client keeps no cache")
+
+    def load() -> ParamSet:
+        if when is None:
+            return load_state_before_apply(cache, key, number, extended=True)
+        return cache.state_at(key, number, when, extended=True)
+
+    await wait_for_identity(component)
+    await component.core.cache_writer.write_all()
+    return await component.core.cache_writer.run_in_thread(load)
 
 
 async def _write(
     component: Component,
-    wanted: ExtParamSet,
+    wanted: ParamSet,
     *,
     reason: str,
     durable: bool,
     backup: str | os.PathLike[str] | None,
     timeout: float | None,
     author: str | None,
-    progress: Callable[[ExtSetOutcome], None] | None,
+    progress: Callable[[SetOutcome], None] | None,
     before_writing: Callable[[], object] | None,
 ) -> ExtApplyResult:
     began = anyio.current_time()
@@ -257,21 +265,31 @@ async def _write(
         return None if timeout is None else max(0.0, began + timeout - anyio.current_time())
 
     ext = component.ext
+    await wait_for_identity(component)
     plan = await verify_extended(component, wanted, timeout=timeout)
     if plan.changes and before_writing is not None:
         await call_and_wait(before_writing)
     source = f"{component.system}/{component.component} {reason}"
-    before = extended_set(component, plan.current, source)
+    before = set_maker(component, source)(plan.current.values())
     if backup is not None:
         from paramclient.files.disk import write_extended_file
 
         await anyio.to_thread.run_sync(write_extended_file, backup, before)
     if not plan.changes:
         return ExtApplyResult(plan, (), before, None, plan.current, None, anyio.current_time() - began)
-    snapshot = await ext.store_snapshot(reason=reason)
-    values = {name: param.value for name, param in plan.changes.items()}
+    cache = component.core.cache
+    snapshot = None
+    if cache is not None:
+        await component.core.cache_writer.write_all()
+        kept = await component.core.cache_writer.run_in_thread(
+            lambda: cache.store_snapshot(
+                component.identity, component.component, before, reason=reason, extended=True
+            )
+        )
+        snapshot = kept.id
+    values = {name: param.settable for name, param in plan.changes.items()}
     done = await ext.set_many(values, progress=progress, timeout=left(), durable=durable, author=author)
-    current: Mapping[str, ExtParam] | None = None
+    current: Mapping[str, Param] | None = None
     error = done.error
     try:
         after = await ext.fetch_all(timeout=left())

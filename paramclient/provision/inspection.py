@@ -14,7 +14,7 @@ from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Renames
 from paramclient.model.values import Param, ParamType, Trust
-from paramclient.protocol.params.fetch_result import FetchResult
+from paramclient.protocol.fetch import FetchResult
 from paramclient.provision.planning import ParamInfo, Plan, check_component, plan
 from paramclient.provision.vehicle_params import set_maker
 
@@ -102,10 +102,8 @@ async def inspect(
         NoReply: the vehicle did not answer.
         LinkError: the link failed, or the client was closed.
     """
-    component.core.machine.sync.expire_hash()  # the hash may have changed since its announcement
     before = {name for name, param in component.params.items() if param.trust is Trust.LIVE}
     fetched = await component.fetch_all()
-    await component.refreshed()
     params = dict(component.params)
     listed = [name for name, param in params.items() if param.index is not None]
     table = {name: params[name] for name in listed if params[name].trust is not Trust.CACHED}
@@ -176,7 +174,7 @@ async def reread(component: Component, inspection: Inspection, names: Iterable[s
 
 async def wait_for_identity(component: Component) -> None:
     """Wait until the vehicle is identified, at most `SETUP_IDENTITY_TIMEOUT`, as the cache key requires."""
-    await component.core.wait_until_identified(SETUP_IDENTITY_TIMEOUT)
+    await component.wait_until_identified(SETUP_IDENTITY_TIMEOUT)
 
 
 async def prepare(
@@ -271,11 +269,11 @@ def _current_values(
 
 def _not_covered(component: Component, fetched: FetchResult) -> Collection[str]:
     """Return the names whose values a fetch neither received nor confirmed, except missing ones."""
-    if fetched.source != "cache" and not fetched.resumed:
+    if fetched.source != "cache":
         return ()
-    if fetched.hash is None:  # the cache policy did not verify it, or the download was resumed
+    if fetched.hash is None:  # the cache policy did not verify it
         return component.params.keys()
-    return component.core.machine.table.unhashed()
+    return [name for name, param in component.params.items() if param.trust is Trust.CACHED]
 
 
 async def _read_names(

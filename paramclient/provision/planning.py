@@ -552,7 +552,7 @@ class _Planner:
         self, name: str, value: WireValue, kind: ParamType | int | None, info: ParamInfo | None
     ) -> tuple[str, str] | None:
         """Return why a value is invalid, as category and sentence, or None."""
-        if self._rules.is_system_id(name) and (isinstance(value, bytes) or not 1 <= value <= 255):
+        if self._rules.is_system_id(name) and (isinstance(value, bytes | str) or not 1 <= value <= 255):
             return WRONG, "a system id is a number from 1 to 255"
         if kind is not None:
             try:
@@ -561,7 +561,7 @@ class _Planner:
                 return WRONG, str(error)
             if isinstance(value, float) and kind < ParamType.REAL32 and not value.is_integer():
                 return WRONG, f"{value!r} is not a whole number, and the parameter is {type_name(kind)}"
-        if isinstance(value, bytes):
+        if isinstance(value, bytes | str):
             return None
         if not math.isfinite(value):
             if self._force:

@@ -19,19 +19,23 @@ if TYPE_CHECKING:
 __all__ = ["choose_restore_point", "load_restore_point", "load_state_before_apply"]
 
 
-def load_state_before_apply(cache: ParamCache, key: str, component: int) -> ParamSet:
+def load_state_before_apply(
+    cache: ParamCache, key: str, component: int, *, extended: bool = False
+) -> ParamSet:
     """Return the state that the cache stored of a component before the latest `apply`.
 
     Args:
         cache: the cache.
         key: `Identity.key` of the vehicle.
         component: component id.
+        extended: that of extended parameters.
 
     Raises:
         AlreadyRestored: a restore ran since that `apply`.
         CacheError: the cache has no snapshot from before an `apply`.
     """
-    return cache.state_at(key, component, _find_snapshot(cache, key, component).id)
+    number = _find_snapshot(cache, key, component, extended=extended).id
+    return cache.state_at(key, component, number, extended=extended)
 
 
 def load_restore_point(cache: ParamCache, key: str, component: int) -> RestorePoint:
@@ -86,9 +90,9 @@ def choose_restore_point(snapshots: Sequence[SnapshotSummary], apply: str) -> Sn
     return point
 
 
-def _find_snapshot(cache: ParamCache, key: str, component: int) -> SnapshotSummary:
+def _find_snapshot(cache: ParamCache, key: str, component: int, *, extended: bool = False) -> SnapshotSummary:
     try:
-        snapshots = cache.snapshots(key, component)
+        snapshots = cache.snapshots(key, component, extended=extended)
     except UnknownVehicle:
         snapshots = []
     return choose_restore_point(snapshots, _apply_to(key))

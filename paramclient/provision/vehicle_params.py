@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from paramclient.errors import NoReply, NotInCache, UsageError, VehicleError
+from paramclient.errors import NotInCache, UsageError, VehicleError
 from paramclient.model.comparison import defaults_of, non_defaults
 from paramclient.model.defaults import add_defaults
-from paramclient.model.ext_params import ExtParam
-from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, Trust
 from paramclient.model.wording import first_of
@@ -22,14 +18,13 @@ from paramclient.model.wording import first_of
 if TYPE_CHECKING:
     from paramclient.cache import CachedComponent, ParamCache
     from paramclient.client.component import Component
-    from paramclient.protocol.params.fetch_result import FetchResult, Progress
+    from paramclient.protocol.fetch import FetchResult, Progress
 
 __all__ = [
     "BEFORE_APPLY",
     "NO_DEFAULTS",
     "FetchedSet",
     "set_maker",
-    "extended_set",
     "load_cached_set",
     "collect_defaults",
     "select_non_defaults",
@@ -41,8 +36,6 @@ __all__ = [
 
 BEFORE_APPLY: Final = "before apply"
 """The reason of the snapshot that `apply` stores before its first write."""
-REFRESH_TIMEOUT: Final = 10.0
-"""Seconds to wait for the values that the vehicle's hash does not cover."""
 NAMES_SHOWN_MAX: Final = 20
 """Parameters that a message names, so that it stays readable; it gives the number of further ones."""
 NO_DEFAULTS: Final = (
@@ -87,42 +80,25 @@ def set_maker(component: Component, source: str) -> Callable[[Iterable[Param]], 
     )
 
 
-def extended_set(component: Component, params: Mapping[str, ExtParam], source: str) -> ExtParamSet:
-    """Return extended parameters of a component as a set, with the identity and the time of this call.
-
-    Args:
-        component: the component.
-        params: its extended parameters by name.
-        source: the origin of the set, in words.
-    """
-    ids = component.system, component.component
-    return ExtParamSet(params, *ids, time.time(), source, component.identity)
-
-
 async def collect_set(
     component: Component,
     result: FetchResult,
     *,
     source: str,
-    timeout: float | None = None,
 ) -> FetchedSet:
     """Return the parameters of a fetched table as a set.
 
-    Waits for the values that the vehicle's hash does not cover. Parameters that the vehicle does not list
+    Parameters that the vehicle does not list
     and that are only cached cannot be confirmed; they are left out.
 
     Args:
         component: the component.
         result: the result of its fetch.
         source: the origin of the set, in words.
-        timeout: seconds to wait for the values that no hash covers, at most `REFRESH_TIMEOUT`; values that
-            were not received by then are missing.
 
     Raises:
         LinkError: the link failed.
     """
-    with suppress(NoReply):  # values that were not read again are reported as missing below
-        await component.refreshed(timeout=min(REFRESH_TIMEOUT, math.inf if timeout is None else timeout))
     params = list(component.params.values())
     known = [param for param in params if param.trust is not Trust.CACHED]
     stale = {

@@ -4,7 +4,6 @@
 - `app`: the FastAPI application: middleware, routes, the page.
 - `documents`: JSON of vehicles, parameters and results.
 - `event_feed`: events for any number of listeners, with resume.
-- `extended`: extended parameters behind the routes of plain ones.
 - `hub`: opens the links, follows their components, and reads the cache.
 - `metrics`: metrics for Prometheus.
 - `problems`: errors as problem documents (RFC 9457).

@@ -20,24 +20,20 @@ from paramclient.cli.json_output import (
     ext_value_json,
 )
 from paramclient.cli.json_setup import ApplyJson, PlanJson
-from paramclient.model.ext_params import ExtParamType
-from paramclient.model.notation import hash_text, rounded, time_text
+from paramclient.model.ext_values import ext_bytes
+from paramclient.model.notation import hash_text, rounded
 from paramclient.model.values import ParamType, Trust
-from paramclient.protocol.params.change import Added
+from paramclient.protocol.kinds import expects_extended
 
 if TYPE_CHECKING:
-    from paramclient.cache import CachedSummary, CachedVehicle, ExtHistoryEntry, HistoryEntry, SnapshotSummary
+    from paramclient.cache import CachedSummary, CachedVehicle, HistoryEntry, SnapshotSummary
     from paramclient.files import ParamFile
     from paramclient.metadata import Metadata
-    from paramclient.model.ext_params import ExtParam
-    from paramclient.model.paramset import ParamSet
+    from paramclient.model.paramset import ParamSet, WrittenParam
     from paramclient.model.values import Param
-    from paramclient.protocol.ext.change import ExtChange
-    from paramclient.protocol.ext.fetch import ExtFetchResult
-    from paramclient.protocol.ext.write_batch import ExtSetOutcome
-    from paramclient.protocol.params.change import Change
-    from paramclient.protocol.params.fetch_result import FetchResult, Progress
-    from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome
+    from paramclient.protocol.events import Change
+    from paramclient.protocol.fetch import FetchResult, Progress
+    from paramclient.protocol.set_results import SetManyResult, SetOutcome
     from paramclient.provision import ApplyResult, ExtApplyResult, ExtPlan, Plan
     from paramclient.service.targets import Target
 
@@ -55,7 +51,6 @@ def vehicle(target: Target) -> dict[str, Any]:
     progress of a running fetch, `fetches` the number of ended ones, `key` the key of its table in the cache.
     """
     component, identity, ext = target.component, target.component.identity, target.component.ext
-    contest = component.contest
     return {
         **target.address,
         "link_state": target.link.state,
@@ -72,13 +67,16 @@ def vehicle(target: Target) -> dict[str, Any]:
         "sync_state": component.sync_state.value,
         "is_armed": component.is_armed,
         "is_lost": component.sync_state == "lost",
-        "contest": None if contest is None else contest.difference,
         "silence_s": round(component.silence, 3),
         "round_trip_s": rounded(component.round_trip),
         "fetch": None if target.progress is None else progress(target.progress),
         "fetches": target.fetches,
         "has_metadata": target.metadata is not None,
-        "extended": {"is_expected": ext.is_expected, "count": ext.count, "params": len(ext.params)},
+        "extended": {
+            "is_expected": expects_extended(identity.vehicle_type, component.component),
+            "count": ext.count,
+            "params": len(ext.params),
+        },
     }
 
 
@@ -114,28 +112,35 @@ def progress(now: Progress) -> dict[str, Any]:
 # Parameters
 
 
-def param(known: Param, metadata: Metadata | None = None, *, whole: bool = True) -> dict[str, Any]:
+def param(
+    known: Param, metadata: Metadata | None = None, *, whole: bool = True, ext: bool = False
+) -> dict[str, Any]:
     """Return a parameter of a table.
 
     Args:
         known: the parameter.
         metadata: the metadata of the vehicle, for the default and the meaning of the value; or None.
         whole: whether to include the whole metadata of the parameter.
+        ext: whether it is an extended parameter.
     """
+    if ext:
+        return dict(as_json(ExtParamJson.of_table(known)))
     info = None if metadata is None else metadata.find(known.name)
     found: dict[str, Any] = as_json(ParamJson.of_table(known, info))
     return found | {"metadata": as_json(InfoJson.of(info))} if whole and info is not None else found
 
 
 def params(
-    known: Iterable[Param], metadata: Metadata | None = None, *, whole: bool = True
+    known: Iterable[Param], metadata: Metadata | None = None, *, whole: bool = True, ext: bool = False
 ) -> dict[str, dict[str, Any]]:
     """Return parameters by name."""
-    return {each.name: param(each, metadata, whole=whole) for each in known}
+    return {each.name: param(each, metadata, whole=whole, ext=ext) for each in known}
 
 
-def param_set(found: ParamSet) -> dict[str, dict[str, Any]]:
+def param_set(found: ParamSet, *, ext: bool = False) -> dict[str, dict[str, Any]]:
     """Return the parameters of a set by name."""
+    if ext:
+        return {name: {"name": name} | _ext_written(each) for name, each in found.items()}
     return {name: as_json(WrittenJson.of(each)) for name, each in found.items()}
 
 
@@ -145,34 +150,31 @@ def param_file(file: ParamFile) -> dict[str, Any]:
     return {"file": file.source, "format": file.file_format, "notes": list(file.notes), "components": sets}
 
 
-def change(found: Change, metadata: Metadata | None) -> dict[str, Any]:
+def change(found: Change, target: Target, *, ext: bool = False) -> dict[str, Any]:
     """Return the members of an event about a changed, added or removed parameter."""
-    old, new = found.old, found.new
-    return {
-        "name": found.name,
-        "old": None if old is None else param(old, metadata, whole=False),
-        "new": None if new is None else param(new, metadata, whole=False),
-        "by": found.by,
-        "kind": "removed" if new is None else "added" if isinstance(found, Added) else "changed",
-    }
+
+    def shown(each: Param | None) -> dict[str, Any] | None:
+        return None if each is None else param(each, target.metadata, whole=False, ext=ext)
+
+    old, new = shown(found.old), shown(found.new)
+    return {"name": found.name, "old": old, "new": new, "by": found.by, "kind": found.kind}
 
 
 # Fetches, writes and set-ups
 
 
-def fetch_result(result: FetchResult, target: Target) -> dict[str, Any]:
+def fetch_result(result: FetchResult, target: Target, *, ext: bool = False) -> dict[str, Any]:
     """Return the result of a fetch, without the parameters."""
-    stats = None if target.link.client is None else target.link.client.stats
-    known = target.component.params
+    client, component = target.link.client, target.parameters(ext=ext)
     found: dict[str, Any] = as_json(
         FetchJson.of(
-            target.component,
+            component,
             result,
             (),
             missing=list(result.missing),
-            cached=[name for name, each in known.items() if each.trust is Trust.CACHED],
-            bytes_received=0 if stats is None else stats.bytes_received,
-            bytes_sent=0 if stats is None else stats.bytes_sent,
+            cached=[name for name, each in component.params.items() if each.trust is Trust.CACHED],
+            bytes_received=0 if client is None else client.bytes_received,
+            bytes_sent=0 if client is None else client.bytes_sent,
             described={},
         )
     )
@@ -180,19 +182,27 @@ def fetch_result(result: FetchResult, target: Target) -> dict[str, Any]:
     return found | {"notes": list(result.notes)}
 
 
-def write(outcome: SetOutcome, target: Target) -> dict[str, Any]:
-    """Return the outcome of a write."""
-    known = target.component.params.get(outcome.name)
-    info = None if target.metadata is None else target.metadata.find(outcome.name)
+def write(outcome: SetOutcome, target: Target, *, ext: bool = False) -> dict[str, Any]:
+    """Return the outcome of a write, of an extended parameter with `actual_hex`, the bytes of its value."""
+    known = target.parameters(ext=ext).params.get(outcome.name)
     kind = ParamType.REAL64 if known is None else known.type_number
-    return dict(as_json(WriteJson.of(outcome, kind, info)))
+    found = dict(as_json(WriteJson.of(outcome, kind, target.info(outcome.name, ext=ext))))
+    if not ext:
+        return found
+    now = None if outcome.result is None else outcome.result.param
+    return found | {
+        "requested": ext_value_json(outcome.requested, ParamType.REAL64),
+        "actual": None if now is None else ext_value_json(now.value, now.type_number),
+        "actual_hex": None if now is None else ext_bytes(now).hex(),
+        "reason": found.get("reason"),
+    }
 
 
-def writes(result: SetManyResult, target: Target) -> dict[str, Any]:
+def writes(result: SetManyResult, target: Target, *, ext: bool = False) -> dict[str, Any]:
     """Return the outcomes of several writes in order; `error` says why not all were tried."""
     return {
         "vehicle": as_json(VehicleJson.of(target.component)),
-        "results": [write(outcome, target) for outcome in result.outcomes],
+        "results": [write(outcome, target, ext=ext) for outcome in result.outcomes],
         "error": None if result.error is None else str(result.error),
     }
 
@@ -218,86 +228,19 @@ def apply_result(result: ApplyResult, target: Target) -> dict[str, Any]:
     )
 
 
-# The past
-
-
-def history(entries: Iterable[HistoryEntry]) -> dict[str, Any]:
-    """Return changes of values."""
-    return {"history": [as_json(HistoryLineJson.of(entry)) for entry in entries]}
-
-
-def snapshots(kept: Iterable[SnapshotSummary]) -> dict[str, Any]:
-    """Return snapshots without their parameters."""
-    return {"snapshots": [as_json(SnapshotJson.of(each)) for each in kept]}
-
-
-# Extended parameters
-
-
-def ext_param(known: ExtParam) -> dict[str, Any]:
-    """Return an extended parameter of a table."""
-    return dict(as_json(ExtParamJson.of_table(known)))
-
-
-def ext_change(found: ExtChange) -> dict[str, Any]:
-    """Return the members of an event about an extended parameter."""
-    old, new = found.old, found.new
-    return {
-        "name": found.name,
-        "old": None if old is None else ext_param(old),
-        "new": None if new is None else ext_param(new),
-        "by": found.by,
-        "kind": "removed" if new is None else "added" if found.is_added else "changed",
-    }
-
-
-def ext_fetch_result(result: ExtFetchResult) -> dict[str, Any]:
-    """Return the result of a fetch of extended parameters."""
-    return {
-        "system": result.system,
-        "component": result.component,
-        "count": result.count,
-        "received": len(result.params),
-        "source": result.source,
-        "missing": list(result.missing),
-        "elapsed_s": round(result.elapsed, 3),
-    }
-
-
-def ext_writes(outcomes: Iterable[ExtSetOutcome], error: Exception | None = None) -> dict[str, Any]:
-    """Return the outcomes of writes of extended parameters; `error` says why not all were tried."""
-    return {
-        "results": [_ext_write(each) for each in outcomes],
-        "error": None if error is None else str(error),
-    }
-
-
-def _ext_write(outcome: ExtSetOutcome) -> dict[str, Any]:
-    """Return the outcome of a write of an extended parameter; `actual_hex` has the bytes of its value."""
-    now = None if outcome.result is None else outcome.result.param
-    return {
-        "name": outcome.name,
-        "requested": ext_value_json(outcome.requested, ExtParamType.REAL64),
-        "actual": None if now is None else ext_value_json(now.value, now.type),
-        "status": outcome.status.value,
-        "actual_hex": None if now is None else now.raw.hex(),
-        "reason": None if outcome.error is None else str(outcome.error),
-    }
-
-
 def ext_plan(found: ExtPlan) -> dict[str, Any]:
     """Return what a set-up of extended parameters would write."""
     return {
         "system": found.system,
         "component": found.component,
         "is_met": found.is_met,
-        "changes": {name: as_json(ExtParamJson.of(each)) for name, each in found.changes.items()},
+        "changes": {name: _ext_written(each) for name, each in found.changes.items()},
         "missing": list(found.missing),
         "mistyped": list(found.mistyped),
     }
 
 
-def ext_apply_result(result: ExtApplyResult) -> dict[str, Any]:
+def ext_apply_result(result: ExtApplyResult, target: Target) -> dict[str, Any]:
     """Return the result of a set-up of extended parameters."""
     return {
         "complete": result.complete,
@@ -305,21 +248,30 @@ def ext_apply_result(result: ExtApplyResult) -> dict[str, Any]:
         "different": list(result.different),
         "snapshot": result.snapshot,
         "elapsed_s": round(result.elapsed, 3),
-        **ext_writes(result.outcomes, result.error),
+        "results": [write(outcome, target, ext=True) for outcome in result.outcomes],
+        "error": None if result.error is None else str(result.error),
     }
 
 
-def ext_history(entries: Iterable[ExtHistoryEntry]) -> dict[str, Any]:
-    """Return changes of extended parameters."""
-    lines = [
-        {
-            "time": time_text(each.at),
-            "component": each.component,
-            "name": each.name,
-            "old": as_json(ExtParamJson.of(each.old)),
-            "new": None if each.new is None else as_json(ExtParamJson.of(each.new)),
-            "by": each.by,
-        }
-        for each in entries
-    ]
+def _ext_written(known: WrittenParam) -> dict[str, Any]:
+    return dict(as_json(ExtParamJson.written(known)))
+
+
+# The past
+
+
+def history(entries: Iterable[HistoryEntry], *, ext: bool = False) -> dict[str, Any]:
+    """Return changes of values; those of extended parameters are whole parameters."""
+    lines = []
+    for entry in entries:
+        line = as_json(HistoryLineJson.of(entry))
+        if ext:
+            values = {"old": entry.old, "new": entry.new}
+            line |= {which: each and as_json(ExtParamJson.of(each)) for which, each in values.items()}
+        lines.append(line)
     return {"history": lines}
+
+
+def snapshots(kept: Iterable[SnapshotSummary]) -> dict[str, Any]:
+    """Return snapshots without their parameters."""
+    return {"snapshots": [as_json(SnapshotJson.of(each)) for each in kept]}

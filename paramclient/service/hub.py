@@ -17,12 +17,11 @@ import anyio.to_thread
 
 from paramclient.cache import ParamCache
 from paramclient.client.client import ParamClient
-from paramclient.client.events import Discovered, Event, Found, Rebooted, Resynced, Uncontested
+from paramclient.client.events import Discovered, Event, Found, Rebooted, Resynced
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata import Metadata, MetadataStore, metadata_of
-from paramclient.protocol.params.change import Added, FirstValue
-from paramclient.protocol.params.fetch_result import FetchResult, Progress
+from paramclient.protocol.fetch import FetchResult, Progress
 from paramclient.service import documents
 from paramclient.service.event_feed import EventFeed
 from paramclient.service.problems import ServiceError
@@ -220,13 +219,13 @@ class Hub:
         target = link.targets.get((component.system, component.component))
         if target is None or target.component is not component:
             target = link.targets[component.system, component.component] = Target(link, component)
-            tasks.start_soon(self._publish_changes, target)
-            tasks.start_soon(self._publish_extended_changes, target)
+            for ext in (False, True):
+                tasks.start_soon(self._publish_changes, target, ext)
         if isinstance(event, Resynced):
             target.fetches += 1
         self._check(target)
         listens_only = link.client is not None and link.client.listens_only
-        if isinstance(event, Discovered | Found | Rebooted | Uncontested) and not listens_only:
+        if isinstance(event, Discovered | Found | Rebooted) and not listens_only:
             tasks.start_soon(self._load, target)
 
     async def _load(self, target: Target) -> None:
@@ -235,8 +234,6 @@ class Hub:
             return
         with suppress(ParamClientError):
             await self.fetch(target)
-            await target.component.refreshed()
-            target.fetches += 1
 
     async def _load_known_metadata(self, target: Target) -> None:
         """Load the metadata of the firmware of a component that this computer has, if any."""
@@ -247,26 +244,16 @@ class Hub:
         target.metadata = await anyio.to_thread.run_sync(store.known, identity, component)
         target.described = identity
 
-    async def _publish_changes(self, target: Target) -> None:
-        """Publish the changes of a table, until the client has removed the component or is closed.
+    async def _publish_changes(self, target: Target, ext: bool) -> None:
+        """Publish the changes of the plain or the extended parameters, until the client is closed.
 
         First values are not published: a fetch has thousands, and its end is published.
         """
         with suppress(ParamClientError):
-            async for change in target.component.changes():
-                if isinstance(change, Added) or not isinstance(change, FirstValue):
-                    members = documents.change(change, target.metadata)
-                    self.feed.publish("change", **target.address, **members)
-            return  # the end of a log
-        self._forget(target)
-
-    async def _publish_extended_changes(self, target: Target) -> None:
-        """Publish the changes of extended parameters."""
-        with suppress(ParamClientError):
-            async for change in target.component.ext.changes():
-                if change.old is not None or change.is_added:
-                    members = documents.ext_change(change)
-                    self.feed.publish("extended_change", **target.address, **members)
+            async for change in target.parameters(ext=ext).changes():
+                if change.kind != "first":
+                    members = documents.change(change, target, ext=ext)
+                    self.feed.publish("extended_change" if ext else "change", **target.address, **members)
 
     async def _check_regularly(self, link: ServiceLink) -> None:
         while True:

@@ -23,16 +23,8 @@ METRICS_MEDIA_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
 _COUNTERS: Final = {
     "bytes_received": "Received bytes.",
     "bytes_sent": "Sent bytes.",
-    "frames_received": "Received complete frames.",
-    "damaged": "Received frames with a checksum error.",
-    "lost": "Lost frames, by sequence numbers.",
-    "reads": "Parameters read individually.",
-    "writes": "Parameters written.",
-    "retries": "Retries of reads and writes.",
-    "downloads": "Fetches that downloaded the table.",
-    "cache_hits": "Fetches with a matching hash of the cached table.",
 }
-"""Help texts of the counters of a link, by attribute of `ClientStats`."""
+"""Help texts of the counters of a link, by attribute of `ParamClient`."""
 _GAUGES: Final = {
     "up": "1 if the vehicle is not lost.",
     "synced": "1 if the table matches that of the vehicle.",
@@ -71,12 +63,11 @@ def _link_metrics(hub: Hub) -> Iterator[Metric]:
     for link in hub.links.values():
         is_open.add_metric([link.name], link.state == "open")
     yield is_open
-    counted = [(link.name, link.client.stats) for link in hub.links.values() if link.client is not None]
+    opened = [(link.name, link.client) for link in hub.links.values() if link.client is not None]
     for name, text in _COUNTERS.items():
         counter = CounterMetricFamily(f"paramclient_link_{name}_total", text, labels=["link"])
-        for link_name, stats in counted:
-            if (count := getattr(stats, name)) is not None:
-                counter.add_metric([link_name], count)
+        for link_name, client in opened:
+            counter.add_metric([link_name], getattr(client, name))
         yield counter
 
 

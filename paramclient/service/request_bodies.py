@@ -12,8 +12,9 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictFloat,
 from paramclient.errors import UsageError
 from paramclient.files import FileFormat, ParamFile, loads
 from paramclient.metadata.info import number_of
+from paramclient.model.ext_values import check_ext_value, encode_ext_value, ext_param
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import WireValue, check_name, from_bits, type_name
+from paramclient.model.values import Param, ParamType, WireValue, check_name, from_bits, type_name
 
 if TYPE_CHECKING:
     from paramclient.service.targets import Target
@@ -75,6 +76,8 @@ def _parse_timestamp(given: object) -> object:
         return moment.timestamp()
 
 
+GivenValue: TypeAlias = int | float | str | Bits | Hex
+"""A value as a request gives it."""
 Name = Annotated[str, Field(min_length=1, max_length=16)]
 Number: TypeAlias = StrictInt | Annotated[StrictFloat, Field(allow_inf_nan=False)]
 Value = Annotated[
@@ -232,51 +235,70 @@ class SnapshotRequest(Body):
     reason: Annotated[str, Field(min_length=1, max_length=200)]
 
 
-def values_set(values: dict[str, int | float | str | Bits | Hex], target: Target) -> ParamSet:
-    """Return values as a set. A value by its bits takes the type that the vehicle has sent.
+async def values_set(values: dict[str, GivenValue], target: Target, *, ext: bool) -> ParamSet:
+    """Return values as a set. Values of extended parameters take the types that the component reports.
 
     Raises:
         UsageError: a name or value is invalid.
+        ParamClientError: the component did not send the type of an extended parameter.
     """
-    return ParamSet(
-        {
-            name: WrittenParam(check_name(name), resolve_value(target, name, value))
-            for name, value in values.items()
-        }
-    )
+    found = {}
+    for name, given in values.items():
+        value = await resolve_value(target, name, given, ext=ext)
+        if ext:
+            number = (await _known_extended(target, name)).type_number
+            found[name] = WrittenParam.of(ext_param(name, encode_ext_value(value, number), number))
+        else:
+            found[name] = WrittenParam(check_name(name), value)
+    return ParamSet(found)
 
 
-def resolve_value(target: Target, name: str, given: int | float | str | Bits | Hex) -> WireValue:
-    """Return the value of a request.
+async def resolve_value(target: Target, name: str, given: GivenValue, *, ext: bool) -> WireValue:
+    """Return the value of a request. Text for a number is the number: JavaScript rounds 64-bit integers.
 
     Raises:
         UsageError: no value has this name, or the bits do not fit the type.
+        ParamClientError: the component did not send the type of an extended parameter.
     """
     if isinstance(given, Hex):
-        raise UsageError(f'{name}: {{"hex": …}} is for extended parameters')
+        if not ext:
+            raise UsageError(f'{name}: {{"hex": …}} is for extended parameters')
+        return bytes.fromhex(given.hex)
     if isinstance(given, Bits):
-        known, bits = target.component.params.get(name), int(given.bits, 16)
-        if known is None:
-            raise UsageError(f"{name}: the type is not known; read the parameter first")
-        if bits >> (32 if known.is_raw else 8 * known.type.size):
-            raise UsageError(f"{name}: {bits:x} has more bits than {type_name(known.type_number)}")
-        return from_bits(bits, known.type_number, is_raw=known.is_raw)
+        if ext:
+            raise UsageError(f'{name}: {{"bits": …}} is for plain parameters; give {{"hex": …}}')
+        return _value_of_bits(target, name, int(given.bits, 16))
     if not isinstance(given, str):
-        return given
+        return check_ext_value(given) if ext else given
+    if ext and (await _known_extended(target, name)).type == ParamType.CUSTOM:
+        return check_ext_value(given)
     number = number_of(given)
     if number is not None:
         return number
-    info = None if target.metadata is None else target.metadata.find(name)
+    info = target.info(name, ext=ext)
     if info is None:
         raise UsageError(f"{name}: {given!r} is not a number, and there is no metadata with names of values")
     return info.parse(given)
 
 
-def range_faults(target: Target, values: dict[str, WireValue]) -> dict[str, str]:
+def _value_of_bits(target: Target, name: str, bits: int) -> WireValue:
+    known = target.component.params.get(name)
+    if known is None:
+        raise UsageError(f"{name}: the type is not known; read the parameter first")
+    if bits >> (32 if known.is_raw else 8 * known.type.size):
+        raise UsageError(f"{name}: {bits:x} has more bits than {type_name(known.type_number)}")
+    return from_bits(bits, known.type_number, is_raw=known.is_raw)
+
+
+async def _known_extended(target: Target, name: str) -> Param:
+    return target.component.ext.params.get(name) or await target.component.ext.get(name)
+
+
+def range_faults(target: Target, values: dict[str, WireValue], *, ext: bool) -> dict[str, str]:
     """Return, by name, why values are outside the range in the metadata."""
     found = {}
     for name, value in values.items():
-        info = None if target.metadata is None else target.metadata.find(name)
+        info = target.info(name, ext=ext)
         fault = None if info is None else info.problem(value)
         if fault is not None:
             found[name] = fault

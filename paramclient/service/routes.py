@@ -1,6 +1,6 @@
 """Routes of vehicles, parameters, fetches, events, health and metrics.
 
-With `?ext=true`, the routes of parameters are about the extended parameters of a component; see `extended`.
+With `?ext=true`, the routes of parameters are about the extended parameters of a component.
 With `?key=KEY`, the routes that read are about a vehicle in the cache.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Final, TypeVar
 
 import anyio
@@ -22,8 +23,8 @@ from paramclient.metadata import Metadata
 from paramclient.model.patterns import NameChoice
 from paramclient.model.similar_names import did_you_mean, nearest_names
 from paramclient.model.values import Param, WireValue
-from paramclient.protocol.params.write_batch import SetOutcome, SetStatus
-from paramclient.service import documents, extended
+from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetStatus
+from paramclient.service import documents
 from paramclient.service.access import author_of, holder_of, require_write
 from paramclient.service.hub import Hub
 from paramclient.service.metrics import METRICS_MEDIA_TYPE, metrics_text
@@ -104,17 +105,6 @@ class Source:
     component: int
     target: Target | None
 
-    @property
-    def connected(self) -> Target:
-        """The connected component.
-
-        Raises:
-            ServiceError: 422, a vehicle in the cache is requested.
-        """
-        if self.target is None:
-            raise ServiceError(422, "not-connected", "This is served for connected vehicles only.")
-        return self.target
-
 
 async def _source_of(
     hub: HubArgument, system: System, component: ComponentId, link: LinkName = None, key: Key = None
@@ -178,12 +168,9 @@ async def fetch(
     request: Request, hub: HubArgument, target: TargetArgument, body: FetchRequest, ext: Ext = False
 ) -> Any:
     """Fetch the whole table. Simultaneous requests share one download; the progress is in the events."""
-    if ext:
-        return await run_until_disconnect(request, lambda: extended.fetch(target, body))
-    result = await run_until_disconnect(
-        request, lambda: hub.fetch(target, refresh=body.refresh, timeout=body.timeout_s)
-    )
-    return documents.fetch_result(result, target)
+    work = target.component.ext.fetch_all if ext else partial(hub.fetch, target)
+    result = await run_until_disconnect(request, lambda: work(refresh=body.refresh, timeout=body.timeout_s))
+    return documents.fetch_result(result, target, ext=ext)
 
 
 @reading.post(f"{VEHICLE}/metadata")
@@ -211,32 +198,30 @@ async def params(
     """Return the known parameters by name, without traffic."""
     position = hub.feed.position
     when = at if snapshot is None else snapshot
-    if ext:
-        target = source.connected
-        found = extended.params(target) if when is None else await extended.state(target, when)
-        return JSONResponse({**position, "params": _chosen(found, names)})
     if when is not None:
-        state = await hub.read_cache(lambda cache: cache.state_at(source.key, source.component, when))
-        return JSONResponse({**position, "params": _chosen(documents.param_set(state), names)})
-    described, known = await _known_params(hub, source)
+        place = source.key, source.component, when
+        state = await hub.read_cache(lambda cache: cache.state_at(*place, extended=ext))
+        return JSONResponse({**position, "params": _chosen(documents.param_set(state, ext=ext), names)})
+    described, known = await _known_params(hub, source, ext=ext)
     chosen = _chosen(known, names).values()
 
     def encode() -> Response:
-        return JSONResponse({**position, "params": documents.params(chosen, described, whole=metadata)})
+        found = documents.params(chosen, described, whole=metadata, ext=ext)
+        return JSONResponse({**position, "params": found})
 
     return await anyio.to_thread.run_sync(encode)
 
 
-async def _known_params(hub: Hub, source: Source) -> tuple[Metadata | None, dict[str, Param]]:
+async def _known_params(hub: Hub, source: Source, *, ext: bool) -> tuple[Metadata | None, dict[str, Param]]:
     """Return the metadata and the parameters of a vehicle.
 
     Raises:
         NotInCache: the cache has no such table.
     """
     if source.target is not None:
-        return source.target.metadata, dict(source.target.component.params)
+        return source.target.metadata, dict(source.target.parameters(ext=ext).params)
     key, component, store = source.key, source.component, hub.metadata_store
-    table = await hub.read_cache(lambda cache: cache.load(key, component))
+    table = await hub.read_cache(lambda cache: cache.load(key, component, extended=ext))
     if table is None:
         raise NotInCache(f"The cache has no table of component {component} of vehicle {key!r}.")
     described = None
@@ -254,19 +239,16 @@ async def param(
     ext: Ext = False,
 ) -> dict[str, Any]:
     """Return one parameter: the known value, or with `live` that of the vehicle."""
-    if ext:
-        return await run_until_disconnect(request, lambda: extended.param(target, name, live=live))
-    known = target.component.params.get(name)
+    component = target.parameters(ext=ext)
+    known = component.params.get(name)
     if live:
-        known = await run_until_disconnect(request, lambda: target.component.get(name))
+        known = await run_until_disconnect(request, lambda: component.get(name))
     if known is None:
-        nearest = tuple(nearest_names(name, target.component.params))
+        nearest = tuple(nearest_names(name, component.params))
         why = f"no value of {name} has been received yet.{did_you_mean(nearest)}"
-        system, component = target.component.system, target.component.component
-        raise UnknownParameter(
-            why, system=system, component=component, name=name, index=None, nearest=nearest
-        )
-    return documents.param(known, target.metadata)
+        ids = {"system": component.system, "component": component.component}
+        raise UnknownParameter(why, **ids, name=name, index=None, nearest=nearest)
+    return documents.param(known, target.metadata, ext=ext)
 
 
 @writing.put(f"{VEHICLE}/params/{{name:path}}")
@@ -274,15 +256,15 @@ async def set_param(
     request: Request, target: TargetArgument, name: str, body: WriteRequest, ext: Ext = False
 ) -> dict[str, Any]:
     """Write one parameter, and verify the value that the vehicle reports."""
-    author = author_of(request)
-    if ext:
-        return await run_until_disconnect(
-            request, lambda: extended.set_one(target, name, body, author=author)
-        )
-    value = resolve_value(target, name, body.value)
-    options = _write_options(target, {name: value}, body, author)
-    result = await run_until_disconnect(request, lambda: target.component.set(name, value, **options))
-    return documents.write(SetOutcome(name, value, SetStatus(result.status), result), target)
+    author, component = author_of(request), target.parameters(ext=ext)
+
+    async def work() -> SetOutcome:
+        value = await resolve_value(target, name, body.value, ext=ext)
+        _check_ranges(target, {name: value}, body, ext=ext)
+        result = await component.set(name, value, **_write_options(body, author))
+        return SetOutcome(name, value, SetStatus(result.status), result)
+
+    return documents.write(await run_until_disconnect(request, work), target, ext=ext)
 
 
 @writing.patch(f"{VEHICLE}/params")
@@ -294,13 +276,16 @@ async def set_params(
     If a value is invalid or out of range, nothing is written. A value that the vehicle refuses does not stop
     the others. `error` is present if not all could be tried.
     """
-    author = author_of(request)
-    if ext:
-        return await run_until_disconnect(request, lambda: extended.set_many(target, body, author=author))
-    values = {name: resolve_value(target, name, given) for name, given in body.values.items()}
-    options = _write_options(target, values, body, author)
-    result = await run_until_disconnect(request, lambda: target.component.set_many(values, **options))
-    return documents.writes(result, target)
+    author, component = author_of(request), target.parameters(ext=ext)
+
+    async def work() -> SetManyResult:
+        values = {
+            name: await resolve_value(target, name, given, ext=ext) for name, given in body.values.items()
+        }
+        _check_ranges(target, values, body, ext=ext)
+        return await component.set_many(values, **_write_options(body, author))
+
+    return documents.writes(await run_until_disconnect(request, work), target, ext=ext)
 
 
 async def run_until_disconnect(request: Request, work: Callable[[], Awaitable[Result]]) -> Result:
@@ -332,18 +317,20 @@ def _chosen(known: dict[str, Result], names: list[str] | None) -> dict[str, Resu
     return {name: each for name, each in known.items() if choice.has(name)}
 
 
-def _write_options(
-    target: Target, values: dict[str, WireValue], body: WriteOptions, author: str
-) -> dict[str, Any]:
-    """Return the arguments that `set` and `set_many` have in common.
+def _check_ranges(target: Target, values: dict[str, WireValue], body: WriteOptions, *, ext: bool) -> None:
+    """Check that values are in the ranges of the metadata, unless they are forced.
 
     Raises:
         ServiceError: 422, values are out of range.
     """
-    faults = {} if body.force else range_faults(target, values)
+    faults = {} if body.force else range_faults(target, values, ext=ext)
     if faults:
         detail = f"{'; '.join(list(faults.values())[:5])}. Nothing was written; `force` writes it anyway."
         raise ServiceError(422, "out-of-range", detail, names=list(faults))
+
+
+def _write_options(body: WriteOptions, author: str) -> dict[str, Any]:
+    """Return the arguments that `set` and `set_many` have in common."""
     return {
         "settle": body.settle_s,
         "force": body.force,

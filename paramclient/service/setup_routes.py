@@ -19,12 +19,21 @@ from paramclient.files import FileFormat, dumps
 from paramclient.files.formats import ENDINGS
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
-from paramclient.provision import ApplyProgress, apply, prepare, restore
+from paramclient.provision import (
+    ApplyProgress,
+    apply,
+    apply_extended,
+    load_extended_state,
+    prepare,
+    restore,
+    restore_extended,
+    verify_extended,
+)
 from paramclient.provision.apply_restore import restore_categories
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.restore_point import load_state_before_apply
 from paramclient.provision.vehicle_params import fetch_set, load_cached_set, select_non_defaults, set_maker
-from paramclient.service import documents, extended
+from paramclient.service import documents
 from paramclient.service.access import author_of, require_write
 from paramclient.service.hub import Hub
 from paramclient.service.problems import ServiceError
@@ -106,10 +115,12 @@ async def plan(
     request: Request, hub: HubArgument, target: TargetArgument, body: PlanRequest, ext: Ext = False
 ) -> dict[str, Any]:
     """Return which values an apply would write, in which order, and which it would skip, and why."""
-    if ext:
-        return await run_until_disconnect(request, lambda: extended.plan(target, body))
-    wanted = await _wanted(hub, target, body)
-    return await run_until_disconnect(request, lambda: _plan(target, wanted, body.include, force=body.force))
+
+    async def work() -> dict[str, Any]:
+        wanted = await _wanted(hub, target, body, ext=ext)
+        return await _plan(target, wanted, body.include, force=body.force, ext=ext)
+
+    return await run_until_disconnect(request, work)
 
 
 @writing.post(f"{VEHICLE}/apply")
@@ -123,9 +134,13 @@ async def apply_(
     author = author_of(request)
 
     async def work() -> dict[str, Any]:
+        wanted = await _wanted(hub, target, body, ext=ext)
         if ext:
-            return await extended.apply(target, body, author=author)
-        wanted, options = await _wanted(hub, target, body), _options(hub, target, body, author)
+            ended = await apply_extended(
+                target.component, wanted, durable=body.durable, timeout=body.timeout_s, author=author
+            )
+            return documents.ext_apply_result(ended, target)
+        options = _options(hub, target, body, author)
         result = await apply(
             target.component, wanted, skip_invalid=body.skip_invalid, durable=body.durable, **options
         )
@@ -143,20 +158,26 @@ async def restore_(
     author = author_of(request)
 
     async def work() -> dict[str, Any]:
-        if ext:
-            return await extended.restore(target, body, author=author)
-        state = await _earlier_state(hub, target, body.when)
+        component = target.component
+        state = await _earlier_state(hub, target, body.when, ext=ext)
         if body.dry_run:
-            include = (*await restore_categories(target.component, state), *body.include)
-            return await _plan(target, state, include, force=body.force)
-        result = await restore(target.component, state, **_options(hub, target, body, author))
+            categories = () if ext else await restore_categories(component, state)
+            return await _plan(target, state, (*categories, *body.include), force=body.force, ext=ext)
+        if ext:
+            ended = await restore_extended(component, state, timeout=body.timeout_s, author=author)
+            return documents.ext_apply_result(ended, target)
+        result = await restore(component, state, **_options(hub, target, body, author))
         return documents.apply_result(result, target)
 
     with _only_setup(target, author):
         return await run_until_disconnect(request, work)
 
 
-async def _plan(target: Target, wanted: ParamSet, include: Iterable[str], *, force: bool) -> dict[str, Any]:
+async def _plan(
+    target: Target, wanted: ParamSet, include: Iterable[str], *, force: bool, ext: bool
+) -> dict[str, Any]:
+    if ext:
+        return documents.ext_plan(await verify_extended(target.component, wanted))
     found = await prepare(target.component, wanted, include=include, info=target.metadata, force=force)
     return documents.plan(found, target)
 
@@ -181,10 +202,8 @@ def _options(hub: Hub, target: Target, body: ApplyRequest | RestoreRequest, auth
 @reading.get(f"{VEHICLE}/snapshots")
 async def snapshots(hub: HubArgument, source: SourceArgument, ext: Ext = False) -> dict[str, Any]:
     """Return the snapshots, the newest last."""
-    if ext:
-        return documents.snapshots(await source.connected.component.ext.snapshots())
-    kept = await hub.read_cache(lambda cache: cache.snapshots(source.key, source.component))
-    return documents.snapshots(kept)
+    place = source.key, source.component
+    return documents.snapshots(await hub.read_cache(lambda cache: cache.snapshots(*place, extended=ext)))
 
 
 @writing.post(f"{VEHICLE}/snapshots", status_code=201)
@@ -192,22 +211,21 @@ async def create_snapshot(
     hub: HubArgument, target: TargetArgument, body: SnapshotRequest, ext: Ext = False
 ) -> dict[str, Any]:
     """Store a snapshot of the known table."""
-    component = target.component
-    if ext:
-        return {"id": await component.ext.store_snapshot(reason=body.reason)}
+    component, shown = target.component, target.parameters(ext=ext)
     await wait_for_identity(component)
-    if not component.params:
+    if not shown.params:
         raise UsageError("no parameter of the vehicle is known")
-    table = set_maker(component, f"link {target.link.name}")(list(component.params.values()))
-    complete = component.count is not None and len(component.params) >= component.count
+    table = set_maker(component, f"link {target.link.name}")(list(shown.params.values()))
+    complete = shown.count is not None and len(shown.params) >= shown.count
     kept = await hub.read_cache(
         lambda cache: cache.store_snapshot(
             component.identity,
             component.component,
             table,
             reason=body.reason,
-            hash=component.hash,
+            hash=shown.hash,
             complete=complete,
+            extended=ext,
         )
     )
     return {"id": kept.id}
@@ -224,32 +242,33 @@ async def history(
 ) -> Response:
     """Return the newest changes of values, the newest last."""
     which = source.key, source.component, name, limit, since
-    if ext:
-        return JSONResponse(
-            documents.ext_history(await hub.read_cache(lambda cache: cache.ext_history(*which)))
-        )
-    return JSONResponse(documents.history(await hub.read_cache(lambda cache: cache.history(*which))))
+    entries = await hub.read_cache(lambda cache: cache.history(*which, extended=ext))
+    return JSONResponse(documents.history(entries, ext=ext))
 
 
-async def _wanted(hub: Hub, target: Target, body: PlanRequest) -> ParamSet:
+async def _wanted(hub: Hub, target: Target, body: PlanRequest, *, ext: bool) -> ParamSet:
     """Return the wanted parameters of a request."""
     upload, snapshot = body.file, body.snapshot
     if upload is not None:
+        if ext:
+            raise UsageError("extended parameters are given in `values` or `snapshot`, not in a file")
         found = await anyio.to_thread.run_sync(lambda: upload.read_set(target))
     elif snapshot is not None:
-        found = await _earlier_state(hub, target, snapshot)
+        found = await _earlier_state(hub, target, snapshot, ext=ext)
     else:
-        found = values_set(body.values or {}, target)
+        found = await values_set(body.values or {}, target, ext=ext)
     return found if body.only is None else found.only(body.only)
 
 
-async def _earlier_state(hub: Hub, target: Target, when: float | None) -> ParamSet:
+async def _earlier_state(hub: Hub, target: Target, when: float | None, *, ext: bool) -> ParamSet:
     """Return a state of a component from the cache; None for that before the last apply."""
     await wait_for_identity(target.component)
     key, component = target.component.identity.key, target.component.component
+    if when is None and ext:
+        return await load_extended_state(target.component)
     if when is None:
         return await hub.read_cache(lambda cache: load_state_before_apply(cache, key, component))
-    return await hub.read_cache(lambda cache: cache.state_at(key, component, when))
+    return await hub.read_cache(lambda cache: cache.state_at(key, component, when, extended=ext))
 
 
 @contextmanager

@@ -8,9 +8,9 @@ from typing import Any
 
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
-from paramclient.metadata import Metadata
+from paramclient.metadata import Metadata, ParamInfo
 from paramclient.model.identity import Identity
-from paramclient.protocol.params.fetch_result import Progress
+from paramclient.protocol.fetch import Progress
 
 __all__ = ["ServiceLink", "Target"]
 
@@ -47,6 +47,14 @@ class Target:
             "system": self.component.system,
             "component": self.component.component,
         }
+
+    def parameters(self, *, ext: bool) -> Component:
+        """Return the component with its extended or its plain parameters."""
+        return self.component.ext if ext else self.component
+
+    def info(self, name: str, *, ext: bool = False) -> ParamInfo | None:
+        """Return the metadata of a parameter, or None; extended parameters have none."""
+        return None if ext or self.metadata is None else self.metadata.find(name)
 
 
 @dataclass(eq=False)

@@ -10,10 +10,9 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Literal, Unpack
 
-from paramclient.errors import ParamErrorCode, UsageError
+from paramclient.errors import CommandResult, ParamErrorCode, UsageError
 from paramclient.model.values import Encoding, ParamType, bits_of, from_bits
-from paramclient.protocol import wire
-from paramclient.protocol.ftp.packets import Opcode, Packet
+from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.sim.ftp import PARAM_FILE, Address, FileServer
 from paramclient.sim.param_table import (
     Entry,
@@ -25,6 +24,7 @@ from paramclient.sim.param_table import (
     with_system_id,
 )
 from paramclient.sim.vehicle import SIMULATED_COMMIT, Vehicle, VehicleOptions
+from paramclient.wire import frames, messages
 
 __all__ = ["ArduPilotVehicle"]
 
@@ -95,7 +95,7 @@ class ArduPilotVehicle(Vehicle):
 
     _restart_delay = 0.2
     _clock_delay = 1.4
-    _armed_result = wire.MAV_RESULT_FAILED
+    _armed_result = CommandResult.FAILED
     _read_at: float
     _answer_at: float
 
@@ -160,11 +160,11 @@ class ArduPilotVehicle(Vehicle):
             system=system,
             component=component,
             encoding=Encoding.C_CAST,
-            heartbeat=wire.Heartbeat(
-                vehicle_type, wire.MAV_AUTOPILOT_ARDUPILOTMEGA, base_mode=81, system_status=state
+            heartbeat=messages.Heartbeat(
+                vehicle_type, messages.MAV_AUTOPILOT_ARDUPILOTMEGA, base_mode=81, system_status=state
             ),
-            version=wire.AutopilotVersion(
-                64495 if ftp else 64495 & ~wire.CAPABILITY_FTP,
+            version=messages.AutopilotVersion(
+                64495 if ftp else 64495 & ~messages.CAPABILITY_FTP,
                 flight_sw_version=67502080,
                 git_hash=SIMULATED_COMMIT.encode("ascii"),
                 uid2=uid2.ljust(18, b"\0"),
@@ -191,7 +191,7 @@ class ArduPilotVehicle(Vehicle):
         times = (self._read_at, self._look_at, self._answer_at, self._live_at)
         return *times, self._system_id_at, self._window_at, self._measured_at
 
-    def _take(self, frame: wire.Frame) -> None:
+    def _take(self, frame: frames.Frame) -> None:
         if self._window_at == math.inf:
             super()._take(frame)
         elif len(self._backlog) < _BACKLOG:
@@ -206,14 +206,14 @@ class ArduPilotVehicle(Vehicle):
         self._list_pause_at = self._now + _LIST_START
         self._start_list(self._next(_SLOT) if self._position is None else self._next_burst)
 
-    def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
+    def _on_read(self, request: messages.ParamRequestRead, sender: frames.Frame) -> None:
         if len(self._waiting) < _READ_QUEUE:
             self._waiting.append((request, sender))
             self._look_up()
             if self._ready and self._read_at == math.inf:
                 self._read_at = self._next(_SLOT)
 
-    def _on_set(self, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
+    def _on_set(self, request: messages.ParamSet, sender: frames.Frame) -> None:
         entry = self._find(request.param_id)
         (value,) = struct.unpack("<f", request.raw)
         if entry is None:
@@ -221,8 +221,8 @@ class ArduPilotVehicle(Vehicle):
         elif not math.isfinite(value):
             self._refuse(ParamErrorCode.VALUE_OUT_OF_RANGE, request, sender)
         elif entry.name in self._read_only:
-            self._send_value(entry, index=wire.NO_INDEX)
-            self._send(wire.StatusText(_WARNING, f"Param write denied ({entry.name})"))
+            self._send_value(entry, index=messages.NO_INDEX)
+            self._send(messages.StatusText(_WARNING, f"Param write denied ({entry.name})"))
             self._refuse(ParamErrorCode.READ_ONLY, request, sender)
         else:
             bits = _converted(value, entry.type)
@@ -267,8 +267,8 @@ class ArduPilotVehicle(Vehicle):
         self._take_system_id(self._find(_SYSTEM_ID))
 
     def _switch_on(self, at: float) -> None:
-        self._waiting: deque[tuple[wire.ParamRequestRead, wire.Frame]] = deque()
-        self._ready: list[wire.ParamValue] = []
+        self._waiting: deque[tuple[messages.ParamRequestRead, frames.Frame]] = deque()
+        self._ready: list[messages.ParamValue] = []
         self._answers: dict[str, Entry] = {}
         self._untyped: set[str] = set()
         self._read_at = math.inf
@@ -281,7 +281,7 @@ class ArduPilotVehicle(Vehicle):
         self._has_answered_in_list = False
         self._list_pause_at = math.inf
         self._window_at = math.inf
-        self._backlog: list[wire.Frame] = []
+        self._backlog: list[frames.Frame] = []
         self._file_answers: list[tuple[Packet, Address]] = []
         super()._switch_on(at)
 
@@ -311,7 +311,7 @@ class ArduPilotVehicle(Vehicle):
             self._answer_at = math.inf
             for entry in self._answers.values():
                 kind = ParamType.REAL32 if entry.name in self._untyped else None
-                self._send_value(entry, index=wire.NO_INDEX, kind=kind)
+                self._send_value(entry, index=messages.NO_INDEX, kind=kind)
             self._answers.clear()
             self._untyped.clear()
 
@@ -395,7 +395,7 @@ class ArduPilotVehicle(Vehicle):
         if is_held:
             return
         for answer, sender in self._file_answers:
-            self._send(wire.FileTransfer(0, *sender, answer.pack()))
+            self._send(messages.FileTransfer(0, *sender, answer.pack()))
             is_opened = answer.requested == Opcode.OPEN_FILE_RO and answer.opcode == Opcode.ACK
             if is_opened and any(path.startswith(PARAM_FILE) for path in self.open_files):
                 self._send_banner()
@@ -407,7 +407,7 @@ class ArduPilotVehicle(Vehicle):
 
     def _send_banner(self) -> None:
         for text in _BANNER:
-            self._send(wire.StatusText(_INFO, text))
+            self._send(messages.StatusText(_INFO, text))
 
     def _next(self, period: float, *, after: float | None = None) -> float:
         """Return the start of the next period; periods are counted from switching on."""
@@ -426,7 +426,7 @@ class ArduPilotVehicle(Vehicle):
         while self._waiting and len(self._ready) < _READS_PER_SLOT and self._look_at == math.inf:
             request, sender = self._waiting.popleft()
             if request.param_index == -1:
-                entry, name, index = self._find(request.param_id), request.param_id, wire.NO_INDEX
+                entry, name, index = self._find(request.param_id), request.param_id, messages.NO_INDEX
             else:
                 entry = self._by_index(request.param_index)
                 name, index = ("" if entry is None else entry.name), request.param_index
@@ -434,7 +434,7 @@ class ArduPilotVehicle(Vehicle):
                 self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
                 self._look_at = self._now + _LOOK
             elif not self._is_dead(entry):
-                self._ready.append(wire.ParamValue(name, entry.raw, entry.type, len(self._listed), index))
+                self._ready.append(messages.ParamValue(name, entry.raw, entry.type, len(self._listed), index))
 
     def _change_live(self) -> None:
         for entry in self._entries:
@@ -455,9 +455,9 @@ _SYSTEM_ID = "SYSID_THISMAV"
 _STANDBY = 3
 _CALIBRATING = 2
 _KINDS: dict[str, tuple[int, int, tuple[int, float]]] = {
-    "copter": (2, _STANDBY, (wire.MAV_STATE_ACTIVE, 2.0)),
+    "copter": (2, _STANDBY, (messages.MAV_STATE_ACTIVE, 2.0)),
     "plane": (1, _STANDBY, (_CALIBRATING, 0.7)),
-    "rover": (10, wire.MAV_STATE_ACTIVE, (_CALIBRATING, 1.3)),
+    "rover": (10, messages.MAV_STATE_ACTIVE, (_CALIBRATING, 1.3)),
 }
 """By kind: MAV_TYPE, MAV_STATE while disarmed, MAV_STATE after a reboot, and its duration in seconds."""
 _UID2 = b"3d1219c7c4c5404aa\0"

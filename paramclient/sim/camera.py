@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, TypeAlias, Unpack
 
 from paramclient.errors import ExtAckResult, UsageError
-from paramclient.model.ext_params import (
-    ExtParam,
-    ExtParamType,
-    ExtValue,
-    check_ext_value,
-    encode_ext_value,
-)
-from paramclient.model.values import Encoding, check_name
-from paramclient.protocol import wire
+from paramclient.model.ext_values import check_ext_value, encode_ext_value, ext_bytes, ext_param
+from paramclient.model.values import Encoding, Param, ParamType, WireValue, check_name
 from paramclient.sim.generic import BytewiseVehicle
 from paramclient.sim.param_table import Table, as_table
 from paramclient.sim.vehicle import VehicleOptions
+from paramclient.wire import frames, messages
 
 __all__ = ["Camera", "ExtEntries", "camera_table"]
 
@@ -27,14 +21,14 @@ MAV_TYPE_CAMERA: Final = 30
 CAMERA_COMPONENT: Final = 100
 """MAV_COMP_ID_CAMERA."""
 
-ExtEntries: TypeAlias = Mapping[str, ExtValue | tuple[ExtParamType | int, ExtValue]]
+ExtEntries: TypeAlias = Mapping[str, WireValue | tuple[ParamType | int, WireValue]]
 """The extended parameters of a `Camera`: values by name, where an int becomes an INT32, a float a REAL32,
 text and bytes CUSTOM, and `(type, value)` gives another type."""
 
 
 def camera_table() -> ExtEntries:
     """Return the extended parameters of a usual camera, every type among them."""
-    kinds = ExtParamType
+    kinds = ParamType
     return {
         "CAM_MODE": (kinds.UINT32, 1),
         "CAM_WBMODE": (kinds.UINT32, 0),
@@ -92,7 +86,7 @@ class Camera(BytewiseVehicle):
         *,
         system: int = 1,
         component: int = CAMERA_COMPONENT,
-        supported: Mapping[str, Collection[ExtValue]] | None = None,
+        supported: Mapping[str, Collection[WireValue]] | None = None,
         failing: Iterable[str] = (),
         slow: Mapping[str, float] | None = None,
         limits: Mapping[str, tuple[float, float]] | None = None,
@@ -101,11 +95,11 @@ class Camera(BytewiseVehicle):
         period: float = 0.01,
         **options: Unpack[VehicleOptions],
     ) -> None:
-        self._ext: dict[str, ExtParam] = {}
+        self._ext: dict[str, Param] = {}
         for index, (name, entry) in enumerate((camera_table() if table is None else table).items()):
             self._ext[check_name(name)] = _param(name, entry, index)
         self._supported = {
-            name: {encode_ext_value(value, self.ext_param(name).type) for value in values}
+            name: {encode_ext_value(value, self.ext_param(name).type_number) for value in values}
             for name, values in (supported or {}).items()
         }
         self._failing = {self.ext_param(name).name for name in failing}
@@ -119,26 +113,26 @@ class Camera(BytewiseVehicle):
             system=system,
             component=component,
             encoding=Encoding.BYTEWISE,
-            heartbeat=wire.Heartbeat(
-                MAV_TYPE_CAMERA, wire.MAV_AUTOPILOT_INVALID, system_status=wire.MAV_STATE_ACTIVE
+            heartbeat=messages.Heartbeat(
+                MAV_TYPE_CAMERA, messages.MAV_AUTOPILOT_INVALID, system_status=messages.MAV_STATE_ACTIVE
             ),
-            version=wire.AutopilotVersion(8192, uid=0xCA3E_0000 + system),
+            version=messages.AutopilotVersion(8192, uid=0xCA3E_0000 + system),
             burst=burst,
             period=period,
             **options,
         )
 
     @property
-    def ext_params(self) -> dict[str, ExtParam]:
+    def ext_params(self) -> dict[str, Param]:
         """The extended parameters by name, in the order of their indices."""
         return dict(self._ext)
 
     @property
-    def ext_values(self) -> dict[str, ExtValue]:
+    def ext_values(self) -> dict[str, WireValue]:
         """The extended values by name, like `ext_params`."""
         return {name: param.value for name, param in self._ext.items()}
 
-    def ext_param(self, name: str) -> ExtParam:
+    def ext_param(self, name: str) -> Param:
         """Return one extended parameter with its value on board.
 
         Raises:
@@ -149,16 +143,16 @@ class Camera(BytewiseVehicle):
             raise UsageError(f"this camera has no extended parameter {name!r}")
         return param
 
-    def set_ext_param(self, name: str, value: ExtValue) -> None:
+    def set_ext_param(self, name: str, value: WireValue) -> None:
         """Change an extended value as if on board: no message reports it.
 
         Raises:
             UsageError: the camera has no extended parameter with that name, or the value does not fit its
                 type.
         """
-        self._store(name, encode_ext_value(value, self.ext_param(name).type))
+        self._store(name, encode_ext_value(value, self.ext_param(name).type_number))
 
-    def add_ext_param(self, name: str, entry: ExtValue | tuple[ExtParamType | int, ExtValue]) -> None:
+    def add_ext_param(self, name: str, entry: WireValue | tuple[ParamType | int, WireValue]) -> None:
         """Add an extended parameter behind the others; an entry is one of `ExtEntries`.
 
         Raises:
@@ -175,61 +169,65 @@ class Camera(BytewiseVehicle):
             UsageError: the camera has no extended parameter with that name.
         """
         del self._ext[self.ext_param(name).name]
-        self._ext = {each.name: each.with_index(index) for index, each in enumerate(self._ext.values())}
+        self._ext = {each.name: replace(each, index=index) for index, each in enumerate(self._ext.values())}
 
-    def _on_request(self, message: wire.Message, sender: wire.Frame) -> None:
-        if isinstance(message, wire.ParamExtRequestRead):
+    def _on_request(self, message: messages.Message, sender: frames.Frame) -> None:
+        if isinstance(message, messages.ParamExtRequestRead):
             self._on_ext_read(message)
-        elif isinstance(message, wire.ParamExtRequestList):
+        elif isinstance(message, messages.ParamExtRequestList):
             if self._ext:
                 self._ext_position = 0
                 self._ext_burst_at = max(self._now, self._on_at + self._boot_time)
-        elif isinstance(message, wire.ParamExtSet):
+        elif isinstance(message, messages.ParamExtSet):
             self._on_ext_set(message)
         else:
             super()._on_request(message, sender)
 
-    def _on_ext_read(self, request: wire.ParamExtRequestRead) -> None:
+    def _on_ext_read(self, request: messages.ParamExtRequestRead) -> None:
         found = self._ext.get(request.param_id)
         if request.param_index >= 0:
             found = next((each for each in self._ext.values() if each.index == request.param_index), None)
         if found is not None:
             self._send_ext(found)
 
-    def _on_ext_set(self, request: wire.ParamExtSet) -> None:
+    def _on_ext_set(self, request: messages.ParamExtSet) -> None:
         known = self._ext.get(request.param_id)
         if known is None:
             return
-        wanted = ExtParam.of(known.name, request.raw, request.param_type)
-        is_supported = wanted.raw in self._supported.get(known.name, (wanted.raw,))
+        wanted = ext_param(known.name, request.raw, request.param_type)
+        is_supported = ext_bytes(wanted) in self._supported.get(known.name, (ext_bytes(wanted),))
         if known.name in self._at_work:
             self._acknowledge(known, ExtAckResult.IN_PROGRESS)
         elif wanted.type != known.type or known.name in self._failing:
             self._acknowledge(known, ExtAckResult.FAILED)
         elif not is_supported:
             self._acknowledge(known, ExtAckResult.VALUE_UNSUPPORTED)
-        elif known.name in self._slow and wanted.raw != known.raw:
-            self._at_work[known.name] = _Work(wanted.raw, self._now + self._slow[known.name])
+        elif known.name in self._slow and ext_bytes(wanted) != ext_bytes(known):
+            self._at_work[known.name] = _Work(ext_bytes(wanted), self._now + self._slow[known.name])
             self._acknowledge(known, ExtAckResult.IN_PROGRESS)
         else:
-            self._acknowledge(self._store(known.name, wanted.raw), ExtAckResult.ACCEPTED)
+            self._acknowledge(self._store(known.name, ext_bytes(wanted)), ExtAckResult.ACCEPTED)
 
-    def _acknowledge(self, param: ExtParam, result: ExtAckResult) -> None:
-        self._send(wire.ParamExtAck(param.name, param.raw, param.type, result))
+    def _acknowledge(self, param: Param, result: ExtAckResult) -> None:
+        self._send(messages.ParamExtAck(param.name, ext_bytes(param), param.type_number, result))
 
-    def _store(self, name: str, raw: bytes) -> ExtParam:
+    def _store(self, name: str, raw: bytes) -> Param:
         known = self._ext[name]
-        param = ExtParam.of(name, raw, known.type, known.index)
+        param = ext_param(name, raw, known.type_number, known.index)
         if name in self._limits and isinstance(param.value, int | float):
             low, high = self._limits[name]
             value = type(param.value)(min(max(param.value, low), high))
-            param = ExtParam.of(name, encode_ext_value(value, known.type), known.type, known.index)
+            param = ext_param(
+                name, encode_ext_value(value, known.type_number), known.type_number, known.index
+            )
         self._ext[name] = param
         return param
 
-    def _send_ext(self, param: ExtParam) -> None:
+    def _send_ext(self, param: Param) -> None:
         index = 0 if param.index is None else param.index
-        self._send(wire.ParamExtValue(param.name, param.raw, param.type, len(self._ext), index))
+        self._send(
+            messages.ParamExtValue(param.name, ext_bytes(param), param.type_number, len(self._ext), index)
+        )
 
     def _switch_on(self, at: float) -> None:
         self._at_work.clear()
@@ -272,12 +270,12 @@ class Camera(BytewiseVehicle):
         self._send_ext(entries[position])
 
 
-def _param(name: str, entry: ExtValue | tuple[ExtParamType | int, ExtValue], index: int) -> ExtParam:
+def _param(name: str, entry: WireValue | tuple[ParamType | int, WireValue], index: int) -> Param:
     if isinstance(entry, tuple):
         number, value = entry
     else:
         value = check_ext_value(entry)
-        kinds = ExtParamType
+        kinds = ParamType
         number = kinds.INT32 if isinstance(value, int) else kinds.CUSTOM
         number = kinds.REAL32 if isinstance(value, float) else number
-    return ExtParam.of(name, encode_ext_value(value, number), number, index)
+    return ext_param(name, encode_ext_value(value, number), number, index)

@@ -9,9 +9,9 @@ from collections import Counter
 from dataclasses import replace
 from typing import Final, TypedDict
 
-from paramclient.errors import UsageError
-from paramclient.protocol import wire
+from paramclient.errors import CommandResult, UsageError
 from paramclient.sim.air import OUT_LIMIT
+from paramclient.wire import frames, messages, signing
 
 __all__ = ["Device", "DeviceOptions"]
 
@@ -24,7 +24,7 @@ class DeviceOptions(TypedDict, total=False):
     mavlink_version: int
     stream: bool
     high_latency: bool
-    signing_key: wire.SigningKey | None
+    signing_key: signing.SigningKey | None
     signing_timestamp: int
     usb: bool
     armed: bool
@@ -44,7 +44,7 @@ class Device(ABC):
     """Whether COMMAND_ACK precedes the requested message."""
     _restart_delay = 0.3
     """Seconds from accepting a reboot command until the vehicle switches off."""
-    _armed_result = wire.MAV_RESULT_DENIED
+    _armed_result = CommandResult.DENIED
     """MAV_RESULT of a reboot command while armed."""
     _clock_delay = 0.0
     """Seconds from the first heartbeat until SYSTEM_TIME is sent, also on request."""
@@ -57,14 +57,14 @@ class Device(ABC):
         *,
         system: int,
         component: int,
-        heartbeat: wire.Heartbeat,
-        version: wire.AutopilotVersion,
+        heartbeat: messages.Heartbeat,
+        version: messages.AutopilotVersion,
         boot_time: float = 0.0,
         telemetry: float = 0.0,
         mavlink_version: int = 2,
         stream: bool = False,
         high_latency: bool = False,
-        signing_key: wire.SigningKey | None = None,
+        signing_key: signing.SigningKey | None = None,
         signing_timestamp: int = 0,
         usb: bool = False,
         armed: bool = False,
@@ -94,10 +94,10 @@ class Device(ABC):
         self._boot_time = boot_time
         self._telemetry_period = 1.0 / telemetry if telemetry else math.inf
         self._mavlink_version = mavlink_version
-        self._framer = wire.Framer(wire.DECODED_IDS, stream=stream)
+        self._framer = frames.Framer(messages.DECODED_IDS, stream=stream)
         self._usb = usb
-        self._signer: wire.Signer | None = None
-        self._verifier: wire.Verifier | None = None
+        self._signer: signing.Signer | None = None
+        self._verifier: signing.Verifier | None = None
         self._sequence = 0
         self._out: list[bytes] = []
         self._started = False
@@ -107,12 +107,12 @@ class Device(ABC):
         self._take_key(signing_key, signing_timestamp)
 
     @property
-    def signing_key(self) -> wire.SigningKey | None:
+    def signing_key(self) -> signing.SigningKey | None:
         """The current signing key; None without signing."""
         return None if self._signer is None else self._signer.key
 
     @property
-    def signing_report(self) -> wire.SigningReport | None:
+    def signing_report(self) -> signing.SigningReport | None:
         """The statistics of received signatures; None without a key."""
         return None if self._verifier is None else self._verifier.report()
 
@@ -184,7 +184,7 @@ class Device(ABC):
     # Implemented by subclasses
 
     @abstractmethod
-    def _on_request(self, message: wire.Message, sender: wire.Frame) -> None:
+    def _on_request(self, message: messages.Message, sender: frames.Frame) -> None:
         """Handle a request for this component that is not a command."""
 
     def _answers_system(self, target: int) -> bool:
@@ -207,7 +207,7 @@ class Device(ABC):
         """Return the MAV_RESULT of MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN with this first parameter."""
         if self.armed:
             return self._armed_result
-        return wire.MAV_RESULT_ACCEPTED if mode == _REBOOT else wire.MAV_RESULT_UNSUPPORTED
+        return CommandResult.ACCEPTED if mode == _REBOOT else CommandResult.UNSUPPORTED
 
     def _skip_suppressed(self) -> None:
         """Move deadlines that passed in high-latency mode to now, each only once."""
@@ -246,9 +246,9 @@ class Device(ABC):
 
     # Helpers for subclasses
 
-    def _send(self, message: wire.Message) -> None:
+    def _send(self, message: messages.Message) -> None:
         self._queue(
-            wire.encode(
+            messages.encode(
                 message,
                 system=self.system,
                 component=self.component,
@@ -259,22 +259,22 @@ class Device(ABC):
 
     # Internal
 
-    def _take_key(self, key: wire.SigningKey | None, timestamp: int) -> None:
+    def _take_key(self, key: signing.SigningKey | None, timestamp: int) -> None:
         """Sign with another key from now on, or not at all."""
-        self._signer = None if key is None else wire.Signer(key, timestamp=timestamp)
+        self._signer = None if key is None else signing.Signer(key, timestamp=timestamp)
         self._forget_streams()
 
     def _forget_streams(self) -> None:
         """Forget the timestamps of all signing streams, as after a start."""
         self._verifier = None
         if self._signer is not None:
-            policy = wire.SigningPolicy.ACCEPT_ALL if self._usb else wire.SigningPolicy.UNSIGNED_RADIOS
-            self._verifier = wire.Verifier(self._signer, policy, most_streams=_STREAMS_MAX)
+            policy = signing.SigningPolicy.ACCEPT_ALL if self._usb else signing.SigningPolicy.UNSIGNED_RADIOS
+            self._verifier = signing.Verifier(self._signer, policy, most_streams=_STREAMS_MAX)
         self._framer.guard = None if self._verifier is None else self._verifier.accepts
 
     def _send_heartbeat(self, now: float) -> None:
         if self._high_latency:
-            self._send(wire.HighLatency2(self._heartbeat.type, self._heartbeat.autopilot))
+            self._send(messages.HighLatency2(self._heartbeat.type, self._heartbeat.autopilot))
             return
         self._send(self._beat)
         self._send_clock(now)
@@ -284,14 +284,14 @@ class Device(ABC):
         self._send_system_time(now)
 
     def _send_system_time(self, now: float) -> None:
-        self._send(wire.SystemTime(0, self._time_boot_ms(now)))
+        self._send(messages.SystemTime(0, self._time_boot_ms(now)))
 
     def _time_boot_ms(self, now: float) -> int:
         """Return the time since switching on in milliseconds, in 32 bits."""
         return int((now - self._on_at) * 1000.0) & 0xFFFFFFFF
 
     @property
-    def _beat(self) -> wire.Heartbeat:
+    def _beat(self) -> messages.Heartbeat:
         """The current heartbeat."""
         beat = self._heartbeat
         if self._start_state is not None and not self._is_first_run:
@@ -299,14 +299,14 @@ class Device(ABC):
             if self._now < self._on_at + seconds:
                 beat = replace(beat, system_status=state)
         if self._now < self._on_at + self._boot_time:
-            beat = replace(beat, system_status=wire.MAV_STATE_BOOT)
+            beat = replace(beat, system_status=messages.MAV_STATE_BOOT)
         if self.armed:
-            beat = replace(beat, base_mode=beat.base_mode | wire.MAV_MODE_FLAG_SAFETY_ARMED)
+            beat = replace(beat, base_mode=beat.base_mode | messages.MAV_MODE_FLAG_SAFETY_ARMED)
         return beat
 
     def _send_attitude(self, now: float) -> None:
         self._queue(
-            wire.build_frame(
+            frames.build_frame(
                 _ATTITUDE,
                 self._time_boot_ms(now).to_bytes(4, "little") + _LEVEL_FLIGHT,
                 system=self.system,
@@ -319,89 +319,89 @@ class Device(ABC):
     def _queue(self, frame: bytes) -> None:
         self._sequence = (self._sequence + 1) & 0xFF
         if self._signer is not None:
-            frame = wire.sign_frame(frame, self._signer)
+            frame = frames.sign_frame(frame, self._signer)
         if len(self._out) < OUT_LIMIT:
             self._out.append(frame)
 
-    def _take(self, frame: wire.Frame) -> None:
-        message = wire.decode(frame)
-        if isinstance(message, wire.Heartbeat):
+    def _take(self, frame: frames.Frame) -> None:
+        message = messages.decode(frame)
+        if isinstance(message, messages.Heartbeat):
             self.requests["HEARTBEAT"] += 1
             return
         if not isinstance(
             message,
-            wire.ParamRequestRead
-            | wire.ParamRequestList
-            | wire.ParamSetMessage
-            | wire.ParamExtRequestRead
-            | wire.ParamExtRequestList
-            | wire.ParamExtSet
-            | wire.CommandLong
-            | wire.FileTransfer
-            | wire.SetupSigning,
+            messages.ParamRequestRead
+            | messages.ParamRequestList
+            | messages.ParamSet
+            | messages.ParamExtRequestRead
+            | messages.ParamExtRequestList
+            | messages.ParamExtSet
+            | messages.CommandLong
+            | messages.FileTransfer
+            | messages.SetupSigning,
         ):
             return
         if not self._answers_system(message.target_system):
             return
-        if message.target_component not in (wire.COMP_ID_ALL, self.component):
+        if message.target_component not in (messages.COMP_ID_ALL, self.component):
             return
         self.requests[_NAMES[type(message)]] += 1
-        if isinstance(message, wire.CommandLong):
+        if isinstance(message, messages.CommandLong):
             self._on_command(message, frame)
-        elif isinstance(message, wire.SetupSigning):
+        elif isinstance(message, messages.SetupSigning):
             if not self.armed:
                 self._take_key(message.key, message.initial_timestamp)
         else:
             self._on_request(message, frame)
 
-    def _on_command(self, request: wire.CommandLong, sender: wire.Frame) -> None:
-        if request.command == wire.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN:
-            self._on_restart_command(int(request.params[0]), sender)
+    def _on_command(self, request: messages.CommandLong, sender: frames.Frame) -> None:
+        if request.command == messages.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN:
+            self._on_restart_command(int(request.param1), sender)
             return
-        requested: wire.Message | None = None
-        if request.command == wire.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES:
+        requested: messages.Message | None = None
+        if request.command == messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES:
             requested = self._version
-        elif request.command == wire.MAV_CMD_REQUEST_MESSAGE:
-            known: dict[float, wire.Message] = {
-                wire.AUTOPILOT_VERSION_ID: self._version,
-                wire.HEARTBEAT_ID: self._beat,
+        elif request.command == messages.MAV_CMD_REQUEST_MESSAGE:
+            known: dict[float, messages.Message] = {
+                messages.message_id(messages.AutopilotVersion): self._version,
+                messages.message_id(messages.Heartbeat): self._beat,
             }
-            requested = known.get(request.params[0])  # a float, possibly NaN
-            if request.params[0] == wire.SYSTEM_TIME_ID:
+            requested = known.get(request.param1)  # a float, possibly NaN
+            if request.param1 == messages.message_id(messages.SystemTime):
                 self._on_clock_request(sender)
                 return
-        result = wire.MAV_RESULT_UNSUPPORTED if requested is None else wire.MAV_RESULT_ACCEPTED
-        ack = wire.CommandAck(request.command, result, sender.system, sender.component)
-        answers: list[wire.Message] = [ack] if requested is None else [ack, requested]
+        result = CommandResult.UNSUPPORTED if requested is None else CommandResult.ACCEPTED
+        ack = messages.CommandAck(request.command, result, sender.system, sender.component)
+        answers: list[messages.Message] = [ack] if requested is None else [ack, requested]
         for answer in answers if self._ack_first else reversed(answers):
             self._send(answer)
 
-    def _on_clock_request(self, sender: wire.Frame) -> None:
+    def _on_clock_request(self, sender: frames.Frame) -> None:
         """Acknowledge a request for SYSTEM_TIME, and send the message as soon as the main loop runs."""
-        number, result = wire.MAV_CMD_REQUEST_MESSAGE, wire.MAV_RESULT_ACCEPTED
-        self._send(wire.CommandAck(number, result, sender.system, sender.component))
+        number, result = messages.MAV_CMD_REQUEST_MESSAGE, CommandResult.ACCEPTED
+        self._send(messages.CommandAck(number, result, sender.system, sender.component))
         self._clock_due = max(self._now, self._on_at + self._clock_delay)
 
-    def _on_restart_command(self, mode: int, sender: wire.Frame) -> None:
+    def _on_restart_command(self, mode: int, sender: frames.Frame) -> None:
         result = self._may_restart(mode)
-        is_obeyed = result == wire.MAV_RESULT_ACCEPTED and mode == _REBOOT
+        is_obeyed = result == CommandResult.ACCEPTED and mode == _REBOOT
         if is_obeyed:
             self._restart_at = min(self._restart_at, self._now + self._restart_delay)
         if self._reboot_ack or not is_obeyed:
-            command = wire.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
-            self._send(wire.CommandAck(command, result, sender.system, sender.component))
+            command = messages.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
+            self._send(messages.CommandAck(command, result, sender.system, sender.component))
 
 
 _NAMES = {
-    wire.ParamRequestRead: "PARAM_REQUEST_READ",
-    wire.ParamRequestList: "PARAM_REQUEST_LIST",
-    wire.ParamSetMessage: "PARAM_SET",
-    wire.ParamExtRequestRead: "PARAM_EXT_REQUEST_READ",
-    wire.ParamExtRequestList: "PARAM_EXT_REQUEST_LIST",
-    wire.ParamExtSet: "PARAM_EXT_SET",
-    wire.CommandLong: "COMMAND_LONG",
-    wire.FileTransfer: "FILE_TRANSFER_PROTOCOL",
-    wire.SetupSigning: "SETUP_SIGNING",
+    messages.ParamRequestRead: "PARAM_REQUEST_READ",
+    messages.ParamRequestList: "PARAM_REQUEST_LIST",
+    messages.ParamSet: "PARAM_SET",
+    messages.ParamExtRequestRead: "PARAM_EXT_REQUEST_READ",
+    messages.ParamExtRequestList: "PARAM_EXT_REQUEST_LIST",
+    messages.ParamExtSet: "PARAM_EXT_SET",
+    messages.CommandLong: "COMMAND_LONG",
+    messages.FileTransfer: "FILE_TRANSFER_PROTOCOL",
+    messages.SetupSigning: "SETUP_SIGNING",
 }
 _REBOOT = 1
 """Value of the command that reboots the autopilot; other values shut down, or stay in the bootloader."""

@@ -10,9 +10,9 @@ from typing import Final, NamedTuple, TypeAlias
 
 from paramclient.errors import FileErrorCode, UsageError
 from paramclient.model.px4_hash import crc32_px4
-from paramclient.protocol.ftp import param_pck
-from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
-from paramclient.protocol.ftp.param_pck import PackedParam
+from paramclient.protocol import param_pck
+from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
+from paramclient.protocol.param_pck import PackedParam
 
 __all__ = ["PARAM_FILE", "Address", "FileServer"]
 

@@ -6,9 +6,9 @@ from typing import Unpack
 
 from paramclient.errors import ParamErrorCode
 from paramclient.model.values import Encoding, ParamType
-from paramclient.protocol import wire
 from paramclient.sim.param_table import Entry, Table, as_table
 from paramclient.sim.vehicle import Vehicle, VehicleOptions
+from paramclient.wire import frames, messages
 
 __all__ = ["BytewiseVehicle", "GenericVehicle"]
 
@@ -19,14 +19,14 @@ class BytewiseVehicle(Vehicle):
     def _on_list(self) -> None:
         self._start_list(self._now)
 
-    def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
+    def _on_read(self, request: messages.ParamRequestRead, sender: frames.Frame) -> None:
         entry = self._requested_entry(request)
         if entry is None:
             self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
         elif not self._is_dead(entry):
             self._send_value(entry)
 
-    def _on_set(self, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
+    def _on_set(self, request: messages.ParamSet, sender: frames.Frame) -> None:
         entry = self._find(request.param_id)
         if entry is None:
             self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
@@ -37,13 +37,13 @@ class BytewiseVehicle(Vehicle):
             self._write(entry, int.from_bytes(request.raw[:size], "little"))
             self._send_value(entry)
 
-    def _on_wrong_type(self, entry: Entry, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
+    def _on_wrong_type(self, entry: Entry, request: messages.ParamSet, sender: frames.Frame) -> None:
         if self._param_error:
             self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
         else:
             self._send_value(entry)
 
-    def _requested_entry(self, request: wire.ParamRequestRead) -> Entry | None:
+    def _requested_entry(self, request: messages.ParamRequestRead) -> Entry | None:
         if request.param_index < 0:
             return self._find(request.param_id)
         return self._by_index(request.param_index)
@@ -78,8 +78,8 @@ class GenericVehicle(BytewiseVehicle):
         system: int = 1,
         component: int = 1,
         uid: int | None = None,
-        autopilot: int = wire.MAV_AUTOPILOT_GENERIC,
-        capabilities: int = 8192 | wire.CAPABILITY_PARAM_ENCODE_BYTEWISE,
+        autopilot: int = messages.MAV_AUTOPILOT_GENERIC,
+        capabilities: int = 8192 | messages.CAPABILITY_PARAM_ENCODE_BYTEWISE,
         burst: int = 10,
         period: float = 0.01,
         **options: Unpack[VehicleOptions],
@@ -89,8 +89,8 @@ class GenericVehicle(BytewiseVehicle):
             system=system,
             component=component,
             encoding=Encoding.BYTEWISE,
-            heartbeat=wire.Heartbeat(0, autopilot, system_status=wire.MAV_STATE_ACTIVE),
-            version=wire.AutopilotVersion(capabilities, uid=0x5EED_0000 + system if uid is None else uid),
+            heartbeat=messages.Heartbeat(0, autopilot, system_status=messages.MAV_STATE_ACTIVE),
+            version=messages.AutopilotVersion(capabilities, uid=0x5EED_0000 + system if uid is None else uid),
             burst=burst,
             period=period,
             **options,

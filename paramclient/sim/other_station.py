@@ -7,8 +7,8 @@ from collections.abc import Iterable
 
 from paramclient.errors import UsageError
 from paramclient.model.values import Encoding
-from paramclient.protocol import wire
 from paramclient.sim.param_table import Entry, SimParam
+from paramclient.wire import messages
 
 __all__ = ["OtherStation"]
 
@@ -37,7 +37,7 @@ class OtherStation:
         system: int = 254,
         component: int = 190,
         target_system: int = 1,
-        target_component: int = wire.AUTOPILOT_COMPONENT,
+        target_component: int = messages.AUTOPILOT_COMPONENT,
         list_every: float = math.inf,
         sets: Iterable[tuple[float, SimParam]] = (),
         encoding: Encoding = Encoding.BYTEWISE,
@@ -67,18 +67,18 @@ class OtherStation:
             self._started_at = self._next_heartbeat = now
             self._next_list = now + self._list_every
         if self._next_heartbeat <= now:
-            beat = wire.Heartbeat(
-                wire.MAV_TYPE_GCS, wire.MAV_AUTOPILOT_INVALID, system_status=wire.MAV_STATE_ACTIVE
+            beat = messages.Heartbeat(
+                messages.MAV_TYPE_GCS, messages.MAV_AUTOPILOT_INVALID, system_status=messages.MAV_STATE_ACTIVE
             )
             self._send(beat)
             self._next_heartbeat = _next(self._next_heartbeat, 1.0, now)
         if self._next_list <= now:
-            self._send(wire.ParamRequestList(*self._target))
+            self._send(messages.ParamRequestList(*self._target))
             self._next_list = _next(self._next_list, self._list_every, now)
         while self._sets and self._started_at + self._sets[0][0] <= now:
             row = self._sets.pop(0)[1]
             raw = Entry(row, 0, self._encoding).raw
-            self._send(wire.ParamSetMessage(*self._target, row.name, raw, row.type))
+            self._send(messages.ParamSet(*self._target, row.name, raw, row.type))
 
     def next_deadline(self) -> float | None:
         """Return the time of the next work; None before the first call."""
@@ -92,8 +92,10 @@ class OtherStation:
         out, self._out = self._out, []
         return out
 
-    def _send(self, message: wire.Message) -> None:
-        frame = wire.encode(message, system=self.system, component=self.component, sequence=self._sequence)
+    def _send(self, message: messages.Message) -> None:
+        frame = messages.encode(
+            message, system=self.system, component=self.component, sequence=self._sequence
+        )
         self._sequence = (self._sequence + 1) & 0xFF
         self._out.append(frame)
 

@@ -22,7 +22,7 @@ from paramclient.model.values import (
     from_bits,
     known_type,
 )
-from paramclient.protocol.ftp.param_pck import PACKABLE, PackedParam
+from paramclient.protocol.param_pck import PACKABLE, PackedParam
 
 __all__ = [
     "Entry",
@@ -127,7 +127,11 @@ class Entry:
         self.bits = bits
         self._packed = None
         value = self.value
-        if self._encoding is Encoding.BYTEWISE or self.type == ParamType.REAL32 or isinstance(value, bytes):
+        if (
+            self._encoding is Encoding.BYTEWISE
+            or self.type == ParamType.REAL32
+            or isinstance(value, bytes | str)
+        ):
             self.raw = (bits & 0xFFFFFFFF).to_bytes(4, "little")
         else:
             self.raw = _cast(value)
@@ -135,7 +139,7 @@ class Entry:
     def _differs_from(self, default: float) -> bool:
         """Compare as ArduPilot does: as float32, and with a tolerance of FLT_EPSILON."""
         value = self.value
-        if isinstance(value, bytes):
+        if isinstance(value, bytes | str):
             return True
         difference = struct.unpack("<f", _cast(value))[0] - struct.unpack("<f", _cast(default))[0]
         return not abs(difference) < FLT_EPSILON

@@ -8,10 +8,9 @@ import zlib
 from collections.abc import Iterable, Mapping
 from typing import Final, Unpack
 
-from paramclient.errors import ParamErrorCode, UsageError
+from paramclient.errors import CommandResult, ParamErrorCode, UsageError
 from paramclient.model.px4_hash import crc32_px4, hash_params
 from paramclient.model.values import Encoding, ParamType, WireValue, bits_of, from_bits
-from paramclient.protocol import wire
 from paramclient.sim.ftp import FileServer
 from paramclient.sim.generic import BytewiseVehicle
 from paramclient.sim.metadata import GENERAL_FILE, metadata_files
@@ -25,6 +24,7 @@ from paramclient.sim.param_table import (
     with_system_id,
 )
 from paramclient.sim.vehicle import SIMULATED_COMMIT, VehicleOptions
+from paramclient.wire import frames, messages
 
 __all__ = ["PX4Vehicle"]
 
@@ -183,10 +183,14 @@ class PX4Vehicle(BytewiseVehicle):
             system=system,
             component=component,
             encoding=Encoding.BYTEWISE,
-            heartbeat=wire.Heartbeat(
-                _QUADROTOR, wire.MAV_AUTOPILOT_PX4, base_mode=29, custom_mode=50593792, system_status=_STANDBY
+            heartbeat=messages.Heartbeat(
+                _QUADROTOR,
+                messages.MAV_AUTOPILOT_PX4,
+                base_mode=29,
+                custom_mode=50593792,
+                system_status=_STANDBY,
             ),
-            version=wire.AutopilotVersion(
+            version=messages.AutopilotVersion(
                 59647,
                 flight_sw_version=_MAIN if ftp else _RELEASE,
                 git_hash=bytes.fromhex(SIMULATED_COMMIT + _commit_end(table, built_in))[::-1],
@@ -256,37 +260,41 @@ class PX4Vehicle(BytewiseVehicle):
         soon = max(self._now + _TURN, self._next_burst - 0.5 * self._period)
         self._start_list(soon if is_running else self._now)
 
-    def _on_command(self, request: wire.CommandLong, sender: wire.Frame) -> None:
-        if request.command == wire.MAV_CMD_PREFLIGHT_STORAGE and request.params[0] == _RESET_ALL:
+    def _on_command(self, request: messages.CommandLong, sender: frames.Frame) -> None:
+        if request.command == messages.MAV_CMD_PREFLIGHT_STORAGE and request.param1 == _RESET_ALL:
             self._load_bits(self._first_bits)
             self._send(
-                wire.CommandAck(request.command, wire.MAV_RESULT_ACCEPTED, sender.system, sender.component)
+                messages.CommandAck(request.command, CommandResult.ACCEPTED, sender.system, sender.component)
             )
             return
         general = self.files.get(GENERAL_FILE) if self._has_metadata else None
-        is_message = request.command == wire.MAV_CMD_REQUEST_MESSAGE
-        if general is None or not is_message or request.params[0] != wire.COMPONENT_METADATA_ID:
+        is_message = request.command == messages.MAV_CMD_REQUEST_MESSAGE
+        if (
+            general is None
+            or not is_message
+            or request.param1 != messages.message_id(messages.ComponentMetadata)
+        ):
             super()._on_command(request, sender)
             return
-        self._send(wire.ComponentMetadata(f"mftp://{GENERAL_FILE}", crc32_px4(general)))
+        self._send(messages.ComponentMetadata(f"mftp://{GENERAL_FILE}", crc32_px4(general)))
         self._send(
-            wire.CommandAck(request.command, wire.MAV_RESULT_ACCEPTED, sender.system, sender.component)
+            messages.CommandAck(request.command, CommandResult.ACCEPTED, sender.system, sender.component)
         )
 
-    def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
-        if request.param_index < 0 and request.param_id == wire.HASH_CHECK:
+    def _on_read(self, request: messages.ParamRequestRead, sender: frames.Frame) -> None:
+        if request.param_index < 0 and request.param_id == messages.HASH_CHECK:
             self._send_hash()
         else:
             super()._on_read(request, sender)
 
-    def _on_set(self, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
-        if request.param_id != wire.HASH_CHECK:
+    def _on_set(self, request: messages.ParamSet, sender: frames.Frame) -> None:
+        if request.param_id != messages.HASH_CHECK:
             super()._on_set(request, sender)
         elif self.announced_hash() is not None:
             self._position = None
             self._hash_next = False
 
-    def _on_wrong_type(self, entry: Entry, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
+    def _on_wrong_type(self, entry: Entry, request: messages.ParamSet, sender: frames.Frame) -> None:
         self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
 
     def _write(self, entry: Entry, bits: int) -> None:
@@ -317,8 +325,8 @@ class PX4Vehicle(BytewiseVehicle):
 
     def _may_restart(self, mode: int) -> int:
         if mode == 0:
-            return wire.MAV_RESULT_ACCEPTED  # without any effect
-        return super()._may_restart(mode) if mode == 1 else wire.MAV_RESULT_DENIED
+            return CommandResult.ACCEPTED  # without any effect
+        return super()._may_restart(mode) if mode == 1 else CommandResult.DENIED
 
     def _end_all(self) -> None:
         super()._end_all()
@@ -407,7 +415,9 @@ class PX4Vehicle(BytewiseVehicle):
         if value is not None:
             raw = value.to_bytes(4, "little")
             self._send(
-                wire.ParamValue(wire.HASH_CHECK, raw, ParamType.UINT32, len(self._listed), wire.NO_INDEX)
+                messages.ParamValue(
+                    messages.HASH_CHECK, raw, ParamType.UINT32, len(self._listed), messages.NO_INDEX
+                )
             )
 
 

@@ -9,11 +9,11 @@ from typing import Final, Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.model.values import Encoding, Param, WireValue, bits_of
-from paramclient.protocol import wire
-from paramclient.protocol.ftp.param_pck import PackedParam
+from paramclient.protocol.param_pck import PackedParam
 from paramclient.sim.device import Device, DeviceOptions
 from paramclient.sim.ftp import FileServer
 from paramclient.sim.param_table import Entry, SimParam
+from paramclient.wire import frames, messages
 
 __all__ = ["SIMULATED_COMMIT", "Vehicle", "VehicleOptions"]
 
@@ -85,8 +85,8 @@ class Vehicle(Device):
         system: int,
         component: int,
         encoding: Encoding,
-        heartbeat: wire.Heartbeat,
-        version: wire.AutopilotVersion,
+        heartbeat: messages.Heartbeat,
+        version: messages.AutopilotVersion,
         burst: int,
         period: float,
         param_error: bool = False,
@@ -208,11 +208,11 @@ class Vehicle(Device):
         """Handle PARAM_REQUEST_LIST."""
 
     @abstractmethod
-    def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
+    def _on_read(self, request: messages.ParamRequestRead, sender: frames.Frame) -> None:
         """Handle PARAM_REQUEST_READ."""
 
     @abstractmethod
-    def _on_set(self, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
+    def _on_set(self, request: messages.ParamSet, sender: frames.Frame) -> None:
         """Handle PARAM_SET."""
 
     @abstractmethod
@@ -262,14 +262,14 @@ class Vehicle(Device):
     def _is_dead(self, entry: Entry) -> bool:
         return bool(self._dead) and (entry.index in self._dead or entry.name in self._dead)
 
-    def _on_request(self, message: wire.Message, sender: wire.Frame) -> None:
-        if isinstance(message, wire.ParamRequestRead):
+    def _on_request(self, message: messages.Message, sender: frames.Frame) -> None:
+        if isinstance(message, messages.ParamRequestRead):
             self._on_read(message, sender)
-        elif isinstance(message, wire.ParamRequestList):
+        elif isinstance(message, messages.ParamRequestList):
             self._on_list()
-        elif isinstance(message, wire.ParamSetMessage):
+        elif isinstance(message, messages.ParamSet):
             self._on_set(message, sender)
-        elif isinstance(message, wire.FileTransfer) and self._ftp is not None:
+        elif isinstance(message, messages.FileTransfer) and self._ftp is not None:
             self._ftp.receive(message.payload, (sender.system, sender.component), self._now)
 
     def _next_transmission(self) -> float:
@@ -312,7 +312,7 @@ class Vehicle(Device):
         """Send the due MAVFTP responses."""
         if self._ftp is not None:
             for answer, sender in self._ftp.work(now):
-                self._send(wire.FileTransfer(0, *sender, answer.pack()))
+                self._send(messages.FileTransfer(0, *sender, answer.pack()))
 
     # Helpers for subclasses
 
@@ -358,19 +358,24 @@ class Vehicle(Device):
     ) -> None:
         """Send a PARAM_VALUE with the entry's index and type and the list's count, or the given ones."""
         if index is None:
-            index = wire.NO_INDEX if entry.index is None else entry.index
+            index = messages.NO_INDEX if entry.index is None else entry.index
         if count is None:
             count = len(self._listed)
-        self._send(wire.ParamValue(entry.name, entry.raw, entry.type if kind is None else kind, count, index))
+        self._send(
+            messages.ParamValue(entry.name, entry.raw, entry.type if kind is None else kind, count, index)
+        )
 
     def _refuse(
-        self, code: ParamErrorCode, request: wire.ParamRequestRead | wire.ParamSetMessage, sender: wire.Frame
+        self,
+        code: ParamErrorCode,
+        request: messages.ParamRequestRead | messages.ParamSet,
+        sender: frames.Frame,
     ) -> None:
         """Send PARAM_ERROR, if this vehicle supports it."""
         if self._param_error:
-            index = request.param_index if isinstance(request, wire.ParamRequestRead) else -1
+            index = request.param_index if isinstance(request, messages.ParamRequestRead) else -1
             name = request.param_id if index < 0 else ""
-            self._send(wire.ParamError(sender.system, sender.component, name, index, code))
+            self._send(messages.ParamError(sender.system, sender.component, name, index, code))
 
 
 _TABLE_SIZE_MAX = 65535

@@ -18,23 +18,12 @@ The functions have the arguments and the results of those in `paramclient.provis
 from __future__ import annotations
 
 from paramclient import metadata, provision
-from paramclient.client.events import (
-    Contested,
-    Discovered,
-    Event,
-    Found,
-    Lost,
-    Rebooted,
-    Resynced,
-    Uncontested,
-)
+from paramclient.client.events import Discovered, Event, Found, Lost, Rebooted, Resynced
 from paramclient.provision.fleet import Wanted
 from paramclient.sync.proxy import (
     Changes,
     Component,
     Events,
-    ExtChanges,
-    ExtParams,
     Ftp,
     ParamClient,
     blocking,
@@ -43,19 +32,15 @@ from paramclient.sync.proxy import (
 __all__ = [
     "Changes",
     "Component",
-    "Contested",
     "Discovered",
     "Event",
     "Events",
-    "ExtChanges",
-    "ExtParams",
     "Found",
     "Ftp",
     "Lost",
     "ParamClient",
     "Rebooted",
     "Resynced",
-    "Uncontested",
     "Wanted",
     "apply",
     "apply_all",

@@ -1,62 +1,49 @@
 """The types of the blocking client. `make sync` writes this file."""
 
-import builtins
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Self, TypeAlias
 
-from paramclient.cache import ParamCache, SnapshotSummary
+from paramclient.cache import ParamCache
 from paramclient.client.arguments import COMPONENT_TIMEOUT
-from paramclient.client.fetch_all import FetchedAll
+from paramclient.client.component import REBOOT_TIMEOUT, ComponentState
+from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.reset import ResetResult
 from paramclient.client.signing import Signing
-from paramclient.client.stats import ClientStats
+from paramclient.client.traffic import TrafficReport
 from paramclient.links import Link
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.metadata_cache import MetadataStore
-from paramclient.model.ext_params import ExtParam, ExtSettable
-from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
 from paramclient.model.values import Encoding, Param, Settable, WireValue
+from paramclient.protocol import ftp
 from paramclient.protocol.addresses import Address
-from paramclient.protocol.ext.change import ExtChange
-from paramclient.protocol.ext.fetch import ExtFetchResult
-from paramclient.protocol.ext.write_batch import ExtSetManyResult, ExtSetOutcome
-from paramclient.protocol.ext.writes import ExtSetResult
-from paramclient.protocol.ftp import FILE_SIZE_MAX, DirectoryEntry
-from paramclient.protocol.params.change import Change
-from paramclient.protocol.params.fetch_result import FetchResult, Policy, Progress
-from paramclient.protocol.params.sync import ComponentState, SyncState
-from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome
-from paramclient.protocol.params.writes import SetResult
-from paramclient.protocol.stats.traffic import TrafficReport
-from paramclient.protocol.vehicle.address_contest import Contest
-from paramclient.protocol.wire import SigningKey, SigningReport
+from paramclient.protocol.events import Change
+from paramclient.protocol.fetch import FetchResult, Policy, Progress
+from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
+from paramclient.protocol.watch import SyncState
 from paramclient.provision.extended import ExtApplyResult, ExtPlan
 from paramclient.provision.planning import ParamInfo, Plan
 from paramclient.provision.results import ApplyProgress, ApplyResult, FleetApplied, FleetVerified
 from paramclient.sim import Endpoint
+from paramclient.wire.signing import SigningKey, SigningReport
 
 __all__ = [
     "Changes",
     "Component",
-    "Contested",
     "Discovered",
     "Event",
     "Events",
-    "ExtChanges",
-    "ExtParams",
     "Found",
     "Ftp",
     "Lost",
     "ParamClient",
     "Rebooted",
     "Resynced",
-    "Uncontested",
     "Wanted",
     "apply",
     "apply_all",
@@ -73,83 +60,26 @@ __all__ = [
 ]
 
 class Changes(Iterator[Change]):
-    "Stream of the parameter changes of one component since its creation; see `Component.changes`."
+    "Stream of the changes since its creation; see `Component.changes`."
     def __next__(self) -> Change: ...
     def next(self, timeout: float | None = None) -> Change: ...
 
-class ExtChanges(Iterator[ExtChange]):
-    "Stream of the changes of one component's extended parameters since its creation."
-    def __next__(self) -> ExtChange: ...
-    def next(self, timeout: float | None = None) -> ExtChange: ...
-
-class ExtParams:
-    "The extended parameters of a component (PARAM_EXT_*); see `Component.ext`."
-
-    params: Mapping[str, ExtParam]
-    @property
-    def count(self) -> int | None:
-        """The `param_count` of the component; None before its first PARAM_EXT_VALUE."""
-    @property
-    def is_spoken(self) -> bool:
-        """Whether the component has sent an extended parameter."""
-    @property
-    def is_expected(self) -> bool:
-        """Whether the component has sent an extended parameter, or is of a kind that usually has them."""
-    @property
-    def is_complete(self) -> bool:
-        """Whether `params` has a parameter for every index below `count`."""
-    def get(self, name: str | int, *, timeout: float | None = None) -> ExtParam:
-        """Read one parameter with PARAM_EXT_REQUEST_READ."""
-    def set(
-        self,
-        name: str,
-        value: ExtSettable,
-        *,
-        timeout: float | None = None,
-        durable: bool = False,
-        author: str | None = None,
-    ) -> ExtSetResult:
-        """Write one parameter with PARAM_EXT_SET; return when the component has acknowledged the value."""
-    def set_many(
-        self,
-        values: Mapping[str, ExtSettable] | Iterable[tuple[str, ExtSettable]],
-        *,
-        progress: Callable[[ExtSetOutcome], None] | None = None,
-        timeout: float | None = None,
-        durable: bool = False,
-        author: str | None = None,
-    ) -> ExtSetManyResult:
-        """Write many parameters in one call, each as `set` does."""
-    def fetch_all(
-        self, *, timeout: float | None = None, progress: Callable[[Progress], None] | None = None
-    ) -> ExtFetchResult:
-        """Download all parameters with PARAM_EXT_REQUEST_LIST, and read the values that the list lacks."""
-    def store_snapshot(self, *, reason: str) -> int | None:
-        """Store a snapshot of the known parameters in the cache, as a restore point."""
-    def snapshots(self) -> list[SnapshotSummary]:
-        """Return the snapshots of the component's extended parameters, the newest last."""
-    def load_state(self, when: float) -> ExtParamSet:
-        """Return an earlier state of the parameters, from the cache."""
-    def changes(self) -> ExtChanges:
-        """Return a stream of changes from now on, like `Component.changes`."""
-
 class Ftp:
-    "Reads and writes files of one component over MAVFTP; see `ParamClient.ftp`."
+    "The files of a component over MAVFTP; see `ParamClient.ftp`."
     def read(
         self,
         path: str,
         *,
-        timeout: float | None = None,
+        read_size: int = ftp.DATA_SIZE_MAX,
+        size_max: int = ftp.FILE_SIZE_MAX,
         progress: Callable[[int, int | None], None] | None = None,
-        limit: int = FILE_SIZE_MAX,
+        timeout: float | None = None,
     ) -> bytes:
-        """Read a file and return its content."""
-    def write(self, path: str, data: bytes, *, timeout: float | None = None) -> None:
-        """Write a file, replacing an existing one."""
-    def list(self, path: str = "/", *, timeout: float | None = None) -> builtins.tuple[DirectoryEntry, ...]:
+        """Read a file. Its session on board is closed, also on cancellation."""
+    def list(self, path: str, *, timeout: float | None = None) -> list[ftp.DirectoryEntry]:
         """Return the entries of a directory."""
     def checksum(self, path: str, *, timeout: float | None = None) -> int:
-        """Return the CRC-32 of a file, computed on board: initial value 0, no final xor, as in PX4's hash."""
+        """Return the CRC-32 of a file, computed by the component; see `crc32_px4`."""
 
 class Component:
     "One component of a vehicle; see `ParamClient.component`."
@@ -157,6 +87,9 @@ class Component:
     system: int
     component: int
     params: ParamMap
+    @property
+    def ext(self) -> Component:
+        """The extended parameters of the component (PARAM_EXT_*), whose values are also text and bytes."""
     @property
     def autopilot(self) -> str:
         """Autopilot of its heartbeat: px4, ardupilot, generic, …; "unknown" before the first heartbeat."""
@@ -170,17 +103,14 @@ class Component:
     def encoding_reason(self) -> str:
         """The reason for `encoding`, as text."""
     @property
-    def ext(self) -> ExtParams:
-        """The extended parameters of the component (PARAM_EXT_*), with their own calls."""
-    @property
     def count(self) -> int | None:
-        """The `param_count` of the component; None before its first PARAM_VALUE."""
+        """The `param_count` of the component; None before its first value."""
     @property
     def hash(self) -> int | None:
         """The PX4 hash (`_HASH_CHECK`) of the complete table; None if it is not known."""
     @property
     def state(self) -> ComponentState:
-        """State of the table: new, cached, fetching, synced, partial, contested or lost."""
+        """State of the table."""
     @property
     def sync_state(self) -> SyncState:
         """Whether the table matches the vehicle, and the running check or update."""
@@ -189,10 +119,7 @@ class Component:
         """Its key in `ParamClient.components`: (system, component), with `split_peers` also the peer."""
     @property
     def peer(self) -> str:
-        """Address and port from which its messages arrive, and to which requests go; empty if unknown."""
-    @property
-    def contest(self) -> Contest | None:
-        """The vehicles that share its address, and their differences; None if there is only one vehicle."""
+        """Address and port from which its messages arrive, and to which requests go."""
     @property
     def is_armed(self) -> bool | None:
         """Whether the vehicle is armed, from `base_mode` of its last heartbeat."""
@@ -203,7 +130,7 @@ class Component:
     def round_trip(self) -> float | None:
         """Smoothed round-trip time in seconds; None before the first response."""
     def get(self, name: str | int, *, timeout: float | None = None) -> Param:
-        """Read one parameter from the vehicle with PARAM_REQUEST_READ."""
+        """Read one parameter from the vehicle."""
     def set(
         self,
         name: str,
@@ -215,7 +142,7 @@ class Component:
         durable: bool = False,
         author: str | None = None,
     ) -> SetResult:
-        """Write one parameter with PARAM_SET and verify the value that the vehicle acknowledges."""
+        """Write one parameter, and verify the value that the vehicle acknowledges."""
     def set_many(
         self,
         values: Mapping[str, Settable] | Iterable[tuple[str, Settable]],
@@ -246,13 +173,11 @@ class Component:
         timeout: float | None = None,
         progress: Callable[[Progress], None] | None = None,
     ) -> FetchResult:
-        """Fetch all parameters. Uses the cache if the vehicle's hash matches, otherwise downloads."""
-    def refreshed(self, *, timeout: float | None = None) -> None:
-        """Wait until the values outside the hash have been read after `fetch_all`."""
+        """Fetch all parameters. Uses the cache if the vehicle confirms it, otherwise downloads."""
     def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
-        """Send a new signing key to the vehicle with SETUP_SIGNING, or with None remove its key."""
-    def reboot(self, *, system: int | None = None, timeout: float | None = None) -> Component:
-        """Reboot the vehicle, and wait until the same vehicle is back."""
+        """Give the vehicle a signing key with SETUP_SIGNING, or with None, disable its signing."""
+    def reboot(self, *, system: int | None = None, timeout: float | None = REBOOT_TIMEOUT) -> Component:
+        """Reboot the vehicle, and wait until it is back and identified. Written values are saved before."""
     def changes(self) -> Changes:
         """Return a stream of parameter changes from now on: `async for change in component.changes()`."""
 
@@ -273,7 +198,7 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    "A lost component sends again. The client requests its identity and its hash."
+    "A lost component sends again. The client requests its identity and checks its table."
 
     component: Component
     silence: float
@@ -292,20 +217,7 @@ class Resynced:
     changed: tuple[str, ...]
     hash: int | None
 
-@dataclass(frozen=True, slots=True)
-class Contested:
-    "Several vehicles use the address of a component."
-
-    component: Component
-    contest: Contest
-
-@dataclass(frozen=True, slots=True)
-class Uncontested:
-    "Only one vehicle uses the address of a component again. The client requests its identity and its hash."
-
-    component: Component
-
-Event: TypeAlias = Discovered | Lost | Found | Rebooted | Resynced | Contested | Uncontested
+Event: TypeAlias = Discovered | Lost | Found | Rebooted | Resynced
 
 class Events(Iterator[Event]):
     "Stream of the component events since its creation; see `ParamClient.events`."
@@ -355,9 +267,6 @@ class ParamClient:
     @property
     def bytes_sent(self) -> int:
         """Bytes of all sent frames, including heartbeats."""
-    @property
-    def stats(self) -> ClientStats:
-        """Counters of the client since its creation, also after it is closed."""
     def events(self) -> Events:
         """Return a stream of component events from now on: `async for event in client.events()`."""
     def ftp(self, component: Component) -> Ftp:
@@ -511,34 +420,34 @@ def restore_all(
 
 def apply_extended(
     component: Component,
-    wanted: ExtParamSet,
+    wanted: ParamSet,
     *,
     durable: bool = False,
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
     author: str | None = None,
-    progress: Callable[[ExtSetOutcome], None] | None = None,
+    progress: Callable[[SetOutcome], None] | None = None,
     before_writing: Callable[[], object] | None = None,
 ) -> ExtApplyResult:
     """Write the wanted values that differ to a component, and verify them by another download."""
 
-def verify_extended(component: Component, wanted: ExtParamSet, *, timeout: float | None = None) -> ExtPlan:
+def verify_extended(component: Component, wanted: ParamSet, *, timeout: float | None = None) -> ExtPlan:
     """Compare wanted extended parameters with those of a component, after a download. Writes nothing."""
 
 def restore_extended(
     component: Component,
-    state: ExtParamSet,
+    state: ParamSet,
     *,
     durable: bool = False,
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
     author: str | None = None,
-    progress: Callable[[ExtSetOutcome], None] | None = None,
+    progress: Callable[[SetOutcome], None] | None = None,
     before_writing: Callable[[], object] | None = None,
 ) -> ExtApplyResult:
     """Restore an earlier state of a component: `apply_extended` with a snapshot *before restore*."""
 
-def load_extended_state(component: Component, when: float | None = None) -> ExtParamSet:
+def load_extended_state(component: Component, when: float | None = None) -> ParamSet:
     """Return an earlier state of the extended parameters of a component, from the cache."""
 
 def metadata_of(

@@ -22,11 +22,11 @@ import anyio
 from anyio.from_thread import BlockingPortal
 
 import paramclient.client.client as asynchronous
-from paramclient.client import component, events, extended_params, files, subscription
+from paramclient.client import component, events, files, streams
 from paramclient.errors import ClientClosed, UsageError
 from paramclient.model.params import ParamMap
 
-__all__ = ["Changes", "Component", "Events", "ExtChanges", "ExtParams", "Ftp", "ParamClient", "blocking"]
+__all__ = ["Changes", "Component", "Events", "Ftp", "ParamClient", "blocking"]
 
 THREAD_NAME: Final = "paramclient blocking client"
 """Name of the thread of a client, in debuggers."""
@@ -56,6 +56,7 @@ class _Session:
             self.client = self._portal.call(make)
         except BaseException:
             self._portal.call(self._portal.stop)
+            self._thread.join()
             raise
         self.proxies: weakref.WeakValueDictionary[object, Proxy] = weakref.WeakValueDictionary()
         self._process = os.getpid()
@@ -258,10 +259,6 @@ class Component(Proxy):
     """See `paramclient.Component`."""
 
 
-class ExtParams(Proxy):
-    """See `paramclient.ExtParams`."""
-
-
 class Ftp(Proxy):
     """See `paramclient.Ftp`."""
 
@@ -315,10 +312,6 @@ class Changes(Stream):
     """See `paramclient.Changes`."""
 
 
-class ExtChanges(Stream):
-    """See `paramclient.ExtChanges`."""
-
-
 class Events(Stream):
     """See `paramclient.Events`."""
 
@@ -326,10 +319,8 @@ class Events(Stream):
 _PROXIES: dict[type, type[Proxy]] = {
     asynchronous.ParamClient: ParamClient,
     component.Component: Component,
-    extended_params.ExtParams: ExtParams,
     files.Ftp: Ftp,
-    subscription.Changes: Changes,
-    subscription.ExtChanges: ExtChanges,
+    streams.Changes: Changes,
     events.Events: Events,
 }
 

@@ -8,8 +8,7 @@ import pytest
 
 from paramclient.cache import SNAPSHOTS, ParamCache, StoredParam, TableState, history
 from paramclient.errors import CacheError, UnknownVehicle, UsageError
-from paramclient.model.ext_params import ExtParam, ExtParamType
-from paramclient.model.ext_paramset import ExtParamSet
+from paramclient.model.ext_values import ext_param
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Param, ParamType
 from tests.cache.conftest import Open
@@ -101,18 +100,17 @@ def test_the_states_of_a_table_that_was_never_complete_are_unknown(cache: ParamC
 
 def test_the_state_of_extended_parameters(cache: ParamCache) -> None:
     def save(at: float, text: bytes) -> None:
-        param = ExtParam.of("A", text, ExtParamType.CUSTOM, 0)
+        param = ext_param("A", text, ParamType.CUSTOM, 0)
         state = TableState(count=1, complete=True)
-        rows = [StoredParam.of_ext(param, NOW + at)]
+        rows = [StoredParam.of(param, NOW + at)]
         cache.save(update(*rows, at=NOW + at, table=state, component=100, extended=True))
 
     save(0, b"tea")
     save(10, b"milk")
-    assert cache.ext_state_at("1", 100, NOW + 5).params["A"].value == "tea"
-    made = cache.store_snapshot(
-        PX4, 100, ExtParamSet({"A": ExtParam.of("A", b"rum", ExtParamType.CUSTOM, 0)}), reason="by hand"
-    )
-    assert cache.ext_state_at("1", 100, made.id).params["A"].value == "rum"
+    assert cache.state_at("1", 100, NOW + 5, extended=True)["A"].value == "tea"
+    rum = ParamSet({"A": WrittenParam("A", "rum", ParamType.CUSTOM)})
+    made = cache.store_snapshot(PX4, 100, rum, reason="by hand", extended=True)
+    assert cache.state_at("1", 100, made.id, extended=True)["A"].value == "rum"
     assert cache.snapshots("1", extended=True) == [made]
     assert cache.snapshots("1") == []
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.errors import CacheError, UsageError
-from paramclient.model.ext_params import ExtParam, ExtParamType
+from paramclient.model.ext_values import ext_param
 from paramclient.model.identity import Identity
 from paramclient.model.px4_hash import hash_params
 from paramclient.model.values import Param, ParamType, Trust, from_bits
@@ -49,7 +49,7 @@ def test_an_empty_cache_has_nothing(cache: ParamCache) -> None:
     assert cache.vehicles() == []
     assert cache.components() == []
     assert cache.load(PX4.key, 1) is None
-    assert cache.load_ext(PX4.key, 1) is None
+    assert cache.load(PX4.key, 1, extended=True) is None
 
 
 def test_a_table_is_read_as_it_was_written(cache: ParamCache, open_cache: Open) -> None:
@@ -107,24 +107,24 @@ def test_a_vehicle_and_its_components(cache: ParamCache) -> None:
 
 
 def test_extended_parameters_are_apart(cache: ParamCache) -> None:
-    text = ExtParam.of("P_0", b"caf\xc3\xa9", ExtParamType.CUSTOM, 0, Trust.CACHED)
-    number = ExtParam.of("P_1", b"\7\0", ExtParamType.UINT16, 1, Trust.CACHED)
-    rows = [StoredParam.of_ext(each, NOW) for each in (text, number)]
+    text = ext_param("P_0", b"caf\xc3\xa9", ParamType.CUSTOM, 0, Trust.CACHED)
+    number = ext_param("P_1", b"\7\0", ParamType.UINT16, 1, Trust.CACHED)
+    rows = [StoredParam.of(each, NOW) for each in (text, number)]
     cache.save(update(*rows, table=TableState(count=2, complete=True), component=100, extended=True))
-    found = cache.load_ext(PX4.key, 100)
+    found = cache.load(PX4.key, 100, extended=True)
     assert found is not None
     assert dict(found.params) == {"P_0": text, "P_1": number}
     assert (found.count, found.complete) == (2, True)
     assert found.params["P_0"].value == "café"
     assert cache.ext_sizes() == {(PX4.key, 100): 2}
     assert [(each.component, each.size) for each in cache.components()] == [(100, 0)]
-    other = ExtParam.of("P_0", b"tea", ExtParamType.CUSTOM, 0)
-    cache.save(update(StoredParam.of_ext(other, NOW + 1, "us"), at=NOW + 1, component=100, extended=True))
-    [entry] = cache.ext_history("1")
+    other = ext_param("P_0", b"tea", ParamType.CUSTOM, 0)
+    cache.save(update(StoredParam.of(other, NOW + 1, by="us"), at=NOW + 1, component=100, extended=True))
+    [entry] = cache.history("1", extended=True)
     assert (entry.old.value, entry.new and entry.new.value, entry.by) == ("café", "tea", "us")
     assert cache.history("1") == []
     assert cache.remove("1") == 1
-    assert cache.load_ext(PX4.key, 100) is None
+    assert cache.load(PX4.key, 100, extended=True) is None
 
 
 def test_an_update_with_an_invalid_time_writes_nothing(cache: ParamCache) -> None:

@@ -30,9 +30,9 @@ from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import LinkOptions
 from paramclient.errors import ClientClosed, ParamClientError, ParamErrorCode
 from paramclient.links import Peer, SimLink
-from paramclient.protocol import wire
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.sim.param_table import Entry
+from paramclient.wire import frames, messages
 from tests.commands import Command, Outcome, Put, behind, in_process, leaping, strict
 from tests.shell import in_simulated_time
 
@@ -307,14 +307,14 @@ class Unchanging(GenericVehicle):
 class Mistyped(GenericVehicle):
     """A vehicle that reports a wrong type for every set."""
 
-    def _on_set(self, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
+    def _on_set(self, request: messages.ParamSet, sender: frames.Frame) -> None:
         self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
 
 
 class SilentOnParams(GenericVehicle):
     """A vehicle with heartbeats that answers no parameter requests."""
 
-    def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
+    def _on_read(self, request: messages.ParamRequestRead, sender: frames.Frame) -> None:
         pass
 
     _on_set = _on_read  # type: ignore[assignment]  # the message is ignored
@@ -580,12 +580,12 @@ class Modem(PX4Vehicle):
     """A vehicle with a telemetry radio, and with a message that is in no dialect."""
 
     def data_to_send(self) -> list[bytes]:
-        frames = super().data_to_send()
-        if frames:
+        sent = super().data_to_send()
+        if sent:
             status = b"\x03\x00\x02\x00\xc8\xbe\x60\x28\x2a"
-            frames.append(wire.build_frame(109, status, system=51, component=68, sequence=0))
-            frames.append(b"\xfd\x01\x00\x00\x00\x33\x44\xff\xff\x7f" + b"abc")
-        return frames
+            sent.append(frames.build_frame(109, status, system=51, component=68, sequence=0))
+            sent.append(b"\xfd\x01\x00\x00\x00\x33\x44\xff\xff\x7f" + b"abc")
+        return sent
 
 
 def test_link_prints_a_table_of_components(command: Command, put: Callable[[Endpoint], str]) -> None:
@@ -629,7 +629,7 @@ def test_a_silent_link_is_exit_code_3(live_command: Command, put: Callable[..., 
     noisy = live_command("link", put(Noise(PX4Vehicle())), "--seconds", 0.3)
     assert (noisy.code, noisy.out) == (3, "")
     assert re.search(
-        r"a MAVLink frame on sim:custom in [0-9.]+ s\. [1-9][0-9,]* bytes were received on sim:custom, but "
+        r"a MAVLink frame on sim:custom in [0-9.]+ s\. [1-9][0-9,]* bytes arrived on sim:custom, but "
         r"no valid MAVLink frame\.$",
         noisy.err,
     )
@@ -978,12 +978,12 @@ class Hostile:
         return [self._renamed(data) for data in self.vehicle.data_to_send()]
 
     def _renamed(self, data: bytes) -> bytes:
-        [frame] = wire.Framer(stream=False).receive(data)
-        message = wire.decode(frame)
-        if isinstance(message, wire.ParamValue):
+        [frame] = frames.Framer(stream=False).receive(data)
+        message = messages.decode(frame)
+        if isinstance(message, messages.ParamValue):
             name = self.NAMES["ABCD".index(message.param_id)]
             message = message._replace(param_id=name)
-            return wire.encode(message, system=1, component=1, sequence=frame.sequence)
+            return messages.encode(message, system=1, component=1, sequence=frame.sequence)
         return data
 
 

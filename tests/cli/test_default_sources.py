@@ -10,8 +10,8 @@ import pytest
 
 from paramclient.files import read_file
 from paramclient.model.values import ParamType
-from paramclient.protocol import wire
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
+from paramclient.wire import messages
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import Tap
 
@@ -64,7 +64,7 @@ def test_without_changed_nothing_is_requested_for_defaults(command: Command, put
     tap = Tap(quad())
     done = command("fetch", put(tap), "--json")
     assert "default" not in done.json["params"]["MC_ROLL_P"]
-    assert not tap.messages(wire.FileTransfer)
+    assert not tap.messages(messages.FileTransfer)
 
 
 def test_the_default_of_the_vehicle_has_priority(command: Command, put: Put, tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ def test_refusals_have_a_status_and_an_exit_code(command: Command, put: Put) -> 
     done = command("set", url, *CAMERA, "A", 2, "B", 5, "C", 9)
     assert done.code == 1
     assert done.rows[1:] == [["A", "2", "refused"], ["B", "5", "refused"], ["C", "9", "5", "adjusted"]]
-    assert "A: 1/100 did not set A to 2: value unsupported" in done.err
+    assert "A: 1/100 refused A: value unsupported" in done.err
     document = command("set", url, *CAMERA, "A", 2, "--json").json
     assert document["results"][0]["status"] == "refused"
     for words, why in (

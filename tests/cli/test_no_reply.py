@@ -33,7 +33,7 @@ class Deaf(PX4Vehicle):
         """Lose what is sent to the vehicle."""
 
 
-SPEAKS = "1/1 sends heartbeats (the last one "
+SPEAKS = "1/1 sends messages (the last one "
 CURE = "Check the link towards the vehicle, and whether the vehicle requires signed messages."
 
 
@@ -72,7 +72,7 @@ def test_a_vehicle_that_falls_silent(command: Command, put: Put) -> None:
 
     done = command("get", put(Dying({"A": 1})), "A")
     assert done.code == 3
-    assert "Nothing was received on sim:custom for " in done.err
+    assert "Nothing was received of 1/1 for " in done.err
 
 
 # On a terminal

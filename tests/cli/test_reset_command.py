@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from paramclient import ParamType
-from paramclient.protocol import wire
 from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
+from paramclient.wire import messages
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import Tap
 
@@ -48,7 +48,7 @@ def copter(**others: Any) -> ArduPilotVehicle:
 
 def written(tap: Tap) -> list[str]:
     """The names of the values that were sent to the vehicles, in their order."""
-    return [each.param_id for each in tap.messages(wire.ParamSetMessage)]
+    return [each.param_id for each in tap.messages(messages.ParamSet)]
 
 
 def values(vehicle: Vehicle, *names: str) -> dict[str, Any]:

@@ -16,9 +16,9 @@ from paramclient.cli import signing as signing_commands
 from paramclient.links import SimLink
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, bits_of
-from paramclient.protocol import wire
-from paramclient.protocol.vehicle_selection import LOOK_TIME
+from paramclient.protocol.selection import LOOK_TIME
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, Vehicle
+from paramclient.wire import messages
 from tests.caches import NOW, update
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import Late, PeersLink, Tap
@@ -31,7 +31,7 @@ LISTED = (
     "paramclient: 2 vehicles on this link: 1/1 PX4 quadrotor, 2/1 ArduPilot quadrotor. "
     "Choose one with --vehicle, as in --vehicle 1/1.\n"
 )
-QUESTIONS = (wire.Heartbeat, wire.CommandLong)
+QUESTIONS = (messages.Heartbeat, messages.CommandLong)
 """What identifies vehicles."""
 
 
@@ -302,7 +302,7 @@ class Watch:
 
     def written_after(self) -> float:
         assert self.first_received is not None
-        first = next(at for at, _, message in self.tap.received if isinstance(message, wire.ParamSetMessage))
+        first = next(at for at, _, message in self.tap.received if isinstance(message, messages.ParamSet))
         return first - self.first_received
 
 

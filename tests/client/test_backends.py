@@ -32,12 +32,14 @@ from paramclient import (
     WrittenParam,
 )
 from paramclient.client import client as client_module
-from paramclient.client import reconnect_delays
+from paramclient.client import link_task
 from paramclient.errors import LinkError
 from paramclient.links import Link, create_link, serve_endpoint
-from paramclient.protocol.vehicle_selection import LOOK_TIME
+from paramclient.protocol.ftp import Opcode, Packet
+from paramclient.protocol.selection import LOOK_TIME
 from paramclient.provision import apply, prepare, restore, verify
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, Vehicle
+from paramclient.wire import messages
 from tests.cable import TIMEOUT, Cable
 from tests.shell import FlakyLink, Tap, a_client, bits, generic, residue, small_px4
 
@@ -147,7 +149,7 @@ async def test_a_second_vehicle_is_looked_for() -> None:
 
 
 async def test_a_tcp_connection_that_drops_is_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.01)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.01)
     vehicle, scope = generic(stream=True, **QUICK), anyio.CancelScope()
     listening = create_link("tcpin:127.0.0.1:0")
     async with beside() as tasks:
@@ -163,7 +165,7 @@ async def test_a_tcp_connection_that_drops_is_opened_again(monkeypatch: pytest.M
 
 
 async def test_a_serial_port_that_is_unplugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.01)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.01)
     vehicle = generic(stream=True, **QUICK)
     with Cable(tmp_path) as cable:
         async with beside() as tasks, a_client(cable.link) as client:
@@ -203,7 +205,6 @@ async def test_a_table_is_downloaded_by_list_and_then_taken_from_the_cache(tmp_p
             async with ParamClient(vehicle, cache=tmp_path / "cache") as client:
                 component = await client.component()
                 result = await component.fetch_all(progress=reported.append)
-                await component.refreshed()
                 sources.append(result.source)
                 assert bits(component.params) == bits(vehicle.params)
     assert sources == ["stream", "cache"]
@@ -213,17 +214,15 @@ async def test_a_table_is_downloaded_by_list_and_then_taken_from_the_cache(tmp_p
         assert bits(cache.component(system=1).params) == bits(vehicle.params)
 
 
-async def test_a_table_is_served_as_a_file_and_files_are_read_and_written() -> None:
+async def test_a_table_is_served_as_a_file_and_files_are_read() -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     async with beside(), a_client(vehicle) as client:
         component = await client.component()
         result = await component.fetch_all()
         assert (result.source, result.complete) == ("ftp", True)
         files = client.ftp(component)
-        await files.write("/APM/notes.txt", b"hello")
-        assert await files.read("/APM/notes.txt") == b"hello"
-        assert await files.checksum("/APM/notes.txt") is not None
-        assert "notes.txt" in {entry.name for entry in await files.list("/APM")}
+        data = await files.read("@PARAM/param.pck")
+        assert data
 
 
 async def test_several_vehicles_are_fetched_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -343,11 +342,35 @@ async def test_a_client_that_is_cancelled_writes_what_it_has_learnt(tmp_path: Pa
         assert len(cache.component(system=1).params) == len(vehicle.params)
 
 
+async def test_a_scope_around_a_client_has_the_file_closed_before_it_ends() -> None:
+    vehicle = ArduPilotVehicle(live_period=0)
+    tap = Tap(Air.symmetric([vehicle], delay=0.02))
+
+    def cancel_in_the_file(progress: Progress) -> None:
+        if progress.received > 0:
+            assert vehicle.open_files
+            scope.cancel()
+
+    async with beside():
+        with anyio.CancelScope() as scope:
+            async with a_client(tap) as client:
+                await (await client.component()).fetch_all(progress=cancel_in_the_file)
+        assert scope.cancelled_caught
+        assert not vehicle.open_files
+        assert not residue(client.components[1, 1])
+        *_, last = tap.messages(messages.FileTransfer)
+        assert Packet.unpack(last.payload).opcode == Opcode.TERMINATE_SESSION
+        async with a_client(tap) as client:
+            again = await (await client.component()).fetch_all()
+        assert again.source == "ftp"
+        assert again.elapsed < 2.0, "a session that stays open is closed on board after 3 s"
+
+
 async def test_a_link_that_fails_reaches_everyone(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(reconnect_delays, "LINK_TIMEOUT", 0.05)
-    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.01)
+    monkeypatch.setattr(link_task, "LINK_TIMEOUT", 0.05)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.01)
     link = FlakyLink(generic(**QUICK))
     async with beside(), a_client(link) as client:
         component = await client.component()

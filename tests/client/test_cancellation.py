@@ -20,8 +20,8 @@ import anyio
 import pytest
 
 from paramclient import Component, ParamCache, ParamClient
-from paramclient.protocol import wire
 from paramclient.sim import Air, PX4Vehicle
+from paramclient.wire import messages
 from tests.caches import set_aside
 from tests.shell import (
     VALUES,
@@ -126,7 +126,7 @@ async def a_session() -> AsyncIterator[tuple[ParamClient, Component]]:
     """A client that has just found a vehicle with a camera; another one is found a little later."""
     late = generic(system=2, table=FEW_VALUES)
     late.reboot(simulated_time_loop().time(), down=0.03)
-    camera = generic(component=100, table=FEW_VALUES, autopilot=wire.MAV_AUTOPILOT_INVALID)
+    camera = generic(component=100, table=FEW_VALUES, autopilot=messages.MAV_AUTOPILOT_INVALID)
     vehicle = PX4Vehicle(table={**FEW_VALUES, "CAL_ACC0_XOFF": 0.5}, burst=3)
     air = Air.symmetric([vehicle, camera, late], delay=0.004)
     async with a_client(air) as client:
@@ -134,11 +134,10 @@ async def a_session() -> AsyncIterator[tuple[ParamClient, Component]]:
 
 
 def registered(client: ParamClient) -> list[object]:
-    """What is registered in any component, except reads of the hash without a waiting caller."""
+    """What is registered in any component."""
     found: list[object] = []
     for component in client.components.values():
-        hashes = ["1 reads"] if wire.HASH_CHECK in component.core.machine.reads else []
-        found += [each for each in residue(component) if each not in hashes]
+        found += residue(component)
     return found
 
 
@@ -227,7 +226,6 @@ async def test_a_whole_session_cancelled_at_each_point(tmp_path: Path, point: st
         async with ParamClient(vehicle, cache=path) as client:
             component = await client.component()
             await component.fetch_all()
-            await component.refreshed()
             await component.set("PARAM_01", number)
             await asyncio.sleep(0.3)
 

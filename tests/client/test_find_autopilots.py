@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from paramclient import NoReply, UsageError
-from paramclient.client.vehicle_search import VEHICLES_LISTENING_TIME
+from paramclient.client.client import VEHICLES_LISTENING_TIME
 from paramclient.sim import Air
 from tests.shell import Late, a_client, generic, in_simulated_time, simulated_time_loop, small_px4
 

@@ -18,7 +18,7 @@ from paramclient.client import forwarding, link_task
 from paramclient.links import Peer, create_link
 from paramclient.links.tlog import read_records
 from paramclient.model.values import Encoding, encode_value
-from paramclient.protocol import wire
+from paramclient.wire import frames, messages, signing
 from tests.shell import FlakyLink, Tap, a_client, bits, generic, in_simulated_time, small_px4, tasks_beside
 
 
@@ -41,17 +41,17 @@ class Program:
         self._activity = anyio.Event()
         self._is_open = False
 
-    def say(self, *messages: wire.Message, system: int = 255) -> None:
-        for message in messages:
-            self.say_bytes(wire.encode(message, system=system, component=190, sequence=0))
+    def say(self, *said: messages.Message, system: int = 255) -> None:
+        for message in said:
+            self.say_bytes(messages.encode(message, system=system, component=190, sequence=0))
 
     def say_bytes(self, data: bytes) -> None:
         self._said.append(data)
         self._activity.set()
 
-    def messages(self) -> list[wire.Message]:
-        framer = wire.Framer(wire.DECODED_IDS, stream=False)
-        found = [wire.decode(each) for data in self.received for each in framer.receive(data)]
+    def messages(self) -> list[messages.Message]:
+        framer = frames.Framer(messages.DECODED_IDS, stream=False)
+        found = [messages.decode(each) for data in self.received for each in framer.receive(data)]
         return [message for message in found if message is not None]
 
     async def open(self) -> None:
@@ -91,8 +91,8 @@ class Recorded(Tap):
         return data
 
 
-def a_set(name: str, value: int) -> wire.ParamSetMessage:
-    return wire.ParamSetMessage(
+def a_set(name: str, value: int) -> messages.ParamSet:
+    return messages.ParamSet(
         1, 1, name, encode_value(value, ParamType.INT32, Encoding.BYTEWISE), ParamType.INT32
     )
 
@@ -105,7 +105,7 @@ async def test_every_frame_of_the_vehicle_is_passed_on_and_none_of_ours() -> Non
         assert result.complete
         await anyio.sleep(1.5)
         assert program.received == vehicle.said
-    assert not any(isinstance(each, wire.ParamRequestList) for each in program.messages())
+    assert not any(isinstance(each, messages.ParamRequestList) for each in program.messages())
 
 
 @in_simulated_time
@@ -115,14 +115,14 @@ async def test_requests_of_the_program_reach_the_vehicle_and_responses_the_progr
         component = await client.component()
         await anyio.sleep(10.0)
         program.received.clear()
-        program.say(wire.ParamRequestRead(1, 1, "PARAM_04", -1), system=200)
+        program.say(messages.ParamRequestRead(1, 1, "PARAM_04", -1), system=200)
         await anyio.sleep(0.5)
-        [answer] = [each for each in program.messages() if isinstance(each, wire.ParamValue)]
+        [answer] = [each for each in program.messages() if isinstance(each, messages.ParamValue)]
         assert answer.param_id == "PARAM_04"
         assert component.params["PARAM_04"].value == 4
         assert [frame.system for _, frame, _ in vehicle.received if frame.message_id == 20] == [200]
         # also messages that mean nothing here
-        program.say_bytes(data := wire.build_frame(4, bytes(range(14)), system=9, component=9, sequence=7))
+        program.say_bytes(data := frames.build_frame(4, bytes(range(14)), system=9, component=9, sequence=7))
         await anyio.sleep(0.5)
         assert client.bytes_sent > 0
         assert data not in program.received
@@ -132,11 +132,11 @@ async def test_requests_of_the_program_reach_the_vehicle_and_responses_the_progr
 async def test_a_key_is_never_passed_on() -> None:
     """Neither way: the guide to message signing asks that it stays on the link on which it was sent."""
     vehicle, program = Tap(generic()), Program()
-    key = wire.SetupSigning(1, 1, wire.SigningKey(bytes(range(32))), 1)
+    key = messages.SetupSigning(1, 1, signing.SigningKey(bytes(range(32))), 1)
     async with a_client(vehicle, forward=program) as client:
         await client.component()
         program.say(key, system=200)
-        program.say(wire.ParamRequestRead(1, 1, "PARAM_04", -1), system=200)
+        program.say(messages.ParamRequestRead(1, 1, "PARAM_04", -1), system=200)
         await anyio.sleep(0.5)
         ids = [seen.message_id for _, seen, _ in vehicle.received if seen.system == 200]
     assert ids == [20]
@@ -170,7 +170,7 @@ async def test_a_program_that_reads_nothing_holds_nothing_up(monkeypatch: pytest
         assert bits((await component.fetch_all()).params) == bits(vehicle.params)
         assert (await component.set("PARAM_01", 8)).status == "accepted"
         assert anyio.current_time() - began < 3.0
-        forwarder = client.core._taps.forwarder
+        forwarder = client.core.taps.forwarder
         assert forwarder is not None
         assert len(forwarder._waiting) == 10
         lost = forwarder.lost
@@ -191,7 +191,7 @@ async def test_a_program_that_floods_takes_turns_with_us(monkeypatch: pytest.Mon
         await anyio.sleep(5.0)
         vehicle.received.clear()
         for _ in range(300):
-            program.say(wire.StatusText(6, "noise"), system=200)
+            program.say(messages.StatusText(6, "noise"), system=200)
         await anyio.lowlevel.checkpoint()
         param = await component.get("PARAM_07")
         assert param.value == 7
@@ -230,7 +230,7 @@ async def test_frames_of_a_stream_are_passed_on_whole_also_after_it_dropped() ->
         component = await client.component()
         await component.fetch_all()
         await link.drop()
-        program.say(wire.StatusText(6, "into the void"))
+        program.say(messages.StatusText(6, "into the void"))
         await anyio.sleep(2.0)
         assert (await component.get("PARAM_01")).value == 1
         await anyio.sleep(0.1)
@@ -250,7 +250,7 @@ async def test_forwarded_frames_are_in_the_telemetry_log(tmp_path: Path) -> None
         await anyio.sleep(1.0)
     with path.open("rb") as file:
         frames = [record.data for record in read_records(file)]
-    assert wire.encode(message, system=77, component=190, sequence=0) in frames
+    assert messages.encode(message, system=77, component=190, sequence=0) in frames
 
 
 @in_simulated_time
@@ -278,8 +278,8 @@ async def test_a_program_that_is_not_there_yet_is_waited_for() -> None:
             with anyio.fail_after(20):
                 connection, _ = await loop.sock_accept(listener)
                 with connection:
-                    frames = wire.Framer()
-                    while not frames.receive(await loop.sock_recv(connection, 4096)):
+                    framer = frames.Framer()
+                    while not framer.receive(await loop.sock_recv(connection, 4096)):
                         pass
     assert tasks_beside() == set()
 
@@ -303,4 +303,4 @@ def test_the_command_forwards_too(capsys: pytest.CaptureFixture[str]) -> None:
         url = f"udpout:127.0.0.1:{program.getsockname()[1]}"
         assert run(["get", "sim:px4", "MC_ROLL_P", "--no-cache", "--forward", url]) == 0
         assert "MC_ROLL_P" in capsys.readouterr().out
-        assert wire.Framer().receive(program.recv(300))
+        assert frames.Framer().receive(program.recv(300))

@@ -15,23 +15,21 @@ from paramclient import (
     ParamClient,
     ParamType,
     Policy,
-    Progress,
     SyncState,
     Trust,
     UsageError,
 )
 from paramclient.cli import run
+from paramclient.client.component import PASSIVE_TIMEOUT
 from paramclient.model.values import Encoding, encode_value
-from paramclient.protocol import wire
-from paramclient.protocol.params.passive import LIST_PAUSE_MAX, PASSIVE_TIMEOUT
-from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.station import Station
 from paramclient.sim import Endpoint
+from paramclient.wire import frames, messages
 from tests.shell import Radio, bits, generic, in_simulated_time, residue, small_px4
-from tests.simulation import is_so, param_value
+from tests.simulation import param_value
 
-LIST = wire.ParamRequestList(1, 1)
-HASH = wire.ParamRequestRead(1, 1, wire.HASH_CHECK, -1)
+LIST = messages.ParamRequestList(1, 1)
+HASH = messages.ParamRequestRead(1, 1, messages.HASH_CHECK, -1)
 
 
 class Channel(Radio):
@@ -39,19 +37,19 @@ class Channel(Radio):
 
     def __init__(self, endpoint: Endpoint) -> None:
         super().__init__(endpoint)
-        self.loses: Callable[[wire.Message], bool] = lambda message: False
+        self.loses: Callable[[messages.Message], bool] = lambda message: False
         self._sequence = 0
 
-    def ask(self, *messages: wire.Message, system: int = 254) -> None:
-        for message in messages:
+    def ask(self, *said: messages.Message, system: int = 254) -> None:
+        for message in said:
             self._sequence = (self._sequence + 1) % 256
-            self.other.append(wire.encode(message, system=system, component=190, sequence=self._sequence))
+            self.other.append(messages.encode(message, system=system, component=190, sequence=self._sequence))
 
     def data_to_send(self) -> list[bytes]:
-        framer = wire.Framer(stream=False)
+        framer = frames.Framer(stream=False)
         kept = []
         for data in super().data_to_send():
-            message = wire.decode(framer.receive(data)[0])
+            message = messages.decode(framer.receive(data)[0])
             if message is None or not self.loses(message):
                 kept.append(data)
         return kept
@@ -115,7 +113,7 @@ async def test_a_write_of_another_station_is_a_change_with_its_author() -> None:
         changes = component.changes()
         raw = encode_value(7, ParamType.INT32, Encoding.BYTEWISE)
         # also of a station with the ids that a client has
-        channel.ask(wire.ParamSetMessage(1, 1, "PARAM_01", raw, ParamType.INT32), system=255)
+        channel.ask(messages.ParamSet(1, 1, "PARAM_01", raw, ParamType.INT32), system=255)
         change = await anext(changes)
         assert (change.name, change.by) == ("PARAM_01", "station 255/190")
         assert component.params["PARAM_01"].value == 7
@@ -141,7 +139,6 @@ async def test_calls_that_send_are_refused_at_once() -> None:
                 await call()
         assert anyio.current_time() - began < 0.01
         assert residue(component) == []
-        await component.refreshed()
     assert channel.received == []
 
 
@@ -168,31 +165,9 @@ async def test_fetch_all_without_any_request_of_others_ends_with_no_reply(timeou
 
 
 @in_simulated_time
-async def test_a_list_with_gaps_ends_when_it_pauses_and_goes_on_with_what_others_read() -> None:
-    vehicle = small_px4()
-    channel = Channel(vehicle)
-    channel.loses = lambda each: isinstance(each, wire.ParamValue) and each.param_index in (3, 9)
-    async with listener(channel) as client:
-        component = await client.component()
-        channel.ask(LIST)
-        began = anyio.current_time()
-        reported: list[Progress] = []
-        result = await component.fetch_all(progress=reported.append)
-        assert result.missing == (3, 9)
-        assert reported[-1].received == result.received == 23
-        assert LIST_PAUSE_MAX <= anyio.current_time() - began < LIST_PAUSE_MAX + 3.0
-        assert (component.state, component.sync_state) == ("partial", SyncState.UNSYNCED)
-        assert (await client.fetch_all()).results[1, 1].missing == (3, 9)
-        channel.loses = lambda each: False
-        channel.ask(wire.ParamRequestRead(1, 1, "", 3), wire.ParamRequestRead(1, 1, "", 9))
-        result = await component.fetch_all()
-        assert (result.missing, result.hash) == ((), vehicle.announced_hash())
-
-
-@in_simulated_time
 async def test_a_timeout_returns_what_was_received() -> None:
     channel = Channel(small_px4())
-    channel.loses = lambda each: isinstance(each, wire.ParamValue) and each.param_index == 24
+    channel.loses = lambda each: isinstance(each, messages.ParamValue) and each.param_index == 24
     async with listener(channel) as client:
         component = await client.component()
         channel.ask(LIST)
@@ -206,7 +181,7 @@ async def test_a_cached_table_is_confirmed_by_a_hash_that_others_ask_for(tmp_pat
     vehicle = small_px4()
     path = tmp_path / "cache"
     channel = Channel(vehicle)
-    version = wire.CommandLong(1, 1, wire.MAV_CMD_REQUEST_MESSAGE, (148.0,) + (0.0,) * 6)
+    version = messages.CommandLong(1, 1, messages.MAV_CMD_REQUEST_MESSAGE, 148.0)
     async with listener(channel, cache=path) as client:
         component = await client.component()
         channel.ask(version, LIST)
@@ -256,73 +231,10 @@ def test_the_command_listens_too(capsys: pytest.CaptureFixture[str]) -> None:
 # the core
 
 
-def station_that_listens() -> Station:
-    station = Station(
-        link="test", is_stream=False, sync_settings=SyncSettings.chosen(None, "auto", listen_only=True)
-    )
-    say(station, wire.Heartbeat(2, wire.MAV_AUTOPILOT_GENERIC, system_status=4), 0.0)
-    return station
-
-
-def say(station: Station, message: wire.Message, now: float) -> None:
-    station.receive(wire.encode(message, system=1, component=1, sequence=0), "peer", now)
+def say(station: Station, message: messages.Message, now: float) -> None:
+    station.receive(messages.encode(message, system=1, component=1, sequence=0), "peer", now)
 
 
 def report(station: Station, count: int, *indices: int, now: float = 1.0, prefix: str = "P") -> None:
     for index in indices:
         say(station, param_value(f"{prefix}{index}", 1.0, index=index, count=count), now)
-
-
-def test_a_table_is_complete_when_every_index_was_received_in_any_order() -> None:
-    station = station_that_listens()
-    machine = station.components[1, 1]
-    report(station, 4, 3, 1, 0, 1, 65535)
-    assert is_so(not machine.table.complete)
-    report(station, 4, 2)
-    assert is_so(machine.table.complete)
-    assert is_so(machine.sync.synced)
-
-
-def test_another_count_or_name_discards_the_received_values() -> None:
-    station = station_that_listens()
-    machine = station.components[1, 1]
-    report(station, 4, 0, 1, 2)
-    report(station, 3, 0, 1)
-    assert is_so(not machine.table.complete)
-    report(station, 3, 2)
-    assert is_so(machine.table.complete)
-    assert sorted(machine.table.params) == ["P0", "P1", "P2"]
-    report(station, 4, 0, 1, 2)
-    report(station, 4, 2, prefix="Q")
-    report(station, 4, 3)
-    assert is_so(not machine.table.complete)
-    report(station, 4, 0, 1)
-    assert is_so(machine.table.complete)
-    assert sorted(machine.table.params) == ["P0", "P1", "P3", "Q2"]
-
-
-def test_values_from_before_a_reboot_do_not_complete_the_table() -> None:
-    station = station_that_listens()
-    machine = station.components[1, 1]
-    report(station, 3, 0, 1)
-    say(station, wire.Heartbeat(2, wire.MAV_AUTOPILOT_GENERIC, system_status=wire.MAV_STATE_BOOT), 1.0)
-    report(station, 3, 2)
-    assert is_so(not machine.sync.synced)
-    report(station, 3, 0, 1)
-    assert is_so(machine.sync.synced)
-
-
-def test_silence_costs_nothing_and_nothing_is_due() -> None:
-    station = station_that_listens()
-    machine = station.components[1, 1]
-    report(station, 3, 0, 1)
-    for now in range(1, 100):
-        station.tick(float(now))
-    assert station.data_to_send() == []
-    assert station.bytes_sent == 0
-    assert station.next_deadline() == float("inf")
-    assert machine.presence.is_lost
-    station.pause()
-    station.resume(200.0)
-    station.tick(200.0)
-    assert station.data_to_send() == []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import re
 import subprocess
@@ -12,13 +11,8 @@ from pathlib import Path
 import anyio
 import pytest
 
-from paramclient import UnknownParameter
 from paramclient.cli import run
-from paramclient.protocol import wire
-from paramclient.protocol.station import Station
-from paramclient.protocol.stats.trace import LazyMessageText
-from paramclient.sim import Air
-from tests.shell import FlakyLink, Tap, a_client, generic, in_simulated_time, small_px4
+from tests.shell import FlakyLink, a_client, generic, in_simulated_time, small_px4
 
 WATCHED = "paramclient"
 
@@ -64,22 +58,6 @@ async def test_each_step_is_reported_in_one_line(caplog: pytest.LogCaptureFixtur
 
 
 @in_simulated_time
-async def test_unanswered_requests_are_logged(caplog: pytest.LogCaptureFixture) -> None:
-    vehicle = Tap(generic())
-    with caplog.at_level(logging.DEBUG, WATCHED):
-        async with a_client(vehicle) as client:
-            component = await client.component()
-            with pytest.raises(UnknownParameter):
-                await component.get("NO_SUCH")
-            await anyio.sleep(1.0)
-            stats = client.stats
-    steps = reported(caplog)
-    assert any(re.fullmatch(r"1/1 NO_SUCH: no answer to try 1 in [0-9.]+ s", each) for each in steps)
-    assert any(re.fullmatch(r"1/1 NO_SUCH: given up after try [0-9]+", each) for each in steps)
-    assert stats.retries > 0
-
-
-@in_simulated_time
 async def test_a_link_that_drops_and_returns_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     link = FlakyLink(generic())
     with caplog.at_level(logging.DEBUG, WATCHED):
@@ -108,28 +86,6 @@ asyncio.run(main())
     assert (done.stdout, done.stderr) == ("", "")
 
 
-def test_trace_lines_are_formatted_only_when_tracing_is_on() -> None:
-    lines: list[tuple[object, ...]] = []
-    station = Station(link="test", is_stream=False, trace=lambda *line: lines.append(line))
-    beat = wire.Heartbeat(2, wire.MAV_AUTOPILOT_PX4, system_status=4)
-    station.receive(wire.encode(beat, system=1, component=1, sequence=0), "peer", 0.0)
-    assert [type(line[-1]) for line in lines] == [LazyMessageText]
-    assert str(lines[0][-1]) == "COMMAND_LONG 512 (148)"
-
-
-@pytest.mark.parametrize(
-    ("message", "words"),
-    [
-        (wire.ParamRequestRead(1, 1, "A", -1), "PARAM_REQUEST_READ A"),
-        (wire.ParamRequestRead(1, 1, "", 17), "PARAM_REQUEST_READ 17"),
-        (wire.FileTransfer(0, 1, 1, bytes((0, 0, 0, 4)) + bytes(247)), "FILE_TRANSFER_PROTOCOL operation 4"),
-        (wire.StatusText(6, "secret"), "StatusText"),
-    ],
-)
-def test_messages_in_words(message: wire.Message, words: str) -> None:
-    assert str(LazyMessageText(message)) == words
-
-
 def test_the_command_logs_its_steps(capsys: pytest.CaptureFixture[str]) -> None:
     level = logging.getLogger(WATCHED).level
     for option in ("-v", "--verbose"):
@@ -151,56 +107,3 @@ def test_control_characters_are_not_printed(capsys: pytest.CaptureFixture[str]) 
 
 
 # numbers
-
-
-@in_simulated_time
-async def test_metrics_count_what_was_done(tmp_path: Path) -> None:
-    vehicle, path = small_px4(), tmp_path / "cache"
-    async with a_client(vehicle, cache=path) as client:
-        before = client.stats
-        assert (before.frames_received, before.reads, before.round_trips) == (0, 0, {})
-        component = await client.component()
-        await component.fetch_all()
-        await component.get("PARAM_01")
-        await component.set("PARAM_01", 9)
-        await anyio.sleep(1.0)
-        stats = client.stats
-        assert (stats.downloads, stats.cache_hits, stats.writes, stats.retries) == (1, 0, 1, 0)
-        assert stats.reads >= 1
-        assert stats.bytes_received == client.bytes_received > 25 * 37
-        assert stats.bytes_sent == client.bytes_sent
-        assert stats.frames_received > 26
-        assert stats.frames_sent >= 4
-        assert (stats.skipped, stats.damaged, stats.lost, stats.repeated) == (0, 0, None, None)
-        assert stats.round_trips == {(1, 1): component.round_trip}
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            stats.reads = 0  # type: ignore[misc]  # that is the point
-    async with a_client(vehicle, cache=path) as client:
-        await (await client.component()).fetch_all()
-    assert (client.stats.downloads, client.stats.cache_hits) == (0, 1)
-
-
-@in_simulated_time
-async def test_losses_are_counted_on_request() -> None:
-    air = Air.symmetric([generic()], seed=1, loss=0.2)
-    async with a_client(air, traffic=True) as client:
-        await client.component()
-        await (await client.component()).fetch_all()
-        await anyio.sleep(5.0)
-        stats, report = client.stats, client.traffic_report()
-    assert stats.lost == sum(each.lost for each in report.components)
-    assert stats.lost
-    assert stats.repeated == 0
-
-
-def test_damage_is_counted_over_all_peers_that_ever_were() -> None:
-    station = Station(link="test", is_stream=True)
-    beat = wire.Heartbeat(2, wire.MAV_AUTOPILOT_PX4, system_status=4)
-    good = wire.encode(beat, system=1, component=1, sequence=0)
-    bad = good[:-1] + bytes((good[-1] ^ 1,))
-    for peer in range(300):
-        station.receive(b"no" + bad + good, peer, 0.0)
-    station.receive(b"", 299, 0.0)
-    assert station.framing == (300, 300 * (2 + len(bad)), 300)
-    station.pause()
-    assert station.framing == (300, 300 * (2 + len(bad)), 300)

@@ -6,9 +6,9 @@ import anyio
 import pytest
 
 from paramclient import AmbiguousVehicle, Component, LinkError, NoReply, UsageError
-from paramclient.protocol import wire
-from paramclient.protocol.vehicle_selection import LOOK_TIME
+from paramclient.protocol.selection import LOOK_TIME
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
+from paramclient.wire import frames, messages
 from tests.shell import (
     FlakyLink,
     Late,
@@ -68,7 +68,7 @@ async def test_several_are_refused_with_the_list_as_soon_as_they_are_heard(phase
     assert error.vehicles == ("1/1 PX4 quadrotor", "2/1 ArduPilot quadrotor")
     assert (error.choose_by, error.summary) == ("system", TEXT)
     assert isinstance(error, UsageError | ValueError)
-    assert {type(message) for _, _, message in tap.received} <= {wire.Heartbeat, wire.CommandLong}
+    assert {type(message) for _, _, message in tap.received} <= {messages.Heartbeat, messages.CommandLong}
 
 
 class NotReceived(Tap):
@@ -76,14 +76,17 @@ class NotReceived(Tap):
 
     def data_to_send(self) -> list[bytes]:
         is_requested = any(
-            message.params[0] == wire.HEARTBEAT_ID for message in self.messages(wire.CommandLong)
+            message.param1 == messages.message_id(messages.Heartbeat)
+            for message in self.messages(messages.CommandLong)
         )
-        framer = wire.Framer(wire.DECODED_IDS, stream=False)
+        framer = frames.Framer(messages.DECODED_IDS, stream=False)
         return [
             data
             for data in super().data_to_send()
             if is_requested
-            or not any(frame.message_id == wire.HEARTBEAT_ID for frame in framer.receive(data))
+            or not any(
+                frame.message_id == messages.message_id(messages.Heartbeat) for frame in framer.receive(data)
+            )
         ]
 
 
@@ -157,7 +160,7 @@ async def test_after_an_absence_of_the_link_a_second_one_is_looked_for_again() -
         found = await client.only_component()
         assert simulated_time_loop().now - began >= LOOK_TIME
         assert address(found) == (1, 1)
-        assert not tap.messages(wire.ParamSetMessage)
+        assert not tap.messages(messages.ParamSet)
 
 
 @in_simulated_time

@@ -6,8 +6,8 @@ import pytest
 
 from paramclient import ParamType, SetStatus, UnknownParameter, UsageError
 from paramclient.metadata import Metadata, ParamInfo
-from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, SimParam
+from paramclient.wire import messages
 from tests.shell import Tap, a_client, in_simulated_time
 
 
@@ -36,7 +36,7 @@ async def test_defaults_of_the_vehicle_are_written_and_verified() -> None:
         assert vehicle.params["COUNT"].value == component.params["COUNT"].value == 12
         assert component.params["CHANGED"].is_changed is False
         assert component.params["CHANGED"].value == pytest.approx(0.1)
-    assert [each.param_id for each in tap.messages(wire.ParamSetMessage)] == ["COUNT", "CHANGED"]
+    assert [each.param_id for each in tap.messages(messages.ParamSet)] == ["COUNT", "CHANGED"]
 
 
 @in_simulated_time
@@ -62,7 +62,7 @@ async def test_a_parameter_without_a_known_default_is_listed_and_not_written() -
         assert [str(each.status) for each in result.written.outcomes] == ["accepted"]
         assert (result.unchanged, result.without_default) == (("C",), ("B",))
         assert component.params["A"].value == 1.5
-    assert {each.param_id for each in tap.messages(wire.ParamSetMessage)} == {"A"}
+    assert {each.param_id for each in tap.messages(messages.ParamSet)} == {"A"}
 
 
 @in_simulated_time
@@ -74,7 +74,7 @@ async def test_an_unknown_name_is_an_error_and_nothing_is_written() -> None:
             await component.reset("COUNT", "NO_SUCH")
         with pytest.raises(UsageError, match="at least one"):
             await component.reset()
-    assert not tap.messages(wire.ParamSetMessage)
+    assert not tap.messages(messages.ParamSet)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import itertools
-import math
 import socket
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -16,102 +14,7 @@ import pytest
 
 from paramclient import ParamCache
 from paramclient.model.values import ParamType
-from paramclient.protocol import wire
-from paramclient.protocol.params.fetch import Fetch
-from paramclient.protocol.station import Station
-from paramclient.protocol.wire import ParamRequestList
-from paramclient.sim import Air, OtherStation, PX4Vehicle, SimParam, Vehicle
-from tests.simulation import Simulation, listing_ardupilot
-
-Make = Callable[[], Vehicle]
-KINDS: dict[str, Make] = {"px4": PX4Vehicle, "ardupilot": listing_ardupilot}
-
-
-class Shared:
-    """Two stations with paramclient on one air: both receive all messages, and neither receives those of the
-    other."""
-
-    def __init__(self, vehicle: Vehicle, **faults: float) -> None:
-        self.vehicle = vehicle
-        self.air = Air.symmetric([vehicle], seed=3, **faults)  # type: ignore[arg-type]  # numbers, all of them
-        self.stations = [Station(link="x", is_stream=False, system=system) for system in (255, 254)]
-        self.now = 0.0
-        self.air.tick(0.0)
-
-    def run(self, until: Callable[[], bool], limit: float = 120.0) -> float:
-        """Let time pass until something is so; what time it is then."""
-        while not until():
-            assert self.now < limit
-            for station in self.stations:
-                station.tick(self.now)
-                for data, _ in station.data_to_send():
-                    self.air.receive(data, self.now)
-            ours = min(station.next_deadline() for station in self.stations)
-            theirs = self.air.next_deadline()
-            self.now = max(min(ours, math.inf if theirs is None else theirs), self.now + 1e-7)
-            self.air.tick(self.now)
-            for data in self.air.data_to_send():
-                for station in self.stations:
-                    station.receive(data, None, self.now)
-        return self.now
-
-    def meet(self) -> None:
-        """Wait until both know who the vehicle is."""
-        self.run(lambda: all((1, 1) in each.components for each in self.stations))
-        self.run(lambda: all(each.components[1, 1].identification.settled for each in self.stations))
-
-    def fetch(self, number: int) -> Fetch:
-        return self.stations[number].components[1, 1].begin_fetch(self.now)
-
-    def is_right(self, fetch: Fetch) -> bool:
-        result = fetch.result
-        return (
-            result is not None
-            and result.complete
-            and all(
-                result.params[name].same_value(param)
-                for name, param in self.vehicle.params.items()
-                if name not in ("STAT_RUNTIME", "BARO1_GND_PRESS")  # they move by themselves
-            )
-        )
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_two_fetches_of_two_stations_complete_with_packet_loss(kind: str) -> None:
-    world = Shared(KINDS[kind](), loss=0.1, delay=0.01)
-    world.meet()
-    began = world.now
-    first = world.fetch(0)
-    world.run(lambda: world.now >= began + 0.5)
-    second = world.fetch(1)
-    world.run(lambda: first.done and second.done)
-    assert world.is_right(first)
-    assert world.is_right(second)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_values_requested_by_another_station_fill_the_table(kind: str) -> None:
-    vehicle = KINDS[kind]()
-    setting = SimParam("MC_ROLL_P" if kind == "px4" else "RTL_ALT", ParamType.REAL32, 7.5)
-    world = Simulation(air=Air([vehicle], others=[OtherStation(list_every=4.0, sets=[(10.0, setting)])]))
-    world.meet()
-    world.run(6.0)
-    params = world.machine.table.params
-    assert params.keys() >= vehicle.params.keys()
-    assert not world.sent_of(ParamRequestList)
-
-
-def test_a_fetch_reads_what_a_stopped_list_of_another_station_lacks() -> None:
-    world = Shared(PX4Vehicle(list_stops_at=500))
-    world.meet()
-    message = wire.encode(ParamRequestList(1, 1), system=253, component=190, sequence=0)
-    world.air.receive(message, world.now)
-    began = world.now
-    world.run(lambda: world.now >= began + 0.3)
-    fetch = world.fetch(1)
-    world.run(lambda: fetch.done)
-    assert world.is_right(fetch)
-
+from paramclient.sim import PX4Vehicle, SimParam
 
 PROGRAM = """
 import anyio, sys

@@ -37,8 +37,8 @@ from paramclient.client.signing_timestamps import (
     TimestampKeeper,
 )
 from paramclient.links import SimLink
-from paramclient.protocol.wire import Refusal
 from paramclient.sim import ArduPilotVehicle, Vehicle
+from paramclient.wire.signing import Refusal
 from tests.shell import VALUES, in_simulated_time, simulated_time_loop, small_px4
 
 SECRET = bytes(range(101, 133))

@@ -14,7 +14,7 @@ import pytest
 
 from paramclient import CacheError, Component, ParamCache, ParamClient
 from paramclient.cache import sqlite
-from paramclient.client.cache_writer import CACHE_FLUSH_INTERVAL, PENDING_MAX, RETRY_INTERVAL
+from paramclient.client.cache_writer import FLUSH_INTERVAL, PENDING_MAX, RETRY_INTERVAL
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.provision import apply
 from paramclient.sim import PX4Vehicle
@@ -80,7 +80,7 @@ async def test_values_written_late_keep_their_times_and_the_whole_history(
                 await until(partial(is_received, component, value))
                 received.append(anyio.current_time() - began_at)
                 await anyio.sleep(10)
-        await anyio.sleep(2 * RETRY_INTERVAL + CACHE_FLUSH_INTERVAL)
+        await anyio.sleep(2 * RETRY_INTERVAL + FLUSH_INTERVAL)
         with ParamCache(path) as cache:
             lines = cache.history(cache.vehicles()[0].key)
     assert [(line.old.value, line.new and line.new.value) for line in lines] == [(1, 5), (5, 6), (6, 7)]
@@ -100,7 +100,7 @@ async def test_after_very_many_changes_the_whole_table_is_written(path: Path) ->
         with locked(path):
             for value in range(PENDING_MAX + 20):
                 vehicle.set_param(NAME, float(value))
-                await anyio.sleep(CACHE_FLUSH_INTERVAL)
+                await anyio.sleep(FLUSH_INTERVAL)
         await anyio.sleep(2 * RETRY_INTERVAL)
         with ParamCache(path) as cache:
             assert cache.component().params[NAME].value == vehicle.values[NAME] == PENDING_MAX + 19

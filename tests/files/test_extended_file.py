@@ -18,34 +18,32 @@ from paramclient.files.disk import (
     read_extended_file,
     write_extended_file,
 )
-from paramclient.model.ext_params import ExtParam, ExtParamType
-from paramclient.model.ext_paramset import ExtParamSet
-from paramclient.model.values import Trust
+from paramclient.model.ext_values import ext_param
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import ParamType
 from paramclient.sim import Camera
 
-KINDS = ExtParamType
+KINDS = ParamType
 DATA = Path(__file__).parents[1] / "data"
 ODD_NAN = struct.pack("<I", 0x7FC00001)
 
 
-def cached(name: str, raw: bytes, kind: int = KINDS.CUSTOM) -> ExtParam:
-    return ExtParam.of(name, raw, kind, None, Trust.CACHED)
+def written(name: str, raw: bytes, kind: int = KINDS.CUSTOM) -> WrittenParam:
+    return WrittenParam.of(ext_param(name, raw, kind))
 
 
-def every_kind() -> dict[str, ExtParam]:
-    params = {
-        name: param.with_index(None).with_trust(Trust.CACHED) for name, param in Camera().ext_params.items()
-    }
+def every_kind() -> dict[str, WrittenParam]:
+    params = {name: WrittenParam.of(param) for name, param in Camera().ext_params.items()}
     more = [
-        cached("NAN", struct.pack("<f", math.nan), KINDS.REAL32),
-        cached("ODD_NAN", ODD_NAN, KINDS.REAL32),
-        cached("INFINITE", struct.pack("<d", -math.inf), KINDS.REAL64),
-        cached("NO", 'off: "yes"\n\ttab 🚁 grün # 1'.encode()),
-        cached("EMPTY", b""),
-        cached("NUMBER", b"0x10"),
-        cached("BYTES", b"\xff\0\xfe"),
-        cached("UNKNOWN", b"\1\2", 77),
-        cached("NULL", b"null"),
+        written("NAN", struct.pack("<f", math.nan), KINDS.REAL32),
+        written("ODD_NAN", ODD_NAN, KINDS.REAL32),
+        written("INFINITE", struct.pack("<d", -math.inf), KINDS.REAL64),
+        written("NO", 'off: "yes"\n\ttab 🚁 grün # 1'.encode()),
+        written("EMPTY", b""),
+        written("NUMBER", b"0x10"),
+        written("BYTES", b"\xff\0\xfe"),
+        written("UNKNOWN", b"\1\2", 77),
+        written("NULL", b"null"),
     ]
     return params | {param.name: param for param in more}
 
@@ -54,7 +52,7 @@ def test_a_written_file_reads_back_unchanged(tmp_path: Path) -> None:
     """The written file is the one that the first version of the format wrote."""
     path = tmp_path / "camera.json"
     params = every_kind()
-    write_extended_file(path, ExtParamSet(params, 1, 100, 1_700_000_000.0, "link sim:camera"))
+    write_extended_file(path, ParamSet(params, 100, 1, at=1_700_000_000.0, source="link sim:camera"))
     assert path.read_bytes() == (DATA / "camera.json").read_bytes()
     assert is_extended_file(path)
     found = read_extended_file(path)
@@ -66,8 +64,8 @@ def test_a_written_file_reads_back_unchanged(tmp_path: Path) -> None:
 @given(raw=st.binary(max_size=128) | st.text(max_size=30).map(str.encode))
 def test_any_custom_value_is_restored(tmp_path_factory: pytest.TempPathFactory, raw: bytes) -> None:
     path = tmp_path_factory.getbasetemp() / "any.json"
-    param = cached("A", raw[:128])
-    write_extended_file(path, ExtParamSet({"A": param}))
+    param = written("A", raw[:128])
+    write_extended_file(path, ParamSet({"A": param}))
     assert read_extended_file(path).params["A"] == param
 
 
@@ -75,13 +73,13 @@ def test_any_custom_value_is_restored(tmp_path_factory: pytest.TempPathFactory, 
 def test_formats_that_cannot_hold_them(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"camera.{ending}"
     with pytest.raises(FileError, match=r"cannot hold extended parameters; write \.json"):
-        write_extended_file(path, ExtParamSet(every_kind()))
+        write_extended_file(path, ParamSet(every_kind()))
     assert not path.exists()
 
 
 def test_nothing_is_written_without_parameters(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="no parameters"):
-        write_extended_file(tmp_path / "a.json", ExtParamSet({}))
+        write_extended_file(tmp_path / "a.json", ParamSet({}))
 
 
 def test_the_two_kinds_of_files_are_distinguished() -> None:
@@ -96,9 +94,9 @@ def test_the_two_kinds_of_files_are_distinguished() -> None:
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"value": 1}, "is no type"),
-        ({"value": 1, "type": "TYPE_5"}, "is no type"),
-        ({"value": 1, "type": "EXT_TYPE_999"}, "is no type"),
+        ({"value": 1}, "expected value or hex, and type"),
+        ({"value": 1, "type": "TYPE_5"}, "unknown type"),
+        ({"value": 1, "type": "EXT_TYPE_999"}, "unknown type"),
         ({"type": "CUSTOM"}, "either value or hex"),
         ({"value": 1, "hex": "00", "type": "INT32"}, "either value or hex"),
         ({"value": 1, "type": "INT32", "more": 1}, "expected value or hex, and type"),

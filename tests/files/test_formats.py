@@ -243,7 +243,7 @@ def test_packed_files_convert_to_other_formats(name: str) -> None:
 
 
 def test_an_incomplete_packed_file_has_a_note() -> None:
-    from paramclient.protocol.ftp import param_pck
+    from paramclient.protocol import param_pck
 
     entry = param_pck.PackedParam("A", ParamType.INT8, 1)
     file = loads(param_pck.encode([entry], total=3))

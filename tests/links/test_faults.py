@@ -16,11 +16,11 @@ import pytest
 
 from paramclient.errors import LinkError
 from paramclient.links import Link, create_link, serve_endpoint, udp
-from paramclient.protocol import wire
+from paramclient.wire import messages
 from tests.cable import TIMEOUT
 from tests.shell import a_client, bits, generic
 
-HEARTBEAT = wire.encode(wire.Heartbeat(6, 8), system=255, component=190, sequence=0)
+HEARTBEAT = messages.encode(messages.Heartbeat(6, 8), system=255, component=190, sequence=0)
 GONE = [errno.ENETDOWN, errno.ENETUNREACH, errno.EADDRNOTAVAIL, errno.EINVAL]
 
 

@@ -34,19 +34,19 @@ from paramclient.links import (
     tcp,
     udp,
 )
-from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
+from paramclient.wire import frames, messages
 from tests.cable import Cable
 
-HEARTBEAT = wire.encode(wire.Heartbeat(6, 8), system=255, component=190, sequence=0)
+HEARTBEAT = messages.encode(messages.Heartbeat(6, 8), system=255, component=190, sequence=0)
 TIMEOUT = 20.0
 """Seconds after which a test fails; a passing test never waits that long."""
 
 
 def frame(number: int) -> bytes:
     """Return a PARAM_VALUE with this index."""
-    value = wire.ParamValue("SYS_AUTOSTART", bytes(4), 6, 2000, number)
-    return wire.encode(value, system=1, component=1, sequence=number % 256)
+    value = messages.ParamValue("SYS_AUTOSTART", bytes(4), 6, 2000, number)
+    return messages.encode(value, system=1, component=1, sequence=number % 256)
 
 
 def open_files() -> int:
@@ -849,24 +849,26 @@ async def test_tcpin_limits_its_connections(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def request_hash(system: int = 1) -> bytes:
-    request = wire.ParamRequestRead(system, 1, wire.HASH_CHECK)
-    return wire.encode(request, system=255, component=190, sequence=0)
+    request = messages.ParamRequestRead(system, 1, messages.HASH_CHECK)
+    return messages.encode(request, system=255, component=190, sequence=0)
 
 
 def request_by_index(index: int, system: int = 1) -> bytes:
-    return wire.encode(wire.ParamRequestRead(system, 1, "", index), system=255, component=190, sequence=0)
+    return messages.encode(
+        messages.ParamRequestRead(system, 1, "", index), system=255, component=190, sequence=0
+    )
 
 
-async def answer(link: Link, request: bytes) -> tuple[wire.Frame, wire.ParamValue]:
+async def answer(link: Link, request: bytes) -> tuple[frames.Frame, messages.ParamValue]:
     """Send a request, and wait for the first PARAM_VALUE."""
-    framer = wire.Framer(stream=link.is_stream)
+    framer = frames.Framer(stream=link.is_stream)
     with anyio.fail_after(TIMEOUT):
         await link.send(request, None)
         while True:
             for _, data in await link.receive():
                 for found in framer.receive(data):
-                    message = wire.decode(found)
-                    if isinstance(message, wire.ParamValue):
+                    message = messages.decode(found)
+                    if isinstance(message, messages.ParamValue):
                         return found, message
 
 
@@ -882,15 +884,15 @@ async def test_a_simulated_vehicle_responds_in_the_process(vehicle: str) -> None
 @pytest.mark.asyncio
 async def test_a_simulated_vehicle_sends_its_complete_list() -> None:
     names: set[str] = set()
-    framer = wire.Framer({22}, stream=False)
+    framer = frames.Framer({22}, stream=False)
     async with opened("sim:px4") as link:
-        request = wire.ParamRequestList(1, 1)
-        await link.send(wire.encode(request, system=255, component=190, sequence=0), None)
+        request = messages.ParamRequestList(1, 1)
+        await link.send(messages.encode(request, system=255, component=190, sequence=0), None)
         with anyio.fail_after(TIMEOUT):
             while len(names) < 904:
                 for _, data in await link.receive():
-                    names.update(wire.text_of(found.payload[8:24]) for found in framer.receive(data))
-    assert wire.HASH_CHECK in names
+                    names.update(messages.text_of(found.payload[8:24]) for found in framer.receive(data))
+    assert messages.HASH_CHECK in names
 
 
 @pytest.mark.asyncio
@@ -928,7 +930,7 @@ async def test_a_simulated_vehicle_on_a_real_link(vehicle_link: str, station_lin
                 assert any(data for _, data in await collect(link, 1))  # its heartbeat
                 _, value = await answer(link, request_hash())
                 tasks.cancel_scope.cancel()
-        assert value.param_id == wire.HASH_CHECK
+        assert value.param_id == messages.HASH_CHECK
         assert int.from_bytes(value.raw, "little") == vehicle.announced_hash()
         tasks.cancel_scope.cancel()
     assert served.address is None

@@ -20,15 +20,15 @@ import anyio.lowlevel
 import pytest
 import serialx
 
-from paramclient.client import reconnect_delays
+from paramclient.client import link_task
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link, serial
 from paramclient.links.serial_transport import UNREAD_BYTES_MAX, Transport
-from paramclient.protocol import wire
+from paramclient.wire import messages
 from tests.cable import TIMEOUT, Cable
 from tests.shell import a_client, bits, generic, small_px4, until
 
-HEARTBEAT = wire.encode(wire.Heartbeat(6, 8), system=255, component=190, sequence=0)
+HEARTBEAT = messages.encode(messages.Heartbeat(6, 8), system=255, component=190, sequence=0)
 RATE = 40_000.0
 """Bytes per second in each direction. With 57600 baud (5,760 bytes per second), tests would take seconds."""
 
@@ -121,9 +121,9 @@ async def test_unplugged_in_the_middle_of_a_download(
 
 @pytest.mark.asyncio
 async def test_unplugged_permanently(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnect_delays, "LINK_TIMEOUT", 0.2)
-    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.05)
-    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MAX", 0.1)
+    monkeypatch.setattr(link_task, "LINK_TIMEOUT", 0.2)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.05)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MAX", 0.1)
     vehicle = generic(stream=True)
     async with (
         asyncio.timeout(TIMEOUT),

@@ -29,7 +29,7 @@ from paramclient.errors import (
 )
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, type_name
-from paramclient.protocol.vehicle.reboot_command import SAVING_TIME
+from paramclient.protocol.commands import SAVING_TIME
 from paramclient.provision import ApplyStatus, apply, restore
 from tests.live.choice import another_value
 from tests.live.journal import check_disarmed
@@ -206,7 +206,6 @@ async def fetch_warm(session: Session) -> Measured:
 async def fetch(session: Session, vehicle: Component, *, refresh: bool = False) -> Measured:
     """Fetch everything, and compare it with the state before."""
     result = await vehicle.fetch_all(refresh=refresh, timeout=SLOWEST_FETCH)
-    await vehicle.refreshed(timeout=SLOWEST_FETCH)
     await session.check_fetched(vehicle, result)
     return reported(result)
 

@@ -15,7 +15,7 @@ import anyio
 from paramclient import Component, ParamSet, write_file
 from paramclient.errors import ParamClientError, VehicleArmed
 from paramclient.model.values import Param, WireValue, format_value
-from paramclient.protocol.params.writes import SetResult
+from paramclient.protocol.set_results import SetResult
 from paramclient.provision.apply_rules import rules_for
 
 __all__ = ["Journal", "check_disarmed"]

@@ -27,14 +27,14 @@ import anyio
 import anyio.from_thread
 import anyio.lowlevel
 
+from paramclient.client.frame_cutter import FrameCutter
 from paramclient.errors import FileErrorCode, LinkError
 from paramclient.links import create_link, parse_link
 from paramclient.links.link import Peer
 from paramclient.links.udp import UdpIn
-from paramclient.protocol import wire
-from paramclient.protocol.ftp.packets import Opcode, Packet
-from paramclient.protocol.stats.sniffer import FrameCutter
+from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.sim import Air, FaultyLink
+from paramclient.wire import frames, messages
 
 __all__ = ["CLEAN", "Conditions", "Counts", "RealVehicle", "Relay"]
 
@@ -57,7 +57,7 @@ LIST_REQUEST_ID: Final = 21
 """PARAM_REQUEST_LIST."""
 PARAMETER_TRAFFIC: Final = frozenset(
     {
-        *(wire.PARAM_VALUE_ID, wire.AUTOPILOT_VERSION_ID),
+        *(messages.message_id(messages.ParamValue), messages.message_id(messages.AutopilotVersion)),
         *(0, 2, 77, 110, 234, 253, 345, 397),
     }
 )
@@ -138,7 +138,7 @@ class RealVehicle:
         self.first_request_at: float | None = None
         self._conditions = CLEAN
         self._cutter = FrameCutter(stream=True) if is_stream else None
-        self._framer = wire.Framer({FILE_TRANSFER_ID}, stream=False)
+        self._framer = frames.Framer({FILE_TRANSFER_ID}, stream=False)
         self._incoming: list[tuple[float, bytes]] = []
         self._now = 0.0
         self._sequence = 0
@@ -165,8 +165,8 @@ class RealVehicle:
         """See `Endpoint.receive`."""
         if self._conditions.refuses_files:
             for frame in self._framer.receive(data):
-                message = wire.decode(frame)
-                if isinstance(message, wire.FileTransfer):
+                message = messages.decode(frame)
+                if isinstance(message, messages.FileTransfer):
                     self._incoming.append((now, self._refusal(message, frame)))
                     return
         self.outgoing.append(data)
@@ -185,7 +185,7 @@ class RealVehicle:
         del self._incoming[: len(due)]
         return due
 
-    def _refusal(self, message: wire.FileTransfer, frame: wire.Frame) -> bytes:
+    def _refusal(self, message: messages.FileTransfer, frame: frames.Frame) -> bytes:
         """Encode the NAK with which a server answers that it has no such file."""
         request = Packet.unpack(message.payload)
         self._sequence = (self._sequence + 1) % 256
@@ -197,8 +197,8 @@ class RealVehicle:
             requested=request.opcode,
             data=b"" if is_close else bytes([FileErrorCode.FILE_NOT_FOUND]),
         )
-        reply = wire.FileTransfer(0, frame.system, frame.component, answer.pack())
-        return wire.encode(
+        reply = messages.FileTransfer(0, frame.system, frame.component, answer.pack())
+        return messages.encode(
             reply,
             system=message.target_system,
             component=message.target_component,

@@ -72,7 +72,7 @@ def test_values_are_multiplied_as_decimal_numbers(
 
 
 def test_raw_bytes_cannot_be_multiplied() -> None:
-    with pytest.raises(UsageError, match="OLD cannot become NEW: its value is raw bytes"):
+    with pytest.raises(UsageError, match="OLD cannot become NEW: its value is no number"):
         CENTIMETRES.convert(WrittenParam("OLD", b"\1\0\0\0"), "NEW")
 
 

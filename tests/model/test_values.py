@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from paramclient.errors import UsageError
+from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import (
     Encoding,
     Param,
@@ -28,12 +29,13 @@ from paramclient.model.values import (
     from_bits,
     same_bits,
 )
+from paramclient.protocol.dialect import PLAIN
 
 BYTEWISE, C_CAST = Encoding.BYTEWISE, Encoding.C_CAST
 KNOWN = [kind for kind in ParamType if kind is not ParamType.UNKNOWN]
 INTEGERS = [kind for kind in ParamType if kind.is_integer]
 SMALL = [kind for kind in INTEGERS if kind.size <= 4]
-UNDEFINED = [0, 11, 77, 255]
+UNDEFINED = [0, 77, 255]
 
 SIGNALLING = [(0xFF800001, 0xFFBFFFFF), (0x7F800001, 0x7FBFFFFF)]
 """Bit patterns of signalling NaNs. As INT32: −8388607 to −4194305 and 2139095041 to 2143289343."""
@@ -80,6 +82,15 @@ def test_a_param_of_an_unknown_type_has_a_number_and_is_raw(number: int) -> None
     assert str(param) == "X = 0x84030201"
     assert param == Param("X", 0x84030201, number, None, 0x84030201)
     assert param != Param("X", b"\x01\x02\x03\x84", 200, None, 0x84030201)
+
+
+def test_a_plain_param_of_the_type_custom_is_one_of_an_unknown_type() -> None:
+    param = PLAIN.param("X", b"abc\n", 11, None, Encoding.BYTEWISE)
+    assert (param.type, param.type_number, param.is_raw) == (ParamType.UNKNOWN, 11, True)
+    assert (param.settable, str(param)) == (b"abc\n", "X = 0x0a636261")
+    written = WrittenParam.of(param.with_trust(Trust.CACHED))
+    assert (written.type, written.is_raw, written.settable) == (ParamType.UNKNOWN, True, b"abc\n")
+    assert written.is_held_by(param)
 
 
 # Byte-wise

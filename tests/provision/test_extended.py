@@ -4,22 +4,25 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import anyio
 import pytest
 
 from paramclient import (
     CacheError,
     Component,
-    ExtParam,
-    ExtParamSet,
     NoReply,
     NotInCache,
     ParamCache,
+    ParamSet,
+    ParamType,
     SetStatus,
     UsageError,
+    Value,
+    WrittenParam,
 )
+from paramclient.cache import SnapshotSummary
 from paramclient.files.disk import read_extended_file
-from paramclient.model.ext_params import ExtValue
-from paramclient.protocol.ext.write_batch import ExtSetOutcome
+from paramclient.protocol.set_results import SetOutcome
 from paramclient.provision import (
     apply_extended,
     load_extended_state,
@@ -43,12 +46,17 @@ def small() -> Camera:
     )
 
 
-def wanted(camera: Camera, **values: ExtValue) -> ExtParamSet:
+def wanted(camera: Camera, **values: Value) -> ParamSet:
     """The set of a camera with some values changed."""
     other = Camera({name: (param.type, param.value) for name, param in camera.ext_params.items()})
     for name, value in values.items():
         other.set_ext_param(name, value)
-    return ExtParamSet({name: param for name, param in other.ext_params.items() if name in values})
+    return ParamSet.of(param for name, param in other.ext_params.items() if name in values)
+
+
+def snapshots(component: Component) -> list[SnapshotSummary]:
+    assert component.core.cache is not None
+    return component.core.cache.snapshots(component.identity.key, 100, extended=True)
 
 
 async def the_camera(client: object, number: int = 100) -> Component:
@@ -62,14 +70,14 @@ async def test_a_set_is_compared_and_nothing_is_written() -> None:
     async with a_client(camera) as client:
         component = await the_camera(client)
         content = wanted(camera, MODE=2, NAME="Front", KEY=b"\1")
-        more = {"LOST": ExtParam.of("LOST", b"x", 11), "EV": ExtParam.of("EV", b"x", 11)}
-        plan = await verify_extended(component, ExtParamSet({**content.params, **more}))
+        more = {name: WrittenParam(name, "x", ParamType.CUSTOM) for name in ("LOST", "EV")}
+        plan = await verify_extended(component, ParamSet({**content.params, **more}))
         assert (list(plan.changes), plan.missing, plan.mistyped) == (["MODE", "KEY"], ("LOST",), ("EV",))
         assert (plan.is_possible, plan.is_met) == (False, False)
         assert (await verify_extended(component, wanted(camera, NAME="Front"))).is_met
         assert camera.ext_values["MODE"] == 1
         with pytest.raises(UsageError, match="of component 101, and 1/100 is chosen"):
-            await verify_extended(component, ExtParamSet({}, component=101))
+            await verify_extended(component, ParamSet({}, component=101))
 
 
 @in_simulated_time
@@ -78,7 +86,7 @@ async def test_what_differs_is_written_and_read_back(tmp_path: Path, path: Path)
     with ParamCache(path) as cache:
         async with a_client(camera, cache=cache) as client:
             component = await the_camera(client)
-            reported: list[ExtSetOutcome] = []
+            reported: list[SetOutcome] = []
             result = await apply_extended(
                 component,
                 wanted(camera, MODE=2, NAME="Rear", KEY=b"\xff\0\xfe", CLOCK=2**62 + 3),
@@ -94,7 +102,7 @@ async def test_what_differs_is_written_and_read_back(tmp_path: Path, path: Path)
             assert {name: each.value for name, each in result.before.params.items()} == {
                 name: each.value for name, each in before.params.items()
             }
-            [kept] = await component.ext.snapshots()
+            [kept] = snapshots(component)
             assert (kept.id, kept.reason, kept.size, kept.complete) == (
                 result.snapshot,
                 "before apply",
@@ -133,7 +141,7 @@ async def test_the_state_before_the_last_apply_is_restored(path: Path) -> None:
         assert {name: param.value for name, param in state.params.items()} == before
         result = await restore_extended(component, state)
         assert (result.complete, camera.ext_values) == (True, before)
-        reasons = [each.reason for each in await component.ext.snapshots()]
+        reasons = [each.reason for each in snapshots(component)]
         assert reasons == ["before apply", "before restore"]
         undone = await restore_extended(component, await load_extended_state(component, result.snapshot))
         assert (undone.complete, camera.ext_values["NAME"]) == (True, "Top")
@@ -142,22 +150,23 @@ async def test_the_state_before_the_last_apply_is_restored(path: Path) -> None:
 @in_simulated_time
 async def test_a_state_at_a_time_is_restored(path: Path) -> None:
     camera = small()
-    async with a_client(camera, cache=path) as client:
-        component = await the_camera(client)
-        await component.ext.fetch_all()
-        first = await component.ext.store_snapshot(reason="by hand")
-        assert first is not None
-        await component.ext.set("NAME", "Rear")
-        [kept] = await component.ext.snapshots()
-        state = await component.ext.load_state(kept.at)
-        assert state.params["NAME"].value == "Front"
-        assert state == await component.ext.load_state(first)
-        assert (await restore_extended(component, state)).complete
-        assert camera.ext_values["NAME"] == "Front"
-        with pytest.raises(CacheError, match="no snapshot 99 of"):
-            await component.ext.load_state(99)
-        with pytest.raises(NotInCache, match="the history begins at"):
-            await component.ext.load_state(5.0)
+    with ParamCache(path) as cache:
+        async with a_client(camera, cache=cache) as client:
+            component = await the_camera(client)
+            await component.ext.fetch_all()
+            await anyio.sleep(2.0)  # until the camera is identified, and the cache has its table
+            first = cache.store_snapshot("1", 100, reason="by hand", extended=True).id
+            await component.ext.set("NAME", "Rear")
+            [kept] = snapshots(component)
+            state = await load_extended_state(component, kept.at)
+            assert state.params["NAME"].value == "Front"
+            assert state == await load_extended_state(component, first)
+            assert (await restore_extended(component, state)).complete
+            assert camera.ext_values["NAME"] == "Front"
+            with pytest.raises(CacheError, match="no snapshot 99 of"):
+                await load_extended_state(component, 99)
+            with pytest.raises(NotInCache, match="the history begins at"):
+                await load_extended_state(component, 5.0)
 
 
 @in_simulated_time

@@ -121,6 +121,7 @@ async def test_snapshots_are_stored_listed_read_and_applied(cache: str) -> None:
         assert made.status_code == 201
         await browser.put(f"{V}/params/PARAM_04", json={"value": 44})
         (kept,) = (await browser.get(f"{V}/snapshots")).json()["snapshots"]
+        assert made.json() == {"id": kept["id"]}
         assert (kept["reason"], kept["size"], kept["complete"]) == ("before the flight", 25, True)
         query = {"snapshot": kept["id"]}
         params = (await browser.get(f"{V}/params", params=query)).json()["params"]

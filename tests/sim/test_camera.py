@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 
 from paramclient.errors import ExtAckResult, UsageError
-from paramclient.model.ext_params import ExtParamType
-from paramclient.protocol import wire
-from paramclient.protocol.wire import (
+from paramclient.model.values import ParamType
+from paramclient.sim import Camera
+from paramclient.wire import frames, messages
+from paramclient.wire.messages import (
     Message,
     ParamExtAck,
     ParamExtRequestList,
@@ -17,19 +18,18 @@ from paramclient.protocol.wire import (
     ParamExtSet,
     ParamExtValue,
 )
-from paramclient.sim import Camera
 
-UINT32 = ExtParamType.UINT32
+UINT32 = ParamType.UINT32
 
 
 def ask(camera: Camera, message: Message, now: float = 1.0, *, until: float | None = None) -> list[Message]:
     """What the camera sends in answer."""
     camera.tick(0.0)
     camera.data_to_send()
-    camera.receive(wire.encode(message, system=255, component=190, sequence=0), now)
+    camera.receive(messages.encode(message, system=255, component=190, sequence=0), now)
     camera.tick(now if until is None else until)
-    framer = wire.Framer({322, 324}, stream=False)
-    found = [wire.decode(frame) for data in camera.data_to_send() for frame in framer.receive(data)]
+    framer = frames.Framer({322, 324}, stream=False)
+    found = [messages.decode(frame) for data in camera.data_to_send() for frame in framer.receive(data)]
     return [message for message in found if message is not None]
 
 
@@ -67,9 +67,9 @@ def test_results_of_sets() -> None:
     camera = Camera(supported={"CAM_MODE": [0, 1]}, failing=["CAM_ISO"], limits={"CAM_EXPMODE": (0, 3)})
     assert result(camera, set_mode(0)) == (0, ExtAckResult.ACCEPTED)
     assert result(camera, set_mode(2)) == (0, ExtAckResult.VALUE_UNSUPPORTED)
-    assert result(camera, set_mode(1, ExtParamType.UINT8)) == (0, ExtAckResult.FAILED)
+    assert result(camera, set_mode(1, ParamType.UINT8)) == (0, ExtAckResult.FAILED)
     assert result(camera, set_mode(1, name="CAM_ISO")) == (100, ExtAckResult.FAILED)
-    assert result(camera, set_mode(9, ExtParamType.UINT8, "CAM_EXPMODE")) == (3, ExtAckResult.ACCEPTED)
+    assert result(camera, set_mode(9, ParamType.UINT8, "CAM_EXPMODE")) == (3, ExtAckResult.ACCEPTED)
     assert ask(camera, set_mode(1, name="NO_SUCH")) == []
 
 
@@ -86,9 +86,9 @@ def test_a_slow_change() -> None:
 def test_changes_on_board() -> None:
     camera = Camera({"A": 1, "B": "text", "C": 0.5})
     assert {name: param.type for name, param in camera.ext_params.items()} == {
-        "A": ExtParamType.INT32,
-        "B": ExtParamType.CUSTOM,
-        "C": ExtParamType.REAL32,
+        "A": ParamType.INT32,
+        "B": ParamType.CUSTOM,
+        "C": ParamType.REAL32,
     }
     camera.set_ext_param("B", "other")
     camera.remove_ext_param("A")
@@ -101,7 +101,7 @@ def test_changes_on_board() -> None:
     [
         {"table": {"": 1}},
         {"table": {"A": "x" * 129}},
-        {"table": {"A": (ExtParamType.UINT8, 300)}},
+        {"table": {"A": (ParamType.UINT8, 300)}},
         {"failing": ["NO_SUCH"]},
         {"slow": {"NO_SUCH": 1.0}},
         {"limits": {"NO_SUCH": (0, 1)}},

@@ -10,9 +10,8 @@ from typing import Literal
 
 import pytest
 
-from paramclient.errors import UsageError
+from paramclient.errors import CommandResult, UsageError
 from paramclient.model.values import Encoding, ParamType
-from paramclient.protocol import wire
 from paramclient.sim import (
     Air,
     ArduPilotVehicle,
@@ -22,11 +21,14 @@ from paramclient.sim import (
     SimParam,
     Vehicle,
 )
+from paramclient.wire import frames, messages
 from tests.ground_station import LIST, PERIODIC_MESSAGES, Station, cast, indices, names, read, write
 
-NO_INDEX = wire.NO_INDEX
+NO_INDEX = messages.NO_INDEX
 TEN = {f"P{number}": number for number in range(10)}
-CLOCK_REQUEST = wire.CommandLong(1, 1, wire.MAV_CMD_REQUEST_MESSAGE, (float(wire.SYSTEM_TIME_ID), *[0.0] * 6))
+CLOCK_REQUEST = messages.CommandLong(
+    1, 1, messages.MAV_CMD_REQUEST_MESSAGE, float(messages.message_id(messages.SystemTime))
+)
 EVERY_KIND = pytest.mark.parametrize("kind", [GenericVehicle, PX4Vehicle, ArduPilotVehicle])
 
 
@@ -70,7 +72,7 @@ class TestDead:
         dead = [read(index=3), read("P3"), read(index=7), read("P7")]
         assert not station.ask(*dead, seconds=0.5)
         station.send(*dead).wait(0.5)
-        assert not station.receive(wire.ParamError)
+        assert not station.receive(messages.ParamError)
         assert len(station.ask(read(index=2), read("P6"))) == 2
         assert len(vehicle.params) == 10
 
@@ -113,10 +115,10 @@ class TestWhenListed:
         vehicle = GenericVehicle(TEN, burst=1)
         seen: list[float] = []
         vehicle.when_listed(3, lambda: seen.append(len(vehicle.data_to_send())))
-        vehicle.receive(wire.encode(LIST, system=255, component=190, sequence=0), 0.0)
+        vehicle.receive(messages.encode(LIST, system=255, component=190, sequence=0), 0.0)
         vehicle.tick(1.0)
         assert seen == [3 + len(PERIODIC_MESSAGES) * 2]
-        vehicle.receive(wire.encode(LIST, system=255, component=190, sequence=0), 1.0)
+        vehicle.receive(messages.encode(LIST, system=255, component=190, sequence=0), 1.0)
         vehicle.tick(2.0)
         assert len(seen) == 1
 
@@ -145,29 +147,29 @@ class TestSwitchingOn:
     def test_the_heartbeat_starts_with_the_vehicle(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN)
         station = Station(vehicle, start=100.0).wait(2.5)
-        assert len(station.receive(wire.Heartbeat)) == 3
+        assert len(station.receive(messages.Heartbeat)) == 3
         vehicle.reboot(station.now, down=0.7)
-        assert len(station.wait(2.0).receive(wire.Heartbeat)) == 2
+        assert len(station.wait(2.0).receive(messages.Heartbeat)) == 2
 
     def test_the_heartbeat_has_the_boot_state(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN, boot_time=2.5)
         station = Station(vehicle).wait(4.5)
-        beats = station.receive(wire.Heartbeat)
+        beats = station.receive(messages.Heartbeat)
         ready = beats[-1].system_status
         assert ready in (3, 4)
         assert [beat.system_status for beat in beats] == [1, 1, 1, ready, ready]
         vehicle.reboot(station.now)
-        assert station.wait(0.5).receive(wire.Heartbeat)[0].system_status == 1
+        assert station.wait(0.5).receive(messages.Heartbeat)[0].system_status == 1
 
 
 class TestClock:
     def test_system_time_starts_with_the_vehicle(self) -> None:
         vehicle = GenericVehicle(table=TEN)
         station = Station(vehicle, start=100.0).wait(2.5)
-        assert [time.time_boot_ms for time in station.receive(wire.SystemTime)] == [0, 1000, 2000]
+        assert [time.time_boot_ms for time in station.receive(messages.SystemTime)] == [0, 1000, 2000]
         vehicle.reboot(station.now, down=0.7)
-        times = station.wait(2.0).receive(wire.SystemTime)
-        assert times == [wire.SystemTime(0, 0), wire.SystemTime(0, 1000)]
+        times = station.wait(2.0).receive(messages.SystemTime)
+        assert times == [messages.SystemTime(0, 0), messages.SystemTime(0, 1000)]
 
     @pytest.mark.parametrize("kind", [GenericVehicle, ArduPilotVehicle])
     def test_telemetry_has_the_time_since_boot(self, kind: Callable[..., Vehicle]) -> None:
@@ -179,7 +181,7 @@ class TestClock:
                 vehicle.reboot(5.0 + step / 10 + 0.01)
             vehicle.tick(5.0 + step / 10 + 0.01)
             for data in vehicle.data_to_send():
-                (frame,) = wire.Framer().receive(data)
+                (frame,) = frames.Framer().receive(data)
                 if frame.message_id == 30:
                     clock.append(int.from_bytes(frame.payload[:4], "little"))
         assert clock[:3] == pytest.approx([110, 210, 310], abs=1)
@@ -194,27 +196,29 @@ class TestClock:
         """A Copter only on request; an earlier request is acknowledged, and SYSTEM_TIME sent then."""
         vehicle = ArduPilotVehicle(table=TEN, kind=kind)
         station = Station(vehicle).wait(5.5)
-        unasked = [time.time_boot_ms for time in station.receive(wire.SystemTime)]
+        unasked = [time.time_boot_ms for time in station.receive(messages.SystemTime)]
         assert unasked == ([] if requested else [2000, 3000, 4000, 5000])
         vehicle.reboot(station.now, down=1.0)
         station.wait(1.2)
         station.log.clear()
         station.send(CLOCK_REQUEST).wait(1.1)
-        assert [message.result for message in station.receive(wire.CommandAck)] == [wire.MAV_RESULT_ACCEPTED]
-        assert [time.time_boot_ms for time in station.wait(0.2).receive(wire.SystemTime)] == [1400]
+        assert [message.result for message in station.receive(messages.CommandAck)] == [
+            CommandResult.ACCEPTED
+        ]
+        assert [time.time_boot_ms for time in station.wait(0.2).receive(messages.SystemTime)] == [1400]
         station.send(CLOCK_REQUEST).wait(0.001)
-        assert [time.time_boot_ms for time in station.receive(wire.SystemTime)] == [1500]
+        assert [time.time_boot_ms for time in station.receive(messages.SystemTime)] == [1500]
 
     def test_px4_sends_the_time_since_boot_with_telemetry(self) -> None:
         vehicle = PX4Vehicle(table=TEN)
         vehicle.tick(10.0)
-        vehicle.receive(wire.encode(CLOCK_REQUEST, system=255, component=190, sequence=0), 10.1)
+        vehicle.receive(messages.encode(CLOCK_REQUEST, system=255, component=190, sequence=0), 10.1)
         for second in (11.0, 12.0, 12.5):
             vehicle.tick(second)
-        frames = [frame for data in vehicle.data_to_send() for frame in wire.Framer().receive(data)]
-        clocks = [int.from_bytes(frame.payload[:4], "little") for frame in frames if frame.message_id == 30]
+        sent = [frame for data in vehicle.data_to_send() for frame in frames.Framer().receive(data)]
+        clocks = [int.from_bytes(frame.payload[:4], "little") for frame in sent if frame.message_id == 30]
         assert clocks == [300, 1300, 2300]
-        assert wire.SYSTEM_TIME_ID not in {frame.message_id for frame in frames}
+        assert messages.message_id(messages.SystemTime) not in {frame.message_id for frame in sent}
 
     @pytest.mark.parametrize(
         ("make", "first", "then"),
@@ -228,9 +232,9 @@ class TestClock:
     def test_the_state_after_a_reboot(self, make: Callable[..., Vehicle], first: int, then: int) -> None:
         vehicle = make(table=TEN)
         station = Station(vehicle).wait(3.5)
-        assert {beat.system_status for beat in station.receive(wire.Heartbeat)} == {then}
+        assert {beat.system_status for beat in station.receive(messages.Heartbeat)} == {then}
         vehicle.reboot(station.now)
-        states = [beat.system_status for beat in station.wait(5.0).receive(wire.Heartbeat)]
+        states = [beat.system_status for beat in station.wait(5.0).receive(messages.Heartbeat)]
         assert states[0] == first
         assert states[-1] == then
         assert states == sorted(states, key=[first, then].index)
@@ -241,8 +245,10 @@ class TestHighLatency:
     def test_one_message_every_5_s(self, kind: Callable[..., Vehicle]) -> None:
         station = Station(kind(table=TEN, high_latency=True, telemetry=50.0)).wait(12.0)
         assert [time for time, _, _ in station.log] == [0.0, 5.0, 10.0]
-        ours = Station(kind(table=TEN)).receive(wire.Heartbeat)[0]
-        assert station.receive(wire.HighLatency2) == [wire.HighLatency2(ours.type, ours.autopilot)] * 3
+        ours = Station(kind(table=TEN)).receive(messages.Heartbeat)[0]
+        assert (
+            station.receive(messages.HighLatency2) == [messages.HighLatency2(ours.type, ours.autopilot)] * 3
+        )
 
     @EVERY_KIND
     def test_reads_are_answered_and_the_list_waits(self, kind: Callable[..., Vehicle]) -> None:

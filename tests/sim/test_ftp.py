@@ -9,11 +9,11 @@ import pytest
 from paramclient.errors import FileErrorCode, UsageError
 from paramclient.model.px4_hash import crc32_px4
 from paramclient.model.values import ParamType
-from paramclient.protocol import wire
-from paramclient.protocol.ftp import param_pck
-from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
-from paramclient.protocol.ftp.param_pck import PackedParam
+from paramclient.protocol import param_pck
+from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
+from paramclient.protocol.param_pck import PackedParam
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
+from paramclient.wire import frames, messages
 
 PARAMS = b"@PARAM/param.pck"
 
@@ -26,7 +26,7 @@ class Pilot:
         self.component = component
         self.now = 0.0
         self.sequence = 0
-        self.framer = wire.Framer(stream=False)
+        self.framer = frames.Framer(stream=False)
         vehicle.tick(0.0)
         vehicle.data_to_send()
 
@@ -42,8 +42,8 @@ class Pilot:
             self.vehicle.tick(self.now)
             for data in self.vehicle.data_to_send():
                 (frame,) = self.framer.receive(data)
-                message = wire.decode(frame)
-                if isinstance(message, wire.FileTransfer):
+                message = messages.decode(frame)
+                if isinstance(message, messages.FileTransfer):
                     assert (message.target_system, message.target_component) == (255, self.component)
                     received.append(Packet.unpack(message.payload))
         self.now = end
@@ -68,8 +68,8 @@ class Pilot:
 
 
 def file_request(packet: Packet, *, component: int = 190) -> bytes:
-    message = wire.FileTransfer(0, 1, 1, packet.pack())
-    return wire.encode(message, system=255, component=component, sequence=0)
+    message = messages.FileTransfer(0, 1, 1, packet.pack())
+    return messages.encode(message, system=255, component=component, sequence=0)
 
 
 def refusal(answer: Packet) -> tuple[int, ...]:
@@ -252,9 +252,9 @@ class TestSessions:
         vehicle.tick(0.0)
         vehicle.receive(file_request(Packet(2, 3, Opcode.OPEN_FILE_RO, path)), 0.0)
         vehicle.tick(0.1)
-        framer = wire.Framer(stream=False)
-        frames = [frame for data in vehicle.data_to_send() for frame in framer.receive(data)]
-        assert sum(isinstance(wire.decode(frame), wire.StatusText) for frame in frames) == texts
+        framer = frames.Framer(stream=False)
+        sent = [frame for data in vehicle.data_to_send() for frame in framer.receive(data)]
+        assert sum(isinstance(messages.decode(frame), messages.StatusText) for frame in sent) == texts
 
     def test_px4_closes_a_session_after_11_s(self) -> None:
         pilot = Pilot(PX4Vehicle())
@@ -329,7 +329,7 @@ class TestPace:
     def test_on_a_serial_port_the_banner_precedes_the_first_block(self) -> None:
         """On a real one at 57600 baud, 0.095 to 0.105 s after the requests for open and burst."""
         air = Air.symmetric([ArduPilotVehicle(ftp_rate=5760.0)], rate=5760.0)
-        framer = wire.Framer(stream=False)
+        framer = frames.Framer(stream=False)
         air.tick(0.0)
         opening = Packet(100, 3, Opcode.OPEN_FILE_RO, PARAMS + b"?withdefaults=1")
         for request in (opening, opening, Packet(200, 3, Opcode.BURST_READ_FILE, size=DATA_SIZE_MAX)):
@@ -342,8 +342,8 @@ class TestPace:
             now = max(now, due)
             air.tick(now)
             for data in air.data_to_send():
-                message = wire.decode(framer.receive(data)[0])
-                if isinstance(message, wire.FileTransfer):
+                message = messages.decode(framer.receive(data)[0])
+                if isinstance(message, messages.FileTransfer):
                     answer = Packet.unpack(message.payload)
                     blocks += [now] * (answer.requested == Opcode.BURST_READ_FILE)
         assert 0.095 <= blocks[0] - 0.5 <= 0.125
@@ -401,12 +401,12 @@ class TestSwitches:
     )
     def test_capabilities_have_the_ftp_bit(self, vehicle: Vehicle, has_it: bool) -> None:
         vehicle.tick(0.0)
-        ask = wire.CommandLong(1, 1, wire.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, (1.0,) + (0.0,) * 6)
-        vehicle.receive(wire.encode(ask, system=255, component=190, sequence=0), 0.1)
-        framer = wire.Framer(stream=False)
-        messages = [wire.decode(frame) for data in vehicle.data_to_send() for frame in framer.receive(data)]
-        (version,) = [each for each in messages if isinstance(each, wire.AutopilotVersion)]
-        assert bool(version.capabilities & wire.CAPABILITY_FTP) is has_it
+        ask = messages.CommandLong(1, 1, messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0)
+        vehicle.receive(messages.encode(ask, system=255, component=190, sequence=0), 0.1)
+        framer = frames.Framer(stream=False)
+        sent = [messages.decode(frame) for data in vehicle.data_to_send() for frame in framer.receive(data)]
+        (version,) = [each for each in sent if isinstance(each, messages.AutopilotVersion)]
+        assert bool(version.capabilities & messages.CAPABILITY_FTP) is has_it
 
     @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])
     def test_invalid_rates_are_rejected(self, rate: float) -> None:

@@ -9,9 +9,9 @@ from functools import partial
 
 import pytest
 
-from paramclient.protocol import wire
-from paramclient.protocol.ftp.packets import Opcode, Packet
+from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.sim import ArduPilotVehicle
+from paramclient.wire import messages
 from tests.ground_station import LIST, Station, cast, indices, read
 
 SET = cast("RTL_ALT", 1234.0)
@@ -32,8 +32,8 @@ def acknowledged(station: Station) -> list[float]:
     return [
         time
         for time, _, message in station.log
-        if isinstance(message, wire.ParamValue)
-        and (message.param_id, message.param_index) == ("RTL_ALT", wire.NO_INDEX)
+        if isinstance(message, messages.ParamValue)
+        and (message.param_id, message.param_index) == ("RTL_ALT", messages.NO_INDEX)
     ]
 
 
@@ -42,7 +42,7 @@ def answered(station: Station, wanted: Container[int]) -> list[float]:
     return [
         time
         for time, _, message in station.log
-        if isinstance(message, wire.ParamValue) and message.param_index in wanted
+        if isinstance(message, messages.ParamValue) and message.param_index in wanted
     ]
 
 
@@ -51,7 +51,7 @@ def pauses(station: Station, without: Container[int] = ()) -> list[tuple[float, 
     times = [
         time
         for time, _, message in station.log
-        if isinstance(message, wire.ParamValue) and message.param_index not in without
+        if isinstance(message, messages.ParamValue) and message.param_index not in without
     ]
     return [pair for pair in itertools.pairwise(times) if pair[1] - pair[0] > 0.02]
 
@@ -71,7 +71,7 @@ def test_on_a_slow_link_a_list_does_not_delay_responses() -> None:
 
 
 def ask_for_file(station: Station, packets: Sequence[Packet]) -> Station:
-    return station.send(*(wire.FileTransfer(0, 1, 1, packet.pack()) for packet in packets))
+    return station.send(*(messages.FileTransfer(0, 1, 1, packet.pack()) for packet in packets))
 
 
 def test_a_list_pauses_a_file_burst() -> None:
@@ -80,7 +80,7 @@ def test_a_list_pauses_a_file_burst() -> None:
     ask_for_file(station, [Packet(2, 3, Opcode.OPEN_FILE_RO, b"@PARAM/param.pck")]).wait(0.02)
     burst = Packet(4, 3, Opcode.BURST_READ_FILE, size=239)
     ask_for_file(station, [burst]).send(LIST).wait(2.0)
-    times = [time for time, _, message in station.log if isinstance(message, wire.FileTransfer)][1:]
+    times = [time for time, _, message in station.log if isinstance(message, messages.FileTransfer)][1:]
     assert len(times) == 65
     at_once = [(time, count) for time, count in Counter(times).items() if count > 1]
     assert [count for _, count in at_once] == [20, 20, 11]

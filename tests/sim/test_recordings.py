@@ -19,10 +19,10 @@ from paramclient.model.values import (
     from_bits,
     known_type,
 )
-from paramclient.protocol import wire
-from paramclient.protocol.ftp import param_pck
-from paramclient.protocol.ftp.packets import Opcode, Packet
+from paramclient.protocol import param_pck
+from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam, ardupilot_table, px4_table
+from paramclient.wire import frames, messages
 from tests.recordings import (
     NAMES,
     Messages,
@@ -47,11 +47,11 @@ def message_id(data: bytes) -> int:
     return int.from_bytes(data[7:10], "little")
 
 
-def params(values: Iterable[wire.ParamValue], encoding: Encoding) -> list[Param]:
+def params(values: Iterable[messages.ParamValue], encoding: Encoding) -> list[Param]:
     """Return the values of a full download, without the hash."""
     found = []
     for value in values:
-        if value.param_index != wire.NO_INDEX:
+        if value.param_index != messages.NO_INDEX:
             number, bits = decode_value(value.raw, value.param_type, encoding)
             found.append(Param(value.param_id, number, known_type(value.param_type), value.param_index, bits))
     return found
@@ -74,35 +74,37 @@ class TestDecoding:
     @pytest.mark.parametrize("name", NAMES)
     def test_a_session_as_one_stream_has_the_same_frames(self, name: str) -> None:
         records = [record for record in read(name) if record.frame is not None]
-        framer = wire.Framer()
+        framer = frames.Framer()
         stream = b"".join(record.data for record in records)
-        frames = [
+        found = [
             frame for at in range(0, len(stream), 100) for frame in framer.receive(stream[at : at + 100])
         ]
-        assert frames == [record.frame for record in records]
+        assert found == [record.frame for record in records]
         assert framer.skipped == 0
 
     @pytest.mark.parametrize("name", NAMES)
     def test_decoded_messages_encode_to_the_same_bytes(self, name: str) -> None:
         """For the messages of the parameter protocol, which `wire` decodes completely."""
-        values = wire.ParamValue | wire.ParamSetMessage | wire.ParamRequestRead | wire.ParamRequestList
-        kinds = values | wire.FileTransfer
+        values = (
+            messages.ParamValue | messages.ParamSet | messages.ParamRequestRead | messages.ParamRequestList
+        )
+        kinds = values | messages.FileTransfer
         for record in read(name):
             message = record.message
             if isinstance(message, kinds):
                 assert record.frame is not None
                 _, system, component, sequence, _, version = record.frame
-                again = wire.encode(
+                again = messages.encode(
                     message, system=system, component=component, sequence=sequence, version=version
                 )
                 assert again == record.data
 
     def test_px4s_table_and_hash(self) -> None:
         values = param_values(from_vehicle("px4_full_download"))
-        first = next(at for at, value in enumerate(values) if value.param_id == wire.HASH_CHECK)
+        first = next(at for at, value in enumerate(values) if value.param_id == messages.HASH_CHECK)
         announced = values[first]
         assert [value.param_id for value in values[:first]] == list(BAROMETER)
-        assert announced[1:] == (PX4_HASH.to_bytes(4, "little"), ParamType.UINT32, 903, wire.NO_INDEX)
+        assert announced[1:] == (PX4_HASH.to_bytes(4, "little"), ParamType.UINT32, 903, messages.NO_INDEX)
         found = params(values[first:], Encoding.BYTEWISE)
         assert found == [
             Param(row.name, row.value, row.type, index, row.bits) for index, row in enumerate(px4_table())
@@ -143,19 +145,19 @@ COMMITS = {
 """The commits of the recorded autopilots, and those that the simulated ones report instead."""
 
 
-def compared(messages: Messages) -> Messages:
+def compared(recorded: Messages) -> Messages:
     """Return the messages that a replay must reproduce, without unsolicited values.
 
     The first 3 s after a start PX4's heartbeat has the state 0; the simulated one has been on for longer.
     Recorded commits are replaced with the simulated ones.
     """
     kept: Messages = []
-    for time, message in messages:
-        if isinstance(message, wire.StatusText) and message.text.startswith(OTHER_TEXTS):
+    for time, message in recorded:
+        if isinstance(message, messages.StatusText) and message.text.startswith(OTHER_TEXTS):
             continue
-        if isinstance(message, wire.Heartbeat) and message.system_status == 0:
+        if isinstance(message, messages.Heartbeat) and message.system_status == 0:
             message = dataclasses.replace(message, system_status=3)
-        if isinstance(message, wire.AutopilotVersion):
+        if isinstance(message, messages.AutopilotVersion):
             commit = COMMITS.get(message.git_hash, message.git_hash)
             message = dataclasses.replace(message, git_hash=commit)
         kept.append((time, message))
@@ -183,7 +185,7 @@ def ardupilot_of(name: str) -> ArduPilotVehicle:
     return vehicle
 
 
-def take(vehicle: ArduPilotVehicle, value: wire.ParamValue) -> None:
+def take(vehicle: ArduPilotVehicle, value: messages.ParamValue) -> None:
     """Store a received value, if it differs."""
     param = vehicle.param(value.param_id)
     if encode_value(param.value, param.type, Encoding.C_CAST) != value.raw:
@@ -195,7 +197,7 @@ def ardupilot_of_file(name: str) -> ArduPilotVehicle:
     """Return an ArduPilot with the values and defaults of a file in the log."""
     blocks = {}
     for _, message in from_vehicle(name):
-        if isinstance(message, wire.FileTransfer):
+        if isinstance(message, messages.FileTransfer):
             packet = Packet.unpack(message.payload)
             if packet.requested == Opcode.BURST_READ_FILE and packet.opcode == Opcode.ACK:
                 blocks[packet.offset] = packet.data
@@ -204,7 +206,7 @@ def ardupilot_of_file(name: str) -> ArduPilotVehicle:
     for entry in param_pck.decode(b"".join(blocks[at] for at in sorted(blocks))).entries:
         value = from_bits(entry.bits, entry.type)
         default = value if entry.default is None else from_bits(entry.default, entry.type)
-        assert not isinstance(default, bytes)
+        assert isinstance(default, int | float)
         is_shipped = shipped[entry.name].bits == entry.bits
         rows.append(
             shipped[entry.name] if is_shipped else SimParam(entry.name, entry.type, value, default=default)
@@ -229,13 +231,13 @@ def with_groups(name: str) -> ArduPilotVehicle:
     return vehicle
 
 
-def without_pushes(name: str, messages: Messages, start: float) -> Messages:
+def without_pushes(name: str, recorded: Messages, start: float) -> Messages:
     """Leave out PARAM_VALUEs after a time, except the first one after a set of its name."""
     sets = [record.message for record in from_ground(name) if record.time >= start]
-    awaited = {message.param_id for message in sets if isinstance(message, wire.ParamSetMessage)}
+    awaited = {message.param_id for message in sets if isinstance(message, messages.ParamSet)}
     kept: Messages = []
-    for time, message in messages:
-        if isinstance(message, wire.ParamValue) and time >= start:
+    for time, message in recorded:
+        if isinstance(message, messages.ParamValue) and time >= start:
             if message.param_id not in awaited:
                 continue
             awaited.remove(message.param_id)
@@ -281,15 +283,15 @@ class TestDifferences:
     def found(self, changed: Messages) -> list[str]:
         return differences(self.NAME, compared(from_vehicle(self.NAME)), changed, burst=10)
 
-    def changed(self, at: int, *instead: tuple[float, wire.Message]) -> Messages:
+    def changed(self, at: int, *instead: tuple[float, messages.Message]) -> Messages:
         """Return the log with other messages in place of one response to a read or set."""
-        messages = compared(from_vehicle(self.NAME))
-        place = [place for place, (_, each) in enumerate(messages) if isinstance(each, wire.ParamValue)][at]
-        return sorted([*messages[:place], *instead, *messages[place + 1 :]], key=lambda item: item[0])
+        log = compared(from_vehicle(self.NAME))
+        place = [place for place, (_, each) in enumerate(log) if isinstance(each, messages.ParamValue)][at]
+        return sorted([*log[:place], *instead, *log[place + 1 :]], key=lambda item: item[0])
 
-    def answer(self, at: int) -> tuple[float, wire.ParamValue]:
-        messages = compared(from_vehicle(self.NAME))
-        return [(time, each) for time, each in messages if isinstance(each, wire.ParamValue)][at]
+    def answer(self, at: int) -> tuple[float, messages.ParamValue]:
+        log = compared(from_vehicle(self.NAME))
+        return [(time, each) for time, each in log if isinstance(each, messages.ParamValue)][at]
 
     def test_the_original_log_passes(self) -> None:
         assert self.found(compared(from_vehicle(self.NAME))) == []
@@ -326,7 +328,7 @@ class TestDifferences:
 
         def slowed(by: float) -> Messages:
             return [
-                (2.06 + (time - 2.06) * by if isinstance(each, wire.ParamValue) else time, each)
+                (2.06 + (time - 2.06) * by if isinstance(each, messages.ParamValue) else time, each)
                 for time, each in recorded
             ]
 
@@ -337,7 +339,7 @@ class TestDifferences:
         """The end of a file is sent after 0.54 s. Sending it 0.1 s later is within 20 %, but out of order."""
         name = "ardupilot_list_beside_ftp"
         recorded = compared(from_vehicle(name))
-        ends = max(time for time, each in recorded if isinstance(each, wire.FileTransfer) and time < 1.0)
+        ends = max(time for time, each in recorded if isinstance(each, messages.FileTransfer) and time < 1.0)
 
         def with_end(later: float) -> Messages:
             changed = [(time + later if time == ends else time, each) for time, each in recorded]
@@ -409,7 +411,7 @@ class TestReplay:
         events: list[tuple[float, str, WireValue]] = [
             (time - 0.005, message.param_id, struct.unpack("<f", message.raw)[0])
             for time, message in recorded
-            if isinstance(message, wire.ParamValue)
+            if isinstance(message, messages.ParamValue)
             and message.param_id in ("BARO1_GND_PRESS", "BARO2_GND_PRESS")
         ]
         assert len(events) == 2
@@ -422,5 +424,5 @@ class TestReplay:
         recorded = compared(from_vehicle(name))
         sent = compared(replay(ArduPilotVehicle(live_period=0.0), name, phase=0.003))
         assert differences(name, recorded, sent, burst=10) == []
-        answers = [message for _, message in sent if isinstance(message, wire.FileTransfer)]
+        answers = [message for _, message in sent if isinstance(message, messages.FileTransfer)]
         assert len(answers) == 2 * (2 + 64 + 1 + 1)

@@ -10,8 +10,8 @@ import pytest
 from paramclient import UsageError
 from paramclient.errors import CommandResult
 from paramclient.model.values import Encoding, ParamType, encode_value
-from paramclient.protocol import wire
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, Vehicle
+from paramclient.wire import frames, messages
 from tests.shell import generic
 
 T = TypeVar("T")
@@ -25,8 +25,8 @@ class Desk:
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
         self.now = 0.0
-        self.received: list[tuple[float, wire.Frame, wire.Message]] = []
-        self._framer = wire.Framer(wire.DECODED_IDS, stream=False)
+        self.received: list[tuple[float, frames.Frame, messages.Message]] = []
+        self._framer = frames.Framer(messages.DECODED_IDS, stream=False)
         self._sequence = 0
         vehicle.tick(0.0)
         self._take()
@@ -44,8 +44,8 @@ class Desk:
                 return
             self.vehicle.tick(self.now)
 
-    def send(self, message: wire.Message) -> None:
-        data = wire.encode(message, system=255, component=190, sequence=self._sequence)
+    def send(self, message: messages.Message) -> None:
+        data = messages.encode(message, system=255, component=190, sequence=self._sequence)
         self._sequence = (self._sequence + 1) % 256
         self.vehicle.receive(data, self.now)
         self._take()
@@ -53,15 +53,13 @@ class Desk:
     def command(self, mode: float = 1.0) -> list[int]:
         """Send the reboot command; return the immediate responses."""
         self.received.clear()
-        self.send(wire.CommandLong(self.vehicle.system, 1, REBOOT, (mode, *[0.0] * 6)))
-        acks = self.messages(wire.CommandAck)
-        assert acks == [wire.CommandAck(REBOOT, ack.result, 255, 190) for ack in acks]
+        self.send(messages.CommandLong(self.vehicle.system, 1, REBOOT, mode))
+        acks = self.messages(messages.CommandAck)
+        assert acks == [messages.CommandAck(REBOOT, ack.result, 255, 190) for ack in acks]
         return [ack.result for ack in acks]
 
     def set(self, name: str, value: int, kind: ParamType, encoding: Encoding) -> None:
-        self.send(
-            wire.ParamSetMessage(self.vehicle.system, 1, name, encode_value(value, kind, encoding), kind)
-        )
+        self.send(messages.ParamSet(self.vehicle.system, 1, name, encode_value(value, kind, encoding), kind))
 
     def messages(self, kind: type[T]) -> list[T]:
         return [message for _, _, message in self.received if isinstance(message, kind)]
@@ -72,7 +70,7 @@ class Desk:
     def _take(self) -> None:
         for data in self.vehicle.data_to_send():
             for frame in self._framer.receive(data):
-                message = wire.decode(frame)
+                message = messages.decode(frame)
                 assert message is not None
                 self.received.append((self.now, frame, message))
 
@@ -108,7 +106,7 @@ def test_reboot_without_acknowledgement(make: Any) -> None:
     desk.run(0.9)
     assert desk.silence(0.45, 0.9)
     desk.run(5.0)
-    assert desk.messages(wire.Heartbeat)
+    assert desk.messages(messages.Heartbeat)
     desk.vehicle.armed = True
     assert len(desk.command()) == 1  # refusals are acknowledged
 
@@ -123,12 +121,12 @@ def test_reboot_without_acknowledgement(make: Any) -> None:
 )
 def test_an_armed_vehicle_refuses_a_reboot(make: Any, answer: int) -> None:
     desk = Desk(make(armed=True))
-    assert desk.messages(wire.Heartbeat)[-1].base_mode & 128
+    assert desk.messages(messages.Heartbeat)[-1].base_mode & 128
     assert desk.command() == [answer]
     desk.run(1.0)
     desk.vehicle.armed = False
     desk.run(2.0)
-    beats = desk.messages(wire.Heartbeat)
+    beats = desk.messages(messages.Heartbeat)
     assert [bool(beat.base_mode & 128) for beat in beats] == [True, False]
     assert beats[0].base_mode & ~128 == beats[1].base_mode
     assert desk.command() == [CommandResult.ACCEPTED]
@@ -144,10 +142,10 @@ def test_px4s_system_id_takes_effect_after_a_reboot() -> None:
     assert desk.vehicle.system == 9
     assert {frame.system for when, frame, _ in desk.received if when > 10.5} == {9}
     desk.received.clear()
-    desk.send(wire.ParamRequestRead(1, 1, "MAV_SYS_ID"))
+    desk.send(messages.ParamRequestRead(1, 1, "MAV_SYS_ID"))
     assert not desk.received
-    desk.send(wire.ParamRequestRead(9, 1, "MAV_SYS_ID"))
-    assert desk.messages(wire.ParamValue)
+    desk.send(messages.ParamRequestRead(9, 1, "MAV_SYS_ID"))
+    assert desk.messages(messages.ParamValue)
 
 
 def test_sys_autoconfig_resets_all_but_kept_parameters() -> None:

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.model.px4_hash import hash_params
 from paramclient.model.values import TYPES_BY_NAME, Param, ParamType, WireValue
-from paramclient.protocol import wire
 from paramclient.sim import (
     Air,
     ArduPilotVehicle,
@@ -27,9 +26,10 @@ from paramclient.sim import (
     ardupilot_table,
     px4_table,
 )
+from paramclient.wire import frames, messages
 from tests.ground_station import LIST, SMALL, Station, cast, indices, names, read, write
 
-NO_INDEX = wire.NO_INDEX
+NO_INDEX = messages.NO_INDEX
 
 
 class TestTables:
@@ -109,7 +109,7 @@ class TestEveryVehicle:
         self, kind: Callable[[], Vehicle], start: float
     ) -> None:
         station = Station(kind(), start=start).wait(3.5)
-        beats = [time - start for time, _, message in station.log if isinstance(message, wire.Heartbeat)]
+        beats = [time - start for time, _, message in station.log if isinstance(message, messages.Heartbeat)]
         assert beats == pytest.approx([0.0, 1.0, 2.0, 3.0])
 
     def test_messages_for_others_are_ignored(self, kind: Callable[[], Vehicle]) -> None:
@@ -117,8 +117,8 @@ class TestEveryVehicle:
         station = Station(vehicle).wait(0.5)
         name = next(iter(vehicle.params))
         assert not station.ask(
-            wire.ParamRequestList(2, 1),
-            wire.ParamRequestList(1, 2),
+            messages.ParamRequestList(2, 1),
+            messages.ParamRequestList(1, 2),
             read(name, system=2),
             read(name, component=99),
             write(name, 1.0, ParamType.REAL32, system=2),
@@ -132,9 +132,9 @@ class TestEveryVehicle:
             read(index=0),
             read("NO_SUCH"),
             write("NO_SUCH", 1.0, ParamType.REAL32),
-            wire.CommandLong(1, 1, 520),
-            wire.Heartbeat(6, 8),
-            wire.StatusText(6, "not a request"),
+            messages.CommandLong(1, 1, 520),
+            messages.Heartbeat(6, 8),
+            messages.StatusText(6, "not a request"),
         )
         assert vehicle.requests == {
             "PARAM_REQUEST_LIST": 1,
@@ -156,7 +156,7 @@ class TestEveryVehicle:
         assert station.log == []
         station.wait(0.2)
         kinds = [type(message) for _, _, message in station.log]
-        assert kinds in ([wire.Heartbeat], [wire.Heartbeat, wire.SystemTime])
+        assert kinds in ([messages.Heartbeat], [messages.Heartbeat, messages.SystemTime])
         assert station.log[0][1].sequence == 0
         assert vehicle.param(name).value == 3
         assert len(station.ask(LIST, seconds=1.5)) >= len(vehicle.params)
@@ -170,7 +170,7 @@ class TestEveryVehicle:
         assert {value.param_count for value in values} == {len(listed)}
 
     def test_a_frame_in_pieces_is_joined_on_a_stream_only(self, kind: Callable[[], Vehicle]) -> None:
-        frame = wire.encode(read(index=0), system=255, component=190, sequence=0)
+        frame = messages.encode(read(index=0), system=255, component=190, sequence=0)
         vehicle = kind()
         vehicle.receive(frame[:10], 0.0)
         vehicle.receive(frame[10:], 0.0)
@@ -181,11 +181,11 @@ _text = st.sampled_from(["", "A_FLOAT", "b_int", "_HASH_CHECK", "A" * 16, "\xff\
 _target = st.sampled_from([0, 1, 2])
 _kind = st.integers(0, 255)
 _requests = st.one_of(
-    st.builds(wire.ParamRequestList, _target, _target),
-    st.builds(wire.ParamRequestRead, _target, _target, _text, st.integers(-32768, 32767)),
-    st.builds(wire.ParamSetMessage, _target, _target, _text, st.binary(min_size=4, max_size=4), _kind),
-    st.builds(wire.CommandLong, _target, _target, st.sampled_from([512, 520, 1])),
-    st.builds(wire.Heartbeat, _kind, _kind),
+    st.builds(messages.ParamRequestList, _target, _target),
+    st.builds(messages.ParamRequestRead, _target, _target, _text, st.integers(-32768, 32767)),
+    st.builds(messages.ParamSet, _target, _target, _text, st.binary(min_size=4, max_size=4), _kind),
+    st.builds(messages.CommandLong, _target, _target, st.sampled_from([512, 520, 1])),
+    st.builds(messages.Heartbeat, _kind, _kind),
 )
 
 
@@ -194,14 +194,14 @@ _requests = st.one_of(
 @given(script=st.lists(st.tuples(st.floats(0, 1e4), _requests), max_size=40))
 @settings(max_examples=30, deadline=None)
 def test_random_requests_are_harmless(
-    kind: Callable[..., Vehicle], error: bool, script: list[tuple[float, wire.Message]]
+    kind: Callable[..., Vehicle], error: bool, script: list[tuple[float, messages.Message]]
 ) -> None:
     """For all requests and clock jumps: no exception, and all pending work ends."""
     vehicle = kind(table=SMALL, param_error=error, telemetry=7.0, stream=True)
     now = 0.0
     for pause, message in script:
         now += pause
-        vehicle.receive(wire.encode(message, system=255, component=190, sequence=0), now)
+        vehicle.receive(messages.encode(message, system=255, component=190, sequence=0), now)
         deadline = vehicle.next_deadline()
         assert deadline is not None
         assert deadline > now
@@ -212,14 +212,14 @@ def test_random_requests_are_harmless(
 class TestOptions:
     def test_mavlink_1(self) -> None:
         vehicle = ArduPilotVehicle(mavlink_version=1, telemetry=10.0)
-        station = Station(vehicle).send(LIST, wire.CommandLong(1, 1, 520)).wait(1.2)
+        station = Station(vehicle).send(LIST, messages.CommandLong(1, 1, 520)).wait(1.2)
         assert {frame.version for _, frame, _ in station.log} == {1}
         assert len(station.values()) == 1382
 
     @pytest.mark.parametrize("version", [1, 2])
     def test_telemetry_at_its_rate(self, version: int) -> None:
         vehicle = GenericVehicle(SMALL, telemetry=50.0, mavlink_version=version)
-        framer = wire.Framer()
+        framer = frames.Framer()
         vehicle.tick(0.0)
         seen: Counter[int] = Counter()
         for step in range(1, 201):
@@ -231,8 +231,8 @@ class TestOptions:
     def test_every_system_has_its_own_hardware_id(self) -> None:
         seen = set()
         for vehicle in [kind(system=n) for n in (1, 2, 255) for kind in (PX4Vehicle, ArduPilotVehicle)]:
-            station = Station(vehicle).send(wire.CommandLong(vehicle.system, 1, 520))
-            (version,) = station.receive(wire.AutopilotVersion)
+            station = Station(vehicle).send(messages.CommandLong(vehicle.system, 1, 520))
+            (version,) = station.receive(messages.AutopilotVersion)
             seen.add((version.uid, version.uid2))
         assert len(seen) == 6
 
@@ -242,8 +242,8 @@ class TestOptions:
             ArduPilotVehicle(uid2=b"hello", system=3),
             GenericVehicle(SMALL, uid=5, system=3, capabilities=8192, autopilot=8),
         ):
-            station = Station(vehicle).send(wire.CommandLong(3, 1, 520))
-            (version,) = station.receive(wire.AutopilotVersion)
+            station = Station(vehicle).send(messages.CommandLong(3, 1, 520))
+            (version,) = station.receive(messages.AutopilotVersion)
             assert (version.uid, version.uid2, version.capabilities) in [
                 (99, bytes(18), 59647),
                 (0, b"hello".ljust(18, b"\0"), 64495),
@@ -263,18 +263,18 @@ class TestGeneric:
         assert by_name["T9"].raw == struct.pack("<f", 1.0)
         assert by_name["T8"].raw == b"\x01\0\0\0"
         assert (by_name["T77"].raw, by_name["T77"].param_type) == (b"abcd", 77)
-        (value,) = station.ask(wire.ParamSetMessage(1, 1, "T2", b"\xff\x01\x02\x03", 2))
+        (value,) = station.ask(messages.ParamSet(1, 1, "T2", b"\xff\x01\x02\x03", 2))
         assert value.raw == b"\xff\0\0\0"
         assert vehicle.values["T2"] == -1
-        (value,) = station.ask(wire.ParamSetMessage(1, 1, "T77", b"wxyz", 77))
+        (value,) = station.ask(messages.ParamSet(1, 1, "T77", b"wxyz", 77))
         assert vehicle.values["T77"] == value.raw == b"wxyz"
 
 
 HASH = read("_HASH_CHECK")
 
 
-def hash_set(value: int = 0) -> wire.ParamSetMessage:
-    return wire.ParamSetMessage(1, 1, "_HASH_CHECK", value.to_bytes(4, "little"), ParamType.UINT32)
+def hash_set(value: int = 0) -> messages.ParamSet:
+    return messages.ParamSet(1, 1, "_HASH_CHECK", value.to_bytes(4, "little"), ParamType.UINT32)
 
 
 class TestPX4:
@@ -282,7 +282,7 @@ class TestPX4:
         vehicle = PX4Vehicle()
         values = Station(vehicle).ask(LIST, seconds=2.0)
         raw = (0xCF579589).to_bytes(4, "little")
-        assert values[0] == wire.ParamValue("_HASH_CHECK", raw, ParamType.UINT32, 903, NO_INDEX)
+        assert values[0] == messages.ParamValue("_HASH_CHECK", raw, ParamType.UINT32, 903, NO_INDEX)
         assert indices(values[1:]) == list(range(903))
 
     def test_20_messages_every_20_ms(self) -> None:
@@ -338,10 +338,10 @@ class TestPX4:
             write("SYS_AUTOSTART", 1.0, ParamType.REAL32),
             write("SYS_AUTOSTART", 1, ParamType.UINT32),
             read("SYS_AUTOSTART", system=0),
-            wire.ParamRequestList(0, 0),
+            messages.ParamRequestList(0, 0),
         )
         assert vehicle.values == before
-        assert not station.receive(wire.ParamError)
+        assert not station.receive(messages.ParamError)
 
     def test_errors_of_newer_firmware(self) -> None:
         station = Station(PX4Vehicle(param_error=True))
@@ -352,7 +352,7 @@ class TestPX4:
             write("SYS_AUTOSTART", 1.0, ParamType.REAL32),
         )
         assert [
-            (error.param_id, error.param_index, error.error) for error in station.receive(wire.ParamError)
+            (error.param_id, error.param_index, error.error) for error in station.receive(messages.ParamError)
         ] == [
             ("NO_SUCH", -1, 1),
             ("", 5000, 1),
@@ -416,7 +416,7 @@ class TestPX4:
         station = Station(vehicle)
         assert names(station.ask(LIST)) == ["_HASH_CHECK", "A_FLOAT", "C_BYTE", "D_SHORT"]
         (value,) = station.ask(read("B_INT"))
-        assert value == wire.ParamValue("B_INT", b"\x07\0\0\0", ParamType.INT32, 3, NO_INDEX)
+        assert value == messages.ParamValue("B_INT", b"\x07\0\0\0", ParamType.INT32, 3, NO_INDEX)
         (value,) = station.ask(write("B_INT", 8, ParamType.INT32))
         assert (value.raw, value.param_index) == (b"\x08\0\0\0", NO_INDEX)
         assert vehicle.announced_hash() == before
@@ -444,17 +444,17 @@ class TestPX4:
     def test_identity_before_its_acknowledgement(self) -> None:
         station = Station(PX4Vehicle())
         station.log.clear()
-        station.send(wire.CommandLong(1, 1, 520))
+        station.send(messages.CommandLong(1, 1, 520))
         (_, _, version), (_, _, ack) = station.log
-        assert isinstance(version, wire.AutopilotVersion)
+        assert isinstance(version, messages.AutopilotVersion)
         assert (version.capabilities, version.uid) == (59647, 5283920058631409231)
-        assert isinstance(ack, wire.CommandAck)
+        assert isinstance(ack, messages.CommandAck)
 
 
 class TestArduPilot:
     def test_the_list(self) -> None:
         station = Station(ArduPilotVehicle()).wait(0.05).send(LIST).wait(2.0)
-        texts = [message.text for _, _, message in station.log if isinstance(message, wire.StatusText)]
+        texts = [message.text for _, _, message in station.log if isinstance(message, messages.StatusText)]
         assert len(texts) == 3
         times = station.times()
         assert times[0] == pytest.approx(0.1)
@@ -498,7 +498,9 @@ class TestArduPilot:
     def test_a_read_by_name_has_no_index_and_the_requested_spelling(self) -> None:
         station = Station(ArduPilotVehicle())
         (value,) = station.ask(read("rtl_Alt"))
-        assert value == wire.ParamValue("rtl_Alt", struct.pack("<f", 1500), ParamType.INT32, 1382, NO_INDEX)
+        assert value == messages.ParamValue(
+            "rtl_Alt", struct.pack("<f", 1500), ParamType.INT32, 1382, NO_INDEX
+        )
         (value,) = station.ask(read(index=8))
         assert (value.param_id, value.param_index) == ("RTL_ALT", 8)
 
@@ -559,9 +561,9 @@ class TestArduPilot:
         station.log.clear()
         station.send(cast("RTL_ALT", 7)).wait(0.5)
         assert [message for _, _, message in station.log] == [
-            wire.ParamValue("RTL_ALT", struct.pack("<f", 1500), ParamType.INT32, 1382, NO_INDEX),
-            wire.StatusText(4, "Param write denied (RTL_ALT)"),
-            wire.ParamError(255, 190, "RTL_ALT", -1, ParamErrorCode.READ_ONLY),
+            messages.ParamValue("RTL_ALT", struct.pack("<f", 1500), ParamType.INT32, 1382, NO_INDEX),
+            messages.StatusText(4, "Param write denied (RTL_ALT)"),
+            messages.ParamError(255, 190, "RTL_ALT", -1, ParamErrorCode.READ_ONLY),
         ][: 3 if error else 2]
         assert vehicle.values["RTL_ALT"] == 1500
         vehicle.set_param("RTL_ALT", 8)
@@ -572,18 +574,18 @@ class TestArduPilot:
         unknown = [read(f"NO_SUCH_{number}") for number in range(19)]
         station = Station(vehicle).send(*unknown, *[read("RTL_ALT")] * 3).wait(0.5)
         assert (
-            len(station.receive(wire.ParamValue)) == 2
+            len(station.receive(messages.ParamValue)) == 2
         )  # one in look-up, 20 waiting: the last one is dropped
         station = Station(ArduPilotVehicle()).send(*unknown[:14], *[read("RTL_ALT")] * 5).wait(0.11)
-        assert len(station.receive(wire.ParamValue)) == 5
+        assert len(station.receive(messages.ParamValue)) == 5
 
     def test_errors_of_newer_firmware_for_reads(self) -> None:
         station = (
             Station(ArduPilotVehicle(param_error=True)).send(read("NO_SUCH"), read(index=5000)).wait(0.5)
         )
-        assert station.receive(wire.ParamError) == [
-            wire.ParamError(255, 190, "NO_SUCH", -1, ParamErrorCode.DOES_NOT_EXIST),
-            wire.ParamError(255, 190, "", 5000, ParamErrorCode.DOES_NOT_EXIST),
+        assert station.receive(messages.ParamError) == [
+            messages.ParamError(255, 190, "NO_SUCH", -1, ParamErrorCode.DOES_NOT_EXIST),
+            messages.ParamError(255, 190, "", 5000, ParamErrorCode.DOES_NOT_EXIST),
         ]
 
     def test_a_group_is_shown_and_hidden(self) -> None:
@@ -639,10 +641,10 @@ class TestArduPilot:
     def test_identity_after_its_acknowledgement(self) -> None:
         station = Station(ArduPilotVehicle())
         station.log.clear()
-        station.send(wire.CommandLong(1, 1, 520))
+        station.send(messages.CommandLong(1, 1, 520))
         (_, _, ack), (_, _, version) = station.log
-        assert isinstance(ack, wire.CommandAck)
-        assert isinstance(version, wire.AutopilotVersion)
+        assert isinstance(ack, messages.CommandAck)
+        assert isinstance(version, messages.AutopilotVersion)
         assert (version.capabilities, version.uid2) == (64495, b"3d1219c7c4c5404aa\0")
 
 
@@ -747,7 +749,7 @@ class TestAir:
     def test_faults_apply_in_each_direction(self) -> None:
         vehicle = GenericVehicle(SMALL)
         deaf = Station(Air([vehicle], uplink=FaultyLink(loss=1.0)))
-        assert deaf.wait(2.5).receive(wire.Heartbeat)
+        assert deaf.wait(2.5).receive(messages.Heartbeat)
         deaf.send(LIST)
         assert not vehicle.requests
         mute = Station(Air([vehicle], downlink=FaultyLink(loss=1.0)))

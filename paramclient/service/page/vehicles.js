@@ -15,7 +15,6 @@ const STATES = {
   partial: "not complete",
   synced: "up to date",
   fetching: "fetching",
-  contested: "contested: several vehicles have this address",
   lost: "lost",
 };
 /** Timeout in milliseconds for fetching a table, over a slow radio too. */
@@ -31,7 +30,7 @@ const FORMATS = [
   ["pck", "Packed file of a vehicle", ".pck"],
   ["json", "paramclient, JSON", ".json"],
 ];
-const KINDS = { new: "idle", cached: "warn", partial: "warn", synced: "good", fetching: "busy", contested: "bad", lost: "bad" };
+const KINDS = { new: "idle", cached: "warn", partial: "warn", synced: "good", fetching: "busy", lost: "bad" };
 /** Display names of MAV_TYPE values of vehicles with parameters. */
 const TYPES = {
   1: "plane",

@@ -1,0 +1,115 @@
+"""Asynchronous streams of items, and of the parameter changes of one component."""
+
+from __future__ import annotations
+
+import weakref
+from abc import abstractmethod
+from collections.abc import AsyncIterator
+from dataclasses import replace
+from typing import Final, Generic, TypeVar
+
+import anyio
+
+from paramclient.errors import ParamClientError
+from paramclient.protocol.events import Change
+
+__all__ = ["Changes", "Stream", "Subscribers"]
+
+CHANGES_MAX: Final = 100_000
+"""Queued changes for a consumer, one for each name, at most: more than a table holds. Above it, the oldest
+are dropped."""
+
+Item = TypeVar("Item")
+
+
+class Stream(AsyncIterator[Item], Generic[Item]):
+    """Stream of the items since its creation, one for each `await`. Cancellation loses no item."""
+
+    def __init__(self) -> None:
+        self._error: ParamClientError | StopAsyncIteration | None = None
+        self._arrived = anyio.Event()
+
+    @abstractmethod
+    def push(self, item: Item) -> None:
+        """Add an item."""
+
+    @abstractmethod
+    def _take(self) -> Item | None:
+        """Remove and return the next item; None while the queue is empty."""
+
+    def end(self, error: ParamClientError | None) -> None:
+        """End the stream after the queued items: with this error, or with None as at the end of a log."""
+        self._error = StopAsyncIteration() if error is None else error
+        self._arrived.set()
+
+    def __aiter__(self) -> Stream[Item]:
+        return self
+
+    async def __anext__(self) -> Item:
+        while (item := self._take()) is None:
+            if self._error is not None:
+                raise self._error.with_traceback(None)
+            if self._arrived.is_set():
+                self._arrived = anyio.Event()
+            await self._arrived.wait()
+        return item
+
+
+class Changes(Stream[Change]):
+    """Stream of the changes since its creation; see `Component.changes`.
+
+    A slow consumer receives several changes of one parameter as one.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._waiting: dict[str, Change] = {}
+
+    def push(self, item: Change) -> None:
+        """Add a change, or merge it with the queued change of the same parameter."""
+        earlier = self._waiting.pop(item.name, None)
+        if earlier is not None:
+            item = _merged(earlier, item)
+            if item.old is None and item.new is None:
+                return
+            if item.old is not None and item.new is not None and item.old.same_value(item.new):
+                return
+        self._waiting[item.name] = item
+        if len(self._waiting) > CHANGES_MAX:
+            del self._waiting[next(iter(self._waiting))]
+        self._arrived.set()
+
+    def _take(self) -> Change | None:
+        return self._waiting.pop(next(iter(self._waiting))) if self._waiting else None
+
+
+class Subscribers(Generic[Item]):
+    """The streams that are still referenced."""
+
+    def __init__(self) -> None:
+        self._streams: weakref.WeakSet[Stream[Item]] = weakref.WeakSet()
+        self._end: tuple[ParamClientError | None] | None = None
+
+    def add(self, stream: Stream[Item]) -> None:
+        """Push all further items to this stream; end it at once if there are none any more."""
+        self._streams.add(stream)
+        if self._end is not None:
+            stream.end(*self._end)
+
+    def push(self, item: Item) -> None:
+        """Push an item to all streams."""
+        for stream in list(self._streams):
+            stream.push(item)
+
+    def end(self, error: ParamClientError | None) -> None:
+        """End all streams, also those that are added later."""
+        self._end = (error,)
+        for stream in list(self._streams):
+            stream.end(error)
+
+
+def _merged(earlier: Change, later: Change) -> Change:
+    kind = later.kind
+    if later.new is not None:
+        kind = earlier.kind if earlier.old is None else "changed"
+    return replace(later, old=earlier.old, kind=kind)

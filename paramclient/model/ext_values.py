@@ -1,0 +1,114 @@
+"""Values of extended parameters: up to 128 bytes, numbers, text or bytes."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Final, SupportsFloat, SupportsIndex
+
+from paramclient.errors import UsageError
+from paramclient.model.values import (
+    Param,
+    ParamType,
+    Settable,
+    Trust,
+    WireValue,
+    byte_length,
+    from_bits,
+    type_name,
+)
+
+__all__ = ["EXT_VALUE_SIZE", "check_ext_value", "encode_ext_value", "ext_bytes", "ext_param", "own_bytes"]
+
+EXT_VALUE_SIZE: Final = 128
+"""Bytes of `param_value` in PARAM_EXT_VALUE, PARAM_EXT_SET and PARAM_EXT_ACK (MAVLink common message set)."""
+
+_LAYOUTS: Final = {
+    number: struct.Struct("<" + code) for number, code in enumerate("BbHhIiQqfd", start=ParamType.UINT8)
+}
+
+
+def own_bytes(data: bytes, number: int) -> bytes:
+    """Return the bytes of a message's value that count for its type: all but zeros at the end, as the message
+    carries no length, for a type that is no number."""
+    layout = _LAYOUTS.get(number)
+    if layout is None:
+        return data[:EXT_VALUE_SIZE].rstrip(b"\0")
+    return data[: layout.size].ljust(layout.size, b"\0")
+
+
+def ext_param(
+    name: str, data: bytes, number: int, index: int | None = None, trust: Trust = Trust.LIVE
+) -> Param:
+    """Return the extended parameter whose value has these bytes, those of a message or of `ext_bytes`."""
+    bits = int.from_bytes(own_bytes(data, number), "little")
+    return Param(name, from_bits(bits, number), number, index, bits, trust)
+
+
+def ext_bytes(param: Param) -> bytes:
+    """Return the bytes of the value of an extended parameter, without zeros at the end of text and bytes."""
+    layout = _LAYOUTS.get(param.type_number)
+    size = byte_length(param.bits) if layout is None else layout.size
+    return param.bits.to_bytes(size, "little")
+
+
+def check_ext_value(value: Settable) -> WireValue:
+    """Convert a caller's value to an int, a float, a str or bytes; else raise UsageError."""
+    if isinstance(value, bytes | str):
+        data = value if isinstance(value, bytes) else value.encode(errors="surrogatepass")
+        if len(data) > EXT_VALUE_SIZE:
+            raise UsageError(f"the value has {len(data)} bytes; an extended parameter holds {EXT_VALUE_SIZE}")
+        if isinstance(value, str) and ("\0" in value or not _is_encodable(value)):
+            raise UsageError(
+                "text for an extended parameter is UTF-8 without NUL; give bytes for anything else"
+            )
+        return value
+    try:
+        if isinstance(value, SupportsIndex):
+            return value.__index__()
+        if isinstance(value, SupportsFloat):
+            return float(value)
+    except (ArithmeticError, TypeError, ValueError) as error:
+        raise UsageError(f"the value must be a number in the range of a float: {error}") from error
+    raise UsageError(f"an extended parameter is a number, text or bytes, not {type(value).__name__}")
+
+
+def encode_ext_value(value: WireValue, number: int) -> bytes:
+    """Return the bytes of a value in a type, as `own_bytes` does.
+
+    Raises:
+        UsageError: the value does not fit the type: a number only fits a numeric type, text and bytes only
+            CUSTOM, and bytes a type that MAVLink does not define.
+    """
+    name = type_name(number)
+    layout = _LAYOUTS.get(number)
+    if layout is None:
+        if isinstance(value, str) and number == ParamType.CUSTOM:
+            return own_bytes(value.encode(), number)
+        if isinstance(value, bytes):
+            return own_bytes(value, number)
+        wanted = "text or bytes" if number == ParamType.CUSTOM else "bytes"
+        raise UsageError(f"{value!r} is not {wanted}, and the parameter is {name}")
+    if isinstance(value, str | bytes):
+        raise UsageError(f"{value!r} is not a number, and the parameter is {name}")
+    if number >= ParamType.REAL32:
+        try:
+            return layout.pack(float(value))
+        except OverflowError:
+            raise UsageError(f"{value} is beyond the range of {name}") from None
+    if isinstance(value, float):
+        if not (math.isfinite(value) and value.is_integer()):
+            raise UsageError(f"{value!r} is not a whole number, and the parameter is {name}")
+        value = int(value)
+    low, high = ParamType(number).bounds
+    if not low <= value <= high:
+        raise UsageError(f"{value} does not fit {name}, which holds {low} to {high}")
+    return layout.pack(value)
+
+
+def _is_encodable(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True

@@ -1,0 +1,402 @@
+"""One component's side of the link: requests out, messages to the conversations that wait for them.
+
+A channel holds no state of any conversation. `exchange` is the one rule of requests: send; wait; repeat; give
+up.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Final, Protocol, TypeAlias, TypeVar
+
+import anyio
+
+from paramclient.errors import LinkError, NoReply
+from paramclient.protocol.timing import Timing
+from paramclient.wire.messages import (
+    NO_INDEX,
+    CommandAck,
+    FileTransfer,
+    Message,
+    ParamError,
+    ParamExtAck,
+    ParamExtValue,
+    ParamValue,
+)
+
+__all__ = ["Channel", "Gate", "Inbox", "keys_of"]
+
+T = TypeVar("T")
+
+Key: TypeAlias = object
+"""What a conversation waits for: a message class, or one with a name, an index or a command."""
+
+PATIENCE_MIN: Final = 2.0
+"""Seconds until a request is given up, at least: a vehicle that writes to its flash may be silent for one."""
+SILENCE_MAX: Final = 20.0
+"""Seconds without a message of a component without heartbeats after which requests are given up."""
+LATE_WAKE_UP: Final = 0.05
+"""Seconds after a deadline from which on the program counts as stalled: the answer may wait in a buffer."""
+LATE_GRACE: Final = 0.02
+"""Seconds for which a stalled program looks once more for the answer."""
+WINDOW: Final = 12
+"""Requests in flight: ArduPilot's queue of reads has 20 places, and its overflow is dropped silently."""
+FTP_SEQUENCES_PER_SECOND: Final = 1000
+"""Sequence numbers of MAVFTP that a second skips, more than a program uses in it."""
+
+
+class Gate:
+    """Whether the link carries messages: open; interrupted, so that requests wait; or failed.
+
+    Attributes:
+        error: with which requests fail, or None.
+    """
+
+    def __init__(self) -> None:
+        self.error: LinkError | None = None
+        self._is_closed = False
+        self._open = anyio.Event()
+        self._open.set()
+        self._waits: dict[anyio.CancelScope, bool] = {}  # and whether they also end at a failure for a time
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the link has failed for good."""
+        return self._is_closed
+
+    @property
+    def is_open(self) -> bool:
+        """Whether requests are sent."""
+        return self._open.is_set() and self.error is None
+
+    def open(self) -> None:
+        """Let requests go on, unless the link is closed."""
+        if not self._is_closed:
+            self.error = None
+            self._open.set()
+
+    def interrupt(self) -> None:
+        """Hold requests until the link is open again."""
+        if self._open.is_set():
+            self._open = anyio.Event()
+
+    def fail(self, error: LinkError, *, for_good: bool = False) -> None:
+        """End all waits and all later requests with an error, until the link is open again, or for good."""
+        if not self._is_closed:
+            self.error = error
+            self._is_closed = for_good
+            self._open.set()
+            for scope, is_brief in self._waits.items():
+                if for_good or is_brief:
+                    scope.cancel()
+
+    def check(self) -> None:
+        """Raise the error of the link, if it has failed."""
+        if self.error is not None:
+            raise self.error.with_traceback(None)
+
+    async def wait(self) -> None:
+        """Wait until the link is open.
+
+        Raises:
+            LinkError: it has failed.
+        """
+        await self._open.wait()
+        self.check()
+
+    @contextmanager
+    def until_closed(self, *, or_failed: bool = False) -> Iterator[None]:
+        """Run a block that waits for something else than a message, such as a pause.
+
+        Args:
+            or_failed: whether the block ends also where the link may come back.
+
+        Raises:
+            LinkError: the link has failed for good; the block was cancelled.
+        """
+        if self._is_closed:
+            self.check()
+        with anyio.CancelScope() as scope:
+            self._waits[scope] = or_failed
+            try:
+                yield
+            finally:
+                del self._waits[scope]
+        if scope.cancelled_caught:
+            self.check()
+
+
+class Liveness(Protocol):
+    """What a channel asks about its component; see `paramclient.protocol.presence`."""
+
+    received_at: float
+
+    @property
+    def timeout(self) -> float:
+        """Seconds of silence after which the component is lost; infinity without heartbeats."""
+
+
+class Inbox:
+    """The messages with some keys, from the moment of its creation until the end of its `with` block."""
+
+    def __init__(self) -> None:
+        self._messages: deque[Message] = deque()
+        self._arrived = anyio.Event()
+        self._error: LinkError | None = None
+
+    def put(self, message: Message) -> None:
+        """Add a message, and wake the conversation."""
+        self._messages.append(message)
+        self._arrived.set()
+
+    def fail(self, error: LinkError) -> None:
+        """End the wait of the conversation with an error."""
+        self._error = error
+        self._arrived.set()
+
+    def __bool__(self) -> bool:
+        return bool(self._messages)
+
+    def clear(self) -> None:
+        """Drop the messages that have arrived."""
+        self._messages.clear()
+
+    async def next(self) -> Message:
+        """Wait for the next message."""
+        while not self._messages:
+            if self._error is not None:
+                raise self._error.with_traceback(None)
+            self._arrived = anyio.Event()
+            await self._arrived.wait()
+        return self._messages.popleft()
+
+
+def keys_of(message: Message) -> tuple[Key, ...]:
+    """Return the keys under which conversations wait for a message."""
+    match message:
+        case ParamValue() | ParamExtValue():
+            value: Key = type(message)
+            if message.param_index == NO_INDEX:
+                return (value, message.param_id), value
+            return (value, message.param_id), (value, message.param_index), value
+        case ParamError(param_id=name, param_index=index):
+            return (ParamValue, name if index == -1 or name else index), (ParamValue, index)
+        case ParamExtAck(param_id=name):
+            return ((ParamExtAck, name),)
+        case CommandAck(command=command):
+            return ((CommandAck, command),)
+        case FileTransfer():
+            return (FileTransfer,)
+        case _:
+            return (type(message),)
+
+
+class Channel:
+    """One component's side of the link.
+
+    Args:
+        system, component: the component's address.
+        transmit: queues a message for the component.
+        gate: whether the link carries messages.
+        presence: when the component was heard.
+
+    Attributes:
+        timing: round trip and loss.
+        window: limits the reads in flight; it follows what the vehicle serves.
+        window_size: of the window.
+        is_streaming: whether a list runs: an answer to a read may be a part of it, and measures nothing.
+        ftp: taken for each use of MAVFTP: servers have one session.
+    """
+
+    def __init__(
+        self,
+        system: int,
+        component: int,
+        transmit: Callable[[Message], None],
+        gate: Gate,
+        presence: Liveness,
+    ) -> None:
+        self.system = system
+        self.component = component
+        self.target = (system, component)
+        self.timing = Timing()
+        self.gate = gate
+        self.is_streaming = False
+        self.ftp = anyio.Lock()
+        self._ftp_sequence: int | None = None
+        self._transmit = transmit
+        self._presence = presence
+        self._inboxes: dict[Key, list[Inbox]] = {}
+        self._waits: dict[anyio.CancelScope, tuple[float, int]] = {}
+        self.window = anyio.Semaphore(WINDOW)
+        self.window_size = WINDOW
+
+    def widen(self, requests: int) -> None:
+        """Enlarge the window to this many requests."""
+        for _ in range(requests - self.window_size):
+            self.window.release()
+        self.window_size = max(self.window_size, requests)
+
+    def next_ftp_sequence(self) -> int:
+        """Return the sequence number of the next MAVFTP request: servers answer a repeated one again.
+
+        The first one follows from the time, so that it differs from the last one of an earlier program, to
+        which the server would answer again.
+        """
+        if self._ftp_sequence is None:
+            self._ftp_sequence = int(anyio.current_time() * FTP_SEQUENCES_PER_SECOND)
+        self._ftp_sequence = (self._ftp_sequence + 2) & 0xFFFF
+        return self._ftp_sequence
+
+    def send(self, message: Message) -> None:
+        """Queue a message."""
+        self._transmit(message)
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a conversation waits for a message."""
+        return bool(self._inboxes)
+
+    def dispatch(self, message: Message) -> None:
+        """Wake the conversations that wait for a message."""
+        if self._inboxes:
+            for key in keys_of(message):
+                for inbox in self._inboxes.get(key, ()):
+                    inbox.put(message)
+
+    def fail(self, error: LinkError) -> None:
+        """End all conversations that wait, as the link has failed."""
+        for inboxes in list(self._inboxes.values()):
+            for inbox in inboxes:
+                inbox.fail(error)
+
+    @contextmanager
+    def inbox(self, *keys: Key) -> Iterator[Inbox]:
+        """Collect the messages with some keys for one conversation, without a gap between its steps."""
+        inbox = Inbox()
+        for key in keys:
+            self._inboxes.setdefault(key, []).append(inbox)
+        try:
+            yield inbox
+        finally:
+            for key in keys:
+                self._inboxes[key].remove(inbox)
+                if not self._inboxes[key]:
+                    del self._inboxes[key]
+
+    def silence_since(self, began: float, now: float) -> float:
+        """Return the seconds since the component was heard, but at most those since `began`."""
+        return now - max(began, self._presence.received_at)
+
+    @property
+    def silence_max(self) -> float:
+        """Seconds of silence after which requests are given up."""
+        return min(self._presence.timeout, SILENCE_MAX)
+
+    def is_hopeless(self, attempts: int, began: float, now: float, attempts_max: int | None = None) -> bool:
+        """Return whether to give up a request that was sent so often since `began`.
+
+        Without `attempts_max`, loss must not explain the silence, and the component must have had time.
+        """
+        if self.silence_since(began, now) >= self.silence_max:
+            return True
+        if attempts_max is not None:
+            return attempts >= attempts_max
+        return attempts >= self.timing.attempts_max and now - began >= PATIENCE_MIN
+
+    def is_lost(self, now: float) -> bool:
+        """Return whether the component sends heartbeats, and was silent for longer than these explain."""
+        return now - self._presence.received_at >= self._presence.timeout
+
+    async def exchange(
+        self,
+        request: Message | Callable[[int], Message],
+        inbox: Inbox,
+        accept: Callable[[Message], T | None],
+        *,
+        what: str,
+        attempts: int | None = None,
+        copies: int = 1,
+        timeout_min: float = 0.0,
+    ) -> T:
+        """Send a request until it is answered. Cancellation leaves nothing behind.
+
+        Args:
+            request: sent in each attempt, or a function that returns it for an attempt, counted from 0.
+            inbox: takes the answers; it may hold earlier ones.
+            accept: returns the answer in a message, or None for a message that is none. It may raise the
+                error that the message tells.
+            what: names the request in the error.
+            attempts: at most; None for as many as loss explains.
+            copies: of the request in each attempt.
+            timeout_min: seconds to wait in each attempt, at least.
+
+        Raises:
+            NoReply: loss no longer explains the silence, or nothing at all was heard of the component.
+            LinkError: the link is closed for good.
+        """
+        began = anyio.current_time()
+        attempt = 0
+        while True:
+            await self.gate.wait()
+            sent = anyio.current_time()
+            message = request(attempt) if callable(request) else request
+            for _ in range(copies):
+                self.send(message)
+            answer = await self.wait_for(inbox, accept, sent, attempt, timeout_min)
+            attempt += 1
+            now = anyio.current_time()
+            if answer is not None:
+                self._measure(attempt, now - sent, now - began)
+                return answer
+            if self.is_hopeless(attempt, began, now, attempts):
+                raise NoReply(what, attempts=attempt, waited=now - began)
+
+    async def wait_for(
+        self,
+        inbox: Inbox,
+        accept: Callable[[Message], T | None],
+        sent: float,
+        attempt: int,
+        timeout_min: float = 0.0,
+    ) -> T | None:
+        """Wait for the answer to an attempt that was sent; return None at its timeout.
+
+        A program that wakes up late, as it was stalled, looks once more.
+        """
+        deadline = sent + max(self.timing.timeout(attempt), timeout_min)
+        with anyio.CancelScope(deadline=deadline) as scope:
+            if self.timing.round_trip is None:
+                self._waits[scope] = (sent, attempt)
+            try:
+                while True:
+                    answer = accept(await inbox.next())
+                    if answer is not None:
+                        return answer
+            finally:
+                self._waits.pop(scope, None)
+        if anyio.current_time() > scope.deadline + LATE_WAKE_UP:
+            with anyio.move_on_after(LATE_GRACE):
+                while True:
+                    answer = accept(await inbox.next())
+                    if answer is not None:
+                        return answer
+        return None
+
+    def _measure(self, attempts: int, last: float, whole: float) -> None:
+        """Take the times of an answered exchange; the first round trip shortens the waits that are open."""
+        timing = self.timing
+        if self.is_streaming:
+            return
+        timing.answered(attempts)
+        is_first = timing.round_trip is None
+        if attempts == 1:
+            timing.measure(last)
+        else:
+            timing.bound(whole)
+        if is_first:
+            for scope, (sent, attempt) in self._waits.items():
+                scope.deadline = min(scope.deadline, sent + timing.timeout(attempt))
+            self._waits.clear()

@@ -1,0 +1,139 @@
+"""COMMAND_LONG: acknowledged commands, requested messages, and the reboot of a vehicle."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import anyio
+
+from paramclient.errors import CommandRefused, CommandResult, NoReply, VehicleArmed
+from paramclient.protocol.channel import Channel
+from paramclient.protocol.node import Node
+from paramclient.wire.messages import (
+    MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN,
+    MAV_CMD_REQUEST_MESSAGE,
+    MAV_MODE_FLAG_SAFETY_ARMED,
+    CommandAck,
+    CommandLong,
+    Message,
+    message_id,
+)
+
+__all__ = ["reboot", "request_message", "send_command"]
+
+M = TypeVar("M")
+
+REBOOT_SILENCE = 0.2
+"""Seconds without a message that a rebooting vehicle is off, at least: an ArduPilot is off 0.2 to 0.3 s after
+its acknowledgement (measured)."""
+PRESENCE_INTERVAL = 0.02
+"""Seconds between two looks at the presence of a vehicle that reboots."""
+SAVING_TIME = 2.5
+"""Seconds from a write until a PX4 has saved it: 0.3 s after it, and at most every 2 s (measured)."""
+
+
+async def send_command(channel: Channel, command: CommandLong) -> None:
+    """Send a command until it is acknowledged.
+
+    Raises:
+        CommandRefused: the vehicle refused it.
+        NoReply: it did not answer. The command may have been executed.
+        LinkError: the link is closed for good.
+    """
+
+    def accept(message: Message) -> bool | None:
+        assert isinstance(message, CommandAck)
+        if message.result == CommandResult.IN_PROGRESS:
+            return None
+        if message.result != CommandResult.ACCEPTED:
+            raise CommandRefused(*channel.target, command.command, message.result)
+        return True
+
+    what = f"the acknowledgement of command {command.command} by {channel.system}/{channel.component}"
+    with channel.inbox((CommandAck, command.command)) as inbox:
+        await channel.exchange(command, inbox, accept, what=what)
+
+
+async def request_message(channel: Channel, kind: type[M]) -> M | None:
+    """Request a message with MAV_CMD_REQUEST_MESSAGE; return None if the vehicle refuses it.
+
+    Raises:
+        NoReply: the vehicle did not answer.
+        LinkError: the link is closed for good.
+    """
+    number = float(message_id(kind))  # type: ignore[arg-type]  # one of the message classes
+    request = CommandLong(*channel.target, MAV_CMD_REQUEST_MESSAGE, number)
+
+    def accept(message: Message) -> M | bool | None:
+        if isinstance(message, kind):
+            return message
+        is_refusal = isinstance(message, CommandAck) and message.result not in (
+            CommandResult.ACCEPTED,
+            CommandResult.IN_PROGRESS,
+        )
+        return False if is_refusal else None
+
+    what = f"message {number:.0f} of {channel.system}/{channel.component}"
+    with channel.inbox(kind, (CommandAck, MAV_CMD_REQUEST_MESSAGE)) as inbox:
+        answer = await channel.exchange(request, inbox, accept, what=what)
+    return answer if isinstance(answer, kind) else None
+
+
+async def reboot(node: Node, *, returns: bool = True) -> None:
+    """Reboot the vehicle, and wait until it is back and identified.
+
+    The reboot is shown by the clock that goes back, by the state in the heartbeat, or by silence after the
+    acknowledgement. The command is not repeated in silence: a vehicle whose acknowledgement was lost would
+    reboot twice.
+
+    Args:
+        node: the vehicle's autopilot.
+        returns: whether it returns under its ids; otherwise the call ends when it has gone off.
+
+    Raises:
+        VehicleArmed: the vehicle is armed.
+        CommandRefused: it refused.
+        NoReply: it did not answer, or did not come back.
+        LinkError: the link is closed for good.
+    """
+    presence, channel = node.presence, node.channel
+    if (presence.base_mode or 0) & MAV_MODE_FLAG_SAFETY_ARMED:
+        raise VehicleArmed(
+            f"{node.system}/{node.component} is armed: it was not rebooted",
+            system=node.system,
+            component=node.component,
+        )
+    generation = node.generation
+    with channel.gate.until_closed():
+        await anyio.sleep_until(node.plain.written_at + SAVING_TIME)
+    command = CommandLong(*channel.target, MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1.0)
+    try:
+        await send_command(channel, command)
+    except NoReply:
+        if node.generation == generation and not presence.is_lost:
+            raise
+    with channel.gate.until_closed():
+        await _wait_until_off(node, generation)
+        if not returns:
+            return
+        await _wait_until_back(node, generation)
+    if node.generation == generation:
+        node.rebooted(anyio.current_time())
+    await node.identified()
+
+
+async def _wait_until_off(node: Node, generation: int) -> None:
+    """Wait until the vehicle is silent, or has shown that it has rebooted already."""
+    while node.generation == generation:
+        if anyio.current_time() - node.presence.received_at >= REBOOT_SILENCE:
+            return
+        await anyio.sleep(PRESENCE_INTERVAL)
+
+
+async def _wait_until_back(node: Node, generation: int) -> None:
+    """Wait until the vehicle is heard again, and does not boot any more."""
+    silent_since = node.presence.received_at
+    while node.generation == generation and node.presence.received_at == silent_since:  # noqa: ASYNC110 - a state
+        await anyio.sleep(PRESENCE_INTERVAL)
+    while node.presence.is_booting or node.presence.is_lost:  # noqa: ASYNC110 - a state, without an event
+        await anyio.sleep(PRESENCE_INTERVAL)

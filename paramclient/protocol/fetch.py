@@ -1,0 +1,281 @@
+"""Fetch all parameters: from the cache where the vehicle confirms it, else by file or by list."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Final, Literal, TypeAlias
+
+import anyio
+
+from paramclient.errors import NoReply
+from paramclient.model.params import ParamMap
+from paramclient.model.values import Param
+from paramclient.protocol.dialect import Digest
+from paramclient.protocol.digest import is_current, request_digest
+from paramclient.protocol.file_download import FileUnavailable, download_file
+from paramclient.protocol.list_download import ListResult, download_list
+from paramclient.protocol.reads import read_many
+from paramclient.protocol.session import Session
+
+__all__ = ["FetchResult", "FetchSource", "Policy", "Progress", "fetch_all", "result_of"]
+
+FetchSource: TypeAlias = Literal["cache", "ftp", "stream"]
+"""Where a fetch has the values from: the cache, the packed file (MAVFTP) or the list."""
+
+REPAIRS_MAX: Final = 2
+"""Downloads after the first one, while the table changes during them."""
+CHANGED_MEANWHILE: Final = "The parameters changed during the download: the table may be a mixture."
+NOT_REFRESHED: Final = "The values outside the hash were not read again, because the policy is hash-only."
+LEFT_OUT: Final = "Skipped {}: no parameter file can contain this name."
+UNPROVEN: Final = "The vehicle's hash could not be computed from the table; it was equal before and after."
+
+
+class Policy(StrEnum):
+    """The requests that a fetch may send."""
+
+    AUTO = "auto"
+    """Whatever is cheapest and certain."""
+    HASH_ONLY = "hash-only"
+    """The digest only, for a vehicle in flight or a metered link: a table that it does not confirm stays as
+    cached."""
+    CACHE_ONLY = "cache-only"
+    """None."""
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """The progress of a fetch.
+
+    Attributes:
+        received: parameters received.
+        total: parameters of the component, or None while unknown.
+        rate: parameters per second since the fetch began.
+        seconds_left: at that rate, or None while unknown.
+    """
+
+    received: int
+    total: int | None
+    rate: float = 0.0
+    seconds_left: float | None = None
+
+    @classmethod
+    def after(cls, received: int, total: int | None, elapsed: float) -> Progress:
+        """Return the progress `elapsed` seconds after the begin."""
+        rate = received / elapsed if elapsed > 0 else 0.0
+        left = (total - received) / rate if rate and total is not None else None
+        return cls(received, total, rate, left)
+
+
+@dataclass(frozen=True, slots=True)
+class FetchResult:
+    """The result of `fetch_all`.
+
+    Attributes:
+        system, component: the component's address.
+        params: all known parameters by name, as they were at the end of the fetch.
+        source: "cache" when the vehicle confirmed the cached table, or the policy allows only the cache;
+            "ftp" for the packed file, "stream" for the list.
+        count: parameters that the component says it has.
+        missing: indices that were not received, rising. Empty when the fetch is complete.
+        hash: the PX4 hash by which the vehicle confirmed the table, or None.
+        elapsed: seconds from the call to the end.
+        notes: further sentences for the user.
+        lost: values of the list that were lost, so that they had to be read one by one or by another list.
+        repeated: values received more than once.
+        round_trip: the measured round trip in seconds, smoothed, or None.
+    """
+
+    system: int
+    component: int
+    params: Mapping[str, Param]
+    source: FetchSource
+    count: int
+    missing: tuple[int, ...]
+    hash: int | None
+    elapsed: float
+    notes: tuple[str, ...] = ()
+    lost: int = 0
+    repeated: int = 0
+    round_trip: float | None = None
+
+    @property
+    def received(self) -> int:
+        """Parameters of the list that are known."""
+        return self.count - len(self.missing)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every parameter of the list is known."""
+        return self.count > 0 and not self.missing
+
+    def __repr__(self) -> str:
+        missing = f", {len(self.missing)} missing" if self.missing else ""
+        return (
+            f"<FetchResult {self.system}/{self.component} {self.received} params{missing} "
+            f"from {self.source} in {self.elapsed:.2f} s>"
+        )
+
+
+async def fetch_all(
+    session: Session,
+    *,
+    refresh: bool = False,
+    policy: Policy = Policy.AUTO,
+    progress: Callable[[Progress], None] | None = None,
+) -> FetchResult:
+    """Fetch all parameters into the table. Callers at the same time share one fetch.
+
+    A cached table that the vehicle confirms is kept, and the values outside its digest are read. Otherwise
+    the table is downloaded: as a file where that is served, as a list elsewhere. A component that is lost
+    ends the fetch with what was received.
+
+    Args:
+        session: the component's.
+        refresh: download also if the vehicle confirms the table.
+        policy: the requests that may be sent.
+        progress: called as values arrive.
+
+    Raises:
+        NoReply: the component does not answer.
+        LinkError: the link is closed for good.
+    """
+
+    async def work() -> FetchResult:
+        return await _Fetch(session, policy).run(refresh=refresh)
+
+    began = anyio.current_time()
+
+    def observe(received: int, total: int | None) -> None:
+        if progress is not None:
+            progress(Progress.after(received, total, anyio.current_time() - began))
+
+    session.observers.add(observe)
+    try:
+        result: FetchResult = await session.fetching.join(work)
+    finally:
+        session.observers.discard(observe)
+    return result
+
+
+class _Fetch:
+    """One fetch, while it runs."""
+
+    def __init__(self, session: Session, policy: Policy) -> None:
+        self.session = session
+        self.table = session.table
+        self.policy = policy
+        self.notes: list[str] = []
+        self.listed = ListResult()
+        self._began = anyio.current_time()
+
+    async def run(self, *, refresh: bool) -> FetchResult:
+        """Fetch, and return the result."""
+        if self.policy is Policy.CACHE_ONLY:
+            return self._unconfirmed()
+        can_confirm = self.table.is_complete or self.policy is Policy.HASH_ONLY
+        digest = await request_digest(self.session) if can_confirm else None
+        if not refresh and is_current(self.session, digest):
+            self.table.verify()
+            if self.policy is Policy.AUTO:
+                await self._read_unverified()
+            elif self.table.unverified():
+                self.notes.append(NOT_REFRESHED)
+            return self._result("cache")
+        if self.policy is Policy.HASH_ONLY:
+            return self._unconfirmed()
+        source = await self._download()
+        for _ in range(REPAIRS_MAX):
+            if not self.table.is_complete or self.listed.missing or await self._settle(digest):
+                break
+            digest = None
+            source = await self._download()
+        return self._result(source)
+
+    async def _download(self) -> FetchSource:
+        """Download the file, or the list where there is none."""
+        session = self.session
+        if session.serves_file is not False and not session.dialect.has_ack:
+            with session.channel.gate.until_closed(or_failed=True):
+                await session.identification.encoding_certain()
+            if session.identification.may_serve_file:
+                try:
+                    await download_file(session)
+                    self.table.complete()
+                    return "ftp"
+                except FileUnavailable as error:
+                    if self._is_lost():
+                        self.notes.append(f"The component was lost: {error.reason}.")
+                        return "ftp"
+                    self.notes.append(f"Downloaded as a list: {error.reason}.")
+        self.listed = await download_list(session)
+        self.table.complete()
+        return "stream"
+
+    def _is_lost(self) -> bool:
+        channel = self.session.channel
+        return channel.silence_since(self._began, anyio.current_time()) >= channel.silence_max
+
+    async def _settle(self, before: Digest | None) -> bool:
+        """Compare the table with the digest after the download; return whether the fetch is done."""
+        listed = self.listed.digest
+        if listed is not None and listed.count == self.table.count and self.table.confirm(listed.hash):
+            return True
+        before = listed or before
+        after = await request_digest(self.session)
+        if after is None:
+            return True
+        if after.count == self.table.count:
+            if self.table.confirm(after.hash):
+                return True
+            if before is not None and before.hash == after.hash:
+                self.notes.append(UNPROVEN)
+                return True
+        self.table.unconfirm()
+        self.notes.append(CHANGED_MEANWHILE)
+        return False
+
+    async def _read_unverified(self) -> None:
+        """Read the values that the digest does not cover, and learn which names are volatile."""
+        try:
+            await read_many(self.session, self.table.unverified(), lambda name, result: None)
+        except* NoReply:
+            self.notes.append("Some values outside the vehicle's hash could not be read.")
+
+    def _unconfirmed(self) -> FetchResult:
+        """Return the table as it is cached."""
+        self.notes.append(f"The vehicle has not confirmed the cached table: the policy is {self.policy}.")
+        return replace(self._result("cache"), hash=None)
+
+    def _result(self, source: FetchSource) -> FetchResult:
+        lost, repeated = self.listed.lost, self.listed.repeated
+        self.notes += [LEFT_OUT.format(repr(name)) for name in self.table.left_out]
+        return result_of(self.session, source, self._began, self.notes, lost=lost, repeated=repeated)
+
+
+def result_of(
+    session: Session,
+    source: FetchSource,
+    began: float,
+    notes: Iterable[str],
+    *,
+    lost: int = 0,
+    repeated: int = 0,
+) -> FetchResult:
+    """Return the result of a fetch with the table as it is; of a partial one where it was ended."""
+    channel, table = session.channel, session.table
+    return FetchResult(
+        channel.system,
+        channel.component,
+        ParamMap(table.view()),
+        source,
+        table.count or 0,
+        tuple(table.missing()),
+        table.hash if table.is_complete else None,
+        anyio.current_time() - began,
+        tuple(dict.fromkeys(notes)),
+        lost,
+        repeated,
+        channel.timing.round_trip,
+    )

@@ -1,0 +1,113 @@
+"""Download all parameters as the packed file of the component, `@PARAM/param.pck`."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import anyio
+
+from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError
+from paramclient.protocol.ftp import FileCutOff, read_file
+from paramclient.protocol.param_pck import PACK_SIZE_MAX, Pack, decode, decode_prefix
+from paramclient.protocol.session import Session
+
+__all__ = ["FileUnavailable", "download_file"]
+
+PARAM_FILE: Final = "@PARAM/param.pck"
+"""The path of the file in MAVFTP."""
+WITH_DEFAULTS: Final = "?withdefaults=1"
+"""Requests the defaults too; a server that does not know it may report that there is no such file."""
+ARDUPILOT_WITH_DEFAULTS: Final = 0x04040000
+"""flight_sw_version of the first ArduPilot of which every build adds the defaults: 4.4."""
+OPEN_ATTEMPTS_MIN: Final = 3
+OPEN_LOST: Final = 1e-3
+"""Probability that all requests to open the file are lost, at which the list is taken instead."""
+DOWNLOADS_MAX: Final = 2
+"""Downloads of the file: one can be a mixture, if the table changes meanwhile."""
+
+
+class FileUnavailable(Exception):
+    """The file cannot be had; the list can.
+
+    Attributes:
+        reason: why, as a sentence for the notes of a fetch.
+    """
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+async def download_file(session: Session) -> int:
+    """Download the file into the table, and return the number of its parameters.
+
+    Accepts only a whole and valid file that has all parameters of the vehicle. Cancellation closes the
+    file on board.
+
+    Raises:
+        FileUnavailable: there is no such file, or it is not valid.
+        LinkError: the link is closed for good.
+    """
+    identification = session.identification
+    query = WITH_DEFAULTS
+    attempts = 0
+    reason = ""
+    while attempts < DOWNLOADS_MAX:
+        requested_at = anyio.current_time()
+        try:
+            pack = decode(await _read(session, PARAM_FILE + query))
+        except FileTransferError as error:
+            is_missing = error.code == FileErrorCode.FILE_NOT_FOUND
+            adds_defaults = identification.is_ardupilot and (
+                identification.identity.firmware >= ARDUPILOT_WITH_DEFAULTS
+            )
+            if is_missing and query and not adds_defaults:
+                query = ""
+                continue
+            if is_missing or error.code == FileErrorCode.UNKNOWN_COMMAND:
+                session.serves_file = False
+            raise FileUnavailable(f"the parameter file was refused: {error.reason}") from None
+        except NoReply as error:
+            if isinstance(error, FileCutOff):
+                _store_beginning(session, error.prefix, requested_at)
+            raise FileUnavailable("MAVFTP did not answer") from None
+        except PackError as error:
+            reason = f"the parameter file is not valid: {error}"
+            attempts += 1
+            continue
+        if not pack.entries or len(pack.entries) != pack.total:
+            reason = f"the parameter file has {len(pack.entries)} of {pack.total} parameters"
+            attempts += 1
+            continue
+        session.serves_file = True
+        _store(session, pack, requested_at)
+        return pack.total
+    raise FileUnavailable(reason)
+
+
+async def _read(session: Session, path: str) -> bytes:
+    channel = session.channel
+
+    def report(received: int, size: int | None) -> None:
+        total = session.table.count
+        if size and total:
+            session.report(min(received * total // size, total), total)
+
+    attempts = max(channel.timing.attempts_for(OPEN_LOST), OPEN_ATTEMPTS_MIN)
+    return await read_file(channel, path, size_max=PACK_SIZE_MAX, open_attempts=attempts, progress=report)
+
+
+def _store_beginning(session: Session, prefix: bytes, requested_at: float) -> None:
+    """Store the whole entries of a file that was cut off."""
+    try:
+        pack, number = decode_prefix(prefix)
+    except PackError:
+        return
+    if number == pack.total:
+        _store(session, pack, requested_at)
+
+
+def _store(session: Session, pack: Pack, requested_at: float) -> None:
+    session.table.recount(pack.total)
+    for index, entry in enumerate(pack.entries):
+        session.table.store_entry(entry, index, requested_at, with_defaults=pack.with_defaults)

@@ -1,0 +1,571 @@
+"""MAVFTP: packets, requests, sessions that are always closed, reads by burst, and checksums.
+
+The format is that of the MAVLink guide, "File Transfer Protocol (FTP)".
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import struct
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+import anyio
+
+from paramclient.errors import FileErrorCode, FileTransferError, NoReply, UsageError
+from paramclient.protocol.channel import Channel, Inbox
+from paramclient.wire.messages import FileTransfer, Message
+
+__all__ = ["DATA_SIZE_MAX", "DirectoryEntry", "Opcode", "Packet", "checksum", "list_directory", "read_file"]
+
+DATA_SIZE_MAX: Final = 239
+"""Bytes of a file in one message, at most."""
+FILE_SIZE_MAX: Final = 64 * 1024 * 1024
+"""Bytes of a file, by default: more than any flight log, less than memory."""
+PATH_SIZE_MAX: Final = DATA_SIZE_MAX - 1
+"""Bytes of a path, at most: it fills one message, with a NUL."""
+BUSY_TIME: Final = 3.3
+"""Seconds after which ArduPilot ends the silent session of another station (measured)."""
+BUSY_ATTEMPTS: Final = 2
+"""Attempts to open a file while the session of another station is in the way."""
+CLOSE_TIMEOUT: Final = 2.0
+"""Seconds for the closing of a session, also when its reader is cancelled. ArduPilot has one session for all
+links: an open one blocks the file access of all stations for 3 s."""
+BURST_PAUSE_MIN: Final = 0.15
+"""Seconds before the first block after which a burst counts as lost: at 57600 baud, ArduPilot begins one
+95 ms after the request."""
+BLOCK_PAUSE_MIN: Final = 0.05
+"""Seconds without a further block after which a burst counts as over."""
+BLOCK_INTERVALS: Final = 8
+"""Mean intervals between two blocks after which a burst counts as over."""
+READS_AT_ONCE: Final = 4
+"""Reads sent at once: ArduPilot's queue of MAVFTP requests has 5 places, and drops the surplus silently."""
+BLOCK_INTERVAL: Final = 0.006
+"""Seconds in which a vehicle serves one read: ArduPilot sends a block every 5.9 ms (measured)."""
+READS_MAX: Final = 64
+"""Reads in flight, at most: what a round trip of 400 ms holds."""
+
+
+class Opcode(IntEnum):
+    """MAV_FTP_OPCODE, as far as it is used here."""
+
+    TERMINATE_SESSION = 1
+    RESET_SESSIONS = 2
+    LIST_DIRECTORY = 3
+    OPEN_FILE_RO = 4
+    READ_FILE = 5
+    CREATE_FILE = 6
+    WRITE_FILE = 7
+    CALC_FILE_CRC32 = 14
+    BURST_READ_FILE = 15
+    ACK = 128
+    NAK = 129
+
+
+class DirectoryEntry(NamedTuple):
+    """One entry of a directory; `size` is None for a directory."""
+
+    name: str
+    size: int | None
+
+    @property
+    def is_directory(self) -> bool:
+        """Whether the entry is a directory."""
+        return self.size is None
+
+
+_HEADER = struct.Struct("<HBBBBBxI")
+
+
+class Packet(NamedTuple):
+    """A request or its response.
+
+    Attributes:
+        sequence: of a request, any rising number; of its response, one more; of a burst, rising from there.
+        session: the open file.
+        opcode: the operation; ACK or NAK in a response.
+        data: up to 239 bytes.
+        size: of a read, the requested bytes; otherwise the length of `data`.
+        offset: in the file; of a list, the entries to skip.
+        requested: in a response, the opcode of the request.
+        burst_complete: whether this is the last message of the burst.
+    """
+
+    sequence: int
+    session: int
+    opcode: int
+    data: bytes = b""
+    size: int = 0
+    offset: int = 0
+    requested: int = 0
+    burst_complete: bool = False
+
+    @classmethod
+    def unpack(cls, payload: bytes) -> Packet:
+        """Decode the 251 bytes of a message; `data` has `size` bytes, or as many as there are."""
+        sequence, session, opcode, size, requested, complete, offset = _HEADER.unpack_from(payload)
+        data = payload[_HEADER.size : _HEADER.size + size]
+        return cls(sequence, session, opcode, data, size, offset, requested, bool(complete))
+
+    def pack(self) -> bytes:
+        """Encode as the payload of a message; the message pads it."""
+        head = _HEADER.pack(
+            self.sequence & 0xFFFF,
+            self.session,
+            self.opcode,
+            self.size or len(self.data),
+            self.requested,
+            self.burst_complete,
+            self.offset,
+        )
+        return head + self.data
+
+    @property
+    def code(self) -> int:
+        """The reason in a NAK, comparable with `FileErrorCode`. A missing file is also an error number."""
+        code = self.data[0] if self.data else FileErrorCode.FAIL
+        if code == FileErrorCode.FAIL_ERRNO and self.data[1:2] == bytes((errno.ENOENT,)):
+            return FileErrorCode.FILE_NOT_FOUND
+        return code
+
+
+async def read_file(
+    channel: Channel,
+    path: str,
+    *,
+    read_size: int = DATA_SIZE_MAX,
+    size_max: int = FILE_SIZE_MAX,
+    open_attempts: int | None = None,
+    progress: Callable[[int, int | None], None] | None = None,
+) -> bytes:
+    """Read a file from the component. Its session on board is closed, whatever happens.
+
+    Args:
+        channel: the component's.
+        path: of the file, as the component names it.
+        read_size: bytes of each read, 1 to 239.
+        size_max: bytes, at most.
+        open_attempts: to open the file, where there is another way without it; None for as many as loss
+            explains.
+        progress: called with the bytes received and the size, which is an estimate for generated files.
+
+    Raises:
+        FileTransferError: the component refused it, or the file is larger than `size_max`.
+        NoReply: it does not answer; `FileCutOff` in the middle of the file.
+        LinkError: the link is closed for good.
+    """
+    async with channel.ftp, _opened(channel, path, open_attempts) as (session, size, inbox):
+        reader = _FileReader(channel, inbox, session, path, read_size, size_max)
+        reader.progress = None if progress is None else (lambda received: progress(received, size))
+        try:
+            return await reader.read()
+        except NoReply as error:
+            raise FileCutOff(error, reader.prefix) from None
+
+
+async def checksum(channel: Channel, path: str) -> int:
+    """Return the CRC-32 of a file, computed by the component: PX4's, see `crc32_px4`. Opens no session.
+
+    Raises:
+        FileTransferError: the component does not compute it, or refused the file.
+        NoReply: it does not answer.
+        LinkError: the link is closed for good.
+    """
+    with channel.inbox(FileTransfer) as inbox:
+        answer = await _request(channel, inbox, Opcode.CALC_FILE_CRC32, path, path_bytes(path))
+    if len(answer.data) < 4:
+        raise _error(channel, path, FileErrorCode.INVALID_DATA_SIZE)
+    return int.from_bytes(answer.data[:4], "little")
+
+
+async def list_directory(channel: Channel, path: str) -> list[DirectoryEntry]:
+    """Return the entries of a directory.
+
+    Raises:
+        FileTransferError: the component refused it.
+        NoReply: it does not answer.
+        LinkError: the link has failed.
+    """
+    entries: list[DirectoryEntry] = []
+    passed = 0
+    async with channel.ftp:
+        with channel.inbox(FileTransfer) as inbox:
+            while True:
+                try:
+                    answer = await _request(
+                        channel, inbox, Opcode.LIST_DIRECTORY, path, path_bytes(path), offset=passed
+                    )
+                except FileTransferError as error:
+                    if error.code == FileErrorCode.EOF:
+                        return entries
+                    raise
+                found = [each.decode("utf-8", "replace") for each in answer.data.split(b"\0") if each]
+                if not found:
+                    return entries
+                passed += len(found)
+                entries += [entry for text in found if (entry := _entry(text)) is not None]
+
+
+def _entry(text: str) -> DirectoryEntry | None:
+    """Return the entry in `F<name>\t<size>` or `D<name>`; None for one to skip."""
+    kind, rest = text[:1], text[1:]
+    if kind == "D":
+        return DirectoryEntry(rest, None)
+    name, _, size = rest.partition("\t")
+    return DirectoryEntry(name, int(size) if size.isdecimal() else 0) if kind == "F" else None
+
+
+def path_bytes(path: str) -> bytes:
+    """Return a path as the data of a request.
+
+    Raises:
+        UsageError: the path is empty, has a NUL, or is too long for a message.
+    """
+    data = path.encode()
+    if not data or b"\0" in data or len(data) > PATH_SIZE_MAX:
+        raise UsageError(f"the path {path!r:.80} has not 1 to {PATH_SIZE_MAX} bytes without NUL")
+    return data
+
+
+async def _request(
+    channel: Channel,
+    inbox: Inbox,
+    opcode: Opcode,
+    path: str,
+    data: bytes = b"",
+    *,
+    session: int = 0,
+    offset: int = 0,
+    size: int = 0,
+    attempts: int | None = None,
+    sequence: int | None = None,
+) -> Packet:
+    """Send one request until its ACK arrives.
+
+    All attempts have one sequence number, so the server repeats its response and does not act twice.
+    """
+    if sequence is None:
+        sequence = channel.next_ftp_sequence()
+    packet = Packet(sequence, session, opcode, data, size, offset)
+
+    def accept(message: Message) -> Packet | None:
+        answer = _answer(message)
+        if answer is None or answer.sequence != (sequence + 1) & 0xFFFF or answer.requested != opcode:
+            return None
+        if answer.opcode == Opcode.NAK:
+            raise _error(channel, path, answer.code)
+        return answer
+
+    return await channel.exchange(
+        FileTransfer(0, *channel.target, packet.pack()),
+        inbox,
+        accept,
+        what=f"MAVFTP {opcode.name} {path} of {channel.system}/{channel.component}",
+        attempts=attempts,
+    )
+
+
+@asynccontextmanager
+async def _opened(
+    channel: Channel, path: str, attempts: int | None
+) -> AsyncIterator[tuple[int, int | None, Inbox]]:
+    """Open a file, and close its session at the end, also if opening is cancelled half-way."""
+    data = path_bytes(path)
+    with channel.inbox(FileTransfer) as inbox:
+        session: int | None = None
+        sequence = 0
+        is_requested = False  # and not answered: it may be open
+        try:
+            for attempt in range(BUSY_ATTEMPTS):
+                try:
+                    is_requested, sequence = True, channel.next_ftp_sequence()
+                    answer = await _request(
+                        channel,
+                        inbox,
+                        Opcode.OPEN_FILE_RO,
+                        path,
+                        data,
+                        attempts=attempts,
+                        sequence=sequence,
+                    )
+                    break
+                except NoReply:
+                    is_requested = False
+                    raise
+                except FileTransferError as error:
+                    is_requested = False
+                    if error.code != FileErrorCode.INVALID_SESSION or attempt + 1 == BUSY_ATTEMPTS:
+                        raise
+                    await anyio.sleep(BUSY_TIME)
+            session = answer.session
+            size = int.from_bytes(answer.data[:4], "little") if len(answer.data) >= 4 else None
+            yield session, size, inbox
+        finally:
+            if session is not None or is_requested:
+                with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT):
+                    await _close(channel, inbox, path, session, sequence)
+
+
+async def _close(channel: Channel, inbox: Inbox, path: str, session: int | None, opening: int) -> None:
+    """Close a session.
+
+    One whose number never arrived is requested once more, with the sequence number of its opening. ArduPilot
+    takes the number of the request, which is 0.
+    """
+    with suppress(FileTransferError, NoReply):  # closed by the server, which ends silent sessions by itself
+        if session is None:
+            with suppress(FileTransferError):
+                data = path_bytes(path)
+                answer = await _request(channel, inbox, Opcode.OPEN_FILE_RO, path, data, sequence=opening)
+                session = answer.session
+        await _request(channel, inbox, Opcode.TERMINATE_SESSION, path, session=session or 0)
+
+
+class FileCutOff(NoReply):
+    """The component does not answer any more in the middle of a file.
+
+    Attributes:
+        prefix: the bytes from the beginning of the file to its first gap.
+    """
+
+    def __init__(self, error: NoReply, prefix: bytes) -> None:
+        super().__init__(error.awaited, attempts=error.attempts, waited=error.waited)
+        self.prefix = prefix
+
+
+class _Pieces:
+    """The received pieces of a file, by offset."""
+
+    def __init__(self) -> None:
+        self.received = 0
+        self.reached = 0  # the offset behind the last received byte
+        self.end: int | None = None
+        self._pieces: dict[int, bytes] = {}
+
+    def take(self, offset: int, data: bytes) -> None:
+        """Keep a piece."""
+        known = self._pieces.get(offset, b"")
+        if len(data) > len(known):
+            self._pieces[offset] = data
+            self.received += len(data) - len(known)
+            self.reached = max(self.reached, offset + len(data))
+
+    def gaps(self) -> list[tuple[int, int]]:
+        """Return first byte and end of what is missing before the end, as far as that is known."""
+        found, at = [], 0
+        for offset in sorted(self._pieces):
+            if offset > at:
+                found.append((at, offset))
+            at = max(at, offset + len(self._pieces[offset]))
+        if self.end is not None and at < self.end:
+            found.append((at, self.end))
+        return found
+
+    def has(self, offset: int) -> bool:
+        """Return whether a piece begins there, or the file ends before."""
+        return offset in self._pieces or (self.end is not None and offset >= self.end)
+
+    def content(self) -> bytes:
+        """Return the whole file."""
+        data = bytearray()
+        for offset in sorted(self._pieces):
+            piece = self._pieces[offset]
+            data[offset : offset + len(piece)] = piece
+        return bytes(data[: self.end])
+
+
+class _FileReader:
+    """The read of one open file: a burst from beginning to end, and single reads of lost blocks."""
+
+    def __init__(
+        self, channel: Channel, inbox: Inbox, session: int, path: str, read_size: int, size_max: int
+    ) -> None:
+        self.progress: Callable[[int], None] | None = None
+        self._channel = channel
+        self._inbox = inbox
+        self._session = session
+        self._path = path
+        self._read_size = read_size
+        self._size_max = size_max
+        self._pieces = _Pieces()
+        self._reads: dict[int, int] = {}  # offset by the sequence number of its response
+        self._has_bursts = True
+        self._began = self._last = 0.0
+        self._blocks = 0
+
+    async def read(self) -> bytes:
+        """Return the content of the file."""
+        self._began = anyio.current_time()
+        while self._has_bursts and self._pieces.end is None:
+            before = self._pieces.reached
+            await self._burst(before)
+            if self._pieces.reached == before:
+                break
+        await self._read_gaps()
+        return self._pieces.content()
+
+    @property
+    def prefix(self) -> bytes:
+        """The bytes from the beginning of the file to its first gap."""
+        gaps = self._pieces.gaps()
+        return self._pieces.content()[: gaps[0][0] if gaps else None]
+
+    async def _burst(self, offset: int) -> None:
+        """Request the rest of the file from an offset, and take its blocks until they end or pause."""
+        channel = self._channel
+        for attempt in range(channel.timing.attempts_max):
+            await channel.gate.wait()
+            sequence = channel.next_ftp_sequence()
+            request = Packet(
+                sequence, self._session, Opcode.BURST_READ_FILE, size=self._read_size, offset=offset
+            )
+            channel.send(FileTransfer(0, *channel.target, request.pack()))
+            sent = self._last = anyio.current_time()
+            pause = max(channel.timing.timeout(attempt), BURST_PAUSE_MIN)
+            first = math.inf
+            while True:
+                packet = None
+                with anyio.move_on_after(max(self._last + pause - anyio.current_time(), 0.001)):
+                    packet = _answer(await self._inbox.next())
+                if packet is None:
+                    break
+                if packet.requested != Opcode.BURST_READ_FILE or packet.session != self._session:
+                    continue
+                if packet.opcode == Opcode.NAK:
+                    self._end_of_burst(packet)
+                    return
+                self._take(packet)
+                first = min(first, self._last)
+                interval = (self._last - first) / max(self._blocks, 1)
+                pause = max(BLOCK_PAUSE_MIN, BLOCK_INTERVALS * interval)
+                if packet.burst_complete:
+                    return
+            if self._pieces.reached > offset:
+                return
+            if channel.silence_since(sent, anyio.current_time()) >= channel.silence_max:
+                return
+
+    def _end_of_burst(self, packet: Packet) -> None:
+        if packet.code == FileErrorCode.EOF:
+            if packet.offset >= self._pieces.reached:  # otherwise the end is unknown, and a read shows it
+                self._pieces.end = packet.offset
+        elif packet.code == FileErrorCode.UNKNOWN_COMMAND:
+            self._has_bursts = False
+        else:
+            raise _error(self._channel, self._path, packet.code)
+        self._has_bursts = False
+
+    async def _read_gaps(self) -> None:
+        """Read what is missing, and the end while it is unknown, block by block."""
+        pieces = self._pieces
+        while True:
+            wanted = [at for first, end in pieces.gaps() for at in range(first, end, self._read_size)]
+            if pieces.end is None:
+                wanted.append(pieces.reached)
+            if not wanted:
+                return
+            await self._read_blocks(wanted)
+
+    async def _read_blocks(self, wanted: list[int]) -> None:
+        """Read these offsets, each again when its time is over; several copies of the last ones."""
+        channel, timing = self._channel, self._channel.timing
+        began = anyio.current_time()
+        in_flight: dict[int, tuple[float, float]] = {}  # when each was sent, and when it counts as lost
+        attempts: dict[int, int] = {}
+        waiting = deque(wanted)
+        paced_at = -math.inf
+        while waiting or in_flight:
+            now = anyio.current_time()
+            for at, (sent, due) in list(in_flight.items()):
+                if self._pieces.has(at):
+                    timing.answered(attempts[at])
+                    if attempts[at] == 1:
+                        timing.measure(now - sent)
+                elif due <= now:
+                    waiting.appendleft(at)
+                else:
+                    continue
+                del in_flight[at]
+            copies = max(1, min(timing.copies, READS_AT_ONCE // max(len(waiting) + len(in_flight), 1)))
+            allowed = int(min((now - paced_at) / BLOCK_INTERVAL, READS_AT_ONCE))
+            while waiting and allowed > 0 and len(in_flight) < READS_MAX:
+                at = waiting.popleft()
+                if self._pieces.has(at):
+                    continue
+                paced_at = now
+                allowed -= copies
+                tried = attempts.get(at, 0)
+                if channel.is_hopeless(tried, began, now):
+                    what = f"{self._path} of {channel.system}/{channel.component} at byte {at}"
+                    raise NoReply(what, attempts=tried, waited=now - began)
+                await channel.gate.wait()
+                for _ in range(copies):
+                    self._send_read(at)
+                attempts[at] = tried + 1
+                in_flight[at] = (now, now + timing.timeout(tried))
+            if in_flight:
+                due = min(due for _, due in in_flight.values())
+                if waiting:
+                    due = min(due, now + BLOCK_INTERVAL * READS_AT_ONCE)
+                with anyio.move_on_after(max(due - now, 0.001)):
+                    self._take_read(_answer(await self._inbox.next()))
+
+    def _send_read(self, offset: int) -> None:
+        sequence = self._channel.next_ftp_sequence()
+        self._reads[(sequence + 1) & 0xFFFF] = offset
+        request = Packet(sequence, self._session, Opcode.READ_FILE, size=self._read_size, offset=offset)
+        self._channel.send(FileTransfer(0, *self._channel.target, request.pack()))
+
+    def _take_read(self, packet: Packet | None) -> None:
+        if packet is None or packet.session != self._session:
+            return
+        if packet.requested == Opcode.BURST_READ_FILE and packet.opcode == Opcode.ACK:
+            self._take(packet)
+        offset = self._reads.get(packet.sequence)
+        if packet.requested != Opcode.READ_FILE or offset is None:
+            return
+        if packet.opcode == Opcode.ACK and packet.data:
+            self._take(packet._replace(offset=offset))
+        elif packet.opcode == Opcode.ACK or packet.code == FileErrorCode.EOF:
+            end = self._pieces.end
+            self._pieces.end = offset if end is None else min(end, offset)
+        else:
+            raise _error(self._channel, self._path, packet.code)
+
+    def _take(self, packet: Packet) -> None:
+        if packet.offset + len(packet.data) > self._size_max:
+            system, component = self._channel.target
+            raise FileTransferError(
+                f"{self._path} of {system}/{component} is longer than {self._size_max} bytes",
+                system=system,
+                component=component,
+                path=self._path,
+                code=FileErrorCode.INVALID_DATA_SIZE,
+            )
+        self._pieces.take(packet.offset, packet.data)
+        self._blocks += 1
+        self._last = anyio.current_time()
+        if self.progress is not None:
+            self.progress(self._pieces.received)
+
+
+def _answer(message: Message) -> Packet | None:
+    assert isinstance(message, FileTransfer)
+    packet = Packet.unpack(message.payload)
+    return packet if packet.opcode in (Opcode.ACK, Opcode.NAK) else None
+
+
+def _error(channel: Channel, path: str, code: int) -> FileTransferError:
+    system, component = channel.target
+    reason = FileErrorCode.name_of(code)
+    return FileTransferError(
+        f"{system}/{component} refused {path}: {reason}",
+        system=system,
+        component=component,
+        path=path,
+        code=code,
+    )

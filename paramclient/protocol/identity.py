@@ -1,0 +1,246 @@
+"""Identity and parameter encoding of a component, from HEARTBEAT and AUTOPILOT_VERSION."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+from typing import Final
+
+import anyio
+
+from paramclient.errors import CommandResult, NoReply
+from paramclient.model.identity import Identity
+from paramclient.model.values import Encoding
+from paramclient.protocol.channel import Channel
+from paramclient.wire.messages import (
+    CAPABILITY_FTP,
+    CAPABILITY_PARAM_ENCODE_BYTEWISE,
+    CAPABILITY_PARAM_ENCODE_C_CAST,
+    MAV_AUTOPILOT_ARDUPILOTMEGA,
+    MAV_AUTOPILOT_INVALID,
+    MAV_AUTOPILOT_PX4,
+    MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
+    MAV_CMD_REQUEST_MESSAGE,
+    MAV_TYPE_GCS,
+    AutopilotVersion,
+    CommandAck,
+    CommandLong,
+    Heartbeat,
+    HighLatency2,
+    Message,
+    message_id,
+)
+
+__all__ = ["Identification", "judge_encoding"]
+
+PX4_WITH_FILE: Final = 0x01120000
+"""flight_sw_version of the first PX4 that serves the packed parameter file: 1.18."""
+VERSION_ATTEMPTS_MAX: Final = 12
+"""Requests for AUTOPILOT_VERSION: cameras and radios often have none."""
+VERSION_ATTEMPTS_REFUSED: Final = 4
+"""Requests after the first refusal, by both commands in turns: a refusal may concern only one of them."""
+
+
+def judge_encoding(
+    chosen: Encoding | None, capabilities: int | None, autopilot: int | None
+) -> tuple[Encoding, str]:
+    """Return the encoding of a component and the reason, by the first available evidence.
+
+    The user's choice; the capability bits of AUTOPILOT_VERSION; the autopilot in its own heartbeat; the
+    standard. ArduPilot sets neither capability bit, PX4 before 1.12 neither, and MAV_PROTOCOL_CAPABILITY_
+    PARAM_FLOAT is set by both, so it proves nothing (measured).
+
+    Args:
+        chosen: the user's choice, or None.
+        capabilities: the bits of AUTOPILOT_VERSION, or None while unknown.
+        autopilot: MAV_AUTOPILOT, or None before a heartbeat.
+    """
+    if chosen is not None:
+        return chosen, "chosen by the user"
+    bits = capabilities or 0
+    if bits & CAPABILITY_PARAM_ENCODE_BYTEWISE:
+        return Encoding.BYTEWISE, "the vehicle's capability PARAM_ENCODE_BYTEWISE"
+    if bits & CAPABILITY_PARAM_ENCODE_C_CAST:
+        return Encoding.C_CAST, "the vehicle's capability PARAM_ENCODE_C_CAST"
+    if autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
+        return Encoding.C_CAST, "its heartbeat says ArduPilot, which casts values to float"
+    if autopilot == MAV_AUTOPILOT_PX4:
+        return Encoding.BYTEWISE, "its heartbeat says PX4, which sends values byte by byte"
+    return Encoding.BYTEWISE, "the standard's encoding, as nothing says otherwise"
+
+
+class Identification:
+    """What a component has said of itself.
+
+    Args:
+        system: system id.
+        link: the link's name.
+        chosen: the encoding that the user has chosen, or None.
+        listens_only: whether nothing is requested, so that the heartbeat decides.
+
+    Attributes:
+        identity: the vehicle's identity; without a hardware id until AUTOPILOT_VERSION is received.
+        autopilot, vehicle_type: of the heartbeat; None before the first.
+        capabilities: of AUTOPILOT_VERSION; None before it.
+        encoding, encoding_reason: the parameter encoding and its evidence.
+        is_settled: whether `identity` is as complete as it gets: the version was received, or never will be.
+        is_confirmed: whether a vehicle with a hardware id has reported it since it was lost, has rebooted or
+            its link was interrupted; until then, values may be of another vehicle.
+    """
+
+    def __init__(
+        self, system: int, link: str, chosen: Encoding | None, *, listens_only: bool = False
+    ) -> None:
+        self.identity = Identity(system, link)
+        self.autopilot: int | None = None
+        self.vehicle_type: int | None = None
+        self.capabilities: int | None = None
+        self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
+        self.is_settled = False
+        self.is_confirmed = True
+        self._chosen = chosen
+        self._listens_only = listens_only
+        self._changed = anyio.Event()
+
+    @property
+    def is_px4(self) -> bool:
+        """Whether the component is a PX4."""
+        return self.autopilot == MAV_AUTOPILOT_PX4
+
+    @property
+    def is_ardupilot(self) -> bool:
+        """Whether the component is an ArduPilot."""
+        return self.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
+
+    @property
+    def is_autopilot(self) -> bool:
+        """Whether the heartbeat names an autopilot."""
+        return self.autopilot not in (None, MAV_AUTOPILOT_INVALID) and self.has_parameters
+
+    @property
+    def has_parameters(self) -> bool:
+        """Whether the component may have parameters: it is no ground station."""
+        return self.vehicle_type != MAV_TYPE_GCS
+
+    @property
+    def may_serve_file(self) -> bool:
+        """Whether the component may serve its parameters as a file.
+
+        PX4 has claimed so since long before it had that file: 1.17 responds "file not found" (measured). An
+        ArduPilot, which mostly has it, counts as having it until its version says otherwise.
+        """
+        if self.is_ardupilot and self.capabilities is None:
+            return True
+        has_none = self.is_px4 and self.identity.firmware < PX4_WITH_FILE
+        return bool((self.capabilities or 0) & CAPABILITY_FTP) and not has_none
+
+    @property
+    def is_encoding_certain(self) -> bool:
+        """Whether no further message can change the encoding."""
+        if self._chosen is not None or self.is_px4 or self.is_ardupilot or self.is_settled:
+            return True
+        return self._listens_only and self.autopilot is not None
+
+    async def settled(self) -> None:
+        """Wait until the identity is as complete as it gets."""
+        while not self.is_settled:
+            await self._changed.wait()
+
+    async def encoding_certain(self) -> None:
+        """Wait until no further message can change the encoding."""
+        while not self.is_encoding_certain:
+            await self._changed.wait()
+
+    def heartbeat(self, message: Heartbeat | HighLatency2) -> bool:
+        """Take a heartbeat, and return whether it is another kind of vehicle than before."""
+        kind = (message.autopilot, message.type)
+        before = (self.autopilot, self.vehicle_type)
+        if kind == before:
+            return False
+        self.autopilot, self.vehicle_type = kind
+        self.identity = replace(self.identity, autopilot=message.autopilot, vehicle_type=message.type)
+        self._derive()
+        return before != (None, None)
+
+    def version(self, message: AutopilotVersion) -> bool:
+        """Take an AUTOPILOT_VERSION, and return whether it is another vehicle's than the last one."""
+        before = self.identity
+        self.identity = Identity.from_version(
+            system=before.system,
+            link=before.link,
+            autopilot=self.autopilot or 0,
+            vehicle_type=self.vehicle_type or 0,
+            uid=message.uid,
+            uid2=message.uid2,
+            firmware=message.flight_sw_version,
+            git_hash=message.git_hash,
+            board=message.board_version,
+            vendor_id=message.vendor_id,
+            product_id=message.product_id,
+            capabilities=message.capabilities,
+        )
+        is_another = before.uid is not None and before.key != self.identity.key
+        self.capabilities = message.capabilities
+        self.is_confirmed = True
+        self.settle()
+        return is_another
+
+    def settle(self) -> None:
+        """Take the identity as it is: no more of it will be received."""
+        self.is_settled = True
+        self._derive()
+
+    def doubt(self) -> None:
+        """Take note that another vehicle may use the address."""
+        self.is_confirmed = self.identity.uid is None
+
+    def forget(self) -> None:
+        """Forget everything: another vehicle uses the address."""
+        self.identity = Identity(self.identity.system, self.identity.link)
+        self.is_settled = False
+        self.autopilot = self.vehicle_type = self.capabilities = None
+        self._derive()
+
+    async def request(self, channel: Channel) -> None:
+        """Request AUTOPILOT_VERSION until it is received, or the component has refused or left it unanswered.
+
+        MAV_CMD_REQUEST_MESSAGE first; older firmware knows only MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES.
+        """
+        number = float(message_id(AutopilotVersion))
+        ways = (
+            CommandLong(*channel.target, MAV_CMD_REQUEST_MESSAGE, number),
+            CommandLong(*channel.target, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0),
+        )
+        keys = [AutopilotVersion, *((CommandAck, way.command) for way in ways)]
+        refused: set[int] = set()
+
+        def accept(message: Message) -> bool | None:
+            if isinstance(message, CommandAck):
+                if message.result not in (CommandResult.ACCEPTED, CommandResult.IN_PROGRESS):
+                    refused.add(message.command)
+                    return False
+                return None
+            return True
+
+        def request_of(attempt: int) -> CommandLong:
+            if ways[0].command in refused or (attempt >= 2 and attempt % 2):
+                return ways[1]
+            return ways[0]
+
+        with channel.inbox(*keys) as inbox, suppress(NoReply):
+            attempts = VERSION_ATTEMPTS_MAX
+            while len(refused) < len(ways):
+                before = len(refused)
+                if await channel.exchange(
+                    request_of, inbox, accept, what="AUTOPILOT_VERSION", attempts=attempts
+                ):
+                    return
+                if len(refused) == before:  # both refusals are of one command
+                    break
+                attempts = VERSION_ATTEMPTS_REFUSED
+        self.settle()
+
+    def _derive(self) -> None:
+        self.encoding, self.encoding_reason = judge_encoding(self._chosen, self.capabilities, self.autopilot)
+        self._changed.set()
+        self._changed = anyio.Event()

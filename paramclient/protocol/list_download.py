@@ -1,0 +1,261 @@
+"""Download all parameters by the list: PARAM_REQUEST_LIST, and reads of the indices that were lost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+import anyio
+
+from paramclient.protocol.channel import Inbox
+from paramclient.protocol.dialect import Digest
+from paramclient.protocol.session import Session
+from paramclient.wire.messages import HASH_CHECK, Message
+
+__all__ = ["ListResult", "download_list"]
+
+LIST_REQUESTS_MAX: Final = 12
+"""Requests for a list that does not begin: an ArduPilot ignores them early after its start."""
+LIST_TIMEOUT_MIN: Final = 0.2
+"""Seconds to wait for the first value of a list, at least: a second request makes the list begin again."""
+PAUSE_PX4: Final = 0.12
+"""Seconds without a value after which a PX4's list has ended: it sends 20 values every 20 ms."""
+PAUSE_OTHERS: Final = 0.6
+"""The same for other components: ArduPilot's list pauses for up to 0.5 s while it serves reads."""
+PAUSE_TAIL: Final = 0.06
+"""The same at the last values of a list, where a pause is rare."""
+PAUSE_INTERVALS: Final = 8
+"""Mean intervals between two values after which a slow list has ended: PX4 sends 8 values a second in its
+low-bandwidth mode."""
+TAIL: Final = 4
+"""Indices before the end of the list that may still be on their way when it is over."""
+READS_PER_SECOND_ARDUPILOT: Final = 49.0
+"""Reads that an ArduPilot serves in a second: five in every 100 ms."""
+PASS_OVERHEAD: Final = 0.15
+"""Seconds that another pass of the list takes beside its values."""
+GAPS_INTERVAL: Final = 0.02
+"""Seconds after which gaps are looked at again without a new value."""
+
+
+@dataclass(slots=True)
+class ListResult:
+    """The result of a download.
+
+    Attributes:
+        missing: indices that were not received.
+        lost: values of the list that were lost, and read one by one or by another list.
+        repeated: values received more than once.
+        digest: PX4's, which begins its list; it is of the table at that moment.
+    """
+
+    missing: list[int] = field(default_factory=list)
+    lost: int = 0
+    repeated: int = 0
+    digest: Digest | None = None
+
+
+async def download_list(session: Session) -> ListResult:
+    """Download the list into the table, and read what is lost of it.
+
+    PX4 answers reads beside its list at once, so gaps are read while it runs. An ArduPilot's list almost
+    stands still while it serves reads, so its gaps are read when it is over, or by another pass of the list
+    where that is quicker. A list that runs is not requested again. Ends with what was received when the
+    component is lost.
+
+    Raises:
+        NoReply: the list does not begin.
+        LinkError: the link is closed for good.
+    """
+    channel = session.channel
+    with channel.inbox(session.dialect.value) as inbox:
+        try:
+            download = _Download(session, inbox)
+            await download.begin()
+            await download.run()
+        finally:
+            channel.is_streaming = False
+    return download.result
+
+
+class _Read(NamedTuple):
+    attempts: int
+    sent: float
+    due: float
+    """When the last attempt counts as lost."""
+
+
+_NO_READ: Final = _Read(0, 0.0, 0.0)
+
+
+class _Download:
+    """The state of one download, while it runs: what was received when, and which reads are in flight."""
+
+    def __init__(self, session: Session, inbox: Inbox) -> None:
+        self.session = session
+        self.channel = session.channel
+        self.table = session.table
+        self.result = ListResult()
+        self.reads_beside = session.identification.is_px4
+        self._inbox = inbox
+        self._received: set[int] = set()  # indices of this list
+        self._count: int | None = None
+        self._began = self._last = 0.0
+        self._reached = -1  # the highest index
+        self._skipped: set[int] = set()  # missing indices below the highest one
+        self._reads: dict[int, _Read] = {}
+
+    async def begin(self) -> None:
+        """Request the list until its first value arrives."""
+        channel = self.channel
+        self._began = anyio.current_time()
+
+        def request(attempt: int) -> Message:
+            self.session.report(0, self.table.count)
+            return self.session.dialect.request_list(channel.target)
+
+        first: Message = await channel.exchange(
+            request,
+            self._inbox,
+            self._first,
+            what=f"the list of {channel.system}/{channel.component}",
+            attempts=LIST_REQUESTS_MAX,
+            timeout_min=LIST_TIMEOUT_MIN,
+        )
+        channel.is_streaming = True
+        self._take(first)
+
+    def _first(self, message: Message) -> Message | None:
+        """Return the first value of the list; PX4's hash comes before it, and says nothing of its end."""
+        assert isinstance(message, self.session.dialect.value)
+        if message.param_index < message.param_count:
+            return message
+        self._take(message)
+        return None
+
+    async def run(self) -> None:
+        """Receive the list and read its gaps."""
+        if self.reads_beside:
+            await self._read_gaps()
+        else:
+            while not self._is_over():
+                await self._take_for(GAPS_INTERVAL)
+            while (missing := self._missing()) and not self._is_silent():
+                seconds_left = len(self.table.names) / self._rate() + PASS_OVERHEAD
+                if len(missing) / READS_PER_SECOND_ARDUPILOT <= seconds_left:
+                    await self._read_gaps()
+                    break
+                self.result.lost += len(missing)
+                await self._next_pass(seconds_left)
+        self.result.missing = self._missing()
+
+    async def _next_pass(self, seconds: float) -> None:
+        """Request the list once more, where that is quicker than reads, and receive it."""
+        await self.channel.gate.wait()
+        self.channel.send(self.session.dialect.request_list(self.channel.target))
+        self._reached = -1
+        self._skipped.clear()
+        self._last = anyio.current_time()
+        with anyio.move_on_after(seconds + self.channel.timing.timeout(0)):
+            while self._missing() and not self._is_over():
+                await self._take_for(GAPS_INTERVAL)
+
+    async def _read_gaps(self) -> None:
+        """Read what is missing, each index again when its time is over; several copies of the last ones."""
+        channel, timing = self.channel, self.channel.timing
+        while True:
+            now = anyio.current_time()
+            for index in [index for index in self._reads if index in self._received]:
+                read = self._reads.pop(index)
+                timing.answered(read.attempts)
+                if read.attempts == 1 and self._is_over():
+                    timing.measure(now - read.sent)
+            gaps = self._gaps()
+            if (not gaps and self._is_over()) or self._is_silent():
+                return
+            self._request(gaps, now)
+            if self._is_over() and all(self._is_given_up(index, now) for index in gaps):
+                return
+            await channel.gate.wait()
+            await self._take_for(GAPS_INTERVAL)
+
+    def _request(self, gaps: list[int], now: float) -> None:
+        """Send the reads that are due, as many as the window holds."""
+        timing, window = self.channel.timing, self.channel.window_size
+        in_flight = sum(read.due > now for read in self._reads.values())
+        copies = timing.copies if len(gaps) <= window and self._is_over() else 1
+        for index in gaps:
+            attempts, _, due = self._reads.get(index, _NO_READ)
+            if due > now or attempts >= timing.attempts_max:
+                continue
+            if in_flight >= window:
+                return
+            self.result.lost += attempts == 0
+            for _ in range(copies):
+                self.channel.send(self.session.dialect.request_read(self.channel.target, index))
+            self._reads[index] = _Read(attempts + 1, now, now + timing.timeout(attempts))
+            in_flight += 1
+
+    def _is_given_up(self, index: int, now: float) -> bool:
+        attempts, _, due = self._reads.get(index, _NO_READ)
+        return attempts >= self.channel.timing.attempts_max and due <= now
+
+    def _missing(self) -> list[int]:
+        """Return the indices that are missing."""
+        return [index for index in range(self._count or 0) if index not in self._received]
+
+    def _gaps(self) -> list[int]:
+        """Return the indices that are missing, below the end of the list so far."""
+        if self._is_over():
+            return sorted(self._skipped) + list(range(self._reached + 1, self._count or 0))
+        return sorted(index for index in self._skipped if index <= self._reached - TAIL)
+
+    def _is_over(self) -> bool:
+        """Return whether the list has ended: by its last index, or by a pause."""
+        if self._count is not None and self._reached >= self._count - 1:
+            return True
+        pause = PAUSE_PX4 if self.reads_beside else PAUSE_OTHERS
+        if self._count is not None and self._reached >= self._count - TAIL:
+            pause = PAUSE_TAIL
+        if self._received:
+            pause = max(pause, PAUSE_INTERVALS * (self._last - self._began) / len(self._received))
+        return anyio.current_time() - self._last > min(pause, self.channel.silence_max)
+
+    def _is_silent(self) -> bool:
+        """Return whether the component is silent for so long that it counts as lost."""
+        return self.channel.silence_since(self._began, anyio.current_time()) >= self.channel.silence_max
+
+    def _rate(self) -> float:
+        """Return the values per second of the list so far."""
+        return len(self._received) / max(self._last - self._began, 0.01)
+
+    async def _take_for(self, seconds: float) -> None:
+        """Take the values that arrive, at most for some seconds without one."""
+        with anyio.move_on_after(seconds):
+            self._take(await self._inbox.next())
+        while self._inbox:
+            self._take(await self._inbox.next())
+        self.session.report(len(self._received), self._count)
+
+    def _take(self, message: Message) -> None:
+        """Take one value."""
+        assert isinstance(message, self.session.dialect.value)
+        count, index = message.param_count, message.param_index
+        self._last = anyio.current_time()
+        if message.param_id == HASH_CHECK:
+            self.result.digest = Digest.of(message)
+        if index >= count:
+            return
+        if count != self._count:
+            self._count = count
+            self._received = {each for each in self._received if each in self.table.names}
+            self._skipped.clear()
+            self._reads.clear()
+            self._reached = -1
+        self.result.repeated += index in self._received
+        self._received.add(index)
+        self._skipped.discard(index)
+        if index > self._reached:
+            self._skipped.update(
+                each for each in range(self._reached + 1, index) if each not in self._received
+            )
+            self._reached = index

@@ -1,0 +1,232 @@
+"""One component on the link: its channel, presence, identity, and its plain and extended parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import anyio
+
+from paramclient.model.identity import hardware_id
+from paramclient.model.values import Encoding
+from paramclient.protocol.addresses import Peer
+from paramclient.protocol.channel import Channel, Gate
+from paramclient.protocol.dialect import EXTENDED, PLAIN, Digest
+from paramclient.protocol.events import (
+    Change,
+    ComponentEvent,
+    Found,
+    Identified,
+    Lost,
+    Rebooted,
+    Replaced,
+)
+from paramclient.protocol.identity import Identification
+from paramclient.protocol.presence import Presence
+from paramclient.protocol.session import Session, Shared, Spawn
+from paramclient.wire.messages import (
+    HASH_CHECK,
+    AutopilotVersion,
+    Heartbeat,
+    HighLatency2,
+    Message,
+    ParamExtAck,
+    ParamExtValue,
+    ParamValue,
+    SystemTime,
+    message_id,
+)
+
+__all__ = ["Node"]
+
+RIVAL_TIME: Final = 5.0
+"""Seconds after its last message for which another peer with the same ids counts as live."""
+WINDOW_PX4: Final = 60
+"""Requests in flight to a PX4, which answers each at once."""
+ACCEPTED: Final = 0
+"""PARAM_ACK_ACCEPTED in PARAM_EXT_ACK."""
+_SYSTEM_TIME: Final = message_id(SystemTime)
+
+
+class Node:
+    """One component on the link, as its messages show it.
+
+    Args:
+        system, component: its address.
+        link: the link's name, part of an identity without a hardware id.
+        peer: from which its messages arrive.
+        since: when it was heard first.
+        is_split: whether components with equal ids at other peers are other components.
+        transmit: queues a message for the component.
+        gate: whether the link carries messages.
+        encoding: chosen by the user, or None.
+        listens_only: whether nothing is requested.
+        spawn: starts an async function in the background.
+        emit: called with each event.
+        changed: called with each change of a parameter, and its session.
+
+    Attributes:
+        channel, presence, identification: the parts.
+        plain, extended: the parameters.
+        peer, since, is_split: as given; a vehicle may move to another peer.
+        rival: another live peer that uses the same ids, and when it was heard; None without one.
+        version: of MAVLink, 1 or 2, by its last message.
+        generation: counts how often the component was lost, has rebooted or was replaced: a conversation that
+            sees another number than at its begin knows that values are of different times.
+    """
+
+    def __init__(
+        self,
+        system: int,
+        component: int,
+        *,
+        link: str,
+        peer: Peer,
+        since: float,
+        is_split: bool,
+        transmit: Callable[[Message], None],
+        gate: Gate,
+        encoding: Encoding | None,
+        listens_only: bool,
+        spawn: Spawn,
+        emit: Callable[[ComponentEvent], None],
+        changed: Callable[[Session, Change], None],
+    ) -> None:
+        self.system = system
+        self.component = component
+        self.peer = peer
+        self.since = since
+        self.is_split = is_split
+        self.rival: tuple[Peer, float] | None = None
+        self.presence = Presence()
+        self.channel = Channel(system, component, transmit, gate, self.presence)
+        self.identification = Identification(system, link, encoding, listens_only=listens_only)
+        self.plain = Session(
+            self.channel, self.identification, PLAIN, spawn, lambda change: changed(self.plain, change)
+        )
+        self.extended = Session(
+            self.channel, self.identification, EXTENDED, spawn, lambda change: changed(self.extended, change)
+        )
+        self.sessions = (self.plain, self.extended)
+        self.version = 2
+        self.generation = 0
+        self._spawn = spawn
+        self._emit = emit
+        self._identifying: Shared[None] = Shared(spawn, gate)
+
+    def receive(self, message: Message, now: float, version: int = 2) -> None:
+        """Take a message of the component: into the tables, and to the conversations that wait for it."""
+        presence = self.presence
+        silence, presence.received_at = now - presence.received_at, now
+        self.version = version
+        if presence.is_lost:
+            presence.is_lost = False
+            self._emit(Found(silence))
+            self._spawn(self.identify)
+        match message:
+            case ParamValue():
+                self.plain.receive(message, now)
+                if message.param_id == HASH_CHECK:
+                    self.plain.announced = Digest.of(message)
+            case ParamExtValue():
+                self.extended.table.store(message, now)
+            case ParamExtAck(param_id=name, raw=raw, param_type=number, param_result=result):
+                table = self.extended.table
+                if result == ACCEPTED and (known := table.params.get(name)) is not None:
+                    index = 65535 if known.index is None else known.index
+                    table.store(ParamExtValue(name, raw, number, table.count or 0, index), now)
+            case Heartbeat():
+                if self.identification.heartbeat(message):
+                    self._doubt()
+                    self._spawn(self.identify)
+                self._settle_encoding()
+                if presence.heartbeat(message, now):
+                    self.rebooted(now)
+            case HighLatency2():
+                presence.high_latency()
+                self.identification.heartbeat(message)
+                self._settle_encoding()
+            case SystemTime(time_boot_ms=boot_ms):
+                self.boot_clock(_SYSTEM_TIME, boot_ms, now)
+            case AutopilotVersion():
+                if self.identification.version(message):
+                    self._replace()
+                self._settle_encoding()
+                self._emit(Identified())
+        self.channel.dispatch(message)
+
+    async def identified(self) -> None:
+        """Wait for the identity that was requested last."""
+        await self._identifying.join(lambda: self.identification.request(self.channel))
+
+    def boot_clock(self, number: int, boot_ms: int, now: float) -> None:
+        """Take the time since boot in a message."""
+        if self.presence.boot_clock(number, boot_ms, now):
+            self.rebooted(now)
+
+    def rebooted(self, now: float) -> None:
+        """Doubt all values: the vehicle has rebooted, and may have measured or loaded others."""
+        self.presence.rebooted(now)
+        self._doubt()
+        self._emit(Rebooted())
+        self._spawn(self.identify)
+
+    def resumed(self) -> None:
+        """Doubt all values: the link was interrupted, and may lead to another vehicle."""
+        self._doubt()
+        for session in self.sessions:
+            session.table.recounted()
+        self._spawn(self.identify)
+
+    def is_same_vehicle(self, message: Message) -> bool:
+        """Return whether a message of another peer proves to be of this vehicle, by its hardware id."""
+        if not isinstance(message, AutopilotVersion):
+            return False
+        uid = hardware_id(message.uid, message.uid2)
+        return uid is not None and uid == self.identification.identity.uid
+
+    def has_rival(self, now: float) -> bool:
+        """Return whether another live peer uses the same ids."""
+        return self.rival is not None and now - self.rival[1] <= RIVAL_TIME
+
+    def _settle_encoding(self) -> None:
+        if self.identification.is_px4:
+            self.channel.widen(WINDOW_PX4)
+        self.plain.table.encoding = self.identification.encoding
+        if self.identification.is_encoding_certain:
+            self.plain.table.report_held()
+
+    def _doubt(self) -> None:
+        self.generation += 1
+        self.identification.doubt()
+        for session in self.sessions:
+            session.table.doubt()
+
+    def _replace(self) -> None:
+        self.generation += 1
+        for session in self.sessions:
+            session.table.clear()
+        self._emit(Replaced())
+
+    async def identify(self) -> None:
+        """Request the identity, unless that is in progress."""
+        if not self.identification.has_parameters:
+            self.identification.settle()  # so that nothing waits for what is never requested
+            return
+        was_settled = self.identification.is_settled
+        await self._identifying.join(lambda: self.identification.request(self.channel))
+        self._settle_encoding()
+        if not was_settled and self.identification.capabilities is None:
+            self._emit(Identified())
+
+    async def watch_presence(self) -> None:
+        """Mark the component as lost when it is silent for its timeout."""
+        presence = self.presence
+        while True:
+            silence = anyio.current_time() - presence.received_at
+            timeout = presence.timeout
+            if not presence.is_lost and silence >= timeout:
+                presence.is_lost = True
+                self._doubt()
+                self._emit(Lost(silence))
+            await anyio.sleep(min(max(timeout - silence, 0.001), 1.0) if not presence.is_lost else 1.0)

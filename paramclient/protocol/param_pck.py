@@ -1,0 +1,234 @@
+"""The packed parameter file (param.pck): the whole table as one file, with types and defaults.
+
+The file (ArduPilot, AP_Filesystem/README.md; MAVLink guide, "Parameters over MAVLink FTP"; newest PX4 serves
+the same) has a header of three 16-bit numbers: a magic, the number of entries in the file, and the number of
+parameters of the vehicle; in a file for writing, the last is the length of the file. An entry has: zero bytes
+as padding; the type, with a flag for a default; the number of characters that the name shares with the one
+before; the other characters; the value in its own size; the default likewise. Integers are exact, also those
+that a PARAM_VALUE of ArduPilot would round.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterable
+from typing import Final, NamedTuple
+
+from paramclient.errors import PackError, UsageError
+from paramclient.model.values import NAME_LENGTH, ParamType, check_name
+
+__all__ = [
+    "MAGICS",
+    "Pack",
+    "PackedParam",
+    "decode",
+    "decode_prefix",
+    "encode",
+]
+
+READ_SIZE_DEFAULT: Final = 239
+"""Bytes in one message of MAVFTP, at most, and the usual size of reads of the file."""
+PACK_SIZE_MAX: Final = 6 + 65535 * (2 + NAME_LENGTH + 2 * 4 + 7)
+"""Bytes of the largest possible file: as many entries as the header can count, each with the longest name, a
+default, and the most padding that is useful. Longer files are rejected."""
+
+PACKABLE: Final = frozenset({ParamType.INT8, ParamType.INT16, ParamType.INT32, ParamType.REAL32})
+"""The parameter types that a file can contain."""
+
+_MAGIC = 0x671B
+_MAGIC_WITH_DEFAULTS = 0x671C
+MAGICS: Final = tuple(magic.to_bytes(2, "little") for magic in (_MAGIC, _MAGIC_WITH_DEFAULTS))
+"""The first two bytes of every such file, without and with defaults."""
+_HEADER = struct.Struct("<HHH")
+_TYPES = {1: ParamType.INT8, 2: ParamType.INT16, 3: ParamType.INT32, 4: ParamType.REAL32}
+_NUMBERS = {kind: number for number, kind in _TYPES.items()}
+_HAS_DEFAULT = 0x10
+_padding = re.compile(rb"\0*").match
+
+
+class PackedParam(NamedTuple):
+    """One entry.
+
+    Attributes:
+        name: param_id.
+        type: INT8, INT16, INT32 or REAL32; the file has no others.
+        bits: the value, as in `Param.bits`.
+        default: the firmware's default, likewise; None where the file has none, and in a file with defaults
+            where the value is the default. ArduPilot compares the two as float32.
+    """
+
+    name: str
+    type: ParamType
+    bits: int
+    default: int | None = None
+
+
+class Pack(NamedTuple):
+    """The content of a file.
+
+    Attributes:
+        entries: in the order of the file, which is that of the parameters' indices.
+        total: the number of parameters of the vehicle: more than entries in a part of the table.
+        with_defaults: whether an entry without a default has its default value.
+    """
+
+    entries: tuple[PackedParam, ...]
+    total: int
+    with_defaults: bool
+
+
+def decode(data: bytes) -> Pack:
+    """Decode a file from a vehicle.
+
+    Raises:
+        PackError: the file is invalid: magic, type, flag or name, a name that occurs twice, a truncated file,
+            another number of entries than in the header, or more bytes than possible.
+    """
+    magic, number, total = _header(data)
+    _check_header(magic, number, total)
+    with_defaults = magic == _MAGIC_WITH_DEFAULTS
+    return Pack(_entries(data, number, with_defaults), total, with_defaults)
+
+
+def decode_prefix(data: bytes) -> tuple[Pack, int]:
+    """Decode the complete entries at the beginning of a file from a vehicle.
+
+    No entry depends on later ones, so each of these is valid, whatever is missing. Also returns the number of
+    entries in the whole file by its header.
+
+    Raises:
+        PackError: as in `decode`, except for a file that is truncated behind its header.
+    """
+    magic, number, total = _header(data)
+    _check_header(magic, number, total)
+    with_defaults = magic == _MAGIC_WITH_DEFAULTS
+    return Pack(_entries(data, number, with_defaults, may_end=True), total, with_defaults), number
+
+
+def encode(
+    entries: Iterable[PackedParam],
+    *,
+    total: int | None = None,
+    with_defaults: bool = False,
+    read_size: int = READ_SIZE_DEFAULT,
+) -> bytes:
+    """Encode the file that ArduPilot serves to a client that reads `read_size` bytes at a time.
+
+    Padding keeps a value from being split between two reads, so that a repeated read cannot replace half of
+    it. ArduPilot aligns only the last bytes of an entry: a default, where there is one.
+
+    Args:
+        entries: in the order of their indices.
+        total: the number of parameters of the vehicle; None: these are all.
+        with_defaults: include the defaults of entries that have one; otherwise they are left out.
+        read_size: 1 to 239.
+
+    Raises:
+        UsageError: a name, type or value does not fit such a file, or a name occurs twice.
+    """
+    if not 1 <= read_size <= READ_SIZE_DEFAULT:
+        raise UsageError(f"a file is read by 1 to {READ_SIZE_DEFAULT} bytes, not {read_size}")
+    rows = list(entries)
+    total = len(rows) if total is None else total
+    if not len(rows) <= total <= 0xFFFF:
+        raise UsageError(f"{len(rows)} entries of a table of {total}, and the file counts to 65535")
+    magic = _MAGIC_WITH_DEFAULTS if with_defaults else _MAGIC
+    out = bytearray(_HEADER.pack(magic, len(rows), total))
+    _append(out, rows, with_defaults, read_size)
+    return bytes(out)
+
+
+def _header(data: bytes) -> tuple[int, int, int]:
+    if len(data) > PACK_SIZE_MAX:
+        raise PackError(f"no packed parameter file has {len(data)} bytes", offset=PACK_SIZE_MAX)
+    if len(data) < _HEADER.size:
+        raise PackError("the file is cut off in its header", offset=len(data))
+    magic, number, last = _HEADER.unpack_from(data)
+    return magic, number, last
+
+
+def _check_header(magic: int, number: int, total: int) -> None:
+    if magic not in (_MAGIC, _MAGIC_WITH_DEFAULTS):
+        raise PackError(f"a packed parameter file does not begin with 0x{magic:04x}", offset=0)
+    if total < number:
+        raise PackError(f"{number} entries of a table of {total}", offset=2)
+
+
+def _entries(
+    data: bytes, number: int, with_defaults: bool, *, may_end: bool = False
+) -> tuple[PackedParam, ...]:
+    """Decode all entries behind the header: exactly that many; fewer where the file may be truncated."""
+    found: dict[str, PackedParam] = {}
+    name = b""
+    at = _HEADER.size
+    for place in range(number):
+        match = _padding(data, at)
+        at = at if match is None else match.end()
+        if at + 2 > len(data):
+            if may_end:
+                break
+            raise PackError(f"the file is cut off: {place} of {number} entries", offset=len(data))
+        kind = _TYPES.get(data[at] & 0x0F)
+        flags = data[at] & 0xF0
+        if kind is None or flags not in (0, _HAS_DEFAULT) or (flags and not with_defaults):
+            raise PackError(f"entry {place} begins with 0x{data[at]:02x}", offset=at)
+        shared, more = data[at + 1] & 0x0F, (data[at + 1] >> 4) + 1
+        value_at = at + 2 + more
+        end = value_at + (2 * kind.size if flags else kind.size)
+        if end > len(data):
+            if may_end:
+                break
+            raise PackError(f"the file is cut off in entry {place} of {number}", offset=len(data))
+        if shared > len(name):
+            raise PackError(f"entry {place} shares {shared} characters with {name!r}", offset=at)
+        name = name[:shared] + data[at + 2 : value_at]
+        text = name.decode("latin-1")
+        if len(name) > NAME_LENGTH or not (text.isascii() and text.isprintable()):
+            raise PackError(f"entry {place} has the name {text!r}", offset=at)
+        if text in found:
+            raise PackError(f"{text} occurs twice", offset=at)
+        bits = int.from_bytes(data[value_at : value_at + kind.size], "little")
+        default = int.from_bytes(data[value_at + kind.size : end], "little") if flags else None
+        found[text] = PackedParam(text, kind, bits, default)
+        at = end
+    if len(found) == number and at < len(data):
+        raise PackError(f"{len(data) - at} bytes are left over behind {number} entries", offset=at)
+    return tuple(found.values())
+
+
+def _append(out: bytearray, rows: list[PackedParam], with_defaults: bool, read_size: int | None) -> None:
+    last = ""
+    names = set()
+    for name, kind, bits, default in rows:
+        check_name(name)
+        if name in names:
+            raise UsageError(f"{name} stands twice among the parameters")
+        names.add(name)
+        number = _NUMBERS.get(kind)
+        if number is None:
+            raise UsageError(f"{name}: a packed parameter file has no {kind.name}")
+        try:
+            value = bits.to_bytes(kind.size, "little")
+            if with_defaults and default is not None:
+                number |= _HAS_DEFAULT
+                value += default.to_bytes(kind.size, "little")
+        except OverflowError:
+            raise UsageError(f"{name}: its value or default has more bits than {kind.name}") from None
+        shared = _shared(last, name)
+        own = name[shared:].encode("ascii")
+        size = 2 + len(own) + len(value)
+        if read_size is not None:
+            over = (len(out) + size) % read_size
+            if 0 < over < kind.size:
+                out += bytes(kind.size - over)
+        out += bytes((number, shared | len(own) - 1 << 4))
+        out += own
+        out += value
+        last = name
+
+
+def _shared(last: str, name: str) -> int:
+    """Return how many characters to share; one of the name's own remains, as the file cannot encode none."""
+    shared_max = min(len(last), len(name) - 1)
+    return next((at for at in range(shared_max) if last[at] != name[at]), shared_max)

@@ -1,0 +1,173 @@
+"""Read single parameters: PARAM_REQUEST_READ and PARAM_EXT_REQUEST_READ, and what silence means."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from typing import Final
+
+import anyio
+
+from paramclient.errors import (
+    NoReply,
+    ParamClientError,
+    ParamErrorCode,
+    Refused,
+    TypeMismatch,
+    UnknownParameter,
+)
+from paramclient.model.similar_names import did_you_mean, nearest_names
+from paramclient.model.values import Param
+from paramclient.protocol.channel import Inbox
+from paramclient.protocol.dialect import ReportedValue
+from paramclient.protocol.session import Session
+from paramclient.wire.messages import HASH_CHECK, Message, ParamError
+
+__all__ = ["read", "read_many", "refusal"]
+
+CONTROL_LOST: Final = 1e-4
+"""Probability that all attempts of the control read are lost, which decides whether a component answers
+reads at all."""
+CONTROL_ATTEMPTS_MIN: Final = 8
+SLOT_ARDUPILOT: Final = 0.1
+"""Seconds between two times at which an ArduPilot answers reads."""
+READS_PER_SLOT_ARDUPILOT: Final = 5
+"""Reads that it answers then; others wait for the next slot."""
+
+
+async def read(session: Session, which: str | int) -> ReportedValue:
+    """Read one parameter, by name or index. Its value is in the table then.
+
+    A component that leaves this read unanswered and answers another one has no such parameter: PX4 before
+    1.18 and ArduPilot before 4.7 say nothing of an unknown name.
+
+    Raises:
+        UnknownParameter: the component has no such parameter.
+        Refused: it gave another reason.
+        NoReply: it answered nothing.
+        LinkError: the link is closed for good.
+    """
+    channel, dialect = session.channel, session.dialect
+    what = f"parameter {which} of {channel.system}/{channel.component}"
+
+    def accept(message: Message) -> ReportedValue | None:
+        if isinstance(message, ParamError):
+            raise refusal(session, which, message.error)
+        return message if isinstance(message, dialect.value) else None
+
+    request = dialect.request_read(channel.target, which)
+
+    async def ask(inbox: Inbox) -> ReportedValue:
+        attempts, wait = channel.timing.attempts_max, _queue_time(session)
+        return await channel.exchange(request, inbox, accept, what=what, attempts=attempts, timeout_min=wait)
+
+    async with channel.window:
+        with channel.inbox((dialect.value, which)) as inbox:
+            try:
+                return await ask(inbox)
+            except NoReply:
+                if which == HASH_CHECK or channel.is_lost(anyio.current_time()):
+                    raise
+                control = await _control_read(session, which)
+                if control is None:
+                    raise
+            if control.param_id == which:
+                return control
+            with suppress(NoReply):  # it answers by now, and may only have been busy
+                return await ask(inbox)
+    raise _unknown(session, which, ": it does not respond to reads of this name, but to others")
+
+
+async def read_many(
+    session: Session, names: Iterable[str], done: Callable[[str, Param | ParamClientError], None]
+) -> None:
+    """Read several parameters, as many at once as the component serves.
+
+    Args:
+        session: the component's.
+        names: of the parameters.
+        done: called with each parameter or its error, as it arrives.
+
+    Raises:
+        LinkError: the link is closed for good.
+    """
+
+    async def read_one(name: str) -> None:
+        try:
+            message = await read(session, name)
+        except ParamClientError as error:
+            done(name, error)
+        else:
+            done(name, session.table.params[message.param_id])
+
+    async with anyio.create_task_group() as tasks:
+        for name in names:
+            tasks.start_soon(read_one, name)
+
+
+def refusal(session: Session, which: str | int, code: int) -> UnknownParameter | TypeMismatch | Refused:
+    """Return the error for a PARAM_ERROR with this code."""
+    if code == ParamErrorCode.DOES_NOT_EXIST:
+        return _unknown(session, which)
+    system, component = session.channel.target
+    name, index = (which, None) if isinstance(which, str) else (None, which)
+    what = f"{system}/{component} refused {which}: {ParamErrorCode.name_of(code)}"
+    if code == ParamErrorCode.TYPE_MISMATCH:
+        return TypeMismatch(what, system=system, component=component, name=name, index=index)
+    return Refused(
+        what,
+        system=system,
+        component=component,
+        code=code,
+        name=name,
+        index=index,
+    )
+
+
+def _queue_time(session: Session) -> float:
+    """Return the seconds that an ArduPilot takes to answer the reads in flight; 0 for others.
+
+    Without it, sets, which are answered at once, would measure a round trip at which all reads are repeated.
+    """
+    if not session.identification.is_ardupilot:
+        return 0.0
+    channel = session.channel
+    slots = 1 + (channel.window_size - channel.window.value) // READS_PER_SLOT_ARDUPILOT
+    return slots * SLOT_ARDUPILOT + (channel.timing.round_trip or 0.0)
+
+
+async def _control_read(session: Session, which: str | int) -> ReportedValue | None:
+    """Read something that the component certainly has; return None if that is not answered either.
+
+    That is the same parameter by its index, where that is known: some components answer no read by name.
+    """
+    channel, dialect, table = session.channel, session.dialect, session.table
+    same = table.params[which].index if isinstance(which, str) and which in table.moments else None
+    known = next((name for name in table.moments if name != which), 0) if same is None else same
+    control: str | int = HASH_CHECK if session.identification.is_px4 else known
+
+    def accept(message: Message) -> ReportedValue | None:
+        return message if isinstance(message, dialect.value) else None
+
+    with channel.inbox((dialect.value, control)) as inbox:
+        request = dialect.request_read(channel.target, control)
+        attempts = max(channel.timing.attempts_for(CONTROL_LOST), CONTROL_ATTEMPTS_MIN)
+        try:
+            return await channel.exchange(request, inbox, accept, what="a control read", attempts=attempts)
+        except NoReply:
+            return None
+
+
+def _unknown(session: Session, which: str | int, reason: str = "") -> UnknownParameter:
+    system, component = session.channel.target
+    name, index = (which, None) if isinstance(which, str) else (None, which)
+    nearest = () if name is None else nearest_names(name, session.table.params)
+    what = f"{'' if name else 'parameter with index '}{which}{reason}"
+    return UnknownParameter(
+        f"{system}/{component} has no {what}{'.' if nearest else ''}{did_you_mean(nearest)}",
+        system=system,
+        component=component,
+        name=name,
+        index=index,
+        nearest=nearest,
+    )

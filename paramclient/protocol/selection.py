@@ -1,0 +1,182 @@
+"""The only vehicle on a link, for a write without a full address, and what to say where none was heard.
+
+Every autopilot sends a heartbeat once a second (MAVLink's heartbeat protocol). A vehicle is the only one when
+no other was heard for `LOOK_TIME` after it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+from paramclient.errors import AmbiguousVehicle
+from paramclient.model.wording import counted, first_of
+from paramclient.protocol.addresses import peer_in_words
+from paramclient.protocol.kinds import kind_in_words
+from paramclient.protocol.node import Node
+from paramclient.protocol.station import Station
+from paramclient.wire.messages import AUTOPILOT_COMPONENT, MAV_AUTOPILOT_GENERIC, MAV_TYPE_GCS
+
+__all__ = [
+    "LOOK_TIME",
+    "autopilots_of",
+    "find",
+    "hint_of_link",
+    "hint_of_node",
+    "node_in_words",
+    "only_vehicle",
+]
+
+LOOK_TIME: Final = 1.2
+"""Seconds after the first autopilot in which a second one is looked for: the interval of heartbeats, and a
+fifth of it for jitter."""
+LISTED_MAX: Final = 8
+"""Components that a hint names, so that it stays readable; it gives the number of further ones."""
+_PERIPHERALS: Final = frozenset({18, 26, 27, *range(30, 35), *range(36, 43), 44, 48})
+"""MAV_TYPE of the parts of a vehicle: onboard computers, gimbals, cameras, batteries, GPS receivers. Some of
+them name the generic autopilot in their heartbeat, where they should name none."""
+_CAUSES: Final = {
+    "udpin": " Is the vehicle sending to this port?",
+    "udpout": " Is the address right, and does the vehicle listen there?",
+    "tcp": " Does the other end send MAVLink?",
+    "tcpin": " Has the vehicle connected?",
+    "serial": " Check the cable and the baud rate.",
+}
+"""Likely causes of a silent link, by the first part of its name."""
+
+
+def find(nodes: Iterable[Node], system: int | None, component: int | None, peer: str | None) -> Node | None:
+    """Return the first component that an address fits: without a component the autopilot; None before one."""
+    fitting = [each for each in nodes if system in (None, each.system) and _is_at(each, peer)]
+    if component is not None:
+        return next((each for each in fitting if each.component == component), None)
+    found = autopilots_of(fitting)
+    return found[0] if found else None
+
+
+def autopilots_of(nodes: Iterable[Node]) -> list[Node]:
+    """Return the autopilot of each vehicle, component 1 before others, in the order of their first messages.
+
+    Lost ones are left out while another autopilot is heard, and so are peripherals that claim to be one.
+    """
+    first: dict[object, Node] = {}
+    for each in _autopilots(nodes):
+        key = (each.system, each.peer if each.is_split else None)
+        if key not in first or each.component == AUTOPILOT_COMPONENT != first[key].component:
+            first[key] = each
+    return list(first.values())
+
+
+def only_vehicle(
+    nodes: Iterable[Node],
+    system: int | None,
+    component: int | None,
+    now: float,
+    *,
+    listening_since: float,
+) -> tuple[Node | None, float | None]:
+    """Return the only component that an address fits, or None before that is certain, and when it may be.
+
+    Lost components do not count. With a system id, component 1 is the autopilot if it is one. With both ids,
+    the component is certain after its first message.
+
+    Raises:
+        AmbiguousVehicle: the address fits several vehicles.
+    """
+    present = [each for each in nodes if not each.presence.is_lost]
+    fitting = [each for each in present if system in (None, each.system)]
+    vehicles = autopilots_of(fitting)
+    if component is None:
+        found = _autopilots(fitting)
+        if system is not None:
+            found = [each for each in found if each.component == AUTOPILOT_COMPONENT] or found
+    else:
+        found = [each for each in fitting if each.component == component]
+        vehicles = (
+            found
+            if system is not None
+            else list({each.system: each for each in [*found, *vehicles]}.values())
+        )
+    if len(vehicles) > 1 or len(found) > 1:
+        raise _ambiguous(vehicles if len(vehicles) > 1 else found)
+    if not found:
+        return None, None
+    is_usual = system is not None and (component is not None or found[0].component == AUTOPILOT_COMPONENT)
+    due = max(min(each.since for each in vehicles), listening_since) + LOOK_TIME
+    if now >= due or (is_usual and not found[0].is_split):
+        return found[0], None
+    return None, due
+
+
+def node_in_words(node: Node) -> str:
+    """Return address, autopilot and kind of vehicle: `1/1 PX4 quadrotor`."""
+    kind = kind_in_words(node.identification.autopilot, node.identification.vehicle_type)
+    return f"{node.system}/{node.component} {kind}".rstrip()
+
+
+def hint_of_link(station: Station, bytes_received: int) -> str:
+    """Return what was received on a link so far, where an awaited component was not."""
+    link = station.link
+    cause = _CAUSES.get(link.partition(":")[0], "")
+    if not station.gate.is_open:
+        return f"{link} is down at present."
+    nodes = sorted(station.nodes.values(), key=lambda each: (each.system, each.component))
+    if nodes:
+        listed = first_of([node_in_words(each) for each in nodes], LISTED_MAX)
+        if all(each.identification.vehicle_type == MAV_TYPE_GCS for each in nodes):
+            return f"Heard on {link} so far: only {listed}, and no vehicle.{cause}"
+        return f"Heard on {link} so far: {listed}."
+    frames = station.framing[0]
+    if frames:
+        return f"{counted(frames, 'MAVLink frame')} arrived on {link}, but no heartbeat."
+    if bytes_received:
+        return f"{bytes_received:,} bytes arrived on {link}, but no valid MAVLink frame."
+    return f"Nothing was received on {link}.{cause}"
+
+
+def hint_of_node(station: Station, node: Node, now: float) -> str:
+    """Return what was received while a component did not answer requests; "" where none are sent."""
+    if station.listens_only:
+        return ""
+    if not station.gate.is_open:
+        return f"{station.link} is down at present."
+    label, silence = f"{node.system}/{node.component}", now - node.presence.received_at
+    if node.presence.is_lost or silence > LOOK_TIME:
+        return f"Nothing was received of {label} for {silence:.1f} s."
+    does = f"{label} sends messages (the last one {silence:.1f} s ago)"
+    if node.channel.timing.round_trip is not None:
+        return f"{does} and answered other requests: the link may lose packets, or the vehicle is busy."
+    return (
+        f"{does} and answers no request: requests do not reach it, or it ignores them. Check the link "
+        "towards the vehicle, and whether the vehicle requires signed messages."
+    )
+
+
+def _autopilots(nodes: Iterable[Node]) -> list[Node]:
+    """Return all autopilots; lost ones, and peripherals that claim to be one, only if there is no other."""
+    found = [each for each in nodes if each.identification.is_autopilot]
+    found = [each for each in found if not each.presence.is_lost] or found
+    return [each for each in found if not _is_peripheral(each)] or found
+
+
+def _ambiguous(nodes: Sequence[Node]) -> AmbiguousVehicle:
+    splits = len({each.system for each in nodes}) < len(nodes)
+    words = [
+        node_in_words(each) + (f" at {peer_in_words(each.peer)}" if each.is_split else "")
+        for each in sorted(nodes, key=lambda each: (each.system, each.component))
+    ]
+    choose_by = "system" if not splits else "peer" if nodes[0].is_split else "component"
+    kind = f"autopilots in system {nodes[0].system}" if choose_by == "component" else "vehicles"
+    what = f"{len(nodes)} {kind} on this link: {', '.join(words)}."
+    return AmbiguousVehicle(what, vehicles=words, choose_by=choose_by)
+
+
+def _is_at(node: Node, peer: str | None) -> bool:
+    words = peer_in_words(node.peer)
+    return peer in (None, words, words.rpartition(":")[0])
+
+
+def _is_peripheral(node: Node) -> bool:
+    identification = node.identification
+    is_generic = identification.autopilot == MAV_AUTOPILOT_GENERIC
+    return is_generic and identification.vehicle_type in _PERIPHERALS

@@ -1,0 +1,211 @@
+"""What the conversations about one component's parameters, plain or extended, share."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any, Final, Generic, TypeVar
+
+import anyio
+
+from paramclient.model.values import Param
+from paramclient.protocol.channel import Channel, Gate
+from paramclient.protocol.dialect import Dialect, Digest, ReportedValue
+from paramclient.protocol.events import Change
+from paramclient.protocol.identity import Identification
+from paramclient.protocol.table import Table
+
+__all__ = ["ReplacedValue", "Session", "Shared", "Spawn"]
+
+T = TypeVar("T")
+
+Spawn = Callable[..., object]
+"""Starts an async function, with its arguments, in the background."""
+
+FOREIGN_SET_MEMORY: Final = 2.0
+"""Seconds for which a PARAM_SET of another station explains a change."""
+FOREIGN_SETS_MAX: Final = 256
+"""PARAM_SETs of other stations that are remembered; the oldest is dropped first."""
+
+
+class Shared(Generic[T]):
+    """Work whose result several callers await. The last caller who leaves cancels it.
+
+    Args:
+        spawn: starts the work in the background.
+        gate: fails after the work was cancelled with all background work.
+    """
+
+    def __init__(self, spawn: Spawn, gate: Gate) -> None:
+        self._spawn = spawn
+        self._gate = gate
+        self._run: _Run[T] | None = None
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the work is in progress."""
+        return self._run is not None
+
+    async def join(self, work: Callable[[], Awaitable[T]]) -> T:
+        """Await the result of the work in progress, or of `work`, which begins then.
+
+        Cancellation ends this wait only, and the work if no other caller awaits it.
+
+        Raises:
+            LinkError: the client was closed; or an error of the work.
+        """
+        run = self._run
+        if run is None:
+            run = self._run = _Run(work)
+            self._spawn(self._execute, run)
+        run.waiters += 1
+        try:
+            await run.done.wait()
+            if run.was_cancelled:
+                with self._gate.until_closed():
+                    await anyio.sleep_forever()
+        finally:
+            run.waiters -= 1
+            if not run.waiters:
+                run.scope.cancel()
+                if self._run is run:
+                    self._run = None
+        return run.outcome()
+
+    async def _execute(self, run: _Run[T]) -> None:
+        try:
+            await run.execute()
+        finally:
+            if self._run is run:
+                self._run = None
+
+
+class _Run(Generic[T]):
+    def __init__(self, work: Callable[[], Awaitable[T]]) -> None:
+        self.waiters = 0
+        self.scope = anyio.CancelScope()
+        self.done = anyio.Event()
+        self._work = work
+        self._results: list[T] = []
+        self._error: Exception | None = None
+
+    @property
+    def was_cancelled(self) -> bool:
+        return self.done.is_set() and not self._results and self._error is None
+
+    async def execute(self) -> None:
+        try:
+            with self.scope:
+                self._results.append(await self._work())
+        except Exception as error:  # belongs to the callers
+            self._error = error
+        finally:
+            self.done.set()
+
+    def outcome(self) -> T:
+        if self._error is not None:
+            raise self._error.with_traceback(None)
+        return self._results[0]
+
+
+@dataclass(slots=True)
+class ReplacedValue:
+    """The value before a write, while an answer to an earlier read may still bring it.
+
+    Attributes:
+        param: the parameter before the write.
+        until: when such an answer can arrive no more.
+        was_received: whether the value was received meanwhile, and ignored.
+    """
+
+    param: Param
+    until: float
+    was_received: bool = False
+
+
+class Session:
+    """One component's parameters in one dialect, and the conversations about them.
+
+    Args:
+        channel, identification: the component's.
+        dialect: plain or extended.
+        spawn: starts an async function in the background.
+        changed: called with each change of a parameter.
+
+    Attributes:
+        table: the current values.
+        fetching: the fetch that is in progress, shared by all callers.
+        writing: the authors of the writes in progress, by name.
+        serves_file: whether the parameter file was served on this link; None while unknown.
+        announced: the last PX4 hash that was received, also in another station's list, or None.
+        written_at: when the last write ended; minus infinity before the first.
+        replaced: by name, the values before writes that have just ended.
+        observers: called with the parameters received and their number, while a fetch runs.
+    """
+
+    def __init__(
+        self,
+        channel: Channel,
+        identification: Identification,
+        dialect: Dialect,
+        spawn: Spawn,
+        changed: Callable[[Change], None],
+    ) -> None:
+        self.channel = channel
+        self.identification = identification
+        self.dialect = dialect
+        self.spawn = spawn
+        self.table = Table(dialect, changed)
+        self.table.author_of = self._author_of
+        self.fetching: Shared[Any] = Shared(spawn, channel.gate)
+        self.writing: dict[str, str] = {}
+        self.serves_file: bool | None = None
+        self.announced: Digest | None = None
+        self.written_at = -math.inf
+        self.replaced: defaultdict[str, list[ReplacedValue]] = defaultdict(list)
+        self.observers: set[Callable[[int, int | None], None]] = set()
+        self._locks: dict[str, anyio.Lock] = {}
+        self._foreign_sets: dict[str, tuple[str, float]] = {}
+
+    def receive(self, message: ReportedValue, now: float) -> None:
+        """Store a value, unless it may be the answer to a read from before a write."""
+        name, raw, number, _, _ = message
+        for each in self.replaced.get(name, ()):
+            param = self.dialect.param(name, raw, number, None, self.table.encoding)
+            if now <= each.until and param.same_value(each.param):
+                each.was_received = True
+                return
+        self.table.store(message, now)
+
+    def lock(self, name: str) -> anyio.Lock:
+        """Return the lock of the writes to one name: they run one after the other."""
+        if len(self._locks) > 2 * len(self.table.params) + 16:
+            self._locks = {each: lock for each, lock in self._locks.items() if lock.locked()}
+        return self._locks.setdefault(name, anyio.Lock())
+
+    def confirm_announced(self) -> None:
+        """Confirm a complete table by the hash that was received last, if it is of as many parameters."""
+        table, announced = self.table, self.announced
+        if announced is not None and announced.count == table.count and table.is_complete:
+            table.confirm(announced.hash)
+
+    def report(self, received: int, total: int | None) -> None:
+        """Report the progress of a fetch."""
+        for observer in list(self.observers):
+            observer(received, total)
+
+    def foreign_set(self, name: str, station: str, now: float) -> None:
+        """Remember the PARAM_SET of another station: it explains a change soon after."""
+        self._foreign_sets.pop(name, None)
+        self._foreign_sets[name] = (station, now)
+        if len(self._foreign_sets) > FOREIGN_SETS_MAX:
+            del self._foreign_sets[next(iter(self._foreign_sets))]
+
+    def _author_of(self, name: str) -> str:
+        author = self.writing.get(name)
+        if author is not None:
+            return author
+        station, at = self._foreign_sets.get(name, ("", 0.0))
+        return station if station and self.table.moments[name] - at <= FOREIGN_SET_MEMORY else "vehicle"

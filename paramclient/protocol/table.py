@@ -1,0 +1,346 @@
+"""The parameters of one component as its messages show them: values with trust, indices, count, hash."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import Final
+
+from paramclient.model.px4_hash import find_volatile, hash_bits
+from paramclient.model.values import (
+    Encoding,
+    Param,
+    ParamType,
+    Trust,
+    as_reported,
+    from_bits,
+    is_portable_name,
+)
+from paramclient.protocol.dialect import PLAIN, Dialect, ReportedValue
+from paramclient.protocol.events import Change
+from paramclient.protocol.param_pck import PackedParam
+from paramclient.wire.messages import HASH_CHECK, NO_INDEX, PARAMETERS_MAX
+
+__all__ = ["Table"]
+
+NAMES_MAX: Final = 65_535
+"""Names in one table: as many as there are indices, and as many again without an index (parameters not in
+use). No real component has more."""
+
+LEFT_OUT_MAX: Final = 10
+"""Names that are not stored, of which the notes tell; so that they stay readable."""
+
+
+class Table:
+    """The parameters of one component in one dialect.
+
+    Args:
+        dialect: decodes the values.
+        changed: called with each change, after it is stored.
+
+    Attributes:
+        params: by name, in the order of first reception. Shared with readers; never replaced.
+        count: the latest param_count, or None.
+        names: the name at each known index. Indices are valid for one count only.
+        moments: when each value arrived, by name, in seconds of the event loop's clock.
+        is_exact: whether every integer is exact: read from a file, or small enough for float32.
+        volatile: names outside the vehicle's hash, as far as known.
+        author_of: returns the author of a change of a name.
+        left_out: received names that no parameter file can contain, and that are not stored.
+        recounted: called when the count of a complete table changes, or may have changed.
+    """
+
+    def __init__(
+        self, dialect: Dialect = PLAIN, changed: Callable[[Change], None] = lambda change: None
+    ) -> None:
+        self.dialect = dialect
+        self.params: dict[str, Param] = {}
+        self.count: int | None = None
+        self.names: dict[int, str] = {}
+        self.moments: dict[str, float] = {}
+        self.volatile: frozenset[str] = frozenset()
+        self.volatile_is_known = False
+        self.left_out: set[str] = set()
+        self.author_of: Callable[[str], str] = lambda name: "vehicle"
+        self.recounted: Callable[[], None] = lambda: None
+        self._changed = changed
+        self._held: dict[str, Change] | None = {} if dialect is PLAIN else None
+        self._encoding = Encoding.BYTEWISE
+        self._wire: dict[str, tuple[bytes, int]] = {}  # as received, to decode again in another encoding
+        self._was_complete = False
+        self._outdated: set[str] = set()  # names whose index belongs to an earlier count
+        self._hash: int | None = None
+        self._hash_is_stale = False
+
+    # what is known
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every index below the count has a parameter."""
+        return self.count is not None and len(self.names) >= self.count
+
+    def missing(self, below: int | None = None) -> list[int]:
+        """Return the indices without a parameter, below the count or a smaller number."""
+        end = self.count or 0 if below is None else below
+        names = self.names
+        return [index for index in range(end) if index not in names]
+
+    @property
+    def encoding(self) -> Encoding:
+        """How the component encodes values; a change decodes all received values again."""
+        return self._encoding
+
+    @encoding.setter
+    def encoding(self, encoding: Encoding) -> None:
+        if encoding is self._encoding:
+            return
+        self._encoding = encoding
+        for name, (raw, number) in self._wire.items():
+            old = self.params[name]
+            new = self.dialect.param(name, raw, number, old.index, encoding)
+            self.params[name] = replace(new, default=old.default)
+
+    @property
+    def hash(self) -> int | None:
+        """The PX4 hash by which the vehicle would confirm exactly this table, or None while unknown."""
+        if self._hash_is_stale:
+            self._hash_is_stale = False
+            self._hash = hash_bits(self.listed_bits(), leave_out=self.volatile)
+        return self._hash
+
+    def listed_bits(self) -> dict[str, int]:
+        """Return the bits of the parameters that have an index, by name."""
+        return {name: param.bits for name, param in self.params.items() if param.index is not None}
+
+    # messages
+
+    def store(self, message: ReportedValue, now: float, *, is_exact: bool = False) -> Change | None:
+        """Store one received value, whatever its index is, and return the change, if there is one.
+
+        Args:
+            message: the value.
+            now: when it arrived.
+            is_exact: whether it repeats a value that was just written, so that it cannot be a rounded form
+                of a known integer.
+        """
+        name, raw, number, count, index = message
+        if name == HASH_CHECK or not self._may_store(name):
+            return None
+        if count != self.count and 0 < count <= PARAMETERS_MAX:
+            self.recount(count)
+        place = index if index < count <= PARAMETERS_MAX else None
+        old = self.params.get(name)
+        if place is None and old is not None and index == NO_INDEX:
+            place = old.index
+        elif place is not None:
+            self.names[place] = name
+            self._outdated.discard(name)
+        self.moments[name] = now
+        if old is None:
+            if len(self.params) >= NAMES_MAX:
+                return None
+            new = self.dialect.param(name, raw, number, place, self._encoding)
+        elif (self._wire.get(name) == (raw, number) and not is_exact) or (
+            not is_exact and self._is_rounded(old, raw, number)
+        ):
+            new = self._placed(old, place)
+        else:
+            new = self.dialect.param(name, raw, number, place, self._encoding)
+            if new.type_number == old.type_number:
+                new = replace(new, default=old.default)
+        self._wire[name] = (raw, number)
+        return self._put(name, old, new)
+
+    def store_entry(
+        self, entry: PackedParam, index: int, now: float, *, with_defaults: bool
+    ) -> Change | None:
+        """Store one entry of a parameter file: its integers are exact, its default may be given.
+
+        A value that was received after the file was requested wins, unless it is a rounded form of it.
+
+        Args:
+            entry: the entry.
+            index: its index in the list.
+            now: when the file was requested: the vehicle may have read the value at any time since.
+            with_defaults: whether an entry without a default has its default value.
+        """
+        name = entry.name
+        if not self._may_store(name):
+            return None
+        old = self.params.get(name)
+        self.names[index] = name
+        self._outdated.discard(name)
+        default_bits = entry.default if entry.default is not None else entry.bits if with_defaults else None
+        default = None if default_bits is None else from_bits(default_bits, entry.type)
+        new = Param(
+            name, from_bits(entry.bits, entry.type), entry.type, index, entry.bits, Trust.LIVE, default
+        )
+        raw = as_reported(entry.bits, entry.type, self._encoding)
+        if old is not None and self.moments.get(name, -1.0) > now and old.trust is Trust.LIVE:
+            wire = self._wire.get(name)
+            if wire is not None and wire != (raw, entry.type):
+                self.params[name] = replace(old, index=index, default=default)
+                return None
+        self.moments[name] = now
+        self._wire[name] = (raw, entry.type)
+        return self._put(name, old, new)
+
+    def _may_store(self, name: str) -> bool:
+        if is_portable_name(name):
+            return True
+        if len(self.left_out) < LEFT_OUT_MAX:
+            self.left_out.add(name)
+        return False
+
+    def complete(self) -> list[Change]:
+        """Drop the parameters that a complete list no longer has, and return their removals."""
+        if not self.is_complete:
+            return []
+        self._was_complete = True
+        gone = [name for name in self.params if name in self._outdated]
+        self._outdated.clear()
+        changes = [Change(name, self.params[name], None, "vehicle", "removed") for name in gone]
+        for change in changes:
+            del self.params[change.name]
+            self.moments.pop(change.name, None)
+            self._wire.pop(change.name, None)
+            self._report(change)
+        self._hash_is_stale = self._hash is not None
+        return changes
+
+    def recount(self, count: int) -> None:
+        """Take a count; another one invalidates all indices."""
+        if count == self.count:
+            return
+        was_complete = self.is_complete
+        if self.count is not None:
+            self._outdated |= set(self.names.values())
+            self.names.clear()
+        self.count = count
+        self.unconfirm()
+        if was_complete:
+            self.recounted()
+
+    def _placed(self, param: Param, place: int | None) -> Param:
+        if param.index == place and param.trust is Trust.LIVE:
+            return param
+        return replace(param, index=place, trust=Trust.LIVE)
+
+    def _is_rounded(self, old: Param, raw: bytes, number: int) -> bool:
+        """Return whether these bytes are a C-casting vehicle's form of a known exact integer."""
+        return (
+            self._encoding is Encoding.C_CAST
+            and old.type_number == number
+            and isinstance(old.type, ParamType)
+            and old.type.is_integer
+            and as_reported(old.bits, number, self._encoding) == raw
+        )
+
+    def _put(self, name: str, old: Param | None, new: Param) -> Change | None:
+        self.params[name] = new
+        if old is not None and old.same_value(new):
+            return None
+        if self._hash is not None:
+            self._invalidate_hash(name)
+        by = self.author_of(name)
+        if old is None:
+            change = Change(name, None, new, by, "added" if self._was_complete else "first")
+        else:
+            change = Change(name, old, new, by, "changed")
+        self._report(change)
+        return change
+
+    def _report(self, change: Change) -> None:
+        if self._held is None:
+            self._changed(change)
+        else:
+            self._held.setdefault(change.name, change)
+
+    def report_held(self) -> None:
+        """Report the changes that waited until the encoding was certain, with the values in that encoding."""
+        held, self._held = self._held or {}, None
+        for name, change in held.items():
+            if change.new is not None and name in self.params:
+                self._changed(replace(change, new=self.params[name]))
+
+    # trust
+
+    def doubt(self) -> None:
+        """Mark all values as cached: the component was lost, or has rebooted."""
+        for name, param in self.params.items():
+            self.params[name] = param.with_trust(Trust.CACHED)
+
+    def verify(self) -> None:
+        """Mark the cached values that the confirmed hash covers as verified."""
+        if not self.volatile_is_known:
+            return
+        for name, param in self.params.items():
+            if param.trust is Trust.CACHED and param.index is not None and name not in self.volatile:
+                self.params[name] = param.with_trust(Trust.VERIFIED)
+
+    def unverified(self) -> list[str]:
+        """Return the names whose values are neither received on this link nor covered by the hash."""
+        return [name for name, param in self.params.items() if param.trust is Trust.CACHED]
+
+    def clear(self) -> None:
+        """Forget everything: another vehicle uses the address."""
+        for each in (self.params, self.names, self.moments, self._wire, self._outdated, self.left_out):
+            each.clear()
+        self.count = None
+        self.volatile, self.volatile_is_known = frozenset(), False
+        self._was_complete = False
+        self.unconfirm()
+
+    def load(
+        self,
+        params: Iterable[Param],
+        *,
+        count: int | None,
+        hash: int | None,  # noqa: A002 - the name of the attribute
+        volatile: Iterable[str],
+        volatile_is_known: bool,
+    ) -> None:
+        """Take the cached table of the component; values that were received on this link stay."""
+        for param in params:
+            old = self.params.get(param.name)
+            if old is None:
+                self.params[param.name] = param.with_trust(Trust.CACHED)
+                if param.index is not None and self.count in (None, count):
+                    self.names.setdefault(param.index, param.name)
+            elif old.default is None and old.type_number == param.type_number and param.default is not None:
+                self.params[param.name] = replace(old, default=param.default)
+        if self.count is None:
+            self.count = count
+        if self.count == count:
+            self._hash, self._hash_is_stale = hash, False
+            self.volatile = frozenset(volatile)
+            self.volatile_is_known = volatile_is_known
+            self._was_complete = self.is_complete
+
+    # PX4's hash
+
+    def confirm(self, announced: int) -> bool:
+        """Take a hash that the vehicle announced for exactly this table, and return whether it is proven.
+
+        It is proven where the hash computed here, without some volatile names, is the same.
+        """
+        volatile, is_proven = find_volatile(self.listed_bits(), announced, believed=self.volatile)
+        self._hash, self._hash_is_stale = announced, False
+        if is_proven or not self.volatile_is_known:
+            self.volatile = volatile
+        self.volatile_is_known = is_proven
+        return is_proven
+
+    def unconfirm(self) -> None:
+        """Forget the hash: none is known to belong to this table."""
+        self._hash, self._hash_is_stale = None, False
+
+    def _invalidate_hash(self, name: str) -> None:
+        if not self.volatile_is_known:
+            self.unconfirm()
+        elif name not in self.volatile:
+            self._hash_is_stale = True
+
+    def view(self) -> Mapping[str, Param]:
+        """Return the parameters as they are now."""
+        return dict(self.params)

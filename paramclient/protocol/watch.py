@@ -1,0 +1,178 @@
+"""Keep a table in sync with the vehicle's: check it after signs of change, and at intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from enum import StrEnum
+from typing import Final
+
+import anyio
+
+from paramclient.errors import NoReply
+from paramclient.model.values import Param, Trust
+from paramclient.protocol.digest import is_current, request_digest
+from paramclient.protocol.events import Resynced
+from paramclient.protocol.fetch import Policy, fetch_all
+from paramclient.protocol.presence import Presence
+from paramclient.protocol.session import Session
+from paramclient.wire.messages import MAV_MODE_FLAG_SAFETY_ARMED
+
+__all__ = ["SyncState", "Watch"]
+
+INTERVAL_MIN: Final = 1.0
+"""Shortest interval in seconds that a user may choose."""
+INTERVAL_DEFAULT: Final = 30.0
+"""Seconds between two checks of a vehicle with a digest: two small messages each."""
+SETTLING_TIME: Final = 0.5
+"""Seconds from a sign of change to the check: PX4 pushes what a change has caused within 25 ms, and while an
+ArduPilot sends a list, the numbers of parameters before and after a change alternate."""
+CHECK_TIME_MAX: Final = 1.5
+"""Seconds that a check without a digest, by download, may take to be repeated at intervals."""
+RETRY_INTERVAL: Final = 5.0
+"""Seconds until the next check after one without an answer."""
+
+
+class SyncState(StrEnum):
+    """The relation of a component's table to the vehicle's."""
+
+    UNSYNCED = "unsynced"
+    """Never fetched on this link, or changed since by some sign."""
+    SYNCED = "synced"
+    """Fetched, without a sign of change since."""
+    CHECKING = "checking"
+    """The vehicle was lost or has restarted, or a sign of change was seen: the table is being checked."""
+    LOST = "lost"
+    """The component is lost."""
+
+
+class Watch:
+    """Keeps one table in sync, once it was fetched.
+
+    Args:
+        session, presence: the component's.
+        emit: called with a `Resynced` after a check that a sign of change has caused, or that found one.
+        interval: seconds between two checks of an idle table; None: 30 for a vehicle with a digest, and for
+            others if a download is quick; 0 for none.
+        policy: any but AUTO disables the checks.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        presence: Presence,
+        emit: Callable[[Resynced], None],
+        *,
+        interval: float | None = None,
+        policy: Policy = Policy.AUTO,
+    ) -> None:
+        self._session = session
+        self._presence = presence
+        self._emit = emit
+        self._interval = interval
+        self._policy = policy
+        self._is_fetched = False
+        self._is_doubted = False
+        self._before: Mapping[str, Param] = {}  # the table at the first sign of change
+        self._is_due = False  # a sign of change was seen since the last check began
+        self._download_time = math.inf
+        self._signal = anyio.Event()
+        self._holds = 0
+
+    @property
+    def state(self) -> SyncState:
+        """The present state."""
+        if self._presence.is_lost:
+            return SyncState.LOST
+        if not self._is_fetched:
+            return SyncState.UNSYNCED
+        return SyncState.CHECKING if self._is_doubted else SyncState.SYNCED
+
+    def fetched(self, elapsed: float | None) -> None:
+        """Take note of a complete fetch; `elapsed` is the time of a download in seconds, or None."""
+        self._is_fetched = True
+        self._is_doubted = self._is_due = False
+        if elapsed is not None:
+            self._download_time = elapsed
+        self._signal.set()
+
+    def unconfirmed(self) -> None:
+        """Take note that the table is only what the cache has."""
+        self._is_fetched = False
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Begin no check during the block: its owner reads the table itself."""
+        self._holds += 1
+        try:
+            yield
+        finally:
+            self._holds -= 1
+
+    def doubt(self) -> None:
+        """Check the table soon: there is a sign of change."""
+        if self._is_fetched:
+            if not self._is_doubted:
+                self._before = self._session.table.view()
+            self._is_doubted = self._is_due = True
+            self._signal.set()
+
+    async def run(self) -> None:
+        """Check until cancelled."""
+        while True:
+            self._signal = anyio.Event()
+            if self._is_due:
+                self._signal.set()
+            with anyio.move_on_after(None if math.isinf(self._wait) else self._wait) as interval:
+                await self._signal.wait()
+                await anyio.sleep(SETTLING_TIME)
+            if not self._is_due and not interval.cancelled_caught:
+                continue
+            if not self._may_check:
+                await anyio.sleep(SETTLING_TIME)
+                continue
+            self._is_due = False
+            try:
+                await self._check()
+            except NoReply:
+                await anyio.sleep(RETRY_INTERVAL)
+                self._is_due = True
+
+    @property
+    def _wait(self) -> float:
+        """Seconds until the next check without a sign of change."""
+        if self._interval is not None:
+            return self._interval or math.inf
+        has_digest = self._session.table.hash is not None
+        return INTERVAL_DEFAULT if has_digest or self._download_time <= CHECK_TIME_MAX else math.inf
+
+    @property
+    def _may_check(self) -> bool:
+        is_allowed = self._policy is Policy.AUTO and self._is_fetched and not self._presence.is_lost
+        is_armed = bool((self._presence.base_mode or 0) & MAV_MODE_FLAG_SAFETY_ARMED)
+        is_busy = self._session.fetching.is_running or bool(self._session.writing)
+        return is_allowed and not is_busy and not self._holds and (self._is_doubted or not is_armed)
+
+    async def _check(self) -> None:
+        """Ask for the digest, and fetch what it does not confirm."""
+        session, table = self._session, self._session.table
+        was_doubted = self._is_doubted
+        before = self._before if was_doubted else table.view()
+        digest = await request_digest(session)
+        has_cached = any(param.trust is Trust.CACHED for param in table.params.values())
+        if has_cached or not is_current(session, digest):
+            result = await fetch_all(session, refresh=not is_current(session, digest))
+            if not result.complete:
+                return
+        self._is_doubted = False
+        changed = _differing(before, table.params)
+        if was_doubted or changed:
+            self._emit(Resynced(changed, table.hash))
+
+
+def _differing(before: Mapping[str, Param], now: Mapping[str, Param]) -> tuple[str, ...]:
+    names = dict.fromkeys([*before, *now])
+    return tuple(
+        name for name in names if (name in before) != (name in now) or not before[name].same_value(now[name])
+    )

@@ -1,0 +1,74 @@
+"""Extended parameters: the same class, cached, with a history."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from paramclient import Component, ParamCache, ParamClient, Trust
+from paramclient.sim import Camera
+from tests.caches import extended
+from tests.shell import in_simulated_time
+
+TABLE: dict[str, int | float | str | bytes] = {"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_ISO": 100}
+
+
+def kept(path: Path) -> dict[str, object]:
+    with ParamCache(path) as cache:
+        return {name: param.value for name, param in extended(cache).params.items()}
+
+
+def history(path: Path) -> list[tuple[str, object, object, str]]:
+    with ParamCache(path) as cache:
+        [vehicle] = cache.vehicles()
+        found = cache.history(vehicle.key, 100, extended=True)
+        return [(each.name, each.old.value, each.new and each.new.value, each.by) for each in found]
+
+
+@in_simulated_time
+async def test_the_next_session_knows_the_table(tmp_path: Path) -> None:
+    path = tmp_path / "cache"
+    camera = Camera(TABLE)
+    async with ParamClient(camera, cache=path) as client:
+        ext = (await client.component(1, 100)).ext
+        assert isinstance(ext, Component)
+        assert (await ext.fetch_all()).complete
+        assert (await ext.set("CAM_NAME", "Rear", author="anna")).actual == "Rear"
+    assert kept(path) == TABLE | {"CAM_NAME": "Rear"}
+    camera.set_ext_param("CAM_ISO", 400)
+    async with ParamClient(camera, cache=path) as client:
+        ext = (await client.component(1, 100)).ext
+        assert {name: param.value for name, param in ext.params.items()} == TABLE | {"CAM_NAME": "Rear"}
+        assert {param.trust for param in ext.params.values()} == {Trust.CACHED}
+        changes = ext.changes()
+        assert (await ext.fetch_all()).complete
+        change = await anext(changes)
+        assert (change.name, change.old and change.old.value, change.kind) == ("CAM_ISO", 100, "changed")
+    assert history(path) == [
+        ("CAM_NAME", "Front", "Rear", "us for anna"),
+        ("CAM_ISO", 100, 400, "vehicle"),
+    ]
+
+
+@in_simulated_time
+async def test_a_removed_parameter_leaves_the_cache(tmp_path: Path) -> None:
+    path = tmp_path / "cache"
+    camera = Camera(TABLE)
+    for _ in range(2):
+        async with ParamClient(camera, cache=path) as client:
+            await (await client.component(1, 100)).ext.fetch_all()
+        if "CAM_NAME" in camera.ext_params:
+            camera.remove_ext_param("CAM_NAME")
+    assert list(kept(path)) == ["CAM_MODE", "CAM_ISO"]
+    assert history(path) == [("CAM_NAME", "Front", None, "vehicle")]
+
+
+@in_simulated_time
+async def test_plain_and_extended_tables_are_kept_apart(tmp_path: Path) -> None:
+    path = tmp_path / "cache"
+    async with ParamClient(Camera(TABLE, plain={"CAM_MODE": 0.5}), cache=path) as client:
+        component = await client.component(1, 100)
+        await component.fetch_all()
+        await component.ext.fetch_all()
+    assert kept(path)["CAM_MODE"] == 1
+    with ParamCache(path) as cache:
+        assert cache.component(component=100).params["CAM_MODE"].value == 0.5

@@ -1,0 +1,183 @@
+"""Extended parameters: a camera's values of every type, by the conversations of plain ones."""
+
+from __future__ import annotations
+
+import anyio
+import pytest
+
+from paramclient.errors import (
+    NoReply,
+    SetFailed,
+    UnknownParameter,
+    UsageError,
+    ValueUnsupported,
+)
+from paramclient.model.values import WireValue
+from paramclient.protocol.fetch import fetch_all
+from paramclient.protocol.reads import read
+from paramclient.protocol.set_results import SetOutcome, SetStatus
+from paramclient.protocol.writes import write, write_many
+from paramclient.sim import Air, Camera, PX4Vehicle
+from paramclient.wire.messages import (
+    Message,
+    ParamExtAck,
+    ParamExtRequestList,
+    ParamExtSet,
+    ParamExtValue,
+    ParamRequestList,
+)
+from tests.conversations.virtual import Silence, Tap, converse, virtual, virtual_on_both
+
+CAMERA = (1, 100)
+
+
+@virtual_on_both
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+async def test_values_of_every_type_are_fetched_read_and_set(loss: float) -> None:
+    camera = Camera()
+    async with converse(Air.symmetric([camera], loss=loss, delay=0.02, seed=3)) as conversation:
+        session = (await conversation.node(*CAMERA)).extended
+        result = await fetch_all(session)
+        assert (result.source, result.missing) == ("stream", ())
+        assert dict(result.params) == dict(camera.ext_params.items())
+        new: dict[str, WireValue] = {
+            "CAM_MODE": 2**32 - 1,
+            "CAM_TILT": -128,
+            "CAM_STORAGE": 2**64 - 1,
+            "CAM_CLOCK": -(2**63),
+            "CAM_FOCAL_LEN": 0.1,
+            "CAM_SHUTTERSPD": 0.1,
+            "CAM_NAME": "Rear camera, the long name of a camera",
+            "CAM_LICENSE": bytes(range(128, 256)),
+        }
+        for name, value in new.items():
+            outcome = await write(session, name, value)
+            assert (outcome.status, outcome.actual) == ("accepted", value)
+        assert {name: camera.ext_values[name] for name in new} == new
+        for name in new:
+            await read(session, name)
+            assert session.table.params[name] == camera.ext_params[name]
+        by_index = await read(session, 3)
+        assert by_index.param_id == "CAM_ISO"
+
+
+@virtual
+async def test_a_set_sends_nothing_that_does_not_fit_and_reports_every_refusal() -> None:
+    camera = Camera(supported={"CAM_ISO": [100, 200]}, failing=["CAM_EV"])
+    async with converse(camera) as conversation:
+        session = (await conversation.node(*CAMERA)).extended
+        for name, value in (("CAM_TILT", 128), ("CAM_MODE", "text")):
+            with pytest.raises(UsageError):
+                await write(session, name, value)
+        assert not conversation.sent_of(ParamExtSet)
+        with pytest.raises(ValueUnsupported, match="CAM_ISO"):
+            await write(session, "CAM_ISO", 150)
+        with pytest.raises(SetFailed):
+            await write(session, "CAM_EV", 1.0)
+        with pytest.raises(UnknownParameter):
+            await write(session, "CAM_ISSO", 1)
+        assert camera.ext_values["CAM_ISO"] == 100
+        assert session.table.params["CAM_ISO"].value == 100
+
+
+@virtual
+async def test_a_value_that_the_camera_changes_is_adjusted() -> None:
+    camera = Camera(limits={"CAM_EV": (-2.0, 2.0)})
+    async with converse(camera) as conversation:
+        session = (await conversation.node(*CAMERA)).extended
+        result = await write(session, "CAM_EV", 9.5)
+        assert (result.status, result.requested, result.actual) == ("adjusted", 9.5, 2.0)
+
+
+@pytest.mark.parametrize("seconds", [0.5, 30.0])
+@virtual
+async def test_progress_extends_the_wait_and_a_lost_result_is_requested_again(seconds: float) -> None:
+    camera = Camera(slow={"CAM_MODE": seconds})
+    lost = [0]
+
+    def lose_result(message: Message) -> bool:
+        if isinstance(message, ParamExtAck) and message.param_result == 0 and not lost[0]:
+            lost[0] += 1
+            return False
+        return True
+
+    endpoint = Tap(camera)
+    async with converse(endpoint) as conversation:
+        session = (await conversation.node(*CAMERA)).extended
+        result = await write(session, "CAM_MODE", 2)
+        assert (result.actual, result.attempts) == (2, 1)
+        endpoint.down = lose_result
+        result = await write(session, "CAM_WBMODE", 2)
+        assert (result.actual, lost[0], result.attempts) == (2, 1, 2)
+
+
+@virtual
+async def test_a_change_by_another_station_is_seen_by_its_acknowledgement() -> None:
+    async with converse(Camera()) as conversation:
+        session = (await conversation.node(*CAMERA)).extended
+        await fetch_all(session)
+        conversation.hear(ParamExtSet(*CAMERA, "CAM_ISO", b"\x90\x01", 5), system=254, component=190)
+        conversation.hear(ParamExtAck("CAM_ISO", b"\x90\x01".ljust(128, b"\0"), 5, 0), component=100)
+        assert session.table.params["CAM_ISO"].value == 400
+        assert conversation.changes[-1].by == "station 254/190"
+
+
+@virtual
+async def test_a_list_that_changes_removes_and_adds() -> None:
+    camera = Camera()
+    async with converse(camera) as conversation:
+        session = (await conversation.node(*CAMERA)).extended
+        await fetch_all(session)
+        camera.remove_ext_param("CAM_ISO")
+        camera.add_ext_param("CAM_GAIN", 3)
+        camera.add_ext_param("CAM_GAMMA", 1.5)
+        result = await fetch_all(session)
+        assert dict(result.params) == camera.ext_params
+        kinds = {each.name: each.kind for each in conversation.changes}
+        assert (kinds["CAM_ISO"], kinds["CAM_GAIN"]) == ("removed", "added")
+
+
+@virtual
+async def test_many_are_set_and_a_lost_camera_ends_it() -> None:
+    camera = Camera({f"P{number:02}": number for number in range(60)})
+    endpoint = Silence(Air.symmetric([camera], delay=0.1), at=1e9)
+    async with converse(endpoint) as conversation:
+        session = (await conversation.node(*CAMERA)).extended
+        await fetch_all(session)
+        outcomes: list[SetOutcome] = []
+        pairs: list[tuple[str, WireValue]] = [(f"P{number:02}", number + 100) for number in range(60)]
+        await write_many(session, pairs, outcomes, lambda outcome: None)
+        assert {each.status for each in outcomes} == {SetStatus.ACCEPTED}
+        assert list(camera.ext_values.values()) == [value for _, value in pairs]
+        endpoint.at = anyio.current_time() + 0.3
+        await write_many(session, [(name, 7) for name, _ in pairs], outcomes, lambda outcome: None)
+        assert anyio.current_time() - endpoint.at < 7.0
+        assert {each.status for each in outcomes} >= {SetStatus.UNKNOWN, SetStatus.NOT_TRIED}
+
+
+@virtual
+async def test_a_component_may_have_both_kinds_or_none() -> None:
+    camera = Camera({"A": "text"}, plain={"A": 5})
+    async with converse(Air([camera, PX4Vehicle()])) as conversation:
+        node = await conversation.node(*CAMERA)
+        await fetch_all(node.plain)
+        await fetch_all(node.extended)
+        assert (node.plain.table.params["A"].value, node.extended.table.params["A"].value) == (5, "text")
+        assert {session.dialect.name for session in node.sessions} == {"plain", "extended"}
+        px4 = await conversation.node(1, 1)
+        began = anyio.current_time()
+        with pytest.raises(NoReply, match="list of 1/1"):
+            await fetch_all(px4.extended)
+        assert anyio.current_time() - began < 25.0
+        assert not px4.extended.table.params
+        assert len(conversation.sent_of(ParamExtRequestList)) < 15
+        assert len(conversation.sent_of(ParamRequestList)) == 1
+
+
+@virtual
+async def test_what_other_stations_request_is_taken_too() -> None:
+    async with converse(Camera()) as conversation:
+        node = await conversation.node(*CAMERA)
+        value = ParamExtValue("CAM_ISO", b"\x64".ljust(128, b"\0"), 5, 16, 3)
+        conversation.hear(value, component=100)
+        assert node.extended.table.params["CAM_ISO"].value == 100

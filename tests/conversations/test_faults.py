@@ -1,0 +1,262 @@
+"""Faults by seed, frames of noise, and components that bend the protocol: no wrong value, and an end."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+from contextlib import suppress
+from random import Random
+
+import anyio
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from paramclient.errors import NoReply, ParamClientError
+from paramclient.model.values import ParamType
+from paramclient.protocol.fetch import fetch_all
+from paramclient.protocol.reads import read
+from paramclient.protocol.station import Station
+from paramclient.protocol.writes import write
+from paramclient.sim import Air, ArduPilotVehicle, Faults, PX4Vehicle, Vehicle
+from paramclient.wire.messages import (
+    AutopilotVersion,
+    CommandAck,
+    CommandLong,
+    FileTransfer,
+    Heartbeat,
+    Message,
+    ParamError,
+    ParamExtAck,
+    ParamExtValue,
+    ParamRequestList,
+    ParamRequestRead,
+    ParamSet,
+    ParamValue,
+    StatusText,
+    SystemTime,
+    encode,
+)
+from tests.conversations.virtual import Puppet, converse, run, virtual
+
+KINDS = {
+    "loss in bursts": Faults(loss=0.2, loss_burst=5.0, delay=0.05),
+    "duplicates": Faults(duplicate=0.5, delay=0.03),
+    "reordering": Faults(reorder=0.4, jitter=0.05, delay=0.02),
+    "bit errors": Faults(bit_errors=2e-4, delay=0.02),
+    "a radio": Faults(loss=0.05, delay=0.06, rate=5_760, queue=4_000),
+    "everything": Faults(loss=0.1, duplicate=0.1, reorder=0.2, jitter=0.05, delay=0.05, bit_errors=5e-5),
+}
+RADIO = {"px4": {"burst": 3, "period": 0.02}, "ardupilot": {"burst": 1, "period": 0.025, "ftp_rate": 1_920.0}}
+
+
+def vehicle_on(kind: str, faults: str) -> Vehicle:
+    """Return a vehicle, on a radio with the rates that it has there."""
+    options = RADIO[kind.removesuffix(" by list")] if faults == "a radio" else {}
+    if kind == "px4":
+        return PX4Vehicle(**options)  # type: ignore[arg-type]  # either
+    return ArduPilotVehicle(ftp=kind == "ardupilot", **options)  # type: ignore[arg-type]  # either
+
+
+@pytest.mark.parametrize("kind", ["px4", "ardupilot", "ardupilot by list"])
+@pytest.mark.parametrize("faults", KINDS)
+@virtual
+async def test_a_session_on_a_faulty_link_is_right(kind: str, faults: str) -> None:
+    vehicle = vehicle_on(kind, faults)
+    seed = Random(kind + faults).randrange(1000)
+    async with converse(Air.symmetric([vehicle], seed=seed, **KINDS[faults])) as conversation:
+        session = (await conversation.node()).plain
+        result = await fetch_all(session)
+        assert not result.missing
+        assert result.elapsed < (90.0 if faults == "a radio" else 40.0)
+        check_right(vehicle, session.table.params)
+        name = "MC_ROLL_P" if kind == "px4" else "ATC_ANG_RLL_P"
+        for value in (2.25, 3.5):
+            assert (await write(session, name, value)).actual == value == vehicle.param(name).value
+        await fetch_all(session)
+        check_right(vehicle, session.table.params)
+        assert not session.channel.is_waiting
+
+
+def check_right(vehicle: Vehicle, params: object) -> None:
+    """Check every value but those that change on board meanwhile."""
+    assert isinstance(params, dict)
+    wrong = [each.name for each in vehicle.listed if not params[each.name].same_value(each)]
+    assert set(wrong) <= {"STAT_RUNTIME", "BARO1_GND_PRESS", "BARO2_GND_PRESS"}
+
+
+# bytes and messages of any kind
+
+
+names = st.text(st.characters(min_codepoint=1, max_codepoint=255), max_size=16)
+number, short, word = st.integers(0, 255), st.integers(0, 65535), st.integers(0, 2**32 - 1)
+index = st.integers(-32768, 32767)
+raw = st.binary(min_size=4, max_size=4)
+any_message = st.one_of(
+    st.builds(ParamValue, names, raw, number, st.integers(0, 40), short),
+    st.builds(ParamError, number, number, names, index, number),
+    st.builds(ParamExtValue, names, st.binary(max_size=128), number, st.integers(0, 40), short),
+    st.builds(ParamExtAck, names, st.binary(max_size=128), number, number),
+    st.builds(ParamSet, number, number, names, raw, number),
+    st.builds(Heartbeat, number, number, number, word, number, number),
+    st.builds(SystemTime, st.integers(0, 2**64 - 1), word),
+    st.builds(CommandAck, short, number, number, number),
+    st.builds(FileTransfer, number, number, number, st.binary(max_size=251)),
+    st.builds(AutopilotVersion, st.integers(0, 2**64 - 1), word, uid=word),
+    st.builds(StatusText, number, st.text(st.characters(max_codepoint=255), max_size=50)),
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(any_message, max_size=60), st.lists(st.binary(max_size=60), max_size=5))
+def test_no_message_and_no_bytes_raise_whatever_is_in_progress(
+    messages: list[Message], noise: list[bytes]
+) -> None:
+    async def main() -> None:
+        async with converse(PX4Vehicle(table={"A": 1, "B": 2.5})) as conversation:
+            node = await conversation.node()
+            calls = (
+                (fetch_all, node.plain),
+                (fetch_all, node.extended),
+                (write, node.plain, "A", 5),
+                (read, node.plain, "B"),
+            )
+
+            async def ended(call: tuple[object, ...]) -> None:
+                function, *arguments = call
+                with suppress(ParamClientError), anyio.move_on_after(3.0):
+                    await function(*arguments)  # type: ignore[operator]  # one of the calls
+
+            async with anyio.create_task_group() as tasks:
+                for call in calls:
+                    tasks.start_soon(ended, call)
+                for message in messages:
+                    conversation.hear(message)
+                    await anyio.sleep(0.003)
+                for data in noise:
+                    conversation.station.receive(data, "sim", anyio.current_time())
+
+    run(main)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.binary(max_size=200), max_size=8), st.booleans())
+def test_any_bytes_are_taken_by_a_station(chunks: list[bytes], is_stream: bool) -> None:
+    async def main() -> None:
+        station = Station(
+            link="x", is_stream=is_stream, send=lambda data, peer: None, spawn=lambda *work: None
+        )
+        frame = encode(Heartbeat(2, 12), system=1, component=1, sequence=0)
+        for chunk in chunks:
+            station.receive(chunk, "a", 0.0)
+            station.receive(frame[: len(chunk) % 21] + chunk, "b", 0.0)
+        assert station.framing[0] >= 0
+
+    run(main)
+
+
+# components that bend the protocol
+
+
+def component(
+    names: list[str | bytes],
+    *,
+    count: int | None = None,
+    answers_list: bool = True,
+    answers_reads: bool = True,
+) -> Puppet:
+    """Return a component whose parameters have their index as the value."""
+    rows = [each if isinstance(each, str) else each.decode("latin-1") for each in names]
+
+    def value(at: int) -> Message:
+        total = len(rows) if count is None else count
+        return ParamValue(rows[at], struct.pack("<i", at), ParamType.INT32, total, at)
+
+    def answer(message: Message) -> Iterable[Message]:
+        if isinstance(message, ParamRequestList) and answers_list:
+            yield from map(value, range(len(rows)))
+        elif isinstance(message, ParamRequestRead) and answers_reads:
+            at = message.param_index
+            if at < 0 and message.param_id in rows:
+                at = rows.index(message.param_id)
+            if 0 <= at < len(rows):
+                yield value(at)
+        elif isinstance(message, CommandLong):
+            yield CommandAck(message.command, 3, 255, 190)
+
+    return Puppet(answer)
+
+
+@virtual
+async def test_a_count_that_is_one_too_high_leaves_one_missing_and_an_end() -> None:
+    async with converse(component([f"P{number}" for number in range(8)], count=9)) as conversation:
+        result = await fetch_all((await conversation.node()).plain)
+        assert (len(result.params), result.missing) == (8, (8,))
+        assert result.elapsed < 30.0
+
+
+@virtual
+async def test_names_that_no_file_can_hold_leave_the_others_whole() -> None:
+    async with converse(component(["A", b"RC MAP", "B", b"\xff\x01"])) as conversation:
+        result = await fetch_all((await conversation.node()).plain)
+        assert set(result.params) == {"A", "B"}
+        assert result.elapsed < 30.0
+
+
+@virtual
+async def test_a_component_without_a_list_is_no_reply_and_its_reads_still_work() -> None:
+    async with converse(component(["A", "B"], answers_list=False)) as conversation:
+        session = (await conversation.node()).plain
+        with pytest.raises(NoReply, match="list of 1/1"):
+            await fetch_all(session)
+        assert anyio.current_time() < 30.0
+        await read(session, "B")
+        assert session.table.params["B"].value == 1
+
+
+@virtual
+async def test_a_component_without_parameters_at_all_is_no_reply_within_seconds() -> None:
+    puppet = component(["A"], answers_list=False, answers_reads=False)
+    async with converse(puppet) as conversation:
+        session = (await conversation.node()).plain
+        for call in (fetch_all(session), read(session, "A"), write(session, "A", 1)):
+            began = anyio.current_time()
+            with pytest.raises(NoReply):
+                await call
+            assert anyio.current_time() - began < 40.0
+
+
+@virtual
+async def test_a_component_0_and_one_without_heartbeats_answer() -> None:
+    puppet = component(["A", "B"])
+    async with converse(puppet) as conversation:
+        await conversation.node()
+        for system, number in ((1, 0), (1, 240)):
+            conversation.hear(ParamValue("A", bytes(4), 6, 2, 0), system=system, component=number)
+            node = conversation.station.nodes[system, number]
+            assert node.presence.timeout == float("inf")
+            assert node.plain.table.params["A"].value == 0
+
+
+@virtual
+async def test_a_slow_vehicle_is_waited_for() -> None:
+    vehicle = ArduPilotVehicle(
+        ftp=False, burst=1, period=0.3, table={f"P{number}": number for number in range(40)}
+    )
+    async with converse(Air.symmetric([vehicle], delay=0.5)) as conversation:
+        result = await fetch_all((await conversation.node()).plain)
+        assert (len(result.params), result.missing) == (40, ())
+        assert len(conversation.sent_of(ParamRequestList)) <= 3
+
+
+@virtual
+async def test_a_vehicle_that_restarts_in_the_middle_of_its_list_is_fetched_whole() -> None:
+    for vehicle in (PX4Vehicle(), ArduPilotVehicle(ftp=False)):
+        async with converse(vehicle) as conversation:
+            session = (await conversation.node()).plain
+            vehicle.when_listed(300, lambda vehicle=vehicle: vehicle.reboot(down=1.5))  # type: ignore[misc]  # a default
+            result = await fetch_all(session)
+            assert not result.missing
+            await anyio.sleep(3.0)
+            await fetch_all(session)
+            check_right(vehicle, dict(session.table.params))

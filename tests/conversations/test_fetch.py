@@ -1,0 +1,241 @@
+"""Fetches: complete and right on bad links, from the cache where the hash confirms it, and ended by loss."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import anyio
+import pytest
+
+from paramclient.errors import NoReply
+from paramclient.model.values import Trust
+from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle, px4_table
+from tests.conversations.virtual import Silence, converse, run
+
+BACKENDS = pytest.mark.parametrize("backend", ["trio", "asyncio"])
+
+
+def new_vehicle(kind: str, **options: object) -> Vehicle:
+    """Return a vehicle: px4, ardupilot (with its parameter file), list (ArduPilot without it) or generic."""
+    makers = {
+        "px4": PX4Vehicle,
+        "ardupilot": ArduPilotVehicle,
+        "list": lambda **more: ArduPilotVehicle(ftp=False, **more),
+        "generic": lambda **more: GenericVehicle(px4_table()[:300], **more),
+    }
+    vehicle: Vehicle = makers[kind](**options)  # type: ignore[operator]  # classes with different options
+    return vehicle
+
+
+def check_right(vehicle: Vehicle, result: FetchResult) -> None:
+    """Check that every value of the vehicle's list is there, and right."""
+    assert not result.missing
+    listed = {param.name: param for param in vehicle.listed}
+    assert set(listed) <= set(result.params)
+    wrong = [name for name, param in listed.items() if not result.params[name].same_value(param)]
+    assert not wrong
+
+
+@BACKENDS
+@pytest.mark.parametrize("loss", [0.0, 0.05, 0.2, 0.4])
+@pytest.mark.parametrize("kind", ["px4", "ardupilot", "list", "generic"])
+def test_every_value_arrives_on_a_lossy_link(kind: str, loss: float, backend: str) -> None:
+    async def main() -> None:
+        for seed in range(2):
+            vehicle = new_vehicle(kind)
+            async with converse(Air.symmetric([vehicle], loss=loss, delay=0.05, seed=seed)) as conversation:
+                node = await conversation.node()
+                result = await fetch_all(node.plain)
+                await node.identification.settled()
+                check_right(vehicle, replace(result, params=node.plain.table.params))
+                assert result.source == ("ftp" if kind == "ardupilot" else "stream")
+                assert result.elapsed < (60 if loss == 0.4 else 15)
+
+    run(main, backend=backend)
+
+
+@pytest.mark.parametrize("kind", ["px4", "ardupilot"])
+def test_every_value_arrives_over_a_satellite(kind: str) -> None:
+    async def main() -> None:
+        vehicle = new_vehicle(kind)
+        async with converse(Air.symmetric([vehicle], delay=1.25, seed=1)) as conversation:
+            node = await conversation.node()
+            result = await fetch_all(node.plain)
+            assert not result.missing
+            assert result.elapsed < 60
+
+    run(main)
+
+
+@BACKENDS
+def test_the_hash_confirms_a_table_without_a_download(backend: str) -> None:
+    async def main() -> None:
+        vehicle = PX4Vehicle()
+        async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
+            node = await conversation.node()
+            first = await fetch_all(node.plain)
+            assert first.hash == node.plain.table.hash is not None
+            node.plain.table.doubt()
+            sent, lists = len(conversation.sent), vehicle.requests["PARAM_REQUEST_LIST"]
+            second = await fetch_all(node.plain)
+            assert (second.source, second.hash) == ("cache", first.hash)
+            assert vehicle.requests["PARAM_REQUEST_LIST"] == lists
+            assert len(conversation.sent) - sent < 80  # the hash, and the values outside it
+            trusts = Counter(param.trust for param in second.params.values())
+            assert trusts[Trust.VERIFIED] == len(second.params) - trusts[Trust.LIVE]
+            assert trusts[Trust.LIVE] == len(node.plain.table.volatile)
+
+    run(main, backend=backend)
+
+
+def test_a_value_changed_meanwhile_is_downloaded() -> None:
+    async def main() -> None:
+        vehicle = PX4Vehicle()
+        async with converse(vehicle) as conversation:
+            node = await conversation.node()
+            await fetch_all(node.plain)
+            vehicle.load({"MC_ROLL_P": 3.0})
+            result = await fetch_all(node.plain)
+            assert result.source == "stream"
+            assert result.params["MC_ROLL_P"].value == 3.0
+
+    run(main)
+
+
+@BACKENDS
+def test_fetches_at_once_share_one_and_a_cancelled_caller_ends_only_its_own(backend: str) -> None:
+    async def main() -> None:
+        vehicle = PX4Vehicle()
+        async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
+            node = await conversation.node()
+            results: list[FetchResult] = []
+
+            async def fetch(after: float, limit: float) -> None:
+                await anyio.sleep(after)
+                with anyio.move_on_after(limit):
+                    results.append(await fetch_all(node.plain))
+
+            async with anyio.create_task_group() as tasks:
+                for after, limit in ((0.0, 0.3), (0.1, 60.0), (0.2, 60.0)):
+                    tasks.start_soon(fetch, after, limit)
+            assert len(results) == 2
+            assert results[0] is results[1]
+            assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
+
+    run(main, backend=backend)
+
+
+@BACKENDS
+@pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
+def test_a_lost_vehicle_ends_a_fetch_within_7_s_with_what_came(kind: str, backend: str) -> None:
+    async def main() -> None:
+        vehicle = new_vehicle(kind)
+        endpoint = Silence(Air.symmetric([vehicle], delay=0.05), at=1e9)
+        async with converse(endpoint) as conversation:
+            node = await conversation.node()
+            await node.identification.settled()
+            if kind == "list":
+                node.plain.serves_file = False
+            endpoint.at = anyio.current_time() + 0.45
+            result = await fetch_all(node.plain)
+            assert anyio.current_time() - endpoint.at < 7.0
+            assert 50 < result.received < result.count
+            assert len(result.params) == result.received
+
+    run(main, backend=backend)
+
+
+def test_a_vehicle_that_never_answers_is_no_reply() -> None:
+    async def main() -> None:
+        endpoint = Silence(PX4Vehicle(), at=1e9)
+        async with converse(endpoint) as conversation:
+            node = await conversation.node()
+            endpoint.at = anyio.current_time()
+            with pytest.raises(NoReply):
+                await fetch_all(node.plain)
+            assert anyio.current_time() - endpoint.at < 7.0
+
+    run(main)
+
+
+def test_dead_indices_are_missing() -> None:
+    async def main() -> None:
+        async with converse(PX4Vehicle(dead=[3, 77])) as conversation:
+            result = await fetch_all((await conversation.node()).plain)
+            assert result.missing == (3, 77)
+            assert not result.complete
+
+    run(main)
+
+
+def test_a_list_that_stops_is_completed() -> None:
+    async def main() -> None:
+        for vehicle in (PX4Vehicle(list_stops_at=500), ArduPilotVehicle(ftp=False, list_stops_at=700)):
+            async with converse(vehicle) as conversation:
+                node = await conversation.node()
+                node.plain.serves_file = False
+                check_right(vehicle, await fetch_all(node.plain))
+
+    run(main)
+
+
+def test_silent_mavftp_costs_at_most_one_and_a_half_seconds() -> None:
+    async def elapsed(loss: float, *, asks: bool) -> float:
+        vehicle = ArduPilotVehicle(ftp=False)
+        async with converse(Air.symmetric([vehicle], loss=loss, delay=0.05, seed=2)) as conversation:
+            node = await conversation.node()
+            await node.identification.settled()
+            node.plain.serves_file = None if asks else False
+            node.identification.capabilities = (node.identification.capabilities or 0) | 32
+            return (await fetch_all(node.plain)).elapsed
+
+    assert run(lambda: elapsed(0.0, asks=True)) - run(lambda: elapsed(0.0, asks=False)) < 1.5
+
+
+def test_policies_limit_what_is_sent() -> None:
+    async def main() -> None:
+        vehicle = PX4Vehicle()
+        async with converse(vehicle) as conversation:
+            node = await conversation.node()
+            await fetch_all(node.plain)
+            vehicle.load({"MC_ROLL_P": 3.0})
+            before = Counter(vehicle.requests)
+            cached = await fetch_all(node.plain, policy=Policy.CACHE_ONLY)
+            assert Counter(vehicle.requests) - before == Counter()
+            assert cached.params["MC_ROLL_P"].value != 3.0
+            asked = await fetch_all(node.plain, policy=Policy.HASH_ONLY)
+            assert (asked.source, vehicle.requests["PARAM_REQUEST_LIST"]) == ("cache", 1)
+
+    run(main)
+
+
+def test_progress_rises_to_the_count() -> None:
+    async def main() -> None:
+        async with converse(PX4Vehicle()) as conversation:
+            seen: list[Progress] = []
+            result = await fetch_all((await conversation.node()).plain, progress=seen.append)
+            received = [each.received for each in seen]
+            assert received == sorted(received)
+            assert (seen[-1].received, seen[-1].total) == (result.count, result.count)
+
+    run(main)
+
+
+def test_a_group_that_appears_changes_the_count_and_all_is_fetched() -> None:
+    async def main() -> None:
+        vehicle = ArduPilotVehicle()
+        async with converse(vehicle) as conversation:
+            node = await conversation.node()
+            first = await fetch_all(node.plain)
+            vehicle.set_param("EK2_ENABLE", 1)
+            second = await fetch_all(node.plain)
+            assert second.count > first.count
+            check_right(vehicle, second)
+            vehicle.set_param("EK2_ENABLE", 0)
+            third = await fetch_all(node.plain)
+            assert third.count == first.count
+            assert set(third.params) == set(first.params)
+
+    run(main)

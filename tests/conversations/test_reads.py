@@ -1,0 +1,224 @@
+"""Reads of single parameters: answers, silence, refusals, the window, and the end of the link."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+
+import anyio
+import pytest
+
+from paramclient.errors import LinkError, NoReply, ParamErrorCode, Refused, UnknownParameter
+from paramclient.model.values import Trust
+from paramclient.protocol.fetch import fetch_all
+from paramclient.protocol.reads import read, read_many
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
+from paramclient.wire.messages import Message, ParamError, ParamRequestRead, ParamValue
+from tests.conversations.virtual import Puppet, Silence, Tap, converse, virtual, virtual_on_both
+
+TABLE = {"RTL_ALT": 1500, "MC_ROLL_P": 6.5, "MC_PITCH_P": 6.5}
+MAKERS = {
+    "px4": PX4Vehicle,
+    "ardupilot": ArduPilotVehicle,
+    "px4 with errors": lambda: PX4Vehicle(param_error=True),
+    "ardupilot with errors": lambda: ArduPilotVehicle(param_error=True),
+    "generic": lambda: GenericVehicle(TABLE),
+}
+EVERY = pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
+
+
+@virtual_on_both
+@EVERY
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+async def test_reads_by_name_and_index_bring_the_vehicles_values(make: type[Vehicle], loss: float) -> None:
+    vehicle = make()  # type: ignore[call-arg]  # any vehicle
+    async with converse(Air.symmetric([vehicle], loss=loss, delay=0.02, seed=3)) as conversation:
+        node = await conversation.node()
+        for index, param in list(enumerate(vehicle.listed))[::300]:
+            by_index = await read(node.plain, index)
+            assert (by_index.param_id, by_index.param_index) == (param.name, index)
+            await read(node.plain, param.name)
+            stored = node.plain.table.params[param.name]
+            assert stored.same_value(param)
+            assert (stored.index, stored.trust) == (index, Trust.LIVE)
+
+
+@virtual
+@EVERY
+@pytest.mark.parametrize("which", ["MC_ROLLP", 5000])
+async def test_a_vehicle_that_answers_other_reads_has_no_such_parameter(
+    make: type[Vehicle], which: str | int
+) -> None:
+    vehicle = make()  # type: ignore[call-arg]  # any vehicle
+    async with converse(vehicle) as conversation:
+        node = await conversation.node()
+        await read(node.plain, vehicle.listed[0].name)
+        vehicle_has_roll = "MC_ROLL_P" in vehicle.params
+        if vehicle_has_roll:
+            await read(node.plain, "MC_ROLL_P")
+        began = anyio.current_time()
+        with pytest.raises(UnknownParameter) as caught:
+            await read(node.plain, which)
+        assert anyio.current_time() - began < 3.0
+        assert (caught.value.name if isinstance(which, str) else caught.value.index) == which
+        assert ("MC_ROLL_P" in str(caught.value)) is (vehicle_has_roll and which == "MC_ROLLP")
+
+
+@virtual
+async def test_an_unknown_name_on_a_bad_link_is_never_taken_for_silence_nor_a_known_one_for_unknown() -> None:
+    for seed in range(6):
+        air = Air.symmetric([PX4Vehicle()], loss=0.3, delay=0.05, seed=seed)
+        async with converse(air) as conversation:
+            session = (await conversation.node()).plain
+            await read(session, "MC_ROLL_P")
+            with pytest.raises(UnknownParameter):
+                await read(session, "NO_SUCH")
+            await read(session, "MC_PITCH_P")
+
+
+@virtual
+async def test_silence_is_no_reply_and_not_an_unknown_parameter() -> None:
+    endpoint = Silence(PX4Vehicle(), at=0.5)
+    async with converse(endpoint) as conversation:
+        node = await conversation.node()
+        await anyio.sleep(0.6)
+        with pytest.raises(NoReply, match="MC_ROLL_P of 1/1") as caught:
+            await read(node.plain, "MC_ROLL_P")
+        assert caught.value.attempts >= 5
+        assert anyio.current_time() < 7.0
+        assert not node.channel.is_waiting
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.05, 0.3])
+@virtual
+async def test_on_a_clean_link_few_reads_are_repeated_to_ardupilot(delay: float) -> None:
+    vehicle = ArduPilotVehicle()
+    async with converse(Air.symmetric([vehicle], delay=delay)) as conversation:
+        node = await conversation.node()
+        await node.identification.settled()
+        await read(node.plain, 0)
+        conversation.sent.clear()
+        names = [param.name for param in vehicle.listed[10:1210:10]]
+        began, answers = anyio.current_time(), Counter[str]()
+        await read_many(node.plain, names, lambda name, result: answers.update([type(result).__name__]))
+        assert answers == {"Param": 120}
+        assert len(conversation.sent_of(ParamRequestRead)) <= 140  # the first ones wait in the queue
+        assert anyio.current_time() - began < 120 / 49 + 12 * (0.1 + 2 * delay)  # 5 in each 100 ms
+
+
+@virtual
+async def test_one_value_answers_both_a_read_by_name_and_one_by_index_and_others_none() -> None:
+    async with converse(GenericVehicle(TABLE, dead=range(3))) as conversation:
+        session = (await conversation.node()).plain
+        got: list[str | int] = []
+
+        async def ask(which: str | int) -> None:
+            await read(session, which)
+            got.append(which)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(ask, "MC_ROLL_P")
+            tasks.start_soon(ask, 1)
+            await anyio.sleep(0.1)
+            conversation.hear(ParamValue("MC_PITCH_P", bytes(4), 9, 3, 2))
+            await anyio.sleep(0.01)
+            assert not got
+            conversation.hear(ParamValue("MC_ROLL_P", bytes(4), 9, 3, 1))
+        assert set(got) == {"MC_ROLL_P", 1}
+
+
+@pytest.mark.parametrize("which", ["A", 7])
+@pytest.mark.parametrize(
+    ("code", "kind"),
+    [
+        (ParamErrorCode.DOES_NOT_EXIST, UnknownParameter),
+        (ParamErrorCode.READ_FAIL, Refused),
+        (77, Refused),
+    ],
+)
+@virtual
+async def test_a_refusal_tells_its_reason(which: str | int, code: int, kind: type[Exception]) -> None:
+    def answer(message: Message) -> Iterable[Message]:
+        if isinstance(message, ParamRequestRead):
+            yield ParamError(255, 190, message.param_id, message.param_index, code)
+
+    async with converse(Puppet(answer)) as conversation:
+        with pytest.raises(kind) as caught:
+            await read((await conversation.node()).plain, which)
+        assert isinstance(caught.value, UnknownParameter | Refused)
+        assert (caught.value.name if isinstance(which, str) else caught.value.index) == which
+        if isinstance(caught.value, Refused):
+            assert caught.value.reason == ("read fail" if code != 77 else "error code 77")
+
+
+@virtual
+async def test_a_parameter_that_answers_by_its_index_only_is_read_by_that() -> None:
+    vehicle = GenericVehicle(TABLE)
+    endpoint = Tap(vehicle, up=lambda each: not isinstance(each, ParamRequestRead) or not each.param_id)
+    async with converse(endpoint) as conversation:
+        session = (await conversation.node()).plain
+        await fetch_all(session)
+        await anyio.sleep(1.0)  # late answers
+        vehicle.set_param("MC_ROLL_P", 3.0)
+        await read(session, "MC_ROLL_P")
+        assert session.table.params["MC_ROLL_P"].value == 3.0
+
+
+@virtual
+async def test_ardupilots_names_are_answered_in_the_requested_spelling() -> None:
+    async with converse(ArduPilotVehicle()) as conversation:
+        assert (await read((await conversation.node()).plain, "rtl_alt")).param_id == "rtl_alt"
+
+
+@virtual_on_both
+async def test_reads_wait_while_the_link_is_down_and_end_when_it_fails() -> None:
+    vehicle = PX4Vehicle()
+    async with converse(vehicle) as conversation:
+        session, station = (await conversation.node()).plain, conversation.station
+        await anyio.sleep(0.5)
+        ends: list[float] = []
+
+        async def ask() -> None:
+            await read(session, "MC_ROLL_P")
+            ends.append(anyio.current_time())
+
+        async with anyio.create_task_group() as tasks:
+            station.interrupt()
+            asked = vehicle.requests["PARAM_REQUEST_READ"]
+            tasks.start_soon(ask)
+            await anyio.sleep(30.0)
+            assert vehicle.requests["PARAM_REQUEST_READ"] == asked
+            station.resume(anyio.current_time())
+        assert ends[0] - 30.5 < 0.1
+        station.interrupt()
+        raised: list[LinkError] = []
+
+        async def fail() -> None:
+            with pytest.raises(LinkError) as caught:
+                await read(session, "MC_ROLL_P")
+            raised.append(caught.value)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(fail)
+            await anyio.sleep(1.0)
+            station.fail(LinkError("gone", link="x"), for_good=True)
+        with pytest.raises(LinkError):
+            await read(session, "MC_ROLL_P")
+        station.resume(anyio.current_time())
+        with pytest.raises(LinkError):
+            await read(session, "MC_ROLL_P")
+        assert len(raised) == 1
+
+
+@virtual_on_both
+async def test_a_cancelled_read_leaves_nothing_behind() -> None:
+    async with converse(PX4Vehicle()) as conversation:
+        node = await conversation.node()
+        await node.identification.settled()
+        with anyio.move_on_after(0.3):
+            await read(node.plain, "NO_SUCH")
+        assert not node.channel.is_waiting
+        conversation.sent.clear()
+        await anyio.sleep(5.0)
+        assert not conversation.sent_of(ParamRequestRead)
+        await read_many(node.plain, ["MC_ROLL_P"] * 200, lambda name, result: None)

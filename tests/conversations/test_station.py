@@ -1,0 +1,562 @@
+"""Components of a link: who they are, whether they are there, restarts, rivals, peers, signatures, hints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from functools import partial
+
+import anyio
+import pytest
+
+from paramclient.errors import (
+    AmbiguousVehicle,
+    CommandRefused,
+    CommandResult,
+    LinkError,
+    NoReply,
+    VehicleArmed,
+)
+from paramclient.model.values import Encoding, ParamType, encode_value
+from paramclient.protocol.commands import reboot, request_message, send_command
+from paramclient.protocol.events import Found, Identified, Lost, Rebooted, Replaced
+from paramclient.protocol.fetch import fetch_all
+from paramclient.protocol.identity import judge_encoding
+from paramclient.protocol.presence import BOOT_CLOCK_WRAP, LOST_AFTER_HIGH_LATENCY, REORDERING_TIME, Presence
+from paramclient.protocol.reads import read
+from paramclient.protocol.selection import find, hint_of_link, hint_of_node, only_vehicle
+from paramclient.protocol.writes import write
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
+from paramclient.wire.messages import (
+    CAPABILITY_PARAM_ENCODE_BYTEWISE,
+    CAPABILITY_PARAM_ENCODE_C_CAST,
+    MAV_AUTOPILOT_INVALID,
+    MAV_STATE_BOOT,
+    MAV_TYPE_GCS,
+    AutopilotVersion,
+    CommandAck,
+    CommandLong,
+    Heartbeat,
+    HighLatency2,
+    Message,
+    ParamValue,
+    StatusText,
+    SystemTime,
+    encode,
+)
+from paramclient.wire.signing import Refusal, Signer, SigningKey, Verifier
+from tests.conversations.virtual import (
+    Conversation,
+    Puppet,
+    Silence,
+    converse,
+    messages_in,
+    virtual,
+    virtual_on_both,
+)
+
+PX4 = Heartbeat(2, 12, system_status=4)
+ARDUPILOT = Heartbeat(10, 3, system_status=4)
+GCS = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, system_status=4)
+CAMERA = Heartbeat(30, MAV_AUTOPILOT_INVALID, system_status=4)
+KEY = SigningKey(bytes(range(32)))
+NOW = 36_000_000_000_000
+
+
+class Nothing(Puppet):
+    """An endpoint that says nothing: the test says everything."""
+
+    def __init__(self) -> None:
+        super().__init__(lambda message: (), heartbeat=None)
+
+
+# identity and encoding
+
+
+@pytest.mark.parametrize(
+    ("chosen", "capabilities", "autopilot", "expected", "reason"),
+    [
+        (Encoding.C_CAST, CAPABILITY_PARAM_ENCODE_BYTEWISE, 12, Encoding.C_CAST, "user"),
+        (None, CAPABILITY_PARAM_ENCODE_BYTEWISE, 3, Encoding.BYTEWISE, "PARAM_ENCODE_BYTEWISE"),
+        (None, CAPABILITY_PARAM_ENCODE_C_CAST, 12, Encoding.C_CAST, "PARAM_ENCODE_C_CAST"),
+        (None, 64495, 3, Encoding.C_CAST, "ArduPilot"),
+        (None, None, 12, Encoding.BYTEWISE, "PX4"),
+        (None, 2, 0, Encoding.BYTEWISE, "standard"),
+    ],
+)
+def test_the_first_evidence_of_the_encoding_decides(
+    chosen: Encoding | None, capabilities: int | None, autopilot: int | None, expected: Encoding, reason: str
+) -> None:
+    encoding, why = judge_encoding(chosen, capabilities, autopilot)
+    assert encoding is expected
+    assert reason in why
+
+
+@virtual_on_both
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+async def test_vehicles_are_identified(loss: float) -> None:
+    for vehicle, name in (
+        (PX4Vehicle(), "px4"),
+        (ArduPilotVehicle(), "ardupilot"),
+        (GenericVehicle({"A": 1}), ""),
+    ):
+        async with converse(Air.symmetric([vehicle], loss=loss, delay=0.03, seed=1)) as conversation:
+            node = await conversation.node()
+            await node.identification.settled()
+            assert node.identification.capabilities is not None
+            assert (name == "px4", name == "ardupilot") == (
+                node.identification.is_px4,
+                node.identification.is_ardupilot,
+            )
+            assert node.identification.identity.link == "sim:test"
+            assert conversation.of(Identified)
+            asked = len(conversation.sent_of(CommandLong))
+            await anyio.sleep(20.0)
+            assert len(conversation.sent_of(CommandLong)) == asked
+
+
+@pytest.mark.parametrize("refuses", [True, False])
+@virtual
+async def test_a_vehicle_without_a_version_is_settled_within_seconds(refuses: bool) -> None:
+    def answer(message: Message) -> Iterable[Message]:
+        if isinstance(message, CommandLong) and refuses:
+            yield CommandAck(message.command, CommandResult.UNSUPPORTED, 255, 190)
+
+    async with converse(Puppet(answer)) as conversation:
+        node = await conversation.node()
+        began = anyio.current_time()
+        await node.identification.settled()
+        assert anyio.current_time() - began < (2.5 if refuses else 45.0)
+        assert {each.command for each in conversation.sent_of(CommandLong)} == {512, 520}
+        assert node.identification.capabilities is None
+        assert node.identification.encoding is Encoding.BYTEWISE
+        await anyio.sleep(0.01)
+        assert len(conversation.of(Identified)) == 1
+
+
+@virtual
+async def test_values_received_before_the_encoding_is_known_are_decoded_again() -> None:
+    async with converse(Nothing()) as conversation:
+        raw = encode_value(1500, ParamType.INT32, Encoding.C_CAST)
+        conversation.hear(ParamValue("RTL_ALT", raw, 6, 10, 0))
+        table = conversation.station.nodes[1, 1].plain.table
+        assert table.params["RTL_ALT"].value != 1500
+        conversation.hear(ARDUPILOT)
+        assert table.params["RTL_ALT"].value == 1500
+
+
+@virtual
+async def test_another_hardware_id_clears_the_table_and_the_first_one_does_not() -> None:
+    async with converse(Nothing()) as conversation:
+        conversation.hear(PX4)
+        conversation.hear(ParamValue("A", bytes(4), 6, 10, 0))
+        node = conversation.station.nodes[1, 1]
+        for uid, replaced in ((0, 0), (7, 0), (7, 0), (8, 1)):
+            conversation.hear(AutopilotVersion(0, uid=uid))
+            assert len(conversation.of(Replaced)) == replaced
+        assert node.identification.identity.uid == "0000000000000008"
+        assert not node.plain.table.params
+
+
+@virtual
+async def test_ground_stations_are_asked_nothing_and_own_and_nameless_frames_are_ignored() -> None:
+    async with converse(Nothing()) as conversation:
+        for message, system, component in (
+            (GCS, 254, 190),
+            (GCS, 255, 190),
+            (PX4, 0, 1),
+            (StatusText(6, "x"), 3, 1),
+        ):
+            conversation.hear(message, system=system, component=component)
+        conversation.hear(ParamValue("A", bytes(4), 6, 1, 0), system=4)
+        await anyio.sleep(3.0)
+        assert list(conversation.station.nodes) == [(254, 190), (4, 1)]
+        assert {each.target_system for each in conversation.sent_of(CommandLong)} == {4}
+        assert not conversation.station.nodes[254, 190].identification.has_parameters
+
+
+@virtual
+async def test_our_heartbeat_is_sent_once_a_second_and_a_listener_sends_nothing() -> None:
+    async with converse(PX4Vehicle()) as conversation:
+        await anyio.sleep(9.5)
+        beats = conversation.sent_of(Heartbeat)
+        assert beats == [Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, system_status=4)] * 10
+    async with converse(PX4Vehicle(), listens_only=True) as conversation:
+        await conversation.node()
+        await anyio.sleep(10.0)
+        assert not conversation.sent
+
+
+# presence
+
+
+@virtual_on_both
+async def test_a_silent_vehicle_is_lost_after_5_s_and_found_again() -> None:
+    vehicle = PX4Vehicle()
+    endpoint = Silence(vehicle, at=10.5)
+    async with converse(endpoint) as conversation:
+        node = await conversation.node()
+        await read(node.plain, "MC_ROLL_P")
+        await anyio.sleep_until(14.9)
+        assert not conversation.of(Lost)
+        await anyio.sleep_until(16.2)
+        assert conversation.of(Lost)
+        assert str(node.plain.table.params["MC_ROLL_P"].trust) == "cached"
+        began = anyio.current_time()
+        with pytest.raises(NoReply):
+            await read(node.plain, "MC_ROLL_P")
+        assert anyio.current_time() - began < 3.0
+        endpoint.at = 1e9
+        await anyio.sleep(2.0)
+        lost, found = conversation.of(Lost), conversation.of(Found)
+        assert [5.0 <= each.silence < 6.1 for each in lost] == [True]
+        assert len(found) == 1
+        assert 5.0 < found[0].silence < 12.0
+        await read(node.plain, "MC_ROLL_P")
+
+
+def test_the_heartbeat_timeout_follows_slow_heartbeats_and_satellites() -> None:
+    presence = Presence()
+    assert presence.timeout == math.inf
+    presence.heartbeat(PX4, 0.0)
+    assert presence.timeout == 5.0
+    presence.heartbeat(PX4, 4.0)
+    assert presence.timeout == 12.0
+    presence.heartbeat(PX4, 4.1)  # a copy
+    assert presence.timeout == 12.0
+    presence.high_latency()
+    assert presence.timeout == LOST_AFTER_HIGH_LATENCY
+    presence.heartbeat(PX4, 40.0)
+    assert presence.timeout == 12.0
+
+
+@virtual
+async def test_a_vehicle_on_a_satellite_link_is_lost_later() -> None:
+    async with converse(Nothing()) as conversation:
+        conversation.hear(PX4)
+        conversation.hear(HighLatency2(2, 12))
+        await anyio.sleep(50.0)
+        assert not conversation.of(Lost)
+        await anyio.sleep(15.0)
+        assert len(conversation.of(Lost)) == 1
+
+
+# reboots
+
+
+@pytest.mark.parametrize(
+    ("clock", "reboots"),
+    [
+        ([(0.0, 500_000), (1.0, 501_000), (6.0, 1_200), (7.0, 2_200)], [6.0]),
+        ([(0.0, 50_000), (5.0, 1_000), (6.0, 2_000), (6.0, 2_000), (20.0, 500), (21.0, 1_500)], [5.0, 20.0]),
+        ([(0.0, 3 * BOOT_CLOCK_WRAP // 4), (9.0, 3_000)], [9.0]),
+        ([(0.0, 50_000), (0.1, 49_000), (0.2, 51_000), (0.2, 51_000), (1.0, 50_000)], []),
+        ([(0.0, int(1000 * REORDERING_TIME) + 100), (0.1, 150)], [0.1]),
+        ([(0.0, BOOT_CLOCK_WRAP - 500), (1.0, 500), (2.0, 1_500)], []),
+        ([(0.0, 60_000), (2.0, 400), (2.1, 61_000), (2.2, 600), (4.0, 61_500), (4.1, 2_500)], [2.0]),
+        ([(0.0, 90_000), (1.0, 0), (2.0, 92_000)], []),
+    ],
+    ids=["back", "twice", "after weeks", "reordered", "soon", "wrapped", "late frames", "filled with 0"],
+)
+def test_a_clock_that_goes_back_shows_a_reboot(clock: list[tuple[float, int]], reboots: list[float]) -> None:
+    presence = Presence()
+    assert [now for now, boot_ms in clock if presence.boot_clock(2, boot_ms, now)] == reboots
+
+
+@virtual
+async def test_clocks_of_different_messages_are_not_compared_and_two_signs_are_one_reboot() -> None:
+    async with converse(Nothing()) as conversation:
+        conversation.hear(PX4)
+        node = conversation.station.nodes[1, 1]
+        for second in range(10):
+            conversation.hear(PX4)
+            for number, boot_ms in ((30, 90_000 + 1000 * second), (33, 1000 * second + 1), (132, 700)):
+                node.boot_clock(number, boot_ms, anyio.current_time())
+            await anyio.sleep(1.0)
+        assert not conversation.of(Rebooted)
+        conversation.hear(ParamValue("A", bytes(4), 6, 10, 0))
+        conversation.hear(Heartbeat(2, 12, system_status=MAV_STATE_BOOT))
+        node.boot_clock(30, 500, anyio.current_time())
+        conversation.hear(SystemTime(0, 700))
+        conversation.hear(Heartbeat(2, 12, system_status=MAV_STATE_BOOT))
+        assert len(conversation.of(Rebooted)) == 1
+        assert str(node.plain.table.params["A"].trust) == "cached"
+
+
+@virtual
+async def test_a_reboot_by_others_is_seen_with_telemetry() -> None:
+    vehicle = PX4Vehicle(telemetry=10.0)
+    async with converse(vehicle) as conversation:
+        await conversation.node()
+        await anyio.sleep(8.0)
+        vehicle.reboot(anyio.current_time(), down=1.0)
+        await anyio.sleep(4.0)
+        assert len(conversation.of(Rebooted)) == 1
+
+
+MAKES = pytest.mark.parametrize(
+    "make",
+    [PX4Vehicle, ArduPilotVehicle, partial(ArduPilotVehicle, kind="plane")],
+    ids=["px4", "copter", "plane"],
+)
+
+
+@virtual_on_both
+@MAKES
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+async def test_a_reboot_on_command_happens_once_and_returns_when_the_vehicle_is_back(
+    make: type[Vehicle], loss: float
+) -> None:
+    vehicle = make()  # type: ignore[call-arg]  # each has defaults
+    async with converse(Air.symmetric([vehicle], loss=loss, delay=0.02, seed=5)) as conversation:
+        node = await conversation.node()
+        await node.identification.settled()
+        await reboot(node)
+        assert len(conversation.of(Rebooted)) == 1
+        assert not node.presence.is_lost
+        await read(node.plain, vehicle.listed[0].name)
+        await anyio.sleep(10.0)
+        assert len(conversation.of(Rebooted)) == 1
+
+
+@virtual
+async def test_a_reboot_is_refused_by_an_armed_vehicle_and_waits_for_px4_to_save() -> None:
+    vehicle = PX4Vehicle()
+    async with converse(vehicle) as conversation:
+        node = await conversation.node()
+        await node.identification.settled()
+        await write(node.plain, "MC_ROLL_P", 3.0)
+        vehicle.armed = True
+        await anyio.sleep(1.5)
+        with pytest.raises(VehicleArmed):
+            await reboot(node)
+        vehicle.armed = False
+        await anyio.sleep(1.5)
+        await reboot(node)
+        assert vehicle.param("MC_ROLL_P").value == 3.0
+        with pytest.raises(NoReply):
+            await node_of_silent_reboot(conversation)
+
+
+async def node_of_silent_reboot(conversation: Conversation) -> None:
+    """Send a command to a component that does not exist any more."""
+    conversation.hear(PX4, system=9)
+    node = conversation.station.nodes[9, 1]
+    await send_command(node.channel, CommandLong(9, 1, 246, 1.0))
+
+
+@virtual
+async def test_commands_end_with_their_result_and_wait_while_one_is_in_progress() -> None:
+    results = [CommandResult.IN_PROGRESS, CommandResult.ACCEPTED]
+
+    def answer(message: Message) -> Iterable[Message]:
+        if isinstance(message, CommandLong) and message.command == 400:
+            yield from (CommandAck(400, result, 255, 190) for result in results)
+
+    async with converse(Puppet(answer)) as conversation:
+        channel = (await conversation.node()).channel
+        await send_command(channel, CommandLong(1, 1, 400))
+        results[:] = [CommandResult.DENIED]
+        with pytest.raises(CommandRefused) as caught:
+            await send_command(channel, CommandLong(1, 1, 400))
+        assert caught.value.code == CommandResult.DENIED
+    async with converse(PX4Vehicle()) as conversation:
+        channel = (await conversation.node()).channel
+        assert isinstance(await request_message(channel, Heartbeat), Heartbeat)
+        assert await request_message(channel, HighLatency2) is None
+
+
+# peers
+
+
+@virtual
+async def test_a_second_vehicle_with_the_same_ids_is_ignored_until_the_first_is_silent() -> None:
+    async with converse(Nothing()) as conversation:
+        conversation.hear(PX4, peer="a")
+        conversation.hear(ParamValue("A", b"\1\0\0\0", 6, 10, 0), peer="a")
+        node = conversation.station.nodes[1, 1]
+        await anyio.sleep(1.0)
+        conversation.hear(ParamValue("A", b"\2\0\0\0", 6, 10, 0), peer="b")
+        now = anyio.current_time()
+        assert (node.plain.table.params["A"].value, node.peer, node.has_rival(now)) == (1, "a", True)
+        await anyio.sleep(5.5)
+        assert not node.has_rival(anyio.current_time())
+        conversation.hear(ParamValue("A", b"\2\0\0\0", 6, 10, 0), peer="b")
+        assert (node.plain.table.params["A"].value, node.peer) == (2, "b")
+
+
+@virtual
+async def test_the_same_hardware_id_proves_that_a_vehicle_has_moved() -> None:
+    async with converse(Nothing()) as conversation:
+        conversation.hear(PX4, peer="a")
+        conversation.hear(AutopilotVersion(0, uid=7), peer="a")
+        node = conversation.station.nodes[1, 1]
+        conversation.hear(AutopilotVersion(0, uid=8), peer="b")
+        assert node.peer == "a"
+        conversation.hear(AutopilotVersion(0, uid=7), peer="b")
+        assert (node.peer, node.has_rival(anyio.current_time())) == ("b", False)
+
+
+@virtual
+async def test_split_peers_are_components_of_their_own() -> None:
+    async with converse(Nothing(), split_peers=True) as conversation:
+        for peer in (("10.0.0.1", 1), ("10.0.0.2", 1)):
+            conversation.hear(PX4, peer=peer)
+            conversation.hear(ParamValue("A", bytes((peer[0] == "10.0.0.1", 0, 0, 0)), 6, 1, 0), peer=peer)
+        nodes = list(conversation.station.nodes.values())
+        assert [each.plain.table.params["A"].value for each in nodes] == [1, 0]
+        assert find(nodes, 1, 1, "10.0.0.2") is nodes[1]
+        with pytest.raises(AmbiguousVehicle, match=r"10\.0\.0\.1:1"):
+            only_vehicle(nodes, 1, 1, 5.0, listening_since=0.0)
+
+
+@virtual
+async def test_a_stream_may_cut_frames_anywhere_for_each_peer() -> None:
+    async with converse(Nothing()) as conversation:
+        station = conversation.station
+        stream = encode(PX4, system=1, component=1, sequence=0)
+        station.receive(stream[:5], "a", 0.0)
+        station.receive(stream[5:], "a", 0.0)
+        assert not station.nodes  # datagrams are never joined
+    async with converse(Nothing()) as conversation:
+        sent: list[bytes] = []
+        other = type(conversation.station)(
+            link="x", is_stream=True, send=lambda data, peer: sent.append(data), spawn=lambda *work: None
+        )
+        two = encode(PX4, system=2, component=1, sequence=0)
+        other.receive(stream[:5], "a", 0.0)
+        other.receive(two[:7], "b", 0.0)
+        other.receive(stream[5:], "a", 0.0)
+        other.receive(two[7:], "b", 0.0)
+        assert list(other.nodes) == [(1, 1), (2, 1)]
+
+
+@virtual_on_both
+@MAKES
+async def test_a_whole_session_in_mavlink_1(make: type[Vehicle]) -> None:
+    vehicle = make(mavlink_version=1)  # type: ignore[call-arg]  # each has defaults
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        await session.identification.settled()
+        conversation.sent.clear()
+        result = await fetch_all(session)
+        assert {name: each.bits for name, each in result.params.items()} == {
+            name: each.bits for name, each in vehicle.params.items()
+        }
+        assert {data[0] for data in conversation.sent if not isinstance(messages_in(data)[0], Heartbeat)} == {
+            0xFE
+        }
+
+
+@virtual
+async def test_several_vehicles_on_one_link_get_only_their_own() -> None:
+    vehicles = [PX4Vehicle(system=1), ArduPilotVehicle(system=2), PX4Vehicle(system=3)]
+    vehicles[2].set_param("MC_ROLL_P", 2.25)
+    async with converse(Air.symmetric(vehicles, loss=0.05, delay=0.02, seed=1)) as conversation:
+        async with anyio.create_task_group() as tasks:
+            for system in (1, 2, 3):
+                tasks.start_soon(fetch_all, (await conversation.node(system)).plain)
+        for vehicle, system in zip(vehicles, (1, 2, 3), strict=True):
+            table = conversation.station.nodes[system, 1].plain.table
+            assert {name: each.bits for name, each in table.params.items()} == {
+                name: each.bits for name, each in vehicle.params.items()
+            }
+        await write(conversation.station.nodes[3, 1].plain, "MC_ROLL_P", 2.75)
+        assert [vehicle.param("MC_ROLL_P").value for vehicle in vehicles[::2]] == [4.0, 2.75]
+
+
+@virtual
+async def test_components_have_a_bound() -> None:
+    async with converse(Nothing()) as conversation:
+        for system in range(1, 6):
+            for component in range(1, 204):
+                conversation.hear(CAMERA, system=system, component=component)
+        assert len(conversation.station.nodes) == 1_000
+
+
+# signatures
+
+
+@virtual_on_both
+@pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
+async def test_a_signed_session_takes_no_forged_and_no_replayed_value(make: type[PX4Vehicle]) -> None:
+    vehicle = make(signing_key=KEY, signing_timestamp=NOW)
+    async with converse(vehicle) as conversation:
+        signer = Signer(KEY, timestamp=NOW)
+        verifier = Verifier(signer)
+        conversation.station.begin_signing(signer, verifier)
+        session = (await conversation.node()).plain
+        result = await fetch_all(session)
+        name = vehicle.listed[0].name
+        assert not result.missing
+        conversation.hear(ParamValue(name, b"\x9a\x02\0\0", vehicle.listed[0].type_number, 903, 0))
+        assert session.table.params[name].same_value(vehicle.listed[0])
+        report = verifier.report()
+        assert report.signed > 5
+        assert report.refused.keys() == {Refusal.UNSIGNED}
+        assert vehicle.signing_report is not None
+        assert not vehicle.signing_report.refused
+
+
+@virtual
+async def test_setup_signing_is_obeyed_and_another_key_is_not_understood() -> None:
+    vehicle = PX4Vehicle()
+    async with converse(vehicle) as conversation:
+        node = await conversation.node()
+        conversation.station.send_setup_signing(node, KEY, NOW)
+        await anyio.sleep(0.5)
+        assert vehicle.signing_key == KEY
+        with pytest.raises(NoReply):
+            await read(node.plain, "MC_ROLL_P")
+    async with converse(PX4Vehicle(signing_key=KEY, signing_timestamp=NOW)) as conversation:
+        signer = Signer(SigningKey(bytes(range(2, 34))), timestamp=NOW)
+        conversation.station.begin_signing(signer, verifier := Verifier(signer))
+        await anyio.sleep(5.0)
+        assert not conversation.station.nodes
+        assert verifier.report().refused.keys() == {Refusal.BAD_SIGNATURE}
+
+
+# the only vehicle, and hints
+
+
+@virtual
+async def test_the_only_autopilot_is_chosen_and_peripherals_and_stations_do_not_count() -> None:
+    async with converse(Nothing()) as conversation:
+        await anyio.sleep(5.0)
+        nodes = conversation.station.nodes
+        choose = partial(only_vehicle, nodes.values(), listening_since=-math.inf)
+        conversation.hear(CAMERA, component=100)
+        conversation.hear(GCS, system=254, component=190)
+        conversation.hear(Heartbeat(18, 0, system_status=4), system=2, component=191)  # a companion computer
+        assert choose(None, None, 5.0)[0] is None
+        conversation.hear(PX4)
+        found, due = choose(None, None, 5.0)
+        assert (found, due) == (None, 6.2)
+        assert choose(None, None, 6.2)[0] is nodes[1, 1]
+        assert choose(1, None, 5.0)[0] is nodes[1, 1]
+        assert choose(1, 100, 5.0)[0] is nodes[1, 100]
+        assert find(nodes.values(), None, None, None) is nodes[1, 1]
+        conversation.hear(ARDUPILOT, system=3)
+        with pytest.raises(AmbiguousVehicle, match="1/1 PX4 quadrotor, 3/1 ArduPilot rover"):
+            choose(None, None, 6.2)
+
+
+@virtual
+async def test_hints_say_what_was_received() -> None:
+    async with converse(Nothing()) as conversation:
+        station = conversation.station
+        assert hint_of_link(station, 0) == "Nothing was received on sim:test."
+        assert "no valid MAVLink frame" in hint_of_link(station, 1500)
+        conversation.hear(StatusText(6, "x"), system=9)
+        assert hint_of_link(station, 60) == "1 MAVLink frame arrived on sim:test, but no heartbeat."
+        conversation.hear(GCS, system=252, component=190)
+        assert "only 252/190 ground station, and no vehicle" in hint_of_link(station, 60)
+        conversation.hear(PX4)
+        node = station.nodes[1, 1]
+        assert "1/1 PX4 quadrotor" in hint_of_link(station, 60)
+        assert "answers no request" in hint_of_node(station, node, anyio.current_time())
+        await anyio.sleep(7.0)
+        assert hint_of_node(station, node, anyio.current_time()) == "Nothing was received of 1/1 for 7.0 s."
+        station.interrupt()
+        assert hint_of_link(station, 60) == "sim:test is down at present."
+        station.fail(LinkError("gone", link="x"), for_good=True)

@@ -1,0 +1,207 @@
+"""Watches: a table that was fetched once stays that of the vehicle, for few messages."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import anyio
+import pytest
+
+from paramclient.protocol.events import Resynced
+from paramclient.protocol.fetch import Policy, fetch_all
+from paramclient.protocol.node import Node
+from paramclient.protocol.session import Session
+from paramclient.protocol.watch import SyncState, Watch
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, OtherStation, PX4Vehicle
+from paramclient.wire.messages import ParamRequestList, ParamRequestRead, ParamSet, ParamValue
+from tests.conversations.virtual import Conversation, Silence, Tap, converse, virtual, virtual_on_both
+
+REQUESTS = (ParamRequestList, ParamRequestRead, ParamSet)
+
+
+class Watched:
+    """A component with a watch, as a client sets it up."""
+
+    def __init__(self, conversation: Conversation, node: Node, watch: Watch) -> None:
+        self.conversation = conversation
+        self.node = node
+        self.watch = watch
+        self.resynced: list[Resynced] = []
+
+    @property
+    def session(self) -> Session:
+        """The plain parameters."""
+        return self.node.plain
+
+    async def fetch(self) -> None:
+        """Fetch all parameters, and begin to watch them."""
+        result = await fetch_all(self.session)
+        self.watch.fetched(None if result.source == "cache" else result.elapsed)
+
+    @property
+    def requests(self) -> int:
+        """The requests sent so far."""
+        return sum(len(self.conversation.sent_of(kind)) for kind in REQUESTS)
+
+
+@asynccontextmanager
+async def watched(
+    endpoint: object, interval: float | None = None, policy: Policy = Policy.AUTO
+) -> AsyncIterator[Watched]:
+    """Fetch and watch the component 1/1."""
+    async with converse(endpoint) as conversation:  # type: ignore[arg-type]  # any endpoint
+        node = await conversation.node()
+        await node.identification.settled()
+        resynced: list[Resynced] = []
+        watch = Watch(node.plain, node.presence, resynced.append, interval=interval, policy=policy)
+        node.plain.table.recounted = watch.doubt
+        found = Watched(conversation, node, watch)
+        found.resynced = resynced
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(watch.run)
+            await found.fetch()
+            yield found
+            tasks.cancel_scope.cancel()
+
+
+@virtual_on_both
+async def test_a_silent_change_is_found_within_one_interval() -> None:
+    vehicle = PX4Vehicle()
+    async with watched(Air.symmetric([vehicle], delay=0.02), interval=10.0) as found:
+        assert found.watch.state is SyncState.SYNCED
+        vehicle.load({"MC_ROLL_P": 3.25})
+        await anyio.sleep(13.0)
+        assert found.session.table.params["MC_ROLL_P"].value == 3.25
+        assert [each.changed for each in found.resynced] == [("MC_ROLL_P",)]
+        assert found.resynced[0].hash == found.session.table.hash
+        change = found.conversation.changes[-1]
+        assert (change.name, change.kind, change.by) == ("MC_ROLL_P", "changed", "vehicle")
+
+
+@virtual
+async def test_a_value_announcement_that_is_lost_is_found() -> None:
+    vehicle = PX4Vehicle()
+    lost = [False]
+    endpoint = Tap(vehicle, down=lambda message: not (lost[0] and isinstance(message, ParamValue)))
+    async with watched(endpoint, interval=10.0) as found:
+        lost[0] = True
+        vehicle.set_param("MC_ROLL_P", 3.25)
+        await anyio.sleep(1.0)
+        lost[0] = False
+        await anyio.sleep(12.0)
+        assert found.session.table.params["MC_ROLL_P"].value == 3.25
+
+
+@virtual
+async def test_an_idle_table_costs_one_read_of_the_hash_each_30_s() -> None:
+    async with watched(PX4Vehicle()) as found:
+        before = found.requests
+        await anyio.sleep(140.0)
+        assert found.requests - before == 4
+        assert not found.resynced
+
+
+@pytest.mark.parametrize("policy", [Policy.CACHE_ONLY, Policy.HASH_ONLY, "none"])
+@virtual
+async def test_nothing_is_sent_without_a_policy_or_an_interval(policy: str) -> None:
+    vehicle = PX4Vehicle()
+    options = {"interval": 0.0} if policy == "none" else {"policy": Policy(policy)}
+    async with watched(vehicle, **options) as found:
+        before = found.requests
+        vehicle.load({"MC_ROLL_P": 3.25})
+        await anyio.sleep(100.0)
+        assert found.requests == before
+
+
+@virtual
+async def test_an_armed_vehicle_is_asked_only_after_a_sign_of_change() -> None:
+    vehicle = PX4Vehicle()
+    async with watched(vehicle, interval=5.0) as found:
+        vehicle.armed = True
+        await anyio.sleep(6.5)
+        before = found.requests
+        await anyio.sleep(30.0)
+        assert found.requests == before
+        vehicle.set_param("CAL_MAG2_ID", 197388)  # brings more into use
+        await anyio.sleep(0.1)
+        vehicle.set_param("MC_ROLL_P", 3.0)  # its value has the new count
+        await anyio.sleep(5.0)
+        assert found.requests > before
+        assert "CAL_MAG2_ROT" in found.session.table.params
+
+
+@virtual_on_both
+@pytest.mark.parametrize("ftp", [True, False])
+async def test_a_group_that_is_shown_or_hidden_is_found_by_the_count(ftp: bool) -> None:
+    vehicle = ArduPilotVehicle(ftp=ftp, live_period=0.0)
+    async with watched(Air.symmetric([vehicle], delay=0.02), interval=0.0) as found:
+        count = found.session.table.count or 0
+        for value, change in ((1, 52), (0, 0)):
+            vehicle.set_param("EK2_ENABLE", value)
+            await anyio.sleep(6.0)
+            assert found.session.table.count == count + change
+            assert set(found.session.table.params) == set(vehicle.params)
+            assert found.watch.state is SyncState.SYNCED
+        kinds = [each.kind for each in found.conversation.changes if each.name == "EK2_GPS_TYPE"]
+        assert kinds == ["added", "removed"]
+        assert len(found.resynced) == 2
+
+
+@virtual
+async def test_a_lost_vehicle_is_checked_when_it_is_back_and_its_values_are_cached_meanwhile() -> None:
+    vehicle = PX4Vehicle()
+    endpoint = Silence(vehicle, at=1e9)
+    async with watched(endpoint, interval=0.0) as found:
+        endpoint.at = anyio.current_time()
+        await anyio.sleep(7.0)
+        assert str(found.watch.state) == "lost"
+        assert {str(each.trust) for each in found.session.table.params.values()} == {"cached"}
+        vehicle.load({"MC_ROLL_P": 3.25})
+        endpoint.at = 1e9
+        found.watch.doubt()
+        await anyio.sleep(5.0)
+        assert found.watch.state is SyncState.SYNCED
+        assert found.session.table.params["MC_ROLL_P"].value == 3.25
+        assert not any(str(each.trust) == "cached" for each in found.session.table.params.values())
+
+
+@virtual
+async def test_a_generic_vehicle_is_watched_by_quick_downloads() -> None:
+    vehicle = GenericVehicle({f"P{number}": float(number) for number in range(30)})
+    async with watched(vehicle) as found:
+        vehicle.set_param("P7", 70.5)
+        await anyio.sleep(35.0)
+        assert found.session.table.params["P7"].value == 70.5
+        assert [each.changed for each in found.resynced] == [("P7",)]
+
+
+@virtual
+async def test_a_check_that_fails_is_repeated_and_none_runs_beside_a_hold() -> None:
+    vehicle = PX4Vehicle()
+    deaf = [False]
+    endpoint = Tap(vehicle, up=lambda message: not deaf[0])
+    async with watched(endpoint, interval=10.0) as found:
+        deaf[0] = True
+        vehicle.load({"MC_ROLL_P": 3.25})
+        await anyio.sleep(40.0)
+        assert found.session.table.params["MC_ROLL_P"].value == 4.0
+        deaf[0] = False
+        with found.watch.held():
+            before = found.requests
+            await anyio.sleep(30.0)
+            assert found.requests - before <= 3  # a check in progress goes on
+        await anyio.sleep(16.0)
+        assert found.session.table.params["MC_ROLL_P"].value == 3.25
+
+
+@virtual
+async def test_a_list_for_another_station_is_taken_and_restarts_nothing() -> None:
+    vehicle = PX4Vehicle()
+    air = Air([vehicle], others=[OtherStation(list_every=7.0)])
+    async with watched(air, interval=0.0) as found:
+        vehicle.load({"MC_ROLL_P": 3.25})
+        before = found.requests
+        await anyio.sleep(9.0)
+        assert found.requests == before
+        assert found.session.table.params["MC_ROLL_P"].value == 3.25

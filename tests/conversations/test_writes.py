@@ -1,0 +1,518 @@
+"""Writes: every value is proven, refused or reported as unknown, whatever the link loses."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterable
+
+import anyio
+import pytest
+
+from paramclient.errors import (
+    LinkError,
+    NoReply,
+    ParamClientError,
+    ParamErrorCode,
+    Refused,
+    TypeMismatch,
+    UnknownParameter,
+    UsageError,
+    ValueNotApplied,
+)
+from paramclient.model.values import ParamType, Trust, WireValue
+from paramclient.protocol.fetch import fetch_all
+from paramclient.protocol.reads import read
+from paramclient.protocol.session import Session
+from paramclient.protocol.set_results import SetOutcome, SetStatus
+from paramclient.protocol.writes import write, write_many
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, OtherStation, PX4Vehicle, SimParam
+from paramclient.wire.messages import (
+    AutopilotVersion,
+    CommandLong,
+    Message,
+    ParamError,
+    ParamRequestRead,
+    ParamSet,
+    ParamValue,
+)
+from tests.conversations.virtual import Puppet, Silence, Tap, converse, virtual, virtual_on_both
+
+EVERY_TYPE = {
+    ParamType.UINT8: 255,
+    ParamType.INT8: -128,
+    ParamType.UINT16: 65535,
+    ParamType.INT16: -32768,
+    ParamType.UINT32: 2**32 - 1,
+    ParamType.INT32: -(2**31),
+    ParamType.REAL32: 0.1,
+}
+
+
+async def many(session: Session, pairs: Iterable[tuple[str, WireValue]]) -> list[SetOutcome]:
+    """Set several values; return the outcomes, after checking that each was reported once."""
+    outcomes: list[SetOutcome] = []
+    done: list[SetOutcome] = []
+    error = await write_many(session, list(pairs), outcomes, done.append)
+    assert sorted(each.name for each in done if each.status is not SetStatus.NOT_TRIED) == sorted(
+        each.name for each in outcomes if each.status is not SetStatus.NOT_TRIED
+    )
+    assert (error is None) is all(each.status is not SetStatus.NOT_TRIED for each in outcomes) or error
+    return outcomes
+
+
+@virtual_on_both
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+async def test_values_of_every_type_are_set(loss: float) -> None:
+    vehicle = GenericVehicle([SimParam(kind.name, kind, 0) for kind in EVERY_TYPE])
+    async with converse(Air.symmetric([vehicle], loss=loss, delay=0.02, seed=1)) as conversation:
+        session = (await conversation.node()).plain
+        for kind, value in EVERY_TYPE.items():
+            result = await write(session, kind.name, value)
+            assert (result.status, result.actual, result.param.type) == ("accepted", value, kind)
+            assert session.table.params[kind.name].value == vehicle.param(kind.name).value == value
+        assert vehicle.requests["PARAM_REQUEST_READ"] >= len(EVERY_TYPE)  # each type is learnt first
+
+
+@virtual
+@pytest.mark.parametrize(("make", "name"), [(PX4Vehicle, "MC_ROLL_P"), (ArduPilotVehicle, "ATC_ANG_RLL_P")])
+async def test_a_value_is_the_shortest_decimal_of_its_float(
+    make: type[PX4Vehicle] | type[ArduPilotVehicle], name: str
+) -> None:
+    async with converse(make()) as conversation:
+        session = (await conversation.node()).plain
+        result = await write(session, name, 6.1)
+        assert (result.status, result.actual, result.attempts) == ("accepted", 6.1, 1)
+        assert result.param.bits == int.from_bytes(struct.pack("<f", 6.1), "little")
+        assert str(result) == f"{name} = 6.1"
+
+
+@virtual
+async def test_ardupilot_truncates_a_fraction_which_is_an_adjustment() -> None:
+    async with converse(ArduPilotVehicle()) as conversation:
+        session = (await conversation.node()).plain
+        await fetch_all(session)
+        index = session.table.params["RTL_ALT"].index
+        result = await write(session, "RTL_ALT", 1234.7)
+        assert (result.status, result.requested, result.actual) == ("adjusted", 1234.7, 1234)
+        assert result.attempts == 1
+        assert str(result) == "RTL_ALT = 1234 (adjusted from 1234.7)"
+        assert session.table.params["RTL_ALT"].index == index  # its acknowledgement has 65535
+
+
+@virtual
+async def test_ardupilots_acknowledgement_of_a_default_in_another_type_keeps_the_type() -> None:
+    vehicle = ArduPilotVehicle()
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        await fetch_all(session)
+        defaults = [
+            param
+            for name, param in session.table.params.items()
+            if param.type is ParamType.INT8 and param.default == param.value and "ENABLE" not in name
+        ]
+        for param in defaults[20:24]:
+            assert isinstance(param.value, int)
+            result = await write(session, param.name, param.value)
+            assert (result.status, result.param.type) == ("accepted", ParamType.INT8)
+            assert result.attempts == 1
+
+
+@virtual
+async def test_an_integer_that_float32_cannot_hold_is_not_sent_to_ardupilot() -> None:
+    vehicle = ArduPilotVehicle()
+    name = next(param.name for param in vehicle.listed if param.type is ParamType.INT32)
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        with pytest.raises(UsageError, match="cannot be sent exactly"):
+            await write(session, name, 2**24 + 1)
+        assert not conversation.sent_of(ParamSet)
+
+
+@pytest.mark.parametrize(("name", "value"), [("MC_ROLL_P", math.nan), ("COM_RC_LOSS_T", math.inf)])
+@virtual
+async def test_nan_and_infinity_are_sent_to_px4_only_if_forced(name: str, value: float) -> None:
+    vehicle = PX4Vehicle()
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        with pytest.raises(UsageError, match="was not sent to 1/1"):
+            await write(session, name, value)
+        assert not conversation.sent_of(ParamSet)
+        result = await write(session, name, value, force=True)
+        assert isinstance(result.actual, float)
+        assert not math.isfinite(result.actual)
+
+
+@virtual
+async def test_px4_clamps_a_value_later_which_a_watched_write_reports() -> None:
+    vehicle = PX4Vehicle()
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        most = vehicle.param("MPC_XY_VEL_MAX").value
+        at_once = await write(session, "MPC_XY_CRUISE", 90.0)
+        assert (at_once.status, at_once.actual) == ("accepted", 90.0)
+        watched = await write(session, "MPC_XY_CRUISE", 80.0, settle=1.2)
+        assert (watched.status, watched.requested, watched.actual) == ("adjusted", 80.0, most)
+        assert session.table.params["MPC_XY_CRUISE"].value == most
+
+
+# refused
+
+
+@pytest.mark.parametrize("param_error", [False, True])
+@virtual
+async def test_a_read_only_parameter_is_refused_with_its_reason(param_error: bool) -> None:
+    vehicle = ArduPilotVehicle(param_error=param_error)
+    async with converse(Air.symmetric([vehicle], delay=0.02)) as conversation:
+        session = (await conversation.node()).plain
+        began = anyio.current_time()
+        with pytest.raises(Refused, match="read only") as caught:
+            await write(session, "BARO1_GND_PRESS", 5.0)
+        assert (caught.value.code, caught.value.name) == (ParamErrorCode.READ_ONLY, "BARO1_GND_PRESS")
+        assert anyio.current_time() - began < 3.0
+        assert len(conversation.sent_of(ParamSet)) == 1
+
+
+@virtual
+async def test_an_unknown_name_and_values_that_do_not_fit_are_not_set() -> None:
+    for vehicle in (PX4Vehicle(), ArduPilotVehicle(param_error=True)):
+        async with converse(vehicle) as conversation:
+            session = (await conversation.node()).plain
+            with pytest.raises(UnknownParameter):
+                await write(session, "NO_SUCH", 1)
+            name = next(param.name for param in vehicle.listed if param.type is ParamType.INT32)
+            for value in (2**31, "text"):
+                with pytest.raises(UsageError):
+                    await write(session, name, value)
+            assert not conversation.sent_of(ParamSet)
+            assert not session.writing
+
+
+def table_puppet(params: dict[str, tuple[bytes, int]], on_set: object = None) -> Puppet:
+    """Return a component with these parameters, whose sets are handled by a function."""
+
+    def answer(message: Message) -> Iterable[Message]:
+        names = list(params)
+        if isinstance(message, ParamRequestRead):
+            name = message.param_id or names[message.param_index]
+            if name in params:
+                yield ParamValue(name, *params[name], len(names), names.index(name))
+        elif isinstance(message, ParamSet) and callable(on_set):
+            yield from on_set(message)
+        elif isinstance(message, CommandLong):
+            yield AutopilotVersion(16, uid=7)
+
+    return Puppet(answer)
+
+
+@pytest.mark.parametrize("answers", [False, True])
+@virtual
+async def test_a_set_that_is_never_applied_ends_within_seconds(answers: bool) -> None:
+    params = {"lower_name": (struct.pack("<i", 5), 6)}
+
+    def keep(message: ParamSet) -> Iterable[Message]:
+        if answers:
+            yield ParamValue(message.param_id, *params[message.param_id], 1, 0)
+
+    async with converse(table_puppet(params, keep)) as conversation:
+        session = (await conversation.node()).plain
+        began = anyio.current_time()
+        with pytest.raises(ValueNotApplied if answers else NoReply) as caught:
+            await write(session, "lower_name", 6)
+        assert anyio.current_time() - began < 7.0
+        if isinstance(caught.value, ValueNotApplied):
+            assert (caught.value.requested, caught.value.actual) == (6, 5)
+
+
+@pytest.mark.parametrize(("value", "fits"), [(7, True), (300, False)])
+@virtual
+async def test_a_type_that_has_changed_is_taken_or_is_a_mismatch(value: int, fits: bool) -> None:
+    params = {"A": (struct.pack("<i", 5), 6)}
+
+    def retyped(message: ParamSet) -> Iterable[Message]:
+        if message.param_type == 1:
+            params["A"] = (message.raw, 1)
+        else:
+            params["A"] = (bytes((5, 0, 0, 0)), 1)
+        yield ParamValue("A", *params["A"], 1, 0)
+
+    async with converse(table_puppet(params, retyped)) as conversation:
+        session = (await conversation.node()).plain
+        if fits:
+            result = await write(session, "A", value)
+            assert (result.status, result.param.type) == ("accepted", ParamType.UINT8)
+        else:
+            with pytest.raises(TypeMismatch, match="UINT8"):
+                await write(session, "A", value)
+
+
+@pytest.mark.parametrize(
+    ("code", "kind"),
+    [
+        (ParamErrorCode.VALUE_OUT_OF_RANGE, Refused),
+        (ParamErrorCode.DOES_NOT_EXIST, UnknownParameter),
+        (99, Refused),
+    ],
+)
+@pytest.mark.parametrize("order", ["alone", "before", "after"])
+@virtual
+async def test_a_refusal_counts_whether_the_old_value_comes_with_it(
+    code: int, kind: type[ParamClientError], order: str
+) -> None:
+    params = {"A": (struct.pack("<i", 5), 6)}
+
+    def refuse(message: ParamSet) -> Iterable[Message]:
+        value, error = ParamValue("A", *params["A"], 1, 0), ParamError(255, 190, "A", -1, code)
+        orders: dict[str, list[Message]] = {
+            "alone": [error],
+            "before": [value, error],
+            "after": [error, value],
+        }
+        return orders[order]
+
+    async with converse(table_puppet(params, refuse)) as conversation:
+        with pytest.raises(kind):
+            await write((await conversation.node()).plain, "A", 6)
+        assert len(conversation.sent_of(ParamSet)) == 1
+
+
+# what the link loses
+
+
+@virtual_on_both
+async def test_a_lost_acknowledgement_is_requested_again_and_a_lost_set_too() -> None:
+    for what in (ParamSet, ParamValue):
+        vehicle = PX4Vehicle()
+        async with converse(endpoint := Tap(Air.symmetric([vehicle], delay=0.02))) as conversation:
+            session = (await conversation.node()).plain
+            await read(session, "MC_ROLL_P")
+            left = [2]
+
+            def lose(message: Message, kind: type = what, left: list[int] = left) -> bool:
+                if isinstance(message, kind) and left[0]:
+                    left[0] -= 1
+                    return False
+                return True
+
+            endpoint.up, endpoint.down = lose, lose
+            result = await write(session, "MC_ROLL_P", 3.5)
+            assert (result.status, vehicle.param("MC_ROLL_P").value) == ("accepted", 3.5)
+            assert result.attempts >= (3 if what is ParamSet else 2)
+
+
+@virtual
+async def test_an_old_value_in_passing_proves_nothing_and_another_ones_is_no_adjustment() -> None:
+    for passing, status in ((4.0, "accepted"), (9.0, "accepted")):
+        vehicle = PX4Vehicle()
+        async with converse(endpoint := Tap(Air.symmetric([vehicle], delay=0.1))) as conversation:
+            session = (await conversation.node()).plain
+            await read(session, "MC_ROLL_P")
+            sets = [0]
+
+            def first_is_lost(message: Message, sets: list[int] = sets) -> bool:
+                sets[0] += isinstance(message, ParamSet)
+                return not isinstance(message, ParamSet) or sets[0] > 1
+
+            endpoint.up = first_is_lost
+            async with anyio.create_task_group() as tasks:
+                results: list[object] = []
+
+                async def set_it(session: Session = session, results: list[object] = results) -> None:
+                    results.append((await write(session, "MC_ROLL_P", 3.5)).status)
+
+                tasks.start_soon(set_it)
+                await anyio.sleep(0.05)
+                vehicle.load({"MC_ROLL_P": passing})  # as another station's set
+                conversation.hear(ParamValue("MC_ROLL_P", struct.pack("<f", passing), 9, 903, 65535))
+            assert results == [status]
+            assert vehicle.param("MC_ROLL_P").value == 3.5
+
+
+@virtual
+async def test_a_late_answer_with_an_old_value_undoes_no_acknowledged_write() -> None:
+    """ArduPilot takes the value of a read when it queues it, and answers up to 100 ms later."""
+    vehicle = ArduPilotVehicle(live_period=0.0)
+    async with converse(Air.symmetric([vehicle], delay=0.005)) as conversation:
+        session = (await conversation.node()).plain
+        await fetch_all(session)
+        for step in range(8):
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(read, session, "ATC_ANG_RLL_P")
+                await anyio.sleep(0.013 * step)
+                await write(session, "ATC_ANG_RLL_P", 3.0 + step)
+            await anyio.sleep(1.0)
+            assert session.table.params["ATC_ANG_RLL_P"].value == 3.0 + step
+        changes = [each for each in conversation.changes if each.kind == "changed"]
+        assert [each.by for each in changes] == ["us"] * 8
+        # a write back is no late answer, and a change back by another station is found by a read
+        await write(session, "ATC_ANG_RLL_P", 3.5)
+        assert (await write(session, "ATC_ANG_RLL_P", 10.0)).status == "accepted"
+        await write(session, "ATC_ANG_RLL_P", 3.5)
+        vehicle.set_param("ATC_ANG_RLL_P", 10.0)
+        await anyio.sleep(1.0)
+        assert session.table.params["ATC_ANG_RLL_P"].value == 10.0
+
+
+@virtual
+async def test_nothing_is_sent_before_the_encoding_is_certain() -> None:
+    params = {"A": (struct.pack("<f", 5.0), 6)}
+    vehicle = table_puppet(params)
+    endpoint = Tap(vehicle, up=lambda message: not isinstance(message, CommandLong))
+    async with converse(endpoint) as conversation:
+        session = (await conversation.node()).plain
+        with anyio.move_on_after(1.0):
+            await write(session, "A", 6)
+        assert not any(isinstance(each, ParamSet | ParamRequestRead) for each in vehicle.received)
+
+
+@virtual
+async def test_silence_is_no_reply_within_7_s_and_a_cancelled_write_sends_no_more() -> None:
+    for maker in (PX4Vehicle, ArduPilotVehicle):
+        endpoint = Silence(maker(), at=1e9)
+        async with converse(endpoint) as conversation:
+            session = (await conversation.node()).plain
+            name = "MC_ROLL_P" if maker is PX4Vehicle else "ATC_ANG_RLL_P"
+            await read(session, name)
+            endpoint.at = began = anyio.current_time()
+            with anyio.move_on_after(1.0):
+                await write(session, name, 1.5)
+            sent = len(conversation.sent_of(ParamSet))
+            await anyio.sleep(0.5)
+            assert len(conversation.sent_of(ParamSet)) == sent > 0
+            with pytest.raises(NoReply, match=f"acknowledgement of {name} by 1/1"):
+                await write(session, name, 2.5)
+            assert anyio.current_time() - began < 8.5
+            assert not session.channel.is_waiting
+            assert not session.writing
+
+
+@virtual
+async def test_writes_to_one_name_follow_each_other() -> None:
+    vehicle = PX4Vehicle()
+    async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
+        session = (await conversation.node()).plain
+        async with anyio.create_task_group() as tasks:
+            for value in (1.0, 2.0, 3.0):
+                tasks.start_soon(write, session, "MC_ROLL_P", value)
+                await anyio.sleep(0.001)
+        assert vehicle.param("MC_ROLL_P").value == 3.0
+        assert [each.new.value for each in conversation.changes if each.new][-3:] == [1.0, 2.0, 3.0]
+
+
+# authors
+
+
+@virtual
+async def test_a_change_has_the_author_whose_set_was_seen() -> None:
+    sets = [(2.0, SimParam("MC_ROLL_P", ParamType.REAL32, 3.0))]
+    vehicle = PX4Vehicle()
+    air = Air([vehicle], others=[OtherStation(system=254, sets=sets)])
+    async with converse(air) as conversation:
+        session = (await conversation.node()).plain
+        await read(session, "MC_ROLL_P")
+        await anyio.sleep(3.0)
+        await write(session, "MC_ROLL_P", 5.0)
+        await write(session, "MC_ROLL_P", 6.0, author="us for pilot")
+        await anyio.sleep(5.0)
+        vehicle.set_param("MC_ROLL_P", 7.0)
+        await anyio.sleep(1.0)
+        changes = [(each.new.value, each.by) for each in conversation.changes if each.old and each.new]
+        assert changes == [
+            (3.0, "station 254/190"),
+            (5.0, "us"),
+            (6.0, "us for pilot"),
+            (7.0, "vehicle"),
+        ]
+
+
+# several
+
+
+@virtual_on_both
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+@pytest.mark.parametrize("maker", [PX4Vehicle, ArduPilotVehicle])
+async def test_many_values_are_set_each_with_its_outcome(maker: type[PX4Vehicle], loss: float) -> None:
+    vehicle = maker()
+    async with converse(Air.symmetric([vehicle], loss=loss, delay=0.02, seed=4)) as conversation:
+        session = (await conversation.node()).plain
+        floats = [
+            each
+            for each in vehicle.listed
+            if each.type is ParamType.REAL32 and not each.name.startswith(("MPC", "BARO", "MIS_", "STAT"))
+        ][:150]
+        pairs: list[tuple[str, WireValue]] = [(each.name, 0.5 + n) for n, each in enumerate(floats)]
+        pairs.insert(70, ("NO_SUCH", 1))
+        began = anyio.current_time()
+        outcomes = await many(session, pairs)
+        assert anyio.current_time() - began < (40.0 if loss else 15.0)  # the unknown name is asked for twice
+        assert [each.name for each in outcomes] == [name for name, _ in pairs]
+        refused = outcomes.pop(70)
+        assert (refused.status, type(refused.error)) == (SetStatus.REFUSED, UnknownParameter)
+        for outcome in outcomes:
+            assert outcome.status is SetStatus.ACCEPTED
+            assert vehicle.param(outcome.name).value == outcome.requested
+            assert session.table.params[outcome.name].value == outcome.requested
+
+
+@virtual
+async def test_a_switch_and_the_parameters_behind_it_are_set_in_one_call() -> None:
+    vehicle = ArduPilotVehicle()
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        await fetch_all(session)
+        count = session.table.count
+        hidden = "EK2_GPS_TYPE"
+        outcomes = await many(session, [("RTL_ALT", 1600), ("EK2_ENABLE", 1), (hidden, 1), ("RTL_SPEED", 5)])
+        assert all(each.status is SetStatus.ACCEPTED for each in outcomes)
+        assert vehicle.param(hidden).value == 1
+        await fetch_all(session)
+        assert session.table.count == (count or 0) + 52
+        assert session.table.params[hidden].trust is Trust.LIVE
+        await many(session, [("EK2_ENABLE", 0)])
+        await fetch_all(session)
+        assert (session.table.count, hidden in session.table.params) == (count, False)
+        kinds = [each.kind for each in conversation.changes if each.name == hidden]
+        assert kinds[-1] == "removed"
+
+
+@virtual_on_both
+async def test_a_lost_vehicle_ends_a_batch_within_7_s_with_what_was_acknowledged() -> None:
+    vehicle = PX4Vehicle()
+    endpoint = Silence(Air.symmetric([vehicle], delay=0.05), at=1e9)
+    async with converse(endpoint) as conversation:
+        session = (await conversation.node()).plain
+        names = [each.name for each in vehicle.listed if each.type is ParamType.REAL32][:200]
+        endpoint.at = anyio.current_time() + 1.0
+        outcomes = await many(session, [(name, 0.25) for name in names])
+        assert anyio.current_time() - endpoint.at < 7.0
+        counts = [sum(each.status is status for each in outcomes) for status in SetStatus]
+        by_status = dict(zip(SetStatus, counts, strict=True))
+        assert by_status[SetStatus.ACCEPTED] > 20
+        assert by_status[SetStatus.NOT_TRIED] > 20
+        assert 1 <= by_status[SetStatus.UNKNOWN] <= 20
+        for outcome in outcomes:
+            if outcome.status is SetStatus.ACCEPTED:
+                assert session.table.params[outcome.name].value == 0.25
+            else:
+                assert isinstance(outcome.error, NoReply)
+
+
+@virtual
+async def test_a_link_that_fails_ends_a_batch_and_the_others_are_not_tried() -> None:
+    vehicle = PX4Vehicle()
+    async with converse(Air.symmetric([vehicle], delay=0.3)) as conversation:
+        session = (await conversation.node()).plain
+        names = [each.name for each in vehicle.listed if each.type is ParamType.REAL32][:60]
+        outcomes: list[SetOutcome] = []
+        pairs: list[tuple[str, WireValue]] = [(name, 0.25) for name in names]
+        errors: list[object] = []
+
+        async def set_all() -> None:
+            errors.append(await write_many(session, pairs, outcomes, lambda outcome: None))
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(set_all)
+            await anyio.sleep(2.0)
+            conversation.station.fail(LinkError("gone", link="x"), for_good=True)
+        assert isinstance(errors[0], LinkError)
+        assert {each.status for each in outcomes} >= {SetStatus.UNKNOWN, SetStatus.NOT_TRIED}

@@ -1,0 +1,310 @@
+"""Virtual time: runs a test on trio or asyncio with a clock that jumps to the next deadline."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import selectors
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from contextlib import asynccontextmanager
+from functools import wraps
+from typing import Any, TypeVar
+
+import anyio
+import pytest
+from trio.testing import MockClock
+
+from paramclient.links.sim import SimLink
+from paramclient.protocol.events import Change, ComponentEvent
+from paramclient.protocol.node import Node
+from paramclient.protocol.session import Session
+from paramclient.protocol.station import Station
+from paramclient.sim import Endpoint
+from paramclient.wire.frames import Framer
+from paramclient.wire.messages import DECODED_IDS, Heartbeat, Message, decode, encode
+
+T = TypeVar("T")
+
+TIME_LIMIT = 300.0
+"""Virtual seconds after which a test hangs."""
+
+
+class _JumpingSelector(selectors.SelectSelector):
+    """Waits for nothing: the time of the wait passes at once."""
+
+    passed = 0.0
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        ready = super().select(0)
+        if not ready and timeout is None:
+            raise RuntimeError("nothing will ever happen")
+        if not ready and timeout:
+            self.passed += timeout
+        return ready
+
+
+class _VirtualLoop(asyncio.SelectorEventLoop):
+    def __init__(self) -> None:
+        self._jumps = _JumpingSelector()
+        super().__init__(self._jumps)
+
+    def time(self) -> float:
+        return self._jumps.passed
+
+
+def run(test: Callable[..., Awaitable[T]], *arguments: Any, backend: str = "trio") -> T:
+    """Run an async function in virtual time."""
+
+    async def limited() -> T:
+        with anyio.fail_after(TIME_LIMIT):
+            return await test(*arguments)
+
+    if backend == "trio":
+        options: dict[str, Any] = {"clock": MockClock(autojump_threshold=0)}
+    else:
+        options = {"loop_factory": _VirtualLoop}
+    return anyio.run(limited, backend=backend, backend_options=options)
+
+
+def virtual(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:
+    """Make an async test one that runs in virtual time on trio."""
+
+    @wraps(test)
+    def wrapper(*arguments: Any, **options: Any) -> None:
+        run(lambda: test(*arguments, **options))
+
+    return wrapper
+
+
+def virtual_on_both(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:
+    """Make an async test one that runs in virtual time on trio, and on asyncio."""
+
+    @wraps(test)
+    def wrapper(*arguments: Any, backend: str, **options: Any) -> None:
+        run(lambda: test(*arguments, **options), backend=backend)
+
+    signature = inspect.signature(test)
+    backend = inspect.Parameter("backend", inspect.Parameter.KEYWORD_ONLY, annotation=str)
+    with_backend = signature.replace(parameters=[*signature.parameters.values(), backend])
+    wrapper.__signature__ = with_backend  # type: ignore[attr-defined]  # of every function, for pytest
+    return pytest.mark.parametrize("backend", ["trio", "asyncio"])(wrapper)  # type: ignore[no-any-return]
+
+
+class Conversation:
+    """A station that talks to a simulated endpoint, and what happened.
+
+    Attributes:
+        station: the station.
+        events: of all components.
+        changes: of all parameters.
+        sent: the frames that the station has sent.
+    """
+
+    def __init__(self, station: Station) -> None:
+        self.station = station
+        self.events: list[ComponentEvent] = []
+        self.changes: list[Change] = []
+        self.sent: list[bytes] = []
+        self._sequence = 0
+
+    def sent_of(self, kind: type[T]) -> list[T]:
+        """Return the sent messages of a kind."""
+        return [each for data in self.sent for each in messages_in(data) if isinstance(each, kind)]
+
+    def hear(self, message: Message, *, system: int = 1, component: int = 1, peer: object = "sim") -> None:
+        """Receive a message now, beside those of the endpoint."""
+        self._sequence = (self._sequence + 1) & 0xFF
+        data = encode(message, system=system, component=component, sequence=self._sequence)
+        self.station.receive(data, peer, anyio.current_time())
+
+    async def node(self, system: int = 1, component: int = 1) -> Node:
+        """Wait for a component."""
+        while (system, component) not in self.station.nodes:  # noqa: ASYNC110 - in virtual time
+            await anyio.sleep(0.01)
+        return self.station.nodes[system, component]
+
+    def of(self, kind: type[T]) -> list[T]:
+        """Return the events of a kind."""
+        return [event for event in self.events if isinstance(event, kind)]
+
+
+@asynccontextmanager
+async def converse(endpoint: Endpoint, **options: Any) -> AsyncIterator[Conversation]:
+    """Open a station on a simulated endpoint."""
+    link = SimLink(endpoint)
+    await link.open()
+    queue: list[bytes] = []
+    wake = [anyio.Event()]
+
+    def send(data: bytes, peer: object) -> None:
+        queue.append(data)
+        conversation.sent.append(data)
+        wake[0].set()
+
+    def emit(node: Node, event: ComponentEvent) -> None:
+        conversation.events.append(event)
+
+    def changed(node: Node, session: Session, change: Change) -> None:
+        conversation.changes.append(change)
+
+    async def read() -> None:
+        while True:
+            for peer, data in await link.receive():
+                conversation.station.receive(data, peer, anyio.current_time())
+
+    async def write() -> None:
+        while True:
+            while queue:
+                await link.send(queue.pop(0), None)
+            wake[0] = anyio.Event()
+            await wake[0].wait()
+
+    async with anyio.create_task_group() as tasks:
+        conversation = Conversation(
+            Station(
+                link="sim:test",
+                is_stream=False,
+                send=send,
+                spawn=tasks.start_soon,
+                emit=emit,
+                changed=changed,
+                **options,
+            )
+        )
+        for task in (read, write, conversation.station.send_heartbeats):
+            tasks.start_soon(task)
+        try:
+            yield conversation
+        finally:
+            tasks.cancel_scope.cancel()
+
+
+def messages_in(data: bytes) -> list[Message]:
+    """Return the messages in a datagram."""
+    frames = Framer(DECODED_IDS, stream=False).receive(data)
+    return [message for frame in frames if (message := decode(frame)) is not None]
+
+
+class Tap:
+    """An endpoint behind a filter: messages to it and from it are passed on where a function says so.
+
+    Args:
+        endpoint: the vehicle.
+        up, down: return whether a message to the vehicle, or from it, arrives.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        *,
+        up: Callable[[Message], bool] = lambda message: True,
+        down: Callable[[Message], bool] = lambda message: True,
+    ) -> None:
+        self.up = up
+        self.down = down
+        self._endpoint = endpoint
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Pass a datagram on to the vehicle."""
+        if all(map(self.up, messages_in(data))):
+            self._endpoint.receive(data, now)
+
+    def tick(self, now: float) -> None:
+        """Pass the time on."""
+        self._endpoint.tick(now)
+
+    def next_deadline(self) -> float | None:
+        """Return the vehicle's deadline."""
+        return self._endpoint.next_deadline()
+
+    def data_to_send(self) -> list[bytes]:
+        """Return what arrives of the vehicle's frames."""
+        return [data for data in self._endpoint.data_to_send() if all(map(self.down, messages_in(data)))]
+
+
+QUIET = Heartbeat(2, 0, system_status=4)
+"""The heartbeat of a generic quadrotor."""
+
+
+class Puppet:
+    """A component that answers each message by a function of the test, and sends a heartbeat each second.
+
+    Args:
+        answer: returns the answers to a message.
+        heartbeat: once a second; None for a component without heartbeats.
+        system, component: its address.
+    """
+
+    def __init__(
+        self,
+        answer: Callable[[Message], Iterable[Message]],
+        *,
+        heartbeat: Heartbeat | None = QUIET,
+        system: int = 1,
+        component: int = 1,
+    ) -> None:
+        self.received: list[Message] = []
+        self._answer = answer
+        self._heartbeat = heartbeat
+        self._address = {"system": system, "component": component}
+        self._sequence = 0
+        self._beat_at = 0.0
+        self._out: list[bytes] = []
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Answer the messages in a datagram."""
+        for message in messages_in(data):
+            self.received.append(message)
+            for each in self._answer(message):
+                self.say(each)
+
+    def say(self, message: Message) -> None:
+        """Send a message."""
+        self._sequence = (self._sequence + 1) & 0xFF
+        self._out.append(encode(message, sequence=self._sequence, **self._address))
+
+    def tick(self, now: float) -> None:
+        """Send the heartbeat if it is due."""
+        if self._heartbeat is not None and now >= self._beat_at:
+            self._beat_at = now + 1.0
+            self.say(self._heartbeat)
+
+    def next_deadline(self) -> float | None:
+        """Return the time of the next heartbeat."""
+        return None if self._heartbeat is None else self._beat_at
+
+    def data_to_send(self) -> list[bytes]:
+        """Return the frames to send, and clear them."""
+        out, self._out = self._out, []
+        return out
+
+
+class Silence:
+    """An endpoint that goes silent at a time, as a vehicle that crashes.
+
+    Args:
+        endpoint: the vehicle.
+        at: seconds on the event loop's clock.
+    """
+
+    def __init__(self, endpoint: Endpoint, at: float) -> None:
+        self.at = at
+        self._endpoint = endpoint
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take a frame, unless silent."""
+        if now < self.at:
+            self._endpoint.receive(data, now)
+
+    def tick(self, now: float) -> None:
+        """Let the vehicle run."""
+        self._endpoint.tick(now)
+
+    def next_deadline(self) -> float | None:
+        """Return when the vehicle has something to do."""
+        return self._endpoint.next_deadline()
+
+    def data_to_send(self) -> list[bytes]:
+        """Return the frames of the vehicle; none while silent."""
+        data = self._endpoint.data_to_send()
+        return data if anyio.current_time() < self.at else []

@@ -1,1 +1,0 @@
-"""Tests of `paramclient/protocol/params`."""
