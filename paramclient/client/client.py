@@ -20,11 +20,13 @@ from paramclient.client.core import ClientCore
 from paramclient.client.events import Events
 from paramclient.client.files import Ftp
 from paramclient.client.fleet_fetch import FetchedAll, fetch_components
+from paramclient.client.forwarding import Forwarder
+from paramclient.client.frame_cutter import FrameCutter
+from paramclient.client.recording import Capture
 from paramclient.client.signing import Signing, refused_in_words
 from paramclient.client.signing_timestamps import TimestampKeeper
 from paramclient.client.streams import Subscribers
-from paramclient.client.taps import LinkTaps
-from paramclient.client.traffic import TrafficReport
+from paramclient.client.traffic import Traffic, TrafficReport
 from paramclient.errors import AnotherVehicle, NoReply, ParamClientError, UsageError
 from paramclient.links import Link, ReplayLink, SimLink, create_link
 from paramclient.model.values import Encoding
@@ -138,10 +140,15 @@ class ParamClient:
         self._task: ClientTask | None = None
         self._is_entered = False
         signing = Signing(signing) if isinstance(signing, SigningKey) else signing
+        cutter = FrameCutter(stream=opened.is_stream)
+        forwarder = None if forward is None else Forwarder(create_link(forward))
+        capture = None if tlog is None else Capture(tlog)
+        self._traffic = Traffic(cutter) if traffic else None
         self.core = ClientCore(
             opened,
             CacheWriter(self.cache, owned=self.cache is not cache),
-            LinkTaps(tlog, forward, is_stream=opened.is_stream, counts_traffic=traffic),
+            [tap for tap in (forwarder, capture, self._traffic) if tap is not None],
+            cutter,
             None if signing is None else TimestampKeeper(signing),
             partial(
                 Station,
@@ -453,11 +460,10 @@ class ParamClient:
             UsageError: the client was made without `traffic=True`.
             LinkError: the link failed, or the client was closed.
         """
-        traffic = self.core.taps.traffic
-        if traffic is None:
+        if self._traffic is None:
             raise UsageError("this client does not count traffic; use ParamClient(..., traffic=True)")
         self.core.check_open()
-        return traffic.report(anyio.current_time())
+        return self._traffic.report(anyio.current_time())
 
     def signing_report(self) -> SigningReport | None:
         """Return the signing statistics of the link: signed frames, and refused frames with the reasons.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -11,9 +11,10 @@ import anyio
 import anyio.abc
 
 from paramclient.client.cache_writer import CacheWriter
+from paramclient.client.frame_cutter import FrameCutter
 from paramclient.client.link_task import LinkTask
 from paramclient.client.signing_timestamps import TimestampKeeper
-from paramclient.client.taps import LinkTaps
+from paramclient.client.taps import Tap
 from paramclient.errors import ClientClosed, ParamClientError, UsageError
 from paramclient.links import Link
 from paramclient.protocol.station import Station
@@ -29,13 +30,14 @@ class ClientCore:
     Args:
         link: the link, not open.
         cache_writer: writes tables to the cache.
-        taps: the telemetry log and the forwarder.
+        taps: receivers of all frames of the link.
+        cutter: cuts received data for the taps.
         keeper: stores the signature timestamps; None without a key.
         new_station: makes the station, of functions that queue bytes and start background work.
         ended: called when the streams end: with a log, with a link that has failed for good, or at closing.
 
     Attributes:
-        link_task, station, cache_writer, taps: the parts.
+        link_task, station, cache_writer: the parts.
         cache: the cache of the tables, or None.
         is_over: whether a log has ended.
     """
@@ -44,7 +46,8 @@ class ClientCore:
         self,
         link: Link,
         cache_writer: CacheWriter,
-        taps: LinkTaps,
+        taps: Sequence[Tap],
+        cutter: FrameCutter,
         keeper: TimestampKeeper | None,
         new_station: Callable[..., Station],
         ended: Callable[[], None],
@@ -53,16 +56,14 @@ class ClientCore:
         self.cache_writer = cache_writer
         self.cache = cache_writer.cache
         self.is_over = False
-        self.link_task = LinkTask(link, taps=taps.taps, ended=self._link_ended)
+        self.link_task = LinkTask(link, taps=taps, cutter=cutter, ended=self._link_ended)
         self.station = self.link_task.station = new_station(send=self.link_task.queue, spawn=self.spawn)
-        self.taps = taps
+        self._taps = taps
         self._keeper = keeper
         self._ended = ended
         self._io: anyio.abc.TaskGroup | None = None
         self._work: anyio.abc.TaskGroup | None = None
         self._was_opened = False
-        if not self.station.listens_only:
-            taps.share(self.link_task.forward)
 
     @property
     def state(self) -> str:
@@ -108,7 +109,8 @@ class ClientCore:
         try:
             await self.link.open()
             await self.cache_writer.open()
-            await self.taps.open()
+            for tap in self._taps:
+                await tap.open()
             if self._keeper is not None:
                 self.station.begin_signing(*await self._keeper.open())
         except BaseException:
@@ -121,7 +123,8 @@ class ClientCore:
         self._io.start_soon(self.link_task.read, name="paramclient reader")
         self._io.start_soon(self.link_task.send, name="paramclient sender")
         self._io.start_soon(self.cache_writer.run, name="paramclient cache writer")
-        self.taps.start(self._io)
+        for tap in self._taps:
+            self._io.start_soon(tap.run, self.link_task.forward)
         if self._keeper is not None:
             self._io.start_soon(self._keeper.run, name="paramclient timestamp keeper")
         self.spawn(self.station.send_heartbeats)
@@ -152,8 +155,13 @@ class ClientCore:
 
     async def _release(self) -> None:
         with anyio.CancelScope(shield=True):
-            cache_close = partial(self.cache_writer.close, self.station.nodes.values())
-            for close in (cache_close, self.taps.close, self.link.close):
+            self.link_task.end_streams()
+            closing: list[Callable[[], Awaitable[None]]] = [
+                partial(self.cache_writer.close, self.station.nodes.values()),
+                *(tap.close for tap in self._taps),
+                self.link.close,
+            ]
+            for close in closing:
                 try:
                     await close()
                 except ParamClientError as error:

@@ -1,63 +1,61 @@
-"""All bytes of a link, including unusable ones: frames, damaged frames, and other bytes.
+"""The frames in all bytes of a link, damaged frames and other bytes.
 
-`Framer` returns proven frames and skips everything else as fast as it can. Here everything counts, and speed
-does not matter: this runs only where a user looks at the link itself.
+`Framer` returns proven frames of known messages and skips everything else as fast as it can. Here everything
+counts, and speed does not matter: this runs only for the receivers of all frames of a link.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator
 from typing import Final, NamedTuple
 
-from paramclient.wire.frames import bears_key, checksum
+from paramclient.wire.frames import Frame, checksum
+from paramclient.wire.signing import SIGNATURE_LENGTH
 
-__all__ = ["FrameCutter", "SeenFrame", "Sniffer"]
+__all__ = ["FrameCutter", "SeenFrame"]
 
 UNPROVEN_BYTES_MAX: Final = 4096
 """Bytes of a stream without a proven frame that are kept until the following ones arrive."""
 UNFINISHED_PEERS_MAX: Final = 256
-"""Peers of a stream with an unfinished frame in a `FrameCutter`."""
+"""Peers of a stream with undecided bytes."""
 
 _MAGIC_V1 = 0xFE
-_MAGIC_V2 = 0xFD
+_MAGICS = (b"\xfd", b"\xfe")
 _MAGIC = re.compile(b"[\xfd\xfe]").search
 _SIGNED = 0x01
-_SIGNATURE_LENGTH = 13
+_HEADER_LENGTH = 10  # of MAVLink 2
 
 
 class SeenFrame(NamedTuple):
-    """One frame.
+    """One frame, as its header describes it.
 
     Attributes:
-        message_id, system, component, sequence, payload, version: as in `Frame`.
-        size: of the whole frame, in bytes.
+        frame: its content.
+        data: the bytes of the whole frame.
         is_signed: whether it has a signature, which is not verified.
         is_known: false for an id outside the dialect, so that no checksum proves the frame.
-        data: the bytes of the whole frame.
+        is_proven: whether it is whole and its checksum is right.
+        size: of the whole frame, in bytes.
     """
 
-    message_id: int
-    system: int
-    component: int
-    sequence: int
-    payload: bytes
-    version: int
-    size: int
+    frame: Frame
+    data: bytes
     is_signed: bool
     is_known: bool
-    data: bytes
+    is_proven: bool
+    size: int
 
 
-class Sniffer:
-    """Finds every frame in received bytes, and accounts for each other byte.
+class FrameCutter:
+    """Cuts received bytes into whole frames, and accounts for each other byte.
 
     Bytes between two proven frames are classified from their beginning: a whole frame with a known id has a
     wrong checksum; one with an unknown id counts as a frame when another one, or the end, follows directly;
     anything else is other bytes.
 
     Args:
-        stream: whether a frame may be spread over several calls; see `Framer`.
+        stream: whether a frame may be spread over several chunks of a peer.
 
     Attributes:
         damaged: frames with a wrong checksum.
@@ -68,123 +66,74 @@ class Sniffer:
         self.damaged = 0
         self.other_bytes = 0
         self._stream = stream
-        self._tail = b""
+        self._undecided: dict[Hashable, bytes] = {}
 
-    def receive(self, data: bytes) -> list[SeenFrame]:
-        """Process received bytes and return the frames that are decided by now, in order."""
-        seen, rest = self._scan(self._tail + data, final=not self._stream)
-        self._tail = rest
-        return seen
-
-    def flush(self) -> list[SeenFrame]:
-        """Return the frames in the unfinished end: the stream has ended or was interrupted."""
-        seen, self._tail = self._scan(self._tail, final=True)
-        return seen
-
-    def _scan(self, data: bytes, *, final: bool) -> tuple[list[SeenFrame], bytes]:
-        """Return the frames in `data`, and the undecided bytes at its end."""
+    def cut(self, data: bytes, peer: Hashable) -> list[SeenFrame]:
+        """Return the frames that a chunk completes, in order. An empty chunk ends the peer's stream."""
+        is_final = not (self._stream and data)
+        data = self._undecided.pop(peer, b"") + data
         seen: list[SeenFrame] = []
-        explained = at = 0
+        decided = at = 0
         while (found := _MAGIC(data, at)) is not None:
             at = found.start()
-            frame = _frame_at(data, at)
-            if frame is None or at + frame.size > len(data):
-                if not final and (frame is None or frame.is_known):
-                    break
-            elif frame.is_known and _is_proven(data, at, frame):
-                seen += self._explain(data[explained:at])
-                seen.append(frame)
-                explained = at = at + frame.size
+            each = _frame_at(data, at)
+            if each.is_proven:
+                seen += [*self._classified(data[decided:at]), each]
+                decided = at = at + each.size
                 continue
+            has_header = len(data) - at >= _HEADER_LENGTH
+            if not is_final and at + each.size > len(data) and (each.is_known or not has_header):
+                break
             at += 1
         else:
             at = len(data)
-        if final or at - explained > UNPROVEN_BYTES_MAX:
-            seen += self._explain(data[explained:at])
-            explained = at
-        return seen, data[explained:]
-
-    def _explain(self, gap: bytes) -> list[SeenFrame]:
-        """Classify the bytes between two proven frames; return the frames that nothing proves."""
-        seen: list[SeenFrame] = []
-        at = 0
-        while at < len(gap):
-            frame = _frame_at(gap, at)
-            end = len(gap) + 1 if frame is None else at + frame.size
-            if frame is not None and frame.is_known and end <= len(gap):
-                self.damaged += 1
-            elif frame is not None and (end == len(gap) or gap[end : end + 1] in _MAGICS):
-                seen.append(frame)
-            else:
-                found = _MAGIC(gap, at + 1)
-                end = len(gap) if found is None else found.start()
-                self.other_bytes += end - at
-            at = end
+        if is_final or at - decided > UNPROVEN_BYTES_MAX:
+            seen += self._classified(data[decided:at])
+            decided = at
+        if decided < len(data):
+            self._undecided[peer] = data[decided:]
+            if len(self._undecided) > UNFINISHED_PEERS_MAX:
+                del self._undecided[next(iter(self._undecided))]
         return seen
 
+    @property
+    def unfinished(self) -> list[Hashable]:
+        """The peers with undecided bytes."""
+        return list(self._undecided)
 
-class FrameCutter:
-    """Cuts received bytes into whole frames, for programs that forward them unchanged.
-
-    Left out are damaged frames, bytes outside of frames, and frames with a signing key.
-
-    Args:
-        stream: whether a frame may be spread over several calls.
-    """
-
-    def __init__(self, *, stream: bool) -> None:
-        self._stream = stream
-        self._sniffers: dict[Hashable, Sniffer] = {}
-
-    def cut(self, data: bytes, peer: Hashable) -> list[bytes]:
-        """Return the frames that a chunk completes, in order. An empty chunk means the end of the peer's
-        stream."""
-        if not data:
-            sniffer = self._sniffers.pop(peer, None)
-            return [] if sniffer is None else self._clean(sniffer.flush())
-        key = peer if self._stream else None
-        sniffer = self._sniffers.get(key)
-        if sniffer is None:
-            sniffer = self._sniffers[key] = Sniffer(stream=self._stream)
-            if len(self._sniffers) > UNFINISHED_PEERS_MAX:
-                del self._sniffers[next(iter(self._sniffers))]
-        return self._clean(sniffer.receive(data))
-
-    def flush(self) -> list[bytes]:
-        """Return the frames in the unfinished ends: the link is down, or closed."""
-        return [data for peer in list(self._sniffers) for data in self.cut(b"", peer)]
-
-    def _clean(self, frames: list[SeenFrame]) -> list[bytes]:
-        return [seen.data for seen in frames if not bears_key(seen.data)]
+    def _classified(self, gap: bytes) -> Iterator[SeenFrame]:
+        """Count the bytes between two proven frames; return the frames that nothing proves."""
+        at = 0
+        while (found := _MAGIC(gap, at)) is not None:
+            start = found.start()
+            self.other_bytes += start - at
+            each = _frame_at(gap, start)
+            at = start + each.size
+            if each.is_known and at <= len(gap):
+                self.damaged += 1
+            elif at == len(gap) or gap[at : at + 1] in _MAGICS:
+                yield each
+            else:
+                self.other_bytes += 1
+                at = start + 1
+        self.other_bytes += len(gap) - at
 
 
-_MAGICS = (bytes((_MAGIC_V1,)), bytes((_MAGIC_V2,)))
-
-
-def _frame_at(data: bytes, at: int) -> SeenFrame | None:
-    """Return the frame by the header there, proven or not; None without one, or if it is cut off."""
-    magic = data[at]
-    if magic == _MAGIC_V1 and at + 6 <= len(data):
-        size, sequence, system, component, message_id = data[at + 1 : at + 6]
-        payload = data[at + 6 : at + 6 + size]
-        known = checksum(message_id, b"") is not None
-        whole = size + 8
-        frame = data[at : at + whole]
-        return SeenFrame(message_id, system, component, sequence, payload, 1, whole, False, known, frame)
-    if magic == _MAGIC_V2 and at + 10 <= len(data):
-        size, flags, _, sequence, system, component = data[at + 1 : at + 7]
-        message_id = int.from_bytes(data[at + 7 : at + 10], "little")
-        payload = data[at + 10 : at + 10 + size]
-        whole = size + 12 + (_SIGNATURE_LENGTH if flags else 0)
-        known = flags in (0, _SIGNED) and checksum(message_id, b"") is not None
-        is_signed = flags == _SIGNED
-        frame = data[at : at + whole]
-        return SeenFrame(message_id, system, component, sequence, payload, 2, whole, is_signed, known, frame)
-    return None
-
-
-def _is_proven(data: bytes, at: int, frame: SeenFrame) -> bool:
-    crc_at = at + frame.size - 2 - (_SIGNATURE_LENGTH if frame.is_signed else 0)
-    return checksum(frame.message_id, data[at + 1 : crc_at]) == int.from_bytes(
-        data[crc_at : crc_at + 2], "little"
-    )
+def _frame_at(data: bytes, at: int) -> SeenFrame:
+    """Return the frame whose header begins there; one that is cut off is not proven."""
+    head = data[at : at + _HEADER_LENGTH].ljust(_HEADER_LENGTH, b"\0")
+    flags = 0
+    if head[0] == _MAGIC_V1:
+        size, sequence, system, component, number = head[1:6]
+        payload_at, version = at + 6, 1
+    else:
+        size, flags, _, sequence, system, component = head[1:7]
+        number = int.from_bytes(head[7:10], "little")
+        payload_at, version = at + _HEADER_LENGTH, 2
+    crc_at = payload_at + size
+    end = crc_at + 2 + (SIGNATURE_LENGTH if flags else 0)
+    crc = checksum(number, data[at + 1 : crc_at])
+    is_known = crc is not None and flags in (0, _SIGNED)
+    is_proven = is_known and end <= len(data) and crc == int.from_bytes(data[crc_at : crc_at + 2], "little")
+    frame = Frame(number, system, component, sequence, data[payload_at:crc_at], version)
+    return SeenFrame(frame, data[at:end], flags == _SIGNED, is_known, is_proven, end - at)

@@ -6,16 +6,18 @@ import logging
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Final, Protocol
+from typing import Final
 
 import anyio
 import anyio.lowlevel
 
+from paramclient.client.frame_cutter import FrameCutter
+from paramclient.client.taps import Tap
 from paramclient.errors import LinkError
 from paramclient.links import Link
 from paramclient.protocol.station import Peer, Station
 
-__all__ = ["LinkTask", "Tap"]
+__all__ = ["LinkTask"]
 
 READ_PAUSE: Final = 0.02
 """Seconds for which the reader pauses while no conversation waits, so that telemetry accumulates: one read of
@@ -39,19 +41,6 @@ RECONNECT_BACKOFF_MAX: Final = 5.0
 logger = logging.getLogger(__name__)
 
 
-class Tap(Protocol):
-    """Receiver of all data on a link. Its calls must neither block nor raise."""
-
-    def received(self, data: bytes, peer: Peer) -> None:
-        """Take received data; empty data marks the end of the peer's stream."""
-
-    def sent(self, data: bytes) -> None:
-        """Take a frame that is passed to the link."""
-
-    def pause(self) -> None:
-        """Drop an incomplete frame: the link is disconnected."""
-
-
 class LinkTask:
     """Passes received data from a link to the station, and its frames to the link.
 
@@ -60,7 +49,8 @@ class LinkTask:
 
     Args:
         link: an open link.
-        taps: receivers of all data on the link.
+        taps: receivers of all frames on the link.
+        cutter: cuts the received data for them.
         ended: called when a log has ended, or the link has failed for good.
 
     Attributes:
@@ -72,12 +62,15 @@ class LinkTask:
 
     station: Station
 
-    def __init__(self, link: Link, *, taps: Sequence[Tap] = (), ended: Callable[[], None]) -> None:
+    def __init__(
+        self, link: Link, *, taps: Sequence[Tap], cutter: FrameCutter, ended: Callable[[], None]
+    ) -> None:
         self.is_disconnected = False
         self.activity = anyio.Event()
         self.bytes_received = self.bytes_sent = 0
         self._link = link
         self._taps = taps
+        self._cutter = cutter
         self._ended = ended
         self._queue: deque[tuple[bytes, Peer | None]] = deque()
         self._forwarded: deque[bytes] = deque()
@@ -89,8 +82,9 @@ class LinkTask:
         self._something_to_send.set()
 
     def forward(self, frame: bytes) -> None:
-        """Queue a frame of another program for all peers, unless the queue is full or the link is down."""
-        if len(self._forwarded) < FORWARDED_QUEUE_MAX and not self.is_disconnected:
+        """Queue a frame of another program for all peers, if this client sends and the queue is not full."""
+        may_send = not (self.is_disconnected or self.station.listens_only)
+        if may_send and len(self._forwarded) < FORWARDED_QUEUE_MAX:
             self._forwarded.append(frame)
             self.station.overhear(frame, anyio.current_time())
             self._something_to_send.set()
@@ -121,8 +115,7 @@ class LinkTask:
             for place, (peer, data) in enumerate(chunks, start=1):
                 self.bytes_received += len(data)
                 self.station.receive(data, peer, anyio.current_time())
-                for tap in self._taps:
-                    tap.received(data, peer)
+                self._show(data, peer)
                 if not place % CHUNKS_PER_TURN:
                     await anyio.lowlevel.checkpoint()
             self.notify()
@@ -147,6 +140,18 @@ class LinkTask:
                     await anyio.lowlevel.checkpoint()
             await self._something_to_send.wait()
 
+    def end_streams(self) -> None:
+        """End the unfinished frames: the link is down, or closed."""
+        for peer in self._cutter.unfinished:
+            self._show(b"", peer)
+
+    def _show(self, data: bytes, peer: Peer) -> None:
+        """Pass received data to the taps."""
+        if self._taps:
+            frames = self._cutter.cut(data, peer)
+            for tap in self._taps:
+                tap.received(frames, len(data), peer)
+
     async def _rest(self, seconds: float) -> None:
         """Pause reading for this time, or until a frame is sent, which may cause a response."""
         with anyio.move_on_after(seconds):
@@ -159,8 +164,7 @@ class LinkTask:
         self.station.interrupt()
         self._queue.clear()
         self._forwarded.clear()
-        for tap in self._taps:
-            tap.pause()
+        self.end_streams()
         self.notify()
         deadline = anyio.current_time() + LINK_TIMEOUT
         delay = RECONNECT_BACKOFF_MIN

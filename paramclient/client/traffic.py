@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import struct
-from collections import deque
-from collections.abc import Hashable
+from collections import Counter, deque
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import anyio
 
-from paramclient.client.frame_cutter import SeenFrame, Sniffer
-from paramclient.wire.frames import Frame, message_name
+from paramclient.client.frame_cutter import FrameCutter, SeenFrame
+from paramclient.client.taps import Tap
+from paramclient.protocol.addresses import Address
+from paramclient.wire.frames import message_name
 from paramclient.wire.loss import SequenceCheck
-from paramclient.wire.messages import Heartbeat, decode, message_id
+from paramclient.wire.messages import Heartbeat, decode
 
 __all__ = ["ComponentTraffic", "MessageTraffic", "RadioStatus", "Traffic", "TrafficReport"]
 
@@ -21,15 +23,15 @@ RATE_WINDOW: Final = 5.0
 """Seconds over which rates and losses are measured: several heartbeats, and short enough to adjust an
 antenna."""
 RATE_SLICE: Final = 0.5
-"""Seconds of one slice of that time."""
+"""Seconds between two snapshots of the counts in that time."""
 RATE_TIME_MIN: Final = 1.0
 """Seconds, at least, over which a rate is computed."""
 COUNTED_COMPONENTS_MAX: Final = 1_000
 """Components that are counted separately; frames of further ones count for the link only."""
-COUNTED_MESSAGES_MAX: Final = 500
-"""Message ids of a component that are counted separately; the dialect has fewer."""
+COUNTS_MAX: Final = 500
+"""Counts of a component, most of them by message id; the dialect has fewer."""
 COUNTED_PEERS_MAX: Final = 256
-"""Peers with an unfinished frame, and peers of one component with sequence numbers."""
+"""Peers of one component with sequence numbers."""
 RADIO_STATUS_IDS: Final = frozenset({109, 166})
 """RADIO_STATUS, and RADIO from older firmware of SiK radios; both have the same layout."""
 
@@ -137,219 +139,162 @@ class TrafficReport:
     other_bytes: int
 
 
-class Traffic:
+class Traffic(Tap):
     """Counts all traffic of a link, as a tap; on request only: an ordinary client does without.
 
     Args:
-        is_stream: whether frames may be spread over several chunks.
+        cutter: cuts the received data.
     """
 
-    def __init__(self, *, is_stream: bool) -> None:
-        self._is_stream = is_stream
-        self._sniffers: dict[Hashable, Sniffer] = {}
-        self._sources: dict[tuple[int, int], _Source] = {}
+    def __init__(self, cutter: FrameCutter) -> None:
+        self._cutter = cutter
+        self._counts = _Counts()
+        self._sources: dict[Address, _Source] = {}
         self._began: float | None = None
-        self._received = _Recently()
-        self._sent = _Recently()
-        self._frames = 0
-        self._unknown = 0
-        self._damaged = 0  # this and the next: of removed sniffers
-        self._other_bytes = 0
 
-    def received(self, data: bytes, peer: Hashable) -> None:
-        """Count received bytes; an empty chunk means the end of the peer's stream."""
-        now = anyio.current_time()
-        self._begin(now)
-        self._received.add(now, len(data))
-        key = peer if self._is_stream else None
-        sniffer = self._sniffers.get(key)
-        if sniffer is None:
-            sniffer = self._sniffers[key] = Sniffer(stream=self._is_stream)
-            if len(self._sniffers) > COUNTED_PEERS_MAX:
-                self._forget(next(iter(self._sniffers)))
-        for seen in sniffer.receive(data) if data else self._forget(key):
-            self._count(seen, peer, now)
+    def received(self, frames: Sequence[SeenFrame], size: int, peer: Hashable) -> None:
+        """Count a received chunk and its frames."""
+        now = self._add({"received": size, "frames": len(frames)})
+        for each in frames:
+            address = (each.frame.system, each.frame.component)
+            if not each.is_known:
+                self._add({"unknown": 1})
+            elif len(self._sources) < COUNTED_COMPONENTS_MAX:
+                self._sources.setdefault(address, _Source())
+            if address in self._sources:  # an address that no checksum proves does not count
+                self._sources[address].receive(each, peer, now)
 
-    def sent(self, data: bytes) -> None:
+    def sent(self, frame: bytes) -> None:
         """Count a sent frame."""
-        now = anyio.current_time()
-        self._begin(now)
-        self._sent.add(now, len(data))
-
-    def pause(self) -> None:
-        """End all unfinished frames: the link is down, and they are not continued."""
-        for peer in list(self._sniffers):
-            self._forget(peer)
-
-    @property
-    def lost(self) -> int:
-        """Lost frames of all components."""
-        return sum(source.lost for source in self._sources.values())
-
-    @property
-    def repeated(self) -> int:
-        """Frames of all components received twice."""
-        return sum(source.repeated for source in self._sources.values())
+        self._add({"sent": len(frame)})
 
     def report(self, now: float) -> TrafficReport:
         """Return the present counts."""
         began = now if self._began is None else self._began
-        sniffers = self._sniffers.values()
+        window = _window(began, now)
+        totals, recent = self._counts.totals, self._counts.recent(now)
         return TrafficReport(
             seconds=now - began,
-            components=tuple(self._sources[address].report(began, now) for address in sorted(self._sources)),
-            bytes_received=self._received.total,
-            bytes_sent=self._sent.total,
-            received_rate=self._received.rate(began, now),
-            sent_rate=self._sent.rate(began, now),
-            frames=self._frames,
-            damaged=self._damaged + sum(each.damaged for each in sniffers),
-            unknown=self._unknown,
-            other_bytes=self._other_bytes + sum(each.other_bytes for each in sniffers),
+            components=tuple(
+                source.report(address, window, now) for address, source in sorted(self._sources.items())
+            ),
+            bytes_received=totals["received"],
+            bytes_sent=totals["sent"],
+            received_rate=recent["received"] / window,
+            sent_rate=recent["sent"] / window,
+            frames=totals["frames"],
+            damaged=self._cutter.damaged,
+            unknown=totals["unknown"],
+            other_bytes=self._cutter.other_bytes,
         )
 
-    def _begin(self, now: float) -> None:
+    def _add(self, amounts: Mapping[_What, int]) -> float:
+        """Add to the counts of the link, and return the present time."""
+        now = anyio.current_time()
         if self._began is None:
             self._began = now
-
-    def _forget(self, peer: Hashable) -> list[SeenFrame]:
-        """Remove a peer's stream; return the frames in its unfinished end."""
-        sniffer = self._sniffers.pop(peer)
-        seen = sniffer.flush()
-        self._damaged += sniffer.damaged
-        self._other_bytes += sniffer.other_bytes
-        return seen
-
-    def _count(self, seen: SeenFrame, peer: Hashable, now: float) -> None:
-        self._frames += 1
-        if not seen.is_known:
-            self._unknown += 1
-        address = (seen.system, seen.component)
-        source = self._sources.get(address)
-        if source is None:
-            if not seen.is_known or len(self._sources) >= COUNTED_COMPONENTS_MAX:
-                return  # an address that no checksum proves does not count
-            source = self._sources[address] = _Source(address)
-        source.receive(seen, peer, now)
+        self._counts.add(amounts, now)
+        return now
 
 
 class _Source:
     """One component's frames."""
 
-    def __init__(self, address: tuple[int, int]) -> None:
-        self._address = address
-        self._bytes = _Recently()
-        self._frames = _Recently()
-        self._lost = _Recently()
-        self._repeated = _Recently()
-        self._messages: dict[int, _Recently] = {}
+    def __init__(self) -> None:
+        self._counts = _Counts()
         self._checks: dict[Hashable, SequenceCheck] = {}
-        self._signed = 0
         self._version = 1
         self._received_at = 0.0
         self._heartbeat: Heartbeat | None = None
         self._heartbeat_at = 0.0
         self._radio: RadioStatus | None = None
-        self._late = 0  # of removed peers
 
     def receive(self, seen: SeenFrame, peer: Hashable, now: float) -> None:
+        """Count a frame."""
+        frame = seen.frame
         self._received_at = now
-        self._version = seen.version
-        self._signed += seen.is_signed
-        self._bytes.add(now, seen.size)
-        self._frames.add(now, 1)
-        messages = self._messages.get(seen.message_id)
-        if messages is None and len(self._messages) < COUNTED_MESSAGES_MAX:
-            messages = self._messages[seen.message_id] = _Recently()
-        if messages is not None:
-            messages.add(now, 1)
-        check = self._check(peer)
-        lost, repeated = check.lost, check.repeated
-        check.receive(seen.sequence, now)
-        if (check.lost, check.repeated) != (lost, repeated):
-            self._lost.add(now, check.lost - lost)
-            self._repeated.add(now, check.repeated - repeated)
-        if seen.message_id in RADIO_STATUS_IDS:
-            self._radio = _radio_status(seen.payload)
-        elif seen.message_id == message_id(Heartbeat) and seen.is_known:
-            message = decode(Frame(*seen[:6]))
-            assert isinstance(message, Heartbeat)
+        self._version = frame.version
+        check = self._checks.setdefault(peer, SequenceCheck())
+        if len(self._checks) > COUNTED_PEERS_MAX:
+            del self._checks[next(iter(self._checks))]
+        lost, repeated, late = check.lost, check.repeated, check.late
+        check.receive(frame.sequence, now)
+        self._counts.add(
+            {
+                "frames": 1,
+                "bytes": seen.size,
+                "signed": seen.is_signed,
+                "lost": check.lost - lost,
+                "repeated": check.repeated - repeated,
+                "late": check.late - late,
+                frame.message_id: 1,
+            },
+            now,
+        )
+        if frame.message_id in RADIO_STATUS_IDS:
+            self._radio = _radio_status(frame.payload)
+        elif seen.is_known and isinstance(message := decode(frame), Heartbeat):
             self._heartbeat = message
             self._heartbeat_at = now
 
-    @property
-    def lost(self) -> int:
-        return self._lost.total
-
-    @property
-    def repeated(self) -> int:
-        return self._repeated.total
-
-    @property
-    def is_radio(self) -> bool:
-        return self._radio is not None
-
-    def report(self, began: float, now: float) -> ComponentTraffic:
-        system, component = self._address
-        received = self._frames.recent_total(now) - self._repeated.recent_total(now)
-        lost = max(self._lost.recent_total(now), 0)
+    def report(self, address: Address, window: float, now: float) -> ComponentTraffic:
+        """Return the present counts; rates are those of `window` seconds."""
+        totals, recent = self._counts.totals, self._counts.recent(now)
+        received, lost = recent["frames"] - recent["repeated"], max(recent["lost"], 0)
         messages = [
-            MessageTraffic(message_name(number), number, each.total, each.rate(began, now))
-            for number, each in self._messages.items()
+            MessageTraffic(message_name(what), what, count, recent[what] / window)
+            for what, count in totals.items()
+            if isinstance(what, int)
         ]
         return ComponentTraffic(
-            system,
-            component,
+            *address,
             version=self._version,
             heartbeat=self._heartbeat,
             heartbeat_age=None if self._heartbeat is None else now - self._heartbeat_at,
             age=now - self._received_at,
-            frames=self._frames.total,
-            bytes=self._bytes.total,
-            frame_rate=self._frames.rate(began, now),
-            byte_rate=self._bytes.rate(began, now),
-            lost=self._lost.total,
+            frames=totals["frames"],
+            bytes=totals["bytes"],
+            frame_rate=recent["frames"] / window,
+            byte_rate=recent["bytes"] / window,
+            lost=totals["lost"],
             loss=lost / (received + lost) if received > 0 else None,
-            repeated=self._repeated.total,
-            late=self._late + sum(check.late for check in self._checks.values()),
-            signed=self._signed,
+            repeated=totals["repeated"],
+            late=totals["late"],
+            signed=totals["signed"],
             messages=tuple(sorted(messages, key=lambda each: (-each.rate, -each.count, each.name))),
             radio=self._radio,
         )
 
-    def _check(self, peer: Hashable) -> SequenceCheck:
-        check = self._checks.get(peer)
-        if check is None:
-            check = self._checks[peer] = SequenceCheck()
-            if len(self._checks) > COUNTED_PEERS_MAX:
-                self._late += self._checks.pop(next(iter(self._checks))).late
-        return check
+
+_What: TypeAlias = str | int  # a number is a message id
 
 
-class _Recently:
-    """A sum, and its increase within the last `RATE_WINDOW` seconds."""
-
-    __slots__ = ("_slices", "total")
+class _Counts:
+    """Counts by what is counted, and their increase within the last `RATE_WINDOW` seconds."""
 
     def __init__(self) -> None:
-        self.total = 0
-        # number of the slice, sum; the garbage collector visits no tuples of numbers
-        self._slices: deque[tuple[int, int]] = deque(maxlen=round(RATE_WINDOW / RATE_SLICE))
+        self.totals: Counter[_What] = Counter()
+        # the counts before each of the last slices in which something was counted
+        self._snapshots: deque[tuple[int, Counter[_What]]] = deque(maxlen=round(RATE_WINDOW / RATE_SLICE))
 
-    def add(self, now: float, amount: int) -> None:
-        self.total += amount
+    def add(self, amounts: Mapping[_What, int], now: float) -> None:
         number = int(now / RATE_SLICE)
-        if self._slices and self._slices[-1][0] == number:
-            amount += self._slices.pop()[1]
-        self._slices.append((number, amount))
+        if not self._snapshots or self._snapshots[-1][0] != number:
+            self._snapshots.append((number, self.totals.copy()))
+        if len(self.totals) < COUNTS_MAX:
+            self.totals.update(amounts)
+        else:
+            self.totals.update({what: amount for what, amount in amounts.items() if what in self.totals})
 
-    def recent_total(self, now: float) -> int:
+    def recent(self, now: float) -> Counter[_What]:
         first = _first_slice(now)
-        return sum(amount for number, amount in self._slices if number >= first)
+        before = next((totals for number, totals in self._snapshots if number >= first), self.totals)
+        return Counter({what: count - before[what] for what, count in self.totals.items()})
 
-    def rate(self, began: float, now: float) -> float:
-        """Return the recent increase per second."""
-        return self.recent_total(now) / max(now - max(_first_slice(now) * RATE_SLICE, began), RATE_TIME_MIN)
+
+def _window(began: float, now: float) -> float:
+    """Return the seconds in which recent counts were counted."""
+    return max(now - max(_first_slice(now) * RATE_SLICE, began), RATE_TIME_MIN)
 
 
 def _first_slice(now: float) -> int:

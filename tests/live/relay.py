@@ -155,7 +155,8 @@ class RealVehicle:
 
     def take_data(self, data: bytes, peer: Peer, now: float) -> None:
         """Take what the vehicle has sent over its link at the time `now`."""
-        for datagram in (data,) if self._cutter is None else self._cutter.cut(data, peer):
+        cut = [data] if self._cutter is None else [each.data for each in self._cutter.cut(data, peer)]
+        for datagram in cut:
             number = _message_id(datagram)
             is_telemetry = number not in PARAMETER_TRAFFIC
             if not (is_telemetry and self._conditions.drops_telemetry):
