@@ -8,8 +8,7 @@
   if a write is durable.
 - `streams`, `events`: streams of items and of parameter changes; events of components and their stream.
 - `fleet_fetch`, `files`, `reset`: fetches of several components, MAVFTP calls, resets to defaults.
-- `signing`, `signing_timestamps`: keys and options, persistent timestamps. `file_ownership`: files with
-  secrets.
+- `signing`, `signing_timestamps`: keys and options, persistent timestamps.
 - `taps`, `recording`, `forwarding`, `traffic`, `frame_cutter`: the receivers of all frames of a link: the
   telemetry log, one other program, counts; the cut of a link's bytes into frames.
 """

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from paramclient.client.file_ownership import (
-    GROUP_READS,
-    OF_OTHERS,
-    has_trusted_owner,
-    mode_of,
-    open_regular,
-)
 from paramclient.errors import UsageError
 from paramclient.wire.signing import SigningKey, SigningPolicy, SigningReport, timestamp_of
 
@@ -94,21 +90,26 @@ def read_private(path: str | os.PathLike[str], what: str, most: int) -> bytes:
             A process of root also rejects a file of another user, as the owner of a file can change it.
     """
     try:
-        with open_regular(path) as file:
+        with open(path, "rb", opener=_without_waiting) as file:
             status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise OSError(errno.EINVAL, "Not a regular file")
             data = file.read(most)
     except OSError as error:
         raise UsageError(f"{os.fspath(path)}: the {what} cannot be read: {error.strerror}") from error
-    if not has_trusted_owner(status):
+    if sys.platform == "win32":  # it has neither such ids nor such modes
+        return data
+    if status.st_uid not in (os.geteuid(), 0):
         raise UsageError(
             f"{os.fspath(path)}: this {what} belongs to another user (id {status.st_uid}), who can change it;"
             " `chown` it to the user of this program"
         )
-    mode = mode_of(status)
+    mode = stat.S_IMODE(status.st_mode)
     # since version 254, a systemd credential shows the group-read bit for the access-list entry of the unit's
     # user, although no group can read it (systemd issue 29435)
-    of_others = OF_OTHERS & ~GROUP_READS if _is_credential(path) else OF_OTHERS
-    if mode & of_others:
+    folder = os.environ.get(CREDENTIALS_VARIABLE)
+    is_credential = folder and Path(path).resolve().parent == Path(folder).resolve()
+    if mode & (0o037 if is_credential else 0o077):
         raise UsageError(
             f"{os.fspath(path)}: other users than its owner can access this {what} (mode {mode:o}); "
             "run `chmod 600` on it, and replace it if another user may have read it"
@@ -154,7 +155,6 @@ def refused_in_words(report: SigningReport | None) -> str:
     return f" (frames were refused, {reasons})" if reasons else ""
 
 
-def _is_credential(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file is in the credentials folder of the systemd unit of this process."""
-    folder = os.environ.get(CREDENTIALS_VARIABLE, "")
-    return folder != "" and Path(path).resolve().parent == Path(folder).resolve()
+def _without_waiting(path: str, flags: int) -> int:
+    """Open a file, without waiting for a writer of a named pipe."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))

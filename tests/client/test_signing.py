@@ -8,9 +8,11 @@ import os
 import pty
 import re
 import select
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -33,7 +35,6 @@ from paramclient.client.signing import key_from_environment
 from paramclient.client.signing_timestamps import (
     TIMESTAMP_CHECK_INTERVAL,
     TIMESTAMP_RESERVE,
-    TimestampFile,
     TimestampKeeper,
 )
 from paramclient.links import SimLink
@@ -145,98 +146,56 @@ def test_invalid_signing_settings_are_refused_at_once() -> None:
 # Timestamps
 
 
-def test_each_session_has_the_lowest_link_id_that_is_free(state: Path) -> None:
-    files = [TimestampFile(state, KEY.fingerprint, None) for _ in range(3)]
-    assert [(file.claim(), file.link_id) for file in files] == [(0, 0), (0, 1), (0, 2)]
-    others = TimestampFile(state, OTHER_KEY.fingerprint, None)
-    others.claim()
-    assert others.link_id == 0
-    files[1].write(NOW)
-    files[1].release()
-    again = TimestampFile(state, KEY.fingerprint, None)
-    assert (again.claim(), again.link_id) == (NOW, 1)
-    wanted = TimestampFile(state, KEY.fingerprint, 2)
-    with pytest.raises(UsageError, match="link id 2 of this signing key is in use by other sessions"):
-        wanted.claim()
-    for file in (*files, again, others):
-        file.release()
-    assert wanted.claim() == 0
-    wanted.release()
+async def link_ids(*clients: ParamClient) -> list[int]:
+    reports = [client.signing_report() for client in clients]
+    return [report.link_id for report in reports if report is not None]
 
 
-def test_a_key_without_a_free_link_id_is_an_error(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(signing_timestamps, "LINK_IDS", 2)
-    files = [TimestampFile(state, KEY.fingerprint, None) for _ in range(3)]
-    for file in files[:2]:
-        file.claim()
-    with pytest.raises(UsageError, match="every link id"):
-        files[2].claim()
-    for file in files:
-        file.release()
+@in_simulated_time
+async def test_each_session_has_the_lowest_link_id_that_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with a_client(small_px4()) as first, a_client(small_px4()) as second:
+        async with a_client(small_px4(), signing=OTHER_KEY) as other, a_client(small_px4()) as third:
+            assert await link_ids(first, second, third, other) == [0, 1, 2, 0]
+        async with (
+            a_client(small_px4()) as again,
+            a_client(small_px4(), signing=Signing(KEY, link_id=7)) as own,
+        ):
+            assert await link_ids(again, own) == [2, 7]
+        with pytest.raises(UsageError, match="link id 1 of this signing key is in use by other sessions"):
+            await a_client(small_px4(), signing=Signing(KEY, link_id=1)).open()
+        monkeypatch.setattr(signing_timestamps, "LINK_IDS", 2)
+        with pytest.raises(UsageError, match="every link id"):
+            await a_client(small_px4()).open()
 
 
-def test_another_process_keeps_its_link_id_until_it_ends(state: Path) -> None:
+def test_another_process_keeps_its_link_id_until_it_ends() -> None:
     program = (
-        "import sys; from pathlib import Path\n"
-        "from paramclient.client.signing_timestamps import TimestampFile\n"
-        f"file = TimestampFile(Path({str(state)!r}), {KEY.fingerprint!r}, None); file.claim()\n"
-        "print(file.link_id, flush=True); sys.stdin.read()"
+        "import anyio; from paramclient import ParamClient, SigningKey\n"
+        "async def main():\n"
+        f"    async with ParamClient('sim:px4', cache=False, signing=SigningKey({SECRET!r})) as client:\n"
+        "        print(client.signing_report().link_id, flush=True); await anyio.sleep_forever()\n"
+        "anyio.run(main)"
     )
-    file = TimestampFile(state, KEY.fingerprint, None)
-    with subprocess.Popen(
-        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as other:
+
+    async def own() -> list[int]:
+        async with a_client(small_px4()) as client:
+            return await link_ids(client)
+
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "0\n"
-        file.claim()
-        assert file.link_id == 1
-        file.release()
+        assert anyio.run(own) == [1]
         other.kill()
-    file = TimestampFile(state, KEY.fingerprint, None)
-    file.claim()
-    assert file.link_id == 0
-    file.release()
+    assert anyio.run(own) == [0]
 
 
 def test_the_timestamp_file_is_private_and_contains_no_key(state: Path) -> None:
-    file = TimestampFile(state, KEY.fingerprint, 7)
-    file.claim()
-    file.write(NOW)
-    file.write(NOW + 1)
-    file.release()
+    session(state.parent)
     names = {path.name for path in state.iterdir()}
-    assert names == {f"{KEY.fingerprint}-7.lock", f"{KEY.fingerprint}-7.timestamp"}
-    assert (state / f"{KEY.fingerprint}-7.timestamp").read_text() == f"{NOW + 1}\n"
+    assert names == {f"{KEY.fingerprint}-0.lock", f"{KEY.fingerprint}-0.timestamp"}
+    assert (state / f"{KEY.fingerprint}-0.timestamp").read_text().strip().isdecimal()
     assert {path.stat().st_mode & 0o777 for path in state.iterdir()} == {0o600}
     assert state.stat().st_mode & 0o777 == 0o700
-
-
-@pytest.mark.parametrize("text", ["", "soon", "-5", "9" * 30, "\xff"])
-def test_a_damaged_file_is_reported_and_the_time_of_day_counts(
-    state: Path, text: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    file = TimestampFile(state, KEY.fingerprint, 0)
-    file.claim()
-    (state / f"{KEY.fingerprint}-0.timestamp").write_text(text, encoding="latin-1")
-    file.release()
-    assert file.claim() == 0
-    assert "no valid signature timestamp" in caplog.text
-    file.release()
-
-
-def in_session(use: Callable[[Any], None], *, crashes: bool = False, **options: Any) -> None:
-    """A session of the keeper alone."""
-
-    async def live() -> None:
-        keeper = TimestampKeeper(Signing(KEY, **options))
-        signer, _ = await keeper.open()
-        use(signer)
-        await keeper._keep()
-        if crashes:
-            keeper._signer = None  # nothing is written at the end; the lock goes with the process
-        await keeper.close()
-
-    anyio.run(live)
 
 
 class Clock:
@@ -253,36 +212,63 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return Clock(monkeypatch)
 
 
+def session(state: Path, length: int = 0, *, crash: Path | None = None) -> tuple[int, int]:
+    """A session that uses timestamps of this length; its first and its last one.
+
+    With `crash`, the state that a crash leaves behind is copied there.
+    """
+
+    @in_simulated_time
+    async def live() -> tuple[int, int]:
+        keeper = TimestampKeeper(Signing(KEY, state=state))
+        signer, _ = await keeper.open()
+        first = signer.timestamp
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(keeper.run)
+            signer.catch_up(first + length)
+            await anyio.sleep(TIMESTAMP_CHECK_INTERVAL + 1.0)
+            signer.sign(b"")
+            tasks.cancel_scope.cancel()
+        if crash is not None:
+            shutil.copytree(state, crash)
+        await keeper.close()
+        return first, signer.timestamp
+
+    return live()
+
+
+@pytest.mark.parametrize("text", ["", "soon", "-5", "9" * 30, "\xff"])
+def test_a_damaged_file_is_reported_and_the_time_of_day_counts(
+    state: Path, clock: Clock, text: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    state.mkdir(parents=True)
+    (state / f"{KEY.fingerprint}-0.timestamp").write_text(text, encoding="latin-1")
+    assert session(state.parent)[0] == NOW
+    assert "no valid signature timestamp" in caplog.text
+
+
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     sessions=st.lists(
         st.tuples(st.integers(-(10**9), 10**9), st.integers(0, 10**8), st.booleans()), min_size=2, max_size=5
-    ),
-    number=st.uuids(),
+    )
 )
 def test_no_timestamp_is_used_twice_whatever_clock_and_crashes_do(
-    tmp_path: Path, clock: Clock, sessions: list[tuple[int, int, bool]], number: object
+    tmp_path: Path, clock: Clock, sessions: list[tuple[int, int, bool]]
 ) -> None:
-    used = [0]
+    state, used = Path(tempfile.mkdtemp(dir=tmp_path)), 0
     for offset, length, crashes in sessions:
         clock.now = NOW + offset
-
-        def use(signer: Any, length: int = length) -> None:
-            signer.sign(b"")
-            assert signer.timestamp > used[-1]
-            assert signer.timestamp > clock.now
-            signer.catch_up(signer.timestamp + length)
-            signer.sign(b"")
-            used.append(signer.timestamp)
-
-        in_session(use, crashes=crashes, state=tmp_path / str(number))
+        left = state.with_name(f"{state.name}-") if crashes else None
+        first, last = session(state, length, crash=left)
+        assert first >= max(used, clock.now)
+        used, state = last, left or state
 
 
-def test_after_a_crash_at_most_a_minute_is_skipped(clock: Clock) -> None:
-    in_session(lambda signer: signer.catch_up(NOW + 5), crashes=True)
-    last = []
-    in_session(lambda signer: last.append(signer.timestamp))
-    assert NOW + 5 < last[0] <= NOW + 5 + TIMESTAMP_RESERVE
+def test_after_a_crash_at_most_a_minute_is_skipped(clock: Clock, tmp_path: Path) -> None:
+    _, last = session(tmp_path / "state", 5, crash=tmp_path / "left")
+    first, _ = session(tmp_path / "left")
+    assert last < first <= last + TIMESTAMP_RESERVE
 
 
 @in_simulated_time
