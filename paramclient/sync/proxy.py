@@ -8,10 +8,9 @@ import os
 import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent import futures
-from contextlib import suppress
-from contextvars import Context
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial, wraps
 from queue import Empty, SimpleQueue
@@ -19,7 +18,7 @@ from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
 
 import anyio
-from anyio.from_thread import BlockingPortal
+from anyio.from_thread import BlockingPortal, start_blocking_portal
 
 import paramclient.client.client as asynchronous
 from paramclient.client import component, events, files, streams
@@ -35,9 +34,6 @@ WAIT_INTERVAL: Final = 0.1
 CANCEL_TIMEOUT: Final = 0.5
 """Seconds for which an interrupted call waits until the client has cancelled it. Most calls take 1 ms. A file
 transfer also closes its session on board, which continues in the background."""
-EXIT_TIMEOUT: Final = 3.0
-"""Seconds for which the end of the program waits until open clients are closed: longer than a file session
-takes to be closed on board."""
 
 
 class _Session:
@@ -51,17 +47,14 @@ class _Session:
     """
 
     def __init__(self, make: Callable[[], asynchronous.ParamClient]) -> None:
-        self._portal, self._thread = _start_event_loop()
-        try:
+        with ExitStack() as thread:
+            self._portal = thread.enter_context(start_blocking_portal(name=THREAD_NAME))
             self.client = self._portal.call(make)
-        except BaseException:
-            self._portal.call(self._portal.stop)
-            self._thread.join()
-            raise
+            self._thread = thread.pop_all()
         self.proxies: weakref.WeakValueDictionary[object, Proxy] = weakref.WeakValueDictionary()
         self._process = os.getpid()
-        self._end = weakref.finalize(self, _end_in_background, self._portal, self.client)
-        self._end.atexit = False  # `_close_all` waits for the end
+        self._end = weakref.finalize(self, _end_in_background, self._portal, self.client, self._thread)
+        self._end.atexit = False  # `_close_all` ends it
         _sessions.add(self)
 
     def close(self) -> None:
@@ -71,8 +64,7 @@ class _Session:
                 self.run(self.client.aclose)
         finally:
             if self._end.detach() is not None:
-                self._portal.call(self._portal.stop)
-                self._thread.join()
+                self._thread.close()
 
     def run(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """Call a function in the event loop, and await what it returns. Return the result as a proxy.
@@ -86,9 +78,8 @@ class _Session:
         """
         calls: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
         ended = threading.Event()
-        convert = partial(self._argument, calls, _components_of(args))
-        values = [convert("", value) for value in args]
-        options = {name: convert(name, value) for name, value in kwargs.items()}
+        values = [self._argument(calls, "", value) for value in args]
+        options = {name: self._argument(calls, name, value) for name, value in kwargs.items()}
 
         async def work() -> Any:
             try:
@@ -98,7 +89,14 @@ class _Session:
                 ended.set()
                 calls.put(None)
 
-        future = self.start(work)
+        if os.getpid() != self._process:
+            raise UsageError("a client cannot be used in a forked process; create a new one there")
+        try:
+            future = self._portal.start_task_soon(work)
+        except RuntimeError as error:
+            if "event loop thread" in str(error):
+                raise UsageError("a blocking call cannot be made in the event loop of its client") from None
+            raise ClientClosed("the client was closed", link=self.client.link.name) from None
         try:
             while (call := _next(calls)) is not None:
                 call()
@@ -110,21 +108,6 @@ class _Session:
                 future.cancel()
                 ended.wait(CANCEL_TIMEOUT)
             raise
-
-    def start(self, work: Callable[[], Coroutine[Any, Any, Any]]) -> futures.Future[Any]:
-        """Start a task in the event loop.
-
-        Raises:
-            ClientClosed, UsageError: as from `run`.
-        """
-        if os.getpid() != self._process:
-            raise UsageError("a client cannot be used in a forked process; create a new one there")
-        try:
-            return self._portal.start_task_soon(work)
-        except RuntimeError as error:
-            if "event loop thread" in str(error):
-                raise UsageError("a blocking call cannot be made in the event loop of its client") from None
-            raise ClientClosed("the client was closed", link=self.client.link.name) from None
 
     @property
     def is_open(self) -> bool:
@@ -154,26 +137,15 @@ class _Session:
             return replace(value, component=self.shown(value.component))
         return value
 
-    def _argument(
-        self,
-        calls: SimpleQueue[Callable[[], object] | None],
-        vehicles: Sequence[Component],
-        name: str,
-        value: Any,
-    ) -> Any:
+    def _argument(self, calls: SimpleQueue[Callable[[], object] | None], name: str, value: Any) -> Any:
         """Return an argument of a call as the client is to see it."""
-        if isinstance(value, Proxy):
-            return value._target
         if name == "progress" and value is not None:
             return lambda *items: calls.put(partial(value, *map(self.shown, items)))
         if name == "before_writing" and value is not None:
             return partial(self._ask, calls, value)
-        if callable(value) and vehicles:  # one result for each vehicle
-            results = {each._target: value(each) for each in vehicles}
-            return results.__getitem__
         if isinstance(value, list | tuple):
-            return type(value)(each._target if isinstance(each, Proxy) else each for each in value)
-        return value if isinstance(value, Mapping | str) or not isinstance(value, Iterator) else list(value)
+            return type(value)(map(_target_of, value))
+        return list(value) if isinstance(value, Iterator) else _target_of(value)
 
     async def _ask(
         self,
@@ -193,8 +165,6 @@ class _Session:
 
 
 _sessions: weakref.WeakSet[_Session] = weakref.WeakSet()
-_ending: set[threading.Thread] = set()
-"""The threads that close clients whose last reference was dropped."""
 
 
 class Proxy:
@@ -360,6 +330,8 @@ def blocking(function: Callable[..., Any]) -> Callable[..., Any]:
             )
         if not sessions:
             return anyio.run(partial(function, vehicles, *rest, **kwargs))
+        if callable(rest[0]):  # one result for each vehicle
+            rest[0] = {each._target: rest[0](each) for each in vehicles}.__getitem__
         return sessions.pop().run(function, vehicles, *rest, **kwargs)
 
     return call
@@ -369,61 +341,28 @@ def _target_of(value: Any) -> Any:
     return value._target if isinstance(value, Proxy) else value
 
 
-def _components_of(args: Sequence[Any]) -> Sequence[Component]:
-    """Return the vehicles of a call for several: its first argument."""
-    is_fleet = bool(args) and isinstance(args[0], list) and all(isinstance(each, Proxy) for each in args[0])
-    return args[0] if is_fleet else ()
-
-
 def _next(calls: SimpleQueue[Callable[[], object] | None]) -> Callable[[], object] | None:
     while True:
         with suppress(Empty):
             return calls.get(timeout=WAIT_INTERVAL)
 
 
-def _start_event_loop() -> tuple[BlockingPortal, threading.Thread]:
-    """Start an event loop in a thread of its own."""
-    started: futures.Future[BlockingPortal] = futures.Future()
-
-    async def serve() -> None:
-        async with BlockingPortal() as portal:
-            started.set_result(portal)
-            await portal.sleep_until_stopped()
-
-    def run() -> None:
-        try:
-            anyio.run(serve)
-        except BaseException as error:
-            if not started.done():
-                started.set_exception(error)
-
-    # without the context of the caller, which may run in another event loop
-    thread = threading.Thread(target=Context().run, args=(run,), name=THREAD_NAME, daemon=True)
-    thread.start()
-    return started.result(), thread
-
-
-def _end_in_background(portal: BlockingPortal, client: asynchronous.ParamClient) -> None:
+def _end_in_background(
+    portal: BlockingPortal, client: asynchronous.ParamClient, portal_thread: ExitStack
+) -> None:
     """Close a client whose last reference was dropped. The garbage collector may call this in any thread."""
 
     def end() -> None:
         with suppress(Exception):
             portal.call(client.aclose)
-        portal.call(portal.stop)
-        _ending.discard(thread)
+        portal_thread.close()
 
-    thread = threading.Thread(target=end, name=THREAD_NAME, daemon=True)
-    _ending.add(thread)
-    thread.start()
+    threading.Thread(target=end, name=THREAD_NAME).start()
 
 
 @atexit.register
 def _close_all() -> None:
     """Close the clients that are open at the end of the program."""
-    closing = []
     for session in list(_sessions):
         with suppress(ClientClosed, UsageError):
-            closing.append(session.start(session.client.aclose))
-    futures.wait(closing, EXIT_TIMEOUT)
-    for thread in list(_ending):
-        thread.join(EXIT_TIMEOUT)
+            session.close()
