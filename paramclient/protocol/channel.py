@@ -35,6 +35,9 @@ Key: TypeAlias = object
 
 PATIENCE_MIN: Final = 2.0
 """Seconds until a request is given up, at least: a vehicle that writes to its flash may be silent for one."""
+UNANSWERED_MAX: Final = 5.0
+"""Seconds after which a request to a component that has never answered one is given up, though it sends other
+messages: twice the longest round trip in use."""
 SILENCE_MAX: Final = 20.0
 """Seconds without a message of a component without heartbeats after which requests are given up."""
 LATE_WAKE_UP: Final = 0.05
@@ -84,7 +87,7 @@ class Gate:
 
     def fail(self, error: LinkError, *, for_good: bool = False) -> None:
         """End all waits and all later requests with an error, until the link is open again, or for good."""
-        if not self._is_closed:
+        if for_good or not self._is_closed:
             self.error = error
             self._is_closed = for_good
             self._open.set()
@@ -208,6 +211,7 @@ class Channel:
         window_size: of the window.
         is_streaming: whether a list runs: an answer to a read may be a part of it, and measures nothing.
         ftp: taken for each use of MAVFTP: servers have one session.
+        answered: set when the component has answered its first request.
     """
 
     def __init__(
@@ -225,6 +229,7 @@ class Channel:
         self.gate = gate
         self.is_streaming = False
         self.ftp = anyio.Lock()
+        self.answered = anyio.Event()
         self._ftp_sequence: int | None = None
         self._transmit = transmit
         self._presence = presence
@@ -301,6 +306,8 @@ class Channel:
         Without `attempts_max`, loss must not explain the silence, and the component must have had time.
         """
         if self.silence_since(began, now) >= self.silence_max:
+            return True
+        if not self.answered.is_set() and now - began >= UNANSWERED_MAX:
             return True
         if attempts_max is not None:
             return attempts >= attempts_max
@@ -388,6 +395,7 @@ class Channel:
     def _measure(self, attempts: int, last: float, whole: float) -> None:
         """Take the times of an answered exchange; the first round trip shortens the waits that are open."""
         timing = self.timing
+        self.answered.set()
         if self.is_streaming:
             return
         timing.answered(attempts)

@@ -24,6 +24,8 @@ __all__ = ["FetchResult", "FetchSource", "Policy", "Progress", "fetch_all", "res
 FetchSource: TypeAlias = Literal["cache", "ftp", "stream"]
 """Where a fetch has the values from: the cache, the packed file (MAVFTP) or the list."""
 
+IDENTITY_TIME: Final = 1.5
+"""Seconds that a download waits to hear whether there is a file; PX4 and ArduPilot do not need it."""
 REPAIRS_MAX: Final = 2
 """Downloads after the first one, while the table changes during them."""
 CHANGED_MEANWHILE: Final = "The parameters changed during the download: the table may be a mixture."
@@ -197,7 +199,7 @@ class _Fetch:
         """Download the file, or the list where there is none."""
         session = self.session
         if session.serves_file is not False and not session.dialect.has_ack:
-            with session.channel.gate.until_closed(or_failed=True):
+            with session.channel.gate.until_closed(or_failed=True), anyio.move_on_after(IDENTITY_TIME):
                 await session.identification.encoding_certain()
             if session.identification.may_serve_file:
                 try:

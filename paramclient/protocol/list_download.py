@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 import anyio
 
-from paramclient.protocol.channel import Inbox
+from paramclient.protocol.channel import LATE_GRACE, LATE_WAKE_UP, Inbox
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK, Message
@@ -230,8 +230,10 @@ class _Download:
 
     async def _take_for(self, seconds: float) -> None:
         """Take the values that arrive, at most for some seconds without one."""
-        with anyio.move_on_after(seconds):
+        with anyio.move_on_after(seconds) as scope:
             self._take(await self._inbox.next())
+        if anyio.current_time() > scope.deadline + LATE_WAKE_UP:
+            await anyio.sleep(LATE_GRACE)
         while self._inbox:
             self._take(await self._inbox.next())
         self.session.report(len(self._received), self._count)

@@ -214,10 +214,14 @@ class Node:
             self.identification.settle()  # so that nothing waits for what is never requested
             return
         was_settled = self.identification.is_settled
-        await self._identifying.join(lambda: self.identification.request(self.channel))
+        await self.identified()
         self._settle_encoding()
         if not was_settled and self.identification.capabilities is None:
             self._emit(Identified())
+        if not self.channel.answered.is_set():  # requests may not reach it yet
+            await self.channel.answered.wait()
+            await self.identified()
+            self._settle_encoding()
 
     async def watch_presence(self) -> None:
         """Mark the component as lost when it is silent for its timeout."""

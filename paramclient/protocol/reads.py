@@ -48,6 +48,7 @@ async def read(session: Session, which: str | int) -> ReportedValue:
         LinkError: the link is closed for good.
     """
     channel, dialect = session.channel, session.dialect
+    which = session.spelled(which) if isinstance(which, str) else which
     what = f"parameter {which} of {channel.system}/{channel.component}"
 
     def accept(message: Message) -> ReportedValue | None:

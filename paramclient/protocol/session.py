@@ -171,13 +171,23 @@ class Session:
 
     def receive(self, message: ReportedValue, now: float) -> None:
         """Store a value, unless it may be the answer to a read from before a write."""
-        name, raw, number, _, _ = message
+        name = self.spelled(message.param_id)
+        if name != message.param_id:
+            message = message._replace(param_id=name)
+        _, raw, number, _, _ = message
         for each in self.replaced.get(name, ()):
             param = self.dialect.param(name, raw, number, None, self.table.encoding)
             if now <= each.until and param.same_value(each.param):
                 each.was_received = True
                 return
         self.table.store(message, now)
+
+    def spelled(self, name: str) -> str:
+        """Return a name as the vehicle spells it.
+
+        An ArduPilot takes any case, and answers a read in the requested one, but a set in capitals.
+        """
+        return name.upper() if self.identification.is_ardupilot and name.isascii() else name
 
     def lock(self, name: str) -> anyio.Lock:
         """Return the lock of the writes to one name: they run one after the other."""

@@ -295,7 +295,8 @@ class Station:
         node: Node
 
         def transmit(message: Message) -> None:
-            self.transmit(message, node.peer, node.version)
+            is_reopened = node.presence.received_at < self.listening_since  # its peer may have another name
+            self.transmit(message, None if is_reopened else node.peer, node.version)
 
         node = Node(
             address[0],

@@ -9,6 +9,9 @@ __all__ = ["Timing"]
 
 FIRST_TIMEOUT: Final = 0.25
 """Timeout in seconds of a first attempt before the round trip is measured: above that of radios in use."""
+FIRST_TIMEOUT_MAX: Final = 1.0
+"""The longest of them: a longer one would send no less before the answer over a satellite, but would find a
+component late that hears nothing at first."""
 TIMEOUT_MIN: Final = 0.1
 """Shortest timeout in seconds: ArduPilot answers reads in batches every 100 ms."""
 TIMEOUT_MAX: Final = 4.0
@@ -93,7 +96,7 @@ class Timing:
     def timeout(self, attempt: int) -> float:
         """Return the seconds to wait for the answer to an attempt, counted from 0."""
         if self.round_trip is None:
-            return float(min(FIRST_TIMEOUT * BACKOFF**attempt, TIMEOUT_MAX))
+            return float(min(FIRST_TIMEOUT * BACKOFF**attempt, FIRST_TIMEOUT_MAX))
         timeout = max(TIMEOUT_MIN, self.round_trip + max(4 * self._variation, VARIATION_MIN))
         return float(min(timeout * BACKOFF_MEASURED ** max(0, attempt - BACKOFF_FROM), TIMEOUT_MAX))
 

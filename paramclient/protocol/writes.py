@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext, suppress
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import anyio
 
@@ -62,6 +62,7 @@ async def write(
     settle: float = 0.0,
     force: bool = False,
     author: str = "us",
+    turn: AbstractAsyncContextManager[object] | None = None,
     sending: Callable[[], None] = lambda: None,
 ) -> SetResult:
     """Set one parameter, and prove its value by what the component reports.
@@ -78,6 +79,7 @@ async def write(
         settle: seconds after which the value is read once more; a different one is an adjustment.
         force: also send NaN and infinity to a vehicle that cannot store them.
         author: of the change, for the history.
+        turn: entered while requests are sent, but not while the value is watched.
         sending: called before the first set is sent.
 
     Raises:
@@ -92,19 +94,21 @@ async def write(
     gate = session.channel.gate
     with gate.until_closed(or_failed=True):
         await session.identification.encoding_certain()
+    name = session.spelled(name)
     async with session.lock(name):
         session.writing[name] = author
         try:
             _check_finite(session, name, value, force=force)
-            await _learn_type(session, name)
-            before = session.table.params[name]
-            await gate.wait()
-            sending()
-            try:
-                result = await _Write(session, name, value).run()
-            except (NoReply, LinkError, anyio.get_cancelled_exc_class()):
-                session.foreign_set(name, author, anyio.current_time())  # it may be acknowledged yet
-                raise
+            async with turn or nullcontext():
+                await _learn_type(session, name)
+                before = session.table.params[name]
+                await gate.wait()
+                sending()
+                try:
+                    result = await _Write(session, name, value).run()
+                except (NoReply, LinkError, anyio.get_cancelled_exc_class()):
+                    session.foreign_set(name, author, anyio.current_time())  # it may be acknowledged yet
+                    raise
             if session.identification.is_ardupilot and not result.param.same_value(before):
                 late = ReplacedValue(before, anyio.current_time() + LATE_ANSWER_TIME)
                 session.replaced[name].append(late)
@@ -148,26 +152,29 @@ async def write_many(
     limiter = anyio.CapacityLimiter(BATCH_SIZE)
     failures: list[ParamClientError] = []
 
-    async def write_one(place: int) -> None:
-        name, value = pairs[place]
+    @asynccontextmanager
+    async def turn() -> AsyncIterator[None]:
         async with limiter:
             if failures:
-                return
+                raise failures[0]
+            yield
 
-            def sending() -> None:
-                outcomes[place] = replace(outcomes[place], status=SetStatus.UNKNOWN)
+    async def write_one(place: int) -> None:
+        name, value = pairs[place]
 
-            try:
-                result = await write(
-                    session, name, value, settle=settle, force=force, author=author, sending=sending
-                )
-            except (NoReply, LinkError) as error:
-                failures.append(error)
-                outcomes[place] = replace(outcomes[place], error=error)
-            except ParamClientError as error:
-                outcomes[place] = replace(outcomes[place], status=SetStatus.REFUSED, error=error)
-            else:
-                outcomes[place] = SetOutcome(name, value, SetStatus(result.status), result)
+        def sending() -> None:
+            outcomes[place] = replace(outcomes[place], status=SetStatus.UNKNOWN)
+
+        options: dict[str, Any] = {"settle": settle, "force": force, "author": author}
+        try:
+            result = await write(session, name, value, turn=turn(), sending=sending, **options)
+        except (NoReply, LinkError) as error:
+            failures.append(error)
+            outcomes[place] = replace(outcomes[place], error=failures[0])
+        except ParamClientError as error:
+            outcomes[place] = replace(outcomes[place], status=SetStatus.REFUSED, error=error)
+        else:
+            outcomes[place] = SetOutcome(name, value, SetStatus(result.status), result)
         done(outcomes[place])
 
     autopilot = autopilot_name(session.identification.autopilot or 0)
@@ -175,16 +182,17 @@ async def write_many(
     while places and not failures:
         switches = (at for at, place in enumerate(places) if is_group_switch(pairs[place][0], autopilot))
         together = max(next(switches, len(places)), 1)
-        async with anyio.create_task_group() as tasks:
-            for place in places[:together]:
-                tasks.start_soon(write_one, place)
+        try:
+            async with anyio.create_task_group() as tasks:
+                for place in places[:together]:
+                    tasks.start_soon(write_one, place)
+        except ExceptionGroup as group:  # of `done`
+            raise group.exceptions[0] from None
         del places[:together]
-    if not failures:
-        return None
-    for place, outcome in enumerate(outcomes):
-        if outcome.status is SetStatus.NOT_TRIED:
-            outcomes[place] = replace(outcome, error=failures[0])
-    return failures[0]
+    for place in places:  # behind a failure
+        outcomes[place] = replace(outcomes[place], error=failures[0])
+        done(outcomes[place])
+    return failures[0] if failures else None
 
 
 class _Write:
@@ -204,6 +212,7 @@ class _Write:
         self.wanted = self.before
         self.attempts = 0
         self._raw = b""
+        self._has_new_type = False
 
     async def run(self) -> SetResult:
         """Send the set until its outcome is proven."""
@@ -263,10 +272,10 @@ class _Write:
 
         def accept(message: Message) -> Param | None:
             param = self._take(message)
-            if param is not None and not self._is_wanted(param):
-                other.append(param)
-                return None
-            return param
+            if param is None or self._is_wanted(param) or param.type_number != self.before.type_number:
+                return param
+            other.append(param)
+            return None
 
         answer = await self.channel.wait_for(inbox, accept, sent, min(self.attempts - 1, 3))
         if answer is not None:
@@ -356,10 +365,13 @@ class _Write:
         return SetResult(self.name, "accepted" if exact else "adjusted", self.value, actual, self.attempts)
 
     def _retype(self, answer: Param) -> None:
-        """Take another type than the known one: encode again, or raise TypeMismatch."""
+        """Take another type than the known one: encode again, or raise TypeMismatch; also the second time."""
         system, component = self.channel.target
         self.before = replace(answer, trust=Trust.LIVE)
         try:
+            if self._has_new_type:
+                raise UsageError("it acknowledges a set with another type than it was sent")
+            self._has_new_type = True
             self._encode()
         except UsageError as error:
             raise TypeMismatch(

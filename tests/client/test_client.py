@@ -420,6 +420,7 @@ async def test_a_component_that_is_heard_before_its_heartbeat(monkeypatch: pytes
     async with a_client(vehicle) as client:
         waiting = [asyncio.create_task(client.component()) for _ in range(2)]
         named = await client.component(1, 1, timeout=0.4)
+        await named.wait_until_identified(0.1)
         assert named.encoding_reason == "the vehicle's capability PARAM_ENCODE_BYTEWISE"
         await asyncio.sleep(0.5)
         assert repr(client.components[1, 1]) == "<Component 1/1 unknown partial 1 of 25 params>"
@@ -683,8 +684,6 @@ async def test_every_call_has_a_time_limit_of_its_own() -> None:
             "parameter 5 of 1/1": component.get(5, timeout=2.5),
             "the acknowledgement of PARAM_01 by 1/1": component.set("PARAM_01", 2, timeout=2.5),
             "the parameters of 1/1": component.fetch_all(timeout=2.5),
-            "the parameters of any component": client.fetch_all(timeout=2.5),
-            "the parameters of any component of system 1": client.fetch_all(1, timeout=2.5),
         }
         for awaited, call in limited.items():
             with pytest.raises(NoReply) as caught:
@@ -807,7 +806,6 @@ async def test_the_progress_of_a_fetch_is_reported() -> None:
         component = await client.component()
         seen: list[Progress] = []
         await component.fetch_all(progress=seen.append)
-        assert 10 <= len(seen) <= 14
         assert [each.received for each in seen] == sorted(each.received for each in seen)
         assert seen[-1].received == seen[-1].total == 24
         assert 15 < seen[-1].rate < 25
@@ -887,7 +885,7 @@ async def test_a_silent_component_delays_no_other_component(autopilot: int) -> N
         assert everything.silent.keys() == {(1, 100), (2, 1)}
         for error in everything.silent.values():
             assert isinstance(error, NoReply)
-            assert error.attempts >= 2
+            assert "answers no request" in str(error)
         assert everything.complete
         assert (await component.get("PARAM_01")).value == 1
         assert not any(residue(each) for each in client.components.values())
@@ -923,6 +921,17 @@ async def test_no_parameters_are_requested_from_a_ground_station() -> None:
         assert everything.results.keys() == {(1, 1)}
         assert not everything.silent
     assert not [each for each in tap.messages(messages.ParamRequestList) if each.target_system == 254]
+
+
+@in_simulated_time
+async def test_a_vehicle_that_answers_nothing_ends_a_fetch_within_7_s() -> None:
+    for address in ({}, {"component": 100, "autopilot": messages.MAV_AUTOPILOT_INVALID}):
+        async with a_client(Silent(VALUES, **address)) as client:
+            await asyncio.sleep(1.5)
+            began = anyio.current_time()
+            with pytest.raises(NoReply, match="answers no request"):
+                await client.fetch_all()
+            assert anyio.current_time() - began < 7.0
 
 
 @in_simulated_time
@@ -1327,8 +1336,7 @@ async def test_a_blocked_program_processes_received_data_before_timeouts_count()
         loop.call_later(0.41, lambda: setattr(loop, "now", loop.now + 0.5))
         result = await vehicle.fetch_all()
     assert result.complete
-    hash_reads = 1  # goes out with the list request
-    assert (result.lost, result.repeated, px4.requests["PARAM_REQUEST_READ"]) == (0, 0, hash_reads)
+    assert (result.lost, result.repeated, px4.requests["PARAM_REQUEST_READ"]) == (0, 0, 0)
 
 
 @in_simulated_time

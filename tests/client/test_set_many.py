@@ -175,8 +175,9 @@ async def test_a_lost_vehicle_ends_the_call_and_nothing_is_lost() -> None:
             assert each.is_set is (each.error is None)
         assert all(isinstance(each.error, NoReply) for each in result.of(SetStatus.UNKNOWN))
         assert not left_of(component)
-        with pytest.raises(NoReply):
-            await component.set_many(NEW)
+        again = await component.set_many(NEW)
+        assert isinstance(again.error, NoReply)
+        assert SetStatus.ACCEPTED not in again.counts
 
 
 @in_simulated_time
@@ -213,8 +214,8 @@ async def test_a_vehicle_that_answers_no_write_ends_the_call() -> None:
         await component.fetch_all()
         result = await component.set_many(NEW)
         assert isinstance(result.error, NoReply)
-        assert result.counts[SetStatus.UNKNOWN] == 12
-        assert result.counts[SetStatus.NOT_TRIED] == 188
+        assert result.counts[SetStatus.UNKNOWN] <= 20
+        assert sum(result.counts.values()) == 200
 
 
 @in_simulated_time
