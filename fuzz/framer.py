@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import all as dialect
 from pymavlink.generator.mavcrc import x25crc
 
 from fuzz.draw import Draw
-from paramclient.client.frame_cutter import FrameCutter
+from paramclient.client.taps import FrameCutter
 from paramclient.wire import messages
 from paramclient.wire.frames import Frame, Framer, build_frame, checksum
 from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier

@@ -11,17 +11,16 @@ from pathlib import Path
 from types import ModuleType
 
 from paramclient import metadata, provision
-from paramclient.client import client, component, events, files, streams
+from paramclient.client import client, component, files, streams
 from paramclient.provision import fleet
 
 STUB = Path(__file__).parent.parent / "paramclient" / "sync" / "__init__.pyi"
 
 CLASSES: dict[ModuleType, list[str]] = {
-    streams: ["Changes"],
     files: ["Ftp"],
     component: ["Component"],
     fleet: ["Wanted"],
-    events: ["Discovered", "Lost", "Found", "Rebooted", "Resynced", "Event", "Events"],
+    streams: ["Changes", "Discovered", "Lost", "Found", "Rebooted", "Resynced", "Event", "Events"],
     client: ["ParamClient"],
 }
 FUNCTIONS: list[Callable[..., object]] = [
@@ -37,7 +36,7 @@ ATTRIBUTES = {
     "ParamClient": ("cache: ParamCache | None",),
 }
 """The public attributes that `__init__` sets."""
-INTERNAL = {"is_extended_by", "wait_for_cache", "wait_until_identified"}
+INTERNAL = {"is_extended_by", "limited", "wait_for_cache", "wait_until_identified"}
 """Methods for other modules of the asynchronous client."""
 
 

@@ -237,7 +237,7 @@ class Component:
         """
         check_requested_name(name)
         self._check_may_send()
-        with self._limited(timeout, f"parameter {name} of {self.system}/{self.component}"):
+        with self.limited(timeout, f"parameter {name} of {self.system}/{self.component}"):
             message = await read(self.session, name)
         known = self.session.table.params.get(message.param_id)
         if known is not None and (isinstance(name, str) or known.index == name):
@@ -296,7 +296,7 @@ class Component:
         ((name, checked),) = check_writes([(name, value)], extended=self.session.dialect.has_ack)
         settle, by = check_settle(settle), check_author(author)
         await self._check_may_write(durable=durable)
-        with self._limited(timeout, f"the acknowledgement of {name} by {self.system}/{self.component}"):
+        with self.limited(timeout, f"the acknowledgement of {name} by {self.system}/{self.component}"):
             result = await write(self.session, name, checked, settle=settle, force=force, author=by)
         if durable:
             await self._write_durably(name)
@@ -537,7 +537,7 @@ class Component:
         """
         self._check_may_send()
         moves = system is not None and system != self.system
-        with self._limited(timeout, f"{self.system}/{self.component} to be back after its reboot"):
+        with self.limited(timeout, f"{self.system}/{self.component} to be back after its reboot"):
             await commands.reboot(self.node, returns=not moves)
             if system is None or not moves:
                 return self
@@ -599,8 +599,8 @@ class Component:
             raise NotDurable(f"{address} has accepted {what}, but it is not on the disk: {error}") from error
 
     @contextmanager
-    def _limited(self, timeout: float | None, what: str) -> Iterator[None]:
-        """Raise NoReply at a timeout."""
+    def limited(self, timeout: float | None, what: str) -> Iterator[None]:
+        """Raise NoReply at a timeout, with what was received meanwhile."""
         began = anyio.current_time()
         with self._explained(began):
             with anyio.move_on_after(timeout) as scope:

@@ -10,8 +10,7 @@ from typing import Final
 
 import anyio
 
-from paramclient.client.frame_cutter import FrameCutter, SeenFrame
-from paramclient.client.taps import Tap
+from paramclient.client.taps import FrameCutter, SeenFrame, Tap
 from paramclient.errors import LinkError
 from paramclient.links import Link
 from paramclient.wire.frames import bears_key

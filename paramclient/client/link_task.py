@@ -11,8 +11,7 @@ from typing import Final
 import anyio
 import anyio.lowlevel
 
-from paramclient.client.frame_cutter import FrameCutter
-from paramclient.client.taps import Tap
+from paramclient.client.taps import FrameCutter, Tap
 from paramclient.errors import LinkError
 from paramclient.links import Link
 from paramclient.protocol.station import Peer, Station

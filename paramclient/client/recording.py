@@ -13,8 +13,7 @@ from typing import Final
 import anyio
 import anyio.to_thread
 
-from paramclient.client.frame_cutter import SeenFrame
-from paramclient.client.taps import Tap
+from paramclient.client.taps import SeenFrame, Tap
 from paramclient.errors import UsageError
 from paramclient.links.tlog import packed_time
 from paramclient.wire.frames import bears_key, unsign_frame

@@ -10,8 +10,7 @@ from typing import Final, TypeAlias
 
 import anyio
 
-from paramclient.client.frame_cutter import FrameCutter, SeenFrame
-from paramclient.client.taps import Tap
+from paramclient.client.taps import FrameCutter, SeenFrame, Tap
 from paramclient.protocol.addresses import Address
 from paramclient.wire.frames import message_name
 from paramclient.wire.loss import SequenceCheck

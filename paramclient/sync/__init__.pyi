@@ -59,11 +59,6 @@ __all__ = [
     "verify_extended",
 ]
 
-class Changes(Iterator[Change]):
-    "Stream of the changes since its creation; see `Component.changes`."
-    def __next__(self) -> Change: ...
-    def next(self, timeout: float | None = None) -> Change: ...
-
 class Ftp:
     "The files of a component over MAVFTP; see `ParamClient.ftp`."
     def read(
@@ -182,6 +177,11 @@ class Component:
         """Return a stream of parameter changes from now on: `async for change in component.changes()`."""
 
 Wanted: TypeAlias = ParamSet | Mapping[tuple[int, int], ParamSet] | Callable[[Component], ParamSet]
+
+class Changes(Iterator[Change]):
+    "Stream of the changes since its creation; see `Component.changes`."
+    def __next__(self) -> Change: ...
+    def next(self, timeout: float | None = None) -> Change: ...
 
 @dataclass(frozen=True, slots=True)
 class Discovered:

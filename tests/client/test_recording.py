@@ -21,7 +21,7 @@ import pytest
 from paramclient import ParamClient, UsageError
 from paramclient.cli import run
 from paramclient.client import recording
-from paramclient.client.frame_cutter import FrameCutter
+from paramclient.client.taps import FrameCutter
 from paramclient.links.tlog import TIME_MAX, TIME_STEP_MAX, Record, packed_time, read_records
 from paramclient.sim import ArduPilotVehicle
 from paramclient.wire import frames, messages, signing

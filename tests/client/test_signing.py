@@ -30,12 +30,12 @@ from paramclient import NoReply, ParamClient, Signing, SigningKey, SigningPolicy
 from paramclient.cli import run
 from paramclient.cli import session as cli_session
 from paramclient.cli import signing as signing_commands
-from paramclient.client import signing, signing_timestamps
-from paramclient.client.signing import key_from_environment
-from paramclient.client.signing_timestamps import (
+from paramclient.client import signing
+from paramclient.client.signing import (
     TIMESTAMP_CHECK_INTERVAL,
     TIMESTAMP_RESERVE,
     TimestampKeeper,
+    key_from_environment,
 )
 from paramclient.links import SimLink
 from paramclient.sim import ArduPilotVehicle, Vehicle
@@ -163,7 +163,7 @@ async def test_each_session_has_the_lowest_link_id_that_is_free(monkeypatch: pyt
             assert await link_ids(again, own) == [2, 7]
         with pytest.raises(UsageError, match="link id 1 of this signing key is in use by other sessions"):
             await a_client(small_px4(), signing=Signing(KEY, link_id=1)).open()
-        monkeypatch.setattr(signing_timestamps, "LINK_IDS", 2)
+        monkeypatch.setattr(signing, "LINK_IDS", 2)
         with pytest.raises(UsageError, match="every link id"):
             await a_client(small_px4()).open()
 
@@ -203,8 +203,7 @@ class Clock:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = NOW
-        for module in (signing, signing_timestamps):
-            monkeypatch.setattr(module, "timestamp_now", lambda: self.now)
+        monkeypatch.setattr(signing, "timestamp_now", lambda: self.now)
 
 
 @pytest.fixture

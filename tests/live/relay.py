@@ -27,7 +27,7 @@ import anyio
 import anyio.from_thread
 import anyio.lowlevel
 
-from paramclient.client.frame_cutter import FrameCutter
+from paramclient.client.taps import FrameCutter
 from paramclient.errors import FileErrorCode, LinkError
 from paramclient.links import create_link, parse_link
 from paramclient.links.link import Peer
