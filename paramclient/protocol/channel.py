@@ -337,7 +337,7 @@ class Channel:
                 error that the message tells.
             what: names the request in the error.
             attempts: at most; None for as many as loss explains.
-            copies: of the request in each attempt.
+            copies: of the request in each attempt after the first.
             timeout_min: seconds to wait in each attempt, at least.
 
         Raises:
@@ -350,7 +350,7 @@ class Channel:
             await self.gate.wait()
             sent = anyio.current_time()
             message = request(attempt) if callable(request) else request
-            for _ in range(copies):
+            for _ in range(copies if attempt else 1):
                 self.send(message)
             answer = await self.wait_for(inbox, accept, sent, attempt, timeout_min)
             attempt += 1

@@ -35,6 +35,9 @@ BUSY_ATTEMPTS: Final = 2
 CLOSE_TIMEOUT: Final = 2.0
 """Seconds for the closing of a session, also when its reader is cancelled. ArduPilot has one session for all
 links: an open one blocks the file access of all stations for 3 s."""
+CLOSE_COPIES: Final = 4
+"""Copies of each request that closes a session: the time for it is short, and packets are lost in bursts.
+ArduPilot's queue of requests holds 5."""
 BURST_PAUSE_MIN: Final = 0.15
 """Seconds before the first block after which a burst counts as lost: at 57600 baud, ArduPilot begins one
 95 ms after the request."""
@@ -242,6 +245,7 @@ async def _request(
     offset: int = 0,
     size: int = 0,
     attempts: int | None = None,
+    copies: int = 1,
     sequence: int | None = None,
 ) -> Packet:
     """Send one request until its ACK arrives.
@@ -266,6 +270,7 @@ async def _request(
         accept,
         what=f"MAVFTP {opcode.name} {path} of {channel.system}/{channel.component}",
         attempts=attempts,
+        copies=copies,
     )
 
 
@@ -306,8 +311,11 @@ async def _opened(
             yield session, size, inbox
         finally:
             if session is not None or is_requested:
-                with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT):
+                with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT) as closing:
                     await _close(channel, inbox, path, session, sequence)
+                if closing.cancelled_caught and session is None:  # the opening may just have been repeated
+                    last = Packet(channel.next_ftp_sequence(), 0, Opcode.TERMINATE_SESSION)
+                    channel.send(FileTransfer(0, *channel.target, last.pack()))
 
 
 async def _close(channel: Channel, inbox: Inbox, path: str, session: int | None, opening: int) -> None:
@@ -320,9 +328,13 @@ async def _close(channel: Channel, inbox: Inbox, path: str, session: int | None,
         if session is None:
             with suppress(FileTransferError):
                 data = path_bytes(path)
-                answer = await _request(channel, inbox, Opcode.OPEN_FILE_RO, path, data, sequence=opening)
+                answer = await _request(
+                    channel, inbox, Opcode.OPEN_FILE_RO, path, data, copies=CLOSE_COPIES, sequence=opening
+                )
                 session = answer.session
-        await _request(channel, inbox, Opcode.TERMINATE_SESSION, path, session=session or 0)
+        await _request(
+            channel, inbox, Opcode.TERMINATE_SESSION, path, session=session or 0, copies=CLOSE_COPIES
+        )
 
 
 class FileCutOff(NoReply):
@@ -507,8 +519,8 @@ class _FileReader:
                     self._send_read(at)
                 attempts[at] = tried + 1
                 in_flight[at] = (now, now + timing.timeout(tried))
-            if in_flight:
-                due = min(due for _, due in in_flight.values())
+            if in_flight or waiting:
+                due = min((due for _, due in in_flight.values()), default=math.inf)
                 if waiting:
                     due = min(due, now + BLOCK_INTERVAL * READS_AT_ONCE)
                 with anyio.move_on_after(max(due - now, 0.001)):

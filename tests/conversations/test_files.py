@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine
+from contextlib import suppress
 from functools import partial
 from random import Random
 
@@ -201,6 +202,20 @@ async def test_cancelled_at_any_moment_a_session_is_closed_on_board(make: Maker)
             assert not channel.is_waiting
             assert await read_file(channel, "a.bin") == CONTENT[:20_000]
             assert anyio.current_time() - began < 3.0
+
+
+@virtual
+async def test_sessions_are_closed_where_packets_are_lost_in_bursts() -> None:
+    vehicle = ArduPilotVehicle()
+    vehicle.files["a.bin"] = CONTENT[:20_000]
+    air = Air.symmetric([vehicle], loss=0.05, loss_burst=4.0, delay=0.3, seed=5)
+    async with converse(air) as conversation:
+        channel = (await conversation.node()).channel
+        for number in range(30):
+            with suppress(NoReply), anyio.move_on_after(number * 0.06):
+                await read_file(channel, "a.bin")
+            await anyio.sleep(0.4)  # what was sent last arrives
+            assert vehicle.open_files == []
 
 
 @virtual
