@@ -18,11 +18,12 @@ from __future__ import annotations
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component, ComponentState
+from paramclient.client.events import Discovered, Event, Events, Found, Lost, Rebooted, Resynced
 from paramclient.client.files import Ftp
 from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.reset import ResetResult
 from paramclient.client.signing import Signing, read_key
-from paramclient.client.streams import Changes, Discovered, Event, Events, Found, Lost, Rebooted, Resynced
+from paramclient.client.streams import Changes
 from paramclient.errors import (
     AlreadyRestored,
     AmbiguousVehicle,

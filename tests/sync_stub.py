@@ -11,7 +11,7 @@ from pathlib import Path
 from types import ModuleType
 
 from paramclient import metadata, provision
-from paramclient.client import client, component, files, streams
+from paramclient.client import client, component, events, files, streams
 from paramclient.provision import fleet
 
 STUB = Path(__file__).parent.parent / "paramclient" / "sync" / "__init__.pyi"
@@ -20,7 +20,8 @@ CLASSES: dict[ModuleType, list[str]] = {
     files: ["Ftp"],
     component: ["Component"],
     fleet: ["Wanted"],
-    streams: ["Changes", "Discovered", "Lost", "Found", "Rebooted", "Resynced", "Event", "Events"],
+    streams: ["Changes"],
+    events: ["Discovered", "Lost", "Found", "Rebooted", "Resynced", "Event", "Events"],
     client: ["ParamClient"],
 }
 FUNCTIONS: list[Callable[..., object]] = [

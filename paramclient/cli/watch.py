@@ -17,7 +17,8 @@ from paramclient.cli.output import local_time, print_json, print_line, printable
 from paramclient.cli.param_names import ChosenNames, check_given, may_appear
 from paramclient.cli.read_commands import fetch_table, get_chosen, report_all
 from paramclient.cli.session import CommandSession, connect, report_others
-from paramclient.client.streams import Changes, Discovered, Event, Events, Found, Lost, Rebooted, Resynced
+from paramclient.client.events import Discovered, Event, Events, Found, Lost, Rebooted, Resynced
+from paramclient.client.streams import Changes
 from paramclient.errors import CacheError, ParamClientError
 from paramclient.model.notation import hash_text, time_text, value_json
 from paramclient.model.patterns import NameChoice, is_pattern

@@ -12,17 +12,18 @@ from typing import TYPE_CHECKING, Final, Self
 import anyio
 
 from paramclient.cache import ParamCache
-from paramclient.client import streams
+from paramclient.client import events
 from paramclient.client.arguments import COMPONENT_TIMEOUT, address_in_words
 from paramclient.client.cache_writer import CacheWriter, choose_cache
 from paramclient.client.component import Component
 from paramclient.client.core import ClientCore, ClientTask
+from paramclient.client.events import Events
 from paramclient.client.files import Ftp
 from paramclient.client.fleet_fetch import FetchedAll, fetch_components
 from paramclient.client.forwarding import Forwarder
 from paramclient.client.recording import Capture
 from paramclient.client.signing import Signing, TimestampKeeper, refused_in_words
-from paramclient.client.streams import Events, Subscribers
+from paramclient.client.streams import Subscribers
 from paramclient.client.taps import FrameCutter
 from paramclient.client.traffic import Traffic, TrafficReport
 from paramclient.errors import AnotherVehicle, NoReply, ParamClientError, UsageError
@@ -134,7 +135,7 @@ class ParamClient:
         self._interval = watch_interval
         self._components: dict[Address, Component] = {}
         self._by_session: dict[Session, Component] = {}
-        self._events: Subscribers[streams.Event] = Subscribers()
+        self._events: Subscribers[events.Event] = Subscribers()
         self._task: ClientTask | None = None
         self._is_entered = False
         signing = Signing(signing) if isinstance(signing, SigningKey) else signing
@@ -482,7 +483,7 @@ class ParamClient:
         component, ext = ways
         component.is_extended_by(ext)
         self._components[component.address] = component
-        self._events.push(streams.Discovered(component))
+        self._events.push(events.Discovered(component))
 
     def _new_component(self, node: Node, session: Session) -> Component:
         def emit(event: protocol.Resynced) -> None:
@@ -508,13 +509,13 @@ class ParamClient:
                 self.core.cache_writer.forget(node)
                 return
             case protocol.Lost(silence=silence):
-                self._events.push(streams.Lost(component, silence))
+                self._events.push(events.Lost(component, silence))
             case protocol.Found(silence=silence):
-                self._events.push(streams.Found(component, silence))
+                self._events.push(events.Found(component, silence))
             case protocol.Rebooted():
-                self._events.push(streams.Rebooted(component))
+                self._events.push(events.Rebooted(component))
             case protocol.Resynced(changed=changed, hash=confirmed):
-                self._events.push(streams.Resynced(component, changed, confirmed))
+                self._events.push(events.Resynced(component, changed, confirmed))
         if isinstance(event, protocol.Found | protocol.Rebooted):
             for session in node.sessions:
                 self._by_session[session].watch.doubt()

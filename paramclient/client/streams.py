@@ -1,42 +1,23 @@
-"""Asynchronous streams: of the parameter changes of a component, and of the events of all components."""
+"""Asynchronous streams of items, and of the parameter changes of one component."""
 
 from __future__ import annotations
 
 import weakref
 from abc import abstractmethod
-from collections import deque
 from collections.abc import AsyncIterator
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, Generic, TypeAlias, TypeVar
+from dataclasses import replace
+from typing import Final, Generic, TypeVar
 
 import anyio
 
 from paramclient.errors import ParamClientError
 from paramclient.protocol.events import Change
 
-if TYPE_CHECKING:
-    from paramclient.client.component import Component
-
-__all__ = [
-    "Changes",
-    "Discovered",
-    "Event",
-    "Events",
-    "Found",
-    "Lost",
-    "Rebooted",
-    "Resynced",
-    "Stream",
-    "Subscribers",
-]
-
+__all__ = ["Changes", "Stream", "Subscribers"]
 
 CHANGES_MAX: Final = 100_000
 """Queued changes for a consumer, one for each name, at most: more than a table holds. Above it, the oldest
 are dropped."""
-
-EVENTS_MAX: Final = 1_000
-"""Queued events for a consumer, at most. Above it, the oldest are dropped."""
 
 Item = TypeVar("Item")
 
@@ -100,89 +81,6 @@ class Changes(Stream[Change]):
 
     def _take(self) -> Change | None:
         return self._waiting.pop(next(iter(self._waiting))) if self._waiting else None
-
-
-@dataclass(frozen=True, slots=True)
-class Discovered:
-    """The first message of a component has arrived.
-
-    Attributes:
-        component: the new component.
-    """
-
-    component: Component
-
-
-@dataclass(frozen=True, slots=True)
-class Lost:
-    """A component is lost: it has sent heartbeats before, and no message for the heartbeat timeout: 5 s,
-    longer for slow heartbeats and in high-latency mode.
-
-    Attributes:
-        component: the lost component.
-        silence: seconds since its last message.
-    """
-
-    component: Component
-    silence: float
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """A lost component sends again. The client requests its identity and checks its table.
-
-    Attributes:
-        component: the component.
-        silence: seconds without a message.
-    """
-
-    component: Component
-    silence: float
-
-
-@dataclass(frozen=True, slots=True)
-class Rebooted:
-    """A vehicle has rebooted: its clock has jumped back, or its heartbeat reports MAV_STATE_BOOT.
-
-    Attributes:
-        component: the component that has rebooted.
-    """
-
-    component: Component
-
-
-@dataclass(frozen=True, slots=True)
-class Resynced:
-    """A table that was stale, or possibly stale, matches the vehicle again.
-
-    Attributes:
-        component: the component of the table.
-        changed: names of the parameters that had changed.
-        hash: the vehicle's hash that confirms the table; None for a vehicle without a hash.
-    """
-
-    component: Component
-    changed: tuple[str, ...]
-    hash: int | None
-
-
-Event: TypeAlias = Discovered | Lost | Found | Rebooted | Resynced
-
-
-class Events(Stream[Event]):
-    """Stream of the component events since its creation; see `ParamClient.events`."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._waiting: deque[Event] = deque(maxlen=EVENTS_MAX)
-
-    def push(self, item: Event) -> None:
-        """Add an event."""
-        self._waiting.append(item)
-        self._arrived.set()
-
-    def _take(self) -> Event | None:
-        return self._waiting.popleft() if self._waiting else None
 
 
 class Subscribers(Generic[Item]):

@@ -17,7 +17,7 @@ import anyio.to_thread
 
 from paramclient.cache import ParamCache
 from paramclient.client.client import ParamClient
-from paramclient.client.streams import Discovered, Event, Found, Rebooted, Resynced
+from paramclient.client.events import Discovered, Event, Found, Rebooted, Resynced
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata import Metadata, MetadataStore, metadata_of

@@ -18,7 +18,7 @@ The functions have the arguments and the results of those in `paramclient.provis
 from __future__ import annotations
 
 from paramclient import metadata, provision
-from paramclient.client.streams import Discovered, Event, Found, Lost, Rebooted, Resynced
+from paramclient.client.events import Discovered, Event, Found, Lost, Rebooted, Resynced
 from paramclient.provision.fleet import Wanted
 from paramclient.sync.proxy import (
     Changes,

@@ -21,7 +21,7 @@ import anyio
 from anyio.from_thread import BlockingPortal, start_blocking_portal
 
 import paramclient.client.client as asynchronous
-from paramclient.client import component, files, streams
+from paramclient.client import component, events, files, streams
 from paramclient.errors import ClientClosed, UsageError
 from paramclient.model.params import ParamMap
 
@@ -133,7 +133,7 @@ class _Session:
             return ParamMap(_LiveMapping(self, value))
         if isinstance(value, MappingProxyType):
             return _LiveMapping(self, value)
-        if isinstance(value, streams.Event):
+        if isinstance(value, events.Event):
             return replace(value, component=self.shown(value.component))
         return value
 
@@ -291,7 +291,7 @@ _PROXIES: dict[type, type[Proxy]] = {
     component.Component: Component,
     files.Ftp: Ftp,
     streams.Changes: Changes,
-    streams.Events: Events,
+    events.Events: Events,
 }
 
 

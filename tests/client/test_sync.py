@@ -30,7 +30,8 @@ from paramclient import (
     Trust,
     UsageError,
 )
-from paramclient.client.streams import EVENTS_MAX, Changes
+from paramclient.client.events import EVENTS_MAX
+from paramclient.client.streams import Changes
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle
 from paramclient.wire import frames, messages
 from paramclient.wire.messages import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet

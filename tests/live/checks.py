@@ -19,7 +19,7 @@ from paramclient import (
     ParamClient,
     Rebooted,
 )
-from paramclient.client.streams import Events
+from paramclient.client.events import Events
 from paramclient.errors import (
     ParamClientError,
     Refused,

@@ -1,0 +1,100 @@
+"""Events of the components of a client, and their stream."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+from paramclient.client.streams import Stream
+
+if TYPE_CHECKING:
+    from paramclient.client.component import Component
+
+__all__ = ["Discovered", "Event", "Events", "Found", "Lost", "Rebooted", "Resynced"]
+
+EVENTS_MAX: Final = 1_000
+"""Queued events for a consumer, at most. Above it, the oldest are dropped."""
+
+
+@dataclass(frozen=True, slots=True)
+class Discovered:
+    """The first message of a component has arrived.
+
+    Attributes:
+        component: the new component.
+    """
+
+    component: Component
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """A component is lost: it has sent heartbeats before, and no message for the heartbeat timeout: 5 s,
+    longer for slow heartbeats and in high-latency mode.
+
+    Attributes:
+        component: the lost component.
+        silence: seconds since its last message.
+    """
+
+    component: Component
+    silence: float
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A lost component sends again. The client requests its identity and checks its table.
+
+    Attributes:
+        component: the component.
+        silence: seconds without a message.
+    """
+
+    component: Component
+    silence: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rebooted:
+    """A vehicle has rebooted: its clock has jumped back, or its heartbeat reports MAV_STATE_BOOT.
+
+    Attributes:
+        component: the component that has rebooted.
+    """
+
+    component: Component
+
+
+@dataclass(frozen=True, slots=True)
+class Resynced:
+    """A table that was stale, or possibly stale, matches the vehicle again.
+
+    Attributes:
+        component: the component of the table.
+        changed: names of the parameters that had changed.
+        hash: the vehicle's hash that confirms the table; None for a vehicle without a hash.
+    """
+
+    component: Component
+    changed: tuple[str, ...]
+    hash: int | None
+
+
+Event: TypeAlias = Discovered | Lost | Found | Rebooted | Resynced
+
+
+class Events(Stream[Event]):
+    """Stream of the component events since its creation; see `ParamClient.events`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._waiting: deque[Event] = deque(maxlen=EVENTS_MAX)
+
+    def push(self, item: Event) -> None:
+        """Add an event."""
+        self._waiting.append(item)
+        self._arrived.set()
+
+    def _take(self) -> Event | None:
+        return self._waiting.popleft() if self._waiting else None
