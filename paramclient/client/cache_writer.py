@@ -6,21 +6,23 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Final, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 import anyio
 import anyio.to_thread
 
-from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
+from paramclient.cache import BY_VEHICLE, ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.errors import CacheError, UsageError
 from paramclient.links.clock_offset import seconds_ahead
 from paramclient.model.identity import Identity
+from paramclient.model.values import Param
 from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult
 from paramclient.protocol.node import Node
+from paramclient.protocol.selection import vehicle_of
 from paramclient.protocol.session import Session
 
 __all__ = ["CacheWriter", "choose_cache"]
@@ -40,21 +42,30 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
+class _Observation(NamedTuple):
+    """A changed value, when it arrived by the clock of the event loop, whether it is volatile, its author."""
+
+    param: Param
+    at: float
+    volatile: bool | None
+    by: str = BY_VEHICLE
+
+
 @dataclass(eq=False)
 class _Pending:
-    """What is to be written of one table.
+    """What is to be written of one table. Times are of the event loop, as the computer's clock may be wrong.
 
     Attributes:
+        generation: of the component, when the first of it was received.
         observations: changed values, in order.
         removed: names that the vehicle no longer has, and when that was found.
         is_whole: whether the whole table is to be written, as it is.
-        state: of the table, as written last.
     """
 
-    observations: list[StoredParam] = field(default_factory=list)
+    generation: int
+    observations: list[_Observation] = field(default_factory=list)
     removed: dict[str, float] = field(default_factory=dict)
     is_whole: bool = False
-    state: TableState | None = None
 
 
 class CacheWriter:
@@ -77,24 +88,27 @@ class CacheWriter:
         self.cache = cache
         self._owned = owned
         self._thread = anyio.CapacityLimiter(1)
-        self._identities: dict[Node, Identity] = {}  # under which the tables of a component are written
-        self._synced_at: dict[Session, float] = {}  # when each table was last proven
+        self._identities: dict[Node, Identity] = {}  # of the vehicle, under which tables are written
+        self._vehicles: dict[Node, Node] = {}  # the autopilot with this identity
+        self._synced_at: dict[Session, float] = {}  # when each table was last proven, as the cache knows
+        self._fetched_at: dict[Session, float] = {}  # and in this session, by the event loop's clock
         self._pending: dict[Session, _Pending] = {}
         self._flushing = anyio.Lock()
         self._is_closing = False
         self._durable_calls = 0
         self._durable_until = 0  # the last of these whose values are safe from power loss
         self._something_to_write = anyio.Event()
-        self._known: set[tuple[int, int]] = set()
+        self._known: set[tuple[int | str, int]] = set()  # systems and keys of vehicles, with components
         self._ahead = -math.inf  # of unix time to the time of the event loop, in seconds
+        self._replacements = 0 if cache is None else cache.replacements
 
     async def open(self) -> None:
         """Load the list of cached components."""
         if self.cache is not None:
             summaries = await self._try(self.cache.components) or ()
-            self._known = {(each.system, each.component) for each in summaries}
+            self._known = {(which, each.component) for each in summaries for which in (each.system, each.key)}
 
-    async def close(self, nodes: Iterable[Node]) -> None:
+    async def close(self, nodes: Collection[Node]) -> None:
         """Write all new values, warn of lost ones, and close the cache if it is owned.
 
         Args:
@@ -109,8 +123,8 @@ class CacheWriter:
             for node in nodes:
                 is_known = node.identification.is_settled
                 if is_known or any(each.table.is_complete for each in node.sessions):
-                    await self.load(node)
-            is_written = await self.flush()
+                    await self.load(node, vehicle_of(nodes, node))
+            is_written = await self.flush() and await self.flush()  # the second one after a replaced file
         if not is_written and not was_warned:
             self._warn_of_lost()
         if self._owned:
@@ -129,10 +143,22 @@ class CacheWriter:
         """Return whether the cache had a table for these ids when the client was opened."""
         return (node.system, node.component) in self._known
 
-    async def load(self, node: Node) -> None:
-        """Load the cached tables of an identified component, and write its values from now on."""
-        identity = node.identification.identity
+    def may_load(self, node: Node, vehicle: Node) -> bool:
+        """Return whether it is known which vehicle a component belongs to, as far as the cache knows: the
+        vehicle is identified, or has never been before."""
+        key = vehicle.identification.identity.key
+        return vehicle.identification.is_settled or (key, node.component) in self._known
+
+    async def load(self, node: Node, vehicle: Node) -> None:
+        """Load the cached tables of a component, and write its values from now on.
+
+        Args:
+            node: the component.
+            vehicle: the autopilot of its vehicle, which is identified.
+        """
+        identity = vehicle.identification.identity
         kept = self._identities.get(node)
+        self._vehicles[node] = vehicle
         if self.cache is None or (kept is not None and kept.key == identity.key):
             self._identities[node] = identity
             self._wake()
@@ -141,21 +167,28 @@ class CacheWriter:
         for session in node.sessions:
             is_extended = session is node.extended
             cached = await self._try(partial(cache.load, identity.key, node.component, extended=is_extended))
+            if vehicle.identification.identity.key != identity.key:
+                return  # another vehicle has taken the address meanwhile, and its table is loaded
+            if identity.uid is not None:
+                session.table.forget_doubtful()
+            if kept is not None and session.table.params:  # received before it was known which vehicle it is
+                self._pending_of(node, session).is_whole = True
             if cached is None:
                 continue
-            if node.identification.autopilot is None:  # no heartbeat yet
+            if vehicle.identification.autopilot is None:  # no heartbeat yet
                 known = cached.identity
                 identity = replace(identity, autopilot=known.autopilot, vehicle_type=known.vehicle_type)
             if cached.synced_at is not None:
-                self._synced_at.setdefault(session, cached.synced_at)
+                self._synced_at[session] = cached.synced_at
             is_same_firmware = _firmware(cached.identity) == _firmware(identity)
-            params = cached.params.values()
+            params, ahead = cached.params.values(), self._seconds_ahead()
             session.table.load(
                 params if is_same_firmware else [replace(each, default=None) for each in params],
                 count=cached.count if cached.complete else None,
                 hash=cached.hash,
                 volatile=cached.volatile,
                 volatile_is_known=cached.volatile_known,
+                moments={name: at - ahead for name, at in cached.heard_at.items()},
             )
             if is_same_firmware and session.serves_file is None:
                 session.serves_file = cached.file_works
@@ -166,31 +199,42 @@ class CacheWriter:
         """Drop what waits: another vehicle uses the ids of the component."""
         self._identities.pop(node, None)
         for session in node.sessions:
-            self._pending.pop(session, None)
-            self._synced_at.pop(session, None)
+            for each in (self._pending, self._synced_at, self._fetched_at):
+                each.pop(session, None)
 
-    def changed(self, session: Session, change: Change) -> None:
+    def changed(self, node: Node, session: Session, change: Change) -> None:
         """Take a change of a parameter."""
         if self.cache is None:
             return
-        pending = self._pending.setdefault(session, _Pending())
-        at = self._unix(session.table.moments.get(change.name, math.inf))
+        pending = self._pending_of(node, session)
+        table = session.table
+        at = min(table.moments.get(change.name, math.inf), anyio.current_time())
         if change.new is None:
             pending.removed[change.name] = at
         elif len(pending.observations) < PENDING_MAX:
-            table = session.table
             is_volatile = change.name in table.volatile if table.volatile_is_known else None
-            pending.observations.append(StoredParam.of(change.new, at, is_volatile, change.by))
+            pending.observations.append(_Observation(change.new, at, is_volatile, change.by))
         else:
             pending.is_whole = True
         self._wake()
 
-    def fetched(self, session: Session, result: FetchResult) -> None:
+    def fetched(self, node: Node, session: Session, result: FetchResult) -> None:
         """Take note of a complete fetch."""
-        pending = self._pending.setdefault(session, _Pending())
-        self._synced_at[session] = time.time()
+        pending = self._pending_of(node, session)
+        self._fetched_at[session] = anyio.current_time()
         pending.is_whole = pending.is_whole or result.source != "cache"
         self._wake()
+
+    def _pending_of(self, node: Node, session: Session) -> _Pending:
+        """Return what is to be written of a table.
+
+        What was received of an unidentified component before it was lost may be of another vehicle.
+        """
+        pending = self._pending.get(session)
+        is_doubtful = pending is not None and pending.generation != node.generation
+        if pending is None or (is_doubtful and node not in self._identities):
+            pending = self._pending[session] = _Pending(node.generation)
+        return pending
 
     async def run(self) -> None:
         """Write new values in batches, until cancelled."""
@@ -217,9 +261,8 @@ class CacheWriter:
             if durable and self._durable_until >= call:
                 return True
             last_call = self._durable_calls
-            certain = [node for node in self._identities if node.identification.is_confirmed]
-            taken = [(node, session) for node in certain for session in node.sessions]
-            taken = [(node, session) for node, session in taken if session in self._pending]
+            certain = [node for node in self._identities if self._is_certain(node)]
+            taken = [(node, each) for node in certain for each in node.sessions if each in self._pending]
             before = {session: self._pending.pop(session) for _, session in taken}
             updates = [self._update(node, session, before[session]) for node, session in taken]
             is_saved = False
@@ -236,6 +279,12 @@ class CacheWriter:
                         self._put_back(session, pending)
         if is_saved:
             self.failure = None
+            if cache.replacements != self._replacements:  # a new file, without the earlier values
+                self._replacements = cache.replacements
+                for node in certain:
+                    for session in node.sessions:
+                        self._pending_of(node, session).is_whole = True
+                self._wake()
             if durable:
                 self._durable_until = last_call
         return is_saved
@@ -268,65 +317,67 @@ class CacheWriter:
         """
         if self.cache is None:
             raise UsageError("durable needs a cache, and the client has none; open it with a cache")
-        if node not in self._identities or not node.identification.is_confirmed:
+        if node not in self._identities or not self._is_certain(node):
             raise CacheError(f"it is not known which vehicle {node.system}/{node.component} is")
 
+    def _is_certain(self, node: Node) -> bool:
+        """Return whether the vehicle and the component are still those that were identified."""
+        return node.identification.is_confirmed and self._vehicles[node].identification.is_confirmed
+
     def _update(self, node: Node, session: Session, pending: _Pending) -> TableUpdate:
-        table = session.table
-        identity, heard = self._identities[node], node.identification
+        table, vehicle = session.table, self._vehicles[node]
+        identity, heard = self._identities[node], vehicle.identification
         if heard.autopilot is not None:
             identity = replace(identity, autopilot=heard.autopilot, vehicle_type=heard.vehicle_type or 0)
         observations = list(pending.observations)
         if pending.is_whole:
-            volatile = table.volatile if table.volatile_is_known else None
+            outside = table.volatile if table.volatile_is_known else None
             observations += [
-                StoredParam.of(
-                    param,
-                    self._unix(table.moments.get(name, -math.inf)),
-                    None if volatile is None else name in volatile,
-                )
+                _Observation(param, table.moments[name], None if outside is None else name in outside)
                 for name, param in table.params.items()
-                if name in table.moments
             ]
+        ahead = self._seconds_ahead()
+        fetched_at = self._fetched_at.get(session)
         is_extended = session is node.extended
         state = TableState(
             hash=table.hash if table.is_complete else None,
             count=table.count,
             complete=table.is_complete,
             volatile_known=table.volatile_is_known,
-            synced_at=self._synced_at.get(session),
+            synced_at=self._synced_at.get(session) if fetched_at is None else fetched_at + ahead,
             file_works=session.serves_file,
         )
         return TableUpdate(
             identity=identity,
             component=node.component,
-            autopilot=identity.autopilot,
+            autopilot=identity.autopilot if node is vehicle else node.identification.autopilot or 0,
             at=time.time(),
             table=state,
-            params=observations,
-            removed=dict(pending.removed),
+            params=[
+                StoredParam.of(each.param, each.at + ahead, each.volatile, each.by) for each in observations
+            ],
+            removed={name: at + ahead for name, at in pending.removed.items()},
             replace=pending.is_whole and table.is_complete,
             extended=is_extended,
         )
 
     def _put_back(self, session: Session, pending: _Pending) -> None:
         """Keep what could not be written, before what has come since."""
-        since = self._pending.get(session, _Pending())
+        since = self._pending.get(session, _Pending(pending.generation))
         pending.observations += since.observations
         pending.removed |= since.removed
         pending.is_whole = pending.is_whole or since.is_whole or len(pending.observations) > PENDING_MAX
         self._pending[session] = pending
 
-    def _unix(self, moment: float) -> float:
-        """Return the unix time of a time of the event loop, always the same for one; of a later one, now.
+    def _seconds_ahead(self) -> float:
+        """Return the seconds from the event loop's clock to unix time, always the same.
 
         The two clocks are compared once, and again where the computer's clock was set or was suspended.
         """
-        now = anyio.current_time()
         ahead = seconds_ahead(time.time, anyio.current_time)
-        if abs(ahead - self._ahead) > CLOCK_STEP:
+        if not abs(ahead - self._ahead) <= CLOCK_STEP:  # also where the clock is NaN
             self._ahead = ahead
-        return min(moment, now) + self._ahead
+        return self._ahead
 
     def _wake(self) -> None:
         self._something_to_write.set()
@@ -339,7 +390,7 @@ class CacheWriter:
         """Run a cache call in the thread; return None if it failed, with one warning for several failures."""
         try:
             return await self.run_in_thread(work)
-        except CacheError as error:
+        except (CacheError, UsageError) as error:  # UsageError: the clock has an impossible time
             if self.failure is None and not self._is_closing:
                 logger.warning("continuing without the cache: %s", error)
             self.failure = error

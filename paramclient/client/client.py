@@ -41,6 +41,7 @@ from paramclient.protocol.selection import (
     hint_of_link,
     node_in_words,
     only_vehicle,
+    vehicle_of,
 )
 from paramclient.protocol.session import Session
 from paramclient.protocol.station import Station
@@ -484,6 +485,7 @@ class ParamClient:
         component.is_extended_by(ext)
         self._components[component.address] = component
         self._events.push(events.Discovered(component))
+        self.core.spawn(self._join_vehicle, node)
 
     def _new_component(self, node: Node, session: Session) -> Component:
         def emit(event: protocol.Resynced) -> None:
@@ -503,7 +505,10 @@ class ParamClient:
         component = self._by_session[node.plain]
         match event:
             case protocol.Identified():
-                self.core.spawn(self._load, node)
+                nodes = self.core.station.nodes.values()
+                for each in nodes:
+                    if vehicle_of(nodes, each) is node:
+                        self.core.spawn(self._load, each)
                 return
             case protocol.Replaced():
                 self.core.cache_writer.forget(node)
@@ -523,11 +528,22 @@ class ParamClient:
 
     def _changed(self, node: Node, session: Session, change: protocol.Change) -> None:
         self._by_session[session].subscribers.push(change)
-        self.core.cache_writer.changed(session, change)
+        self.core.cache_writer.changed(node, session, change)
+
+    async def _join_vehicle(self, node: Node) -> None:
+        """Load the cached tables of a component whose vehicle is identified already, or never was."""
+        await anyio.sleep_until(node.since + LOOK_TIME)  # for the heartbeat of its autopilot
+        if self.core.cache_writer.may_load(node, vehicle_of(self.core.station.nodes.values(), node)):
+            await self._load(node)
 
     async def _load(self, node: Node) -> None:
-        """Load the cached tables of an identified component."""
-        await self.core.cache_writer.load(node)
+        """Load the cached tables of a component of an identified vehicle."""
+        nodes = self.core.station.nodes.values()
+        vehicle = vehicle_of(nodes, node)
+        is_young = anyio.current_time() < node.since + LOOK_TIME
+        if vehicle is node and is_young and not node.identification.is_autopilot:
+            return  # it may have an autopilot: `_join_vehicle` waits for its heartbeat
+        await self.core.cache_writer.load(node, vehicle)
         for session in node.sessions:
             self._by_session[session].cache_is_read.set()
 

@@ -40,7 +40,7 @@ from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all, result_of
 from paramclient.protocol.node import Node
 from paramclient.protocol.reads import read
-from paramclient.protocol.selection import hint_of_node, node_in_words
+from paramclient.protocol.selection import hint_of_node, node_in_words, vehicle_of
 from paramclient.protocol.session import Session
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
 from paramclient.protocol.watch import SyncState, Watch
@@ -135,7 +135,11 @@ class Component:
     @property
     def identity(self) -> Identity:
         """Identity of the vehicle from AUTOPILOT_VERSION: hardware id, firmware, capabilities, if known."""
-        return self.node.identification.identity
+        return self._vehicle.identification.identity
+
+    @property
+    def _vehicle(self) -> Node:
+        return vehicle_of(self.core.station.nodes.values(), self.node)
 
     @property
     def encoding(self) -> Encoding:
@@ -356,9 +360,10 @@ class Component:
         hint = hint_of_node(self.core.station, self.node, anyio.current_time())
         outcomes = [replace(each, error=_hinted(each.error, hint)) for each in outcomes]
         error = _hinted(error, hint)
-        if durable and any(outcome.is_set for outcome in outcomes):
+        names = [outcome.name for outcome in outcomes if outcome.is_set]
+        if durable and names:
             try:
-                await self._write_durably(f"{sum(each.is_set for each in outcomes)} values")
+                await self._write_durably(names[0] if len(names) == 1 else f"{len(names)} values")
             except NotDurable as failure:
                 error = error or failure
                 outcomes = [replace(each, error=failure) if each.is_set else each for each in outcomes]
@@ -491,7 +496,7 @@ class Component:
             self.watch.unconfirmed()
         elif result.complete:
             self.watch.fetched(None if result.source == "cache" else result.elapsed)
-            self.core.cache_writer.fetched(self.session, result)
+            self.core.cache_writer.fetched(self.node, self.session, result)
         return result
 
     async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
@@ -561,13 +566,18 @@ class Component:
     async def wait_until_identified(self, timeout: float) -> None:
         """Wait at most `timeout` seconds until the vehicle is identified, as its cache key requires."""
         with anyio.move_on_after(timeout):
-            await self.node.identification.settled()
+            await self._vehicle.identification.settled()
 
     async def wait_for_cache(self) -> None:
-        """Wait until the cached table, if there is one, is in the table; 1.5 s at most."""
+        """Wait until the cached table, if there is one, is in the table; 1.5 s at most.
+
+        Raises:
+            LinkError: the client was closed.
+        """
         if self.core.cache_writer.may_have(self.node):
-            with anyio.move_on_after(CACHE_TIMEOUT):
+            with anyio.CancelScope(deadline=self.node.since + CACHE_TIMEOUT):
                 await self.cache_is_read.wait()
+            self.core.check_open()
 
     def is_extended_by(self, ext: Component) -> None:
         """Take the component with the extended parameters."""

@@ -198,6 +198,7 @@ class _Fetch:
     async def _download(self) -> FetchSource:
         """Download the file, or the list where there is none."""
         session = self.session
+        is_silent = False
         if session.serves_file is not False and not session.dialect.has_ack:
             with session.channel.gate.until_closed(or_failed=True), anyio.move_on_after(IDENTITY_TIME):
                 await session.identification.encoding_certain()
@@ -211,7 +212,10 @@ class _Fetch:
                         self.notes.append(f"The component was lost: {error.reason}.")
                         return "ftp"
                     self.notes.append(f"Downloaded as a list: {error.reason}.")
+                    is_silent = error.is_silent
         self.listed = await download_list(session)
+        if is_silent and not self.listed.missing and not self.listed.lost:  # loss does not explain it
+            session.serves_file = False
         self.table.complete()
         return "stream"
 

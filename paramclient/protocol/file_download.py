@@ -31,11 +31,13 @@ class FileUnavailable(Exception):
 
     Attributes:
         reason: why, as a sentence for the notes of a fetch.
+        is_silent: whether no request was answered.
     """
 
-    def __init__(self, reason: str) -> None:
+    def __init__(self, reason: str, *, is_silent: bool = False) -> None:
         super().__init__(reason)
         self.reason = reason
+        self.is_silent = is_silent
 
 
 async def download_file(session: Session) -> int:
@@ -68,9 +70,10 @@ async def download_file(session: Session) -> int:
                 session.serves_file = False
             raise FileUnavailable(f"the parameter file was refused: {error.reason}") from None
         except NoReply as error:
+            is_cut_off = isinstance(error, FileCutOff)
             if isinstance(error, FileCutOff):
                 _store_beginning(session, error.prefix, requested_at)
-            raise FileUnavailable("MAVFTP did not answer") from None
+            raise FileUnavailable("MAVFTP did not answer", is_silent=not is_cut_off) from None
         except PackError as error:
             reason = f"the parameter file is not valid: {error}"
             attempts += 1

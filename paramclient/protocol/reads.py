@@ -17,7 +17,7 @@ from paramclient.errors import (
     UnknownParameter,
 )
 from paramclient.model.similar_names import did_you_mean, nearest_names
-from paramclient.model.values import Param
+from paramclient.model.values import Param, Trust
 from paramclient.protocol.channel import Inbox
 from paramclient.protocol.dialect import ReportedValue
 from paramclient.protocol.session import Session
@@ -143,8 +143,9 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
     That is the same parameter by its index, where that is known: some components answer no read by name.
     """
     channel, dialect, table = session.channel, session.dialect, session.table
-    same = table.params[which].index if isinstance(which, str) and which in table.moments else None
-    known = next((name for name in table.moments if name != which), 0) if same is None else same
+    live = {name: param.index for name, param in table.params.items() if param.trust is Trust.LIVE}
+    same = live.pop(which, None) if isinstance(which, str) else None
+    known = next(iter(live), 0) if same is None else same
     control: str | int = HASH_CHECK if session.identification.is_px4 else known
 
     def accept(message: Message) -> ReportedValue | None:

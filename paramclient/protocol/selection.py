@@ -25,6 +25,7 @@ __all__ = [
     "hint_of_node",
     "node_in_words",
     "only_vehicle",
+    "vehicle_of",
 ]
 
 LOOK_TIME: Final = 1.2
@@ -65,6 +66,13 @@ def autopilots_of(nodes: Iterable[Node]) -> list[Node]:
         if key not in first or each.component == AUTOPILOT_COMPONENT != first[key].component:
             first[key] = each
     return list(first.values())
+
+
+def vehicle_of(nodes: Iterable[Node], node: Node) -> Node:
+    """Return the autopilot of a component's vehicle, whose identity is the vehicle's; without one, itself."""
+    same = [each for each in nodes if each.system == node.system]
+    near = [each for each in same if each.peer == node.peer] if node.is_split else same
+    return next(iter(autopilots_of(near)), node)
 
 
 def only_vehicle(

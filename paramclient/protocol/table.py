@@ -197,7 +197,12 @@ class Table:
         if not self.is_complete:
             return []
         self._was_complete = True
-        gone = [name for name in self.params if name in self._outdated]
+        names, outdated = self.names, self._outdated
+        gone = [
+            name
+            for name, param in self.params.items()
+            if name in outdated or (param.index is not None and names.get(param.index) != name)
+        ]
         self._outdated.clear()
         changes = [Change(name, self.params[name], None, "vehicle", "removed") for name in gone]
         for change in changes:
@@ -291,6 +296,20 @@ class Table:
         self._was_complete = False
         self.unconfirm()
 
+    def forget_doubtful(self) -> None:
+        """Forget the values that may be of another vehicle: the component was lost since, and is identified
+        only now. A table that the vehicle has confirmed stays."""
+        if any(param.trust is Trust.VERIFIED for param in self.params.values()):
+            return
+        for name in [name for name, param in self.params.items() if param.trust is Trust.CACHED]:
+            index = self.params.pop(name).index
+            self.moments.pop(name, None)
+            self._wire.pop(name, None)
+            if index is not None and self.names.get(index) == name:
+                del self.names[index]
+        if not self.params:
+            self.clear()
+
     def load(
         self,
         params: Iterable[Param],
@@ -299,13 +318,18 @@ class Table:
         hash: int | None,  # noqa: A002 - the name of the attribute
         volatile: Iterable[str],
         volatile_is_known: bool,
+        moments: Mapping[str, float],
     ) -> None:
-        """Take the cached table of the component; values that were received on this link stay."""
+        """Take the cached table of the component; values that were received on this link stay.
+
+        `moments`: when the values arrived in earlier sessions, by the event loop's clock.
+        """
         for param in params:
             old = self.params.get(param.name)
             if old is None:
                 self.params[param.name] = param.with_trust(Trust.CACHED)
-                if param.index is not None and self.count in (None, count):
+                self.moments[param.name] = moments[param.name]
+                if param.index is not None and count is not None and self.count in (None, count):
                     self.names.setdefault(param.index, param.name)
             elif old.default is None and old.type_number == param.type_number and param.default is not None:
                 self.params[param.name] = replace(old, default=param.default)

@@ -111,15 +111,14 @@ async def test_an_unchanged_vehicle_is_not_downloaded_again(
         assert component.state == "cached"
         assert trusts(component, volatile) == {Trust.CACHED}
         result = await component.fetch_all()
-        assert anyio.current_time() - received_at < 0.42, "two round trips: the hash, and the values outside"
+        assert anyio.current_time() - received_at < 0.62, "round trips: identity, hash, values outside of it"
         assert (result.source, result.complete, result.hash) == ("cache", True, vehicle.announced_hash())
         assert bits(result.params) == bits(vehicle.params)
         assert trusts(component, component.params.keys() - volatile) == {Trust.VERIFIED}
         assert trusts(component, volatile) == {Trust.LIVE}
         assert (
-            repr(component) == f"<Component 1/1 px4 synced {len(vehicle.params)} params from cache in 0.00 s>"
+            repr(component) == f"<Component 1/1 px4 synced {len(vehicle.params)} params from cache in 0.40 s>"
         )
-        assert trusts(component, volatile) == {Trust.LIVE}
     reads = [message.param_id for message in tap.messages(messages.ParamRequestRead)]
     assert sorted(reads) == sorted([messages.HASH_CHECK, *volatile])
     assert not tap.messages(messages.ParamRequestList)
@@ -279,9 +278,8 @@ async def test_a_silent_component_with_a_cached_table_delays_no_other_component(
         assert not (await client.fetch_all()).silent
     silent.unanswered = unanswered
     async with ParamClient(Air([vehicle, silent]), cache=path) as client:
-        began = anyio.current_time()
         everything = await client.fetch_all()
-        assert anyio.current_time() - began < 5.0
+        assert everything.results[1, 1].elapsed < 0.5
         assert everything.results.keys() == {(1, 1)}
         assert everything.silent.keys() == {(2, 1)}
 
@@ -405,10 +403,11 @@ async def test_an_identity_that_arrives_long_after_the_values(path: Path, fetche
         tap.is_mute = False
         await asyncio.sleep(2.0)
         assert component.identity.key.startswith("uid:")
-        assert component.params["PARAM_01"].value == 1, "it may be another vehicle that was received before"
         if fetched:
-            assert (await component.fetch_all()).source == "stream"
+            assert trusts(component) == {Trust.LIVE}, "read again from the vehicle that is there now"
         else:
+            value = component.params["PARAM_01"].value
+            assert value == 1, "another vehicle may have been received before"
             await component.get("PARAM_01")
     with ParamCache(path) as cache:
         cached = cache.load(component.identity.key, 1)
