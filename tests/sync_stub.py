@@ -27,8 +27,7 @@ CLASSES: dict[ModuleType, list[str]] = {
 FUNCTIONS: list[Callable[..., object]] = [
     *(provision.prepare, provision.apply, provision.verify, provision.restore),
     *(provision.apply_all, provision.verify_all, provision.restore_all),
-    *(provision.apply_extended, provision.verify_extended, provision.restore_extended),
-    *(provision.load_extended_state, metadata.metadata_of),
+    metadata.metadata_of,
 ]
 STREAMS = {"Changes": "Change", "Events": "Event"}
 OWN = {name for names in CLASSES.values() for name in names} | {each.__name__ for each in FUNCTIONS}

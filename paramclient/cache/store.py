@@ -6,6 +6,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
@@ -409,11 +410,11 @@ class ParamCache:
                 its beginning, and the nearest snapshots).
         """
 
-        return self._read(
-            lambda tx: (
-                snapshots.load_state(tx, self._table(tx, vehicle, component, extended=extended), when).params
-            )
-        )
+        def work(tx: Transaction) -> ParamSet:
+            table = self._table(tx, vehicle, component, extended=extended)
+            return replace(snapshots.load_state(tx, table, when).params, is_extended=extended)
+
+        return self._read(work)
 
     def _read(self, work: Callable[[Transaction], T]) -> T:
         return self._store.run(work, writing=False)

@@ -31,9 +31,10 @@ from paramclient.metadata import (
 )
 from paramclient.metadata.added_files import file_address
 from paramclient.metadata.info import number_of
+from paramclient.model.ext_values import check_ext_value, encode_ext_value
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param, WireValue, check_name, format_value
+from paramclient.model.values import HEX, Param, ParamType, WireValue, check_name, format_value, type_name
 
 __all__ = [
     "DESCRIBED_COLUMNS",
@@ -50,11 +51,11 @@ __all__ = [
     "meaning_of",
     "needs_reboot",
     "parse_pairs",
+    "parse_value",
     "print_descriptions",
     "problems",
     "request_from_vehicle",
     "resolved",
-    "text_pairs",
     "units_of",
 ]
 
@@ -211,15 +212,16 @@ def files_of(autopilots: Collection[str]) -> str:
 # Values to write
 
 
-def parse_pairs(words: Sequence[str]) -> list[tuple[str, int | float | str]]:
+def parse_pairs(words: Sequence[str], *, as_text: bool = False) -> list[tuple[str, WireValue]]:
     """Parse the arguments of `set`: parameters and values, as `NAME VALUE` or `NAME=VALUE`.
 
-    A value after an equals sign may be the name of a value; it is returned as text.
+    A value after an equals sign may be the name of a value; it is returned as text. With `as_text`, every
+    value is.
 
     Raises:
         UsageError: a name has no value, or a name or value is invalid.
     """
-    pairs: list[tuple[str, int | float | str]] = []
+    pairs: list[tuple[str, WireValue]] = []
     left = iter(words)
     for word in left:
         _check_no_option(word)
@@ -228,7 +230,9 @@ def parse_pairs(words: Sequence[str]) -> list[tuple[str, int | float | str]]:
             value = next(left, None)
             if value is None:
                 break
-            pairs.append((check_name(name), _number(name, value)))
+            pairs.append((check_name(name), value if as_text else _number(name, value)))
+        elif as_text:
+            pairs.append((check_name(name), text))
         elif not text.strip():
             raise UsageError(f"{name}: there is no value after the equals sign")
         else:
@@ -241,24 +245,23 @@ def parse_pairs(words: Sequence[str]) -> list[tuple[str, int | float | str]]:
     raise UsageError(f"set takes pairs of NAME and VALUE, or NAME=VALUE{end}")
 
 
-def text_pairs(words: Sequence[str]) -> list[tuple[str, str]]:
-    """Parse the arguments of `set`, as `NAME VALUE` or `NAME=VALUE`, without reading the values.
+def parse_value(name: str, text: str, number: int) -> WireValue:
+    """Return the value that a text gives in a type: a number, text, or bytes after `hex:`.
 
     Raises:
-        UsageError: a name has no value, or is invalid.
+        UsageError: the text is no value of this type.
     """
-    pairs: list[tuple[str, str]] = []
-    left = iter(words)
-    for word in left:
-        _check_no_option(word)
-        name, equals, text = word.partition("=")
-        value = text if equals else next(left, None)
-        if value is None:
-            raise UsageError(f"{name}: there is no value")
-        pairs.append((check_name(name), value))
-    if not pairs:
-        raise UsageError("set takes pairs of NAME and VALUE, or NAME=VALUE")
-    return pairs
+    try:
+        value: WireValue = bytes.fromhex(text.removeprefix(HEX)) if text.startswith(HEX) else text
+        if isinstance(value, str) and ParamType.UINT8 <= number <= ParamType.REAL64:
+            value = float(text) if number >= ParamType.REAL32 else int(text, 0)
+    except ValueError:
+        raise UsageError(f"{name}: {text!r} is not a value of type {type_name(number)}") from None
+    try:
+        encode_ext_value(check_ext_value(value), number)
+    except UsageError as error:
+        raise UsageError(f"{name}: {error}") from None
+    return value
 
 
 def _check_no_option(word: str) -> None:
@@ -275,14 +278,14 @@ def _check_no_option(word: str) -> None:
 
 
 def resolved(
-    pairs: Iterable[tuple[str, int | float | str]], metadata: Metadata | None
-) -> list[tuple[str, int | float]]:
+    pairs: Iterable[tuple[str, WireValue]], metadata: Metadata | None
+) -> list[tuple[str, WireValue]]:
     """Return the pairs with every name of a value replaced by its number.
 
     Raises:
         UsageError: an unknown name of a value, or a parameter without metadata.
     """
-    numbers: list[tuple[str, int | float]] = []
+    numbers: list[tuple[str, WireValue]] = []
     for name, value in pairs:
         if isinstance(value, str):
             info = info_of(metadata, name)
@@ -293,7 +296,7 @@ def resolved(
     return numbers
 
 
-def problems(pairs: Iterable[tuple[str, int | float]], metadata: Metadata | None) -> Iterator[str]:
+def problems(pairs: Iterable[tuple[str, WireValue]], metadata: Metadata | None) -> Iterator[str]:
     """Yield warnings about values, such as one outside of the range; the vehicle may accept them."""
     for name, value in pairs:
         info = info_of(metadata, name)

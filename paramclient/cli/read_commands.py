@@ -13,7 +13,6 @@ from cyclopts import Parameter
 
 from paramclient.cli.default_sources import find_defaults, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode, code_of
-from paramclient.cli.extended import fetch_extended, get_extended
 from paramclient.cli.json_output import FetchJson, ParamJson
 from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
@@ -38,7 +37,6 @@ from paramclient.cli.param_names import ChosenNames, check_given, suggest
 from paramclient.cli.session import (
     CommandSession,
     Done,
-    connect,
     failed_json,
     report_failures,
     report_others,
@@ -95,11 +93,8 @@ async def fetch(
             f"fetch takes no names, as it fetches all: `paramclient get {url} {given}` reads only some, "
             f"`paramclient fetch {url} --only {given}` fetches all and prints some"
         )
-    if extended:
-        async with connect(url, options) as session:
-            return await fetch_extended(session, only)
     from_option = from_file(metadata)
-    async with sessions(url, options, policy=policy) as found:
+    async with sessions(url, options, policy=policy, extended=extended) as found:
 
         async def work(session: CommandSession) -> _Fetched:
             fetched = _Fetched.of(session, await fetch_table(session, refresh=refresh), policy)
@@ -133,11 +128,8 @@ async def get(
         extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
     given = check_given((name, *names))
-    if extended:
-        async with connect(url, options) as session:
-            return await get_extended(session, given)
     from_option = from_file(metadata)
-    async with sessions(url, options) as found:
+    async with sessions(url, options, extended=extended) as found:
 
         async def work(session: CommandSession) -> _Read:
             params, errors = await get_chosen(session, given)
@@ -236,7 +228,7 @@ class _Fetched:
         if len(self.session.client.components) > 1:  # the counters are those of the link
             transferred = f"{transferred} on the whole link"
         return (
-            f"{result.count - len(self.missing)}{of} parameters of {self.session.label} from "
+            f"{result.count - len(self.missing)}{of} {self.session.noun}s of {self.session.label} from "
             f"{result.source} in {result.elapsed:.2f} s, {lost}{trip}{transferred}{crc}"
         )
 

@@ -19,8 +19,7 @@ from paramclient.cli.default_sources import (
     say_sources,
 )
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import is_extended_source
-from paramclient.cli.extended_sources import save_extended
+from paramclient.cli.file_output import noun_of
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets
 from paramclient.cli.offline import tables_of
 from paramclient.cli.options import LinkOptions
@@ -89,12 +88,6 @@ async def save(
             downloaded in 2 s.
         extended: Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them.
     """
-    if extended or is_extended_source(where):
-        if changed or only:
-            raise UsageError("--changed and --only are for plain parameters")
-        return await save_extended(
-            where, file, None if file_format is None else FileFormat(file_format), options
-        )
     if metadata is not None and not changed:
         raise UsageError("--metadata gives the defaults for --changed")
     written = format_of_name(str(file)) if file_format is None else FileFormat(file_format)
@@ -104,10 +97,10 @@ async def save(
     selection = _Selection(changed, STORED_DEFAULTS_HINT if is_offline else DEFAULTS_HINT)
     given = from_file(metadata, offline=is_offline)
     if is_offline:
-        _add_offline(selection, where, given, options)
+        _add_offline(selection, where, given, options, extended=extended)
     else:
         check_link(where)
-        await _add_link(selection, where, metadata, given, options, refresh=refresh)
+        await _add_link(selection, where, metadata, given, options, refresh=refresh, extended=extended)
     for fault in selection.faults:
         report(fault)
     sets = _chosen(selection.sets, only) if only else selection.sets
@@ -159,9 +152,10 @@ async def _add_link(
     options: LinkOptions,
     *,
     refresh: bool,
+    extended: bool,
 ) -> None:
     """Add the parameters of the vehicles on a link that were received or confirmed in this session."""
-    async with sessions(url, options) as found:
+    async with sessions(url, options, extended=extended) as found:
         draws = not found[0].choice.is_all
 
         async def fetch(session: CommandSession) -> ParamSet:
@@ -180,7 +174,9 @@ async def _add_link(
         await report_others(found)
 
 
-def _add_offline(selection: _Selection, where: str, given: Metadata | None, options: LinkOptions) -> None:
+def _add_offline(
+    selection: _Selection, where: str, given: Metadata | None, options: LinkOptions, *, extended: bool
+) -> None:
     """Add the parameters of a file, of an on-board log, or of a vehicle in the cache."""
     choice = ChosenVehicle.parse(options.vehicle)
     if is_file(where):
@@ -189,7 +185,7 @@ def _add_offline(selection: _Selection, where: str, given: Metadata | None, opti
     else:
         if options.place is False:
             raise UsageError(f"{where!r} is a vehicle in the cache, which --no-cache excludes")
-        tables = tables_of(options.cache, where, choice.component)
+        tables = tables_of(options.cache, where, choice.component, extended=extended)
         if not choice.is_all and len(tables) > 1:
             pilots = [table for table in tables if table.component == AUTOPILOT]
             if not pilots:
@@ -203,7 +199,7 @@ def _add_offline(selection: _Selection, where: str, given: Metadata | None, opti
                     f"{table.system}/{table.component} is incomplete: {table.size}{of} parameters are in the "
                     "cache"
                 )
-        sets = [cached_param_set(table) for table in tables if table.complete]
+        sets = [cached_param_set(table, extended=extended) for table in tables if table.complete]
     metadata = [given] * len(sets)
     if selection.is_changed and given is None:
         metadata = known_of_sets(sets, options)
@@ -257,5 +253,5 @@ def _show(files: Mapping[Path, Sequence[ParamSet]], file_format: FileFormat, *, 
         print_json(written[0] if len(written) == 1 else {"files": written})
         return
     for file, sets in files.items():
-        contents = ", ".join(f"{counted(len(each), 'parameter')} of {address(each)}" for each in sets)
+        contents = ", ".join(f"{counted(len(each), noun_of(each))} of {address(each)}" for each in sets)
         say(printable(f"{contents} written to {file} ({file_format})"))

@@ -145,7 +145,7 @@ class ChosenVehicle:
 
 @dataclass(frozen=True, slots=True)
 class CommandSession:
-    """An open client, and a component that the command works on."""
+    """An open client, and a component that the command works on: with --extended, its extended parameters."""
 
     client: ParamClient
     component: Component
@@ -176,6 +176,11 @@ class CommandSession:
         return f"{self.label}: " if self.choice.is_all else ""
 
     @property
+    def noun(self) -> str:
+        """The parameters of the component in words, in the singular."""
+        return "extended parameter" if self.component.is_extended else "parameter"
+
+    @property
     def receiver(self) -> str:
         """The component with its kind and firmware; see `receiver_in_words`."""
         return receiver_in_words(self.component)
@@ -198,7 +203,7 @@ class CommandSession:
             system, component = own.system, own.component
         timeout = self.deadline.left(RECHECK_TIMEOUT)
         found = await self.client.only_component(system, component, timeout=timeout)
-        if found is not own:
+        if found.node is not own.node:
             other = f"{found.system}/{found.component} {found.autopilot}"
             raise AmbiguousVehicle(
                 f"{self.label} was chosen and is no longer heard; {other} is heard instead. Nothing was "
@@ -216,7 +221,7 @@ async def sessions(
     writes: bool = False,
     policy: Policy = Policy.AUTO,
     is_live: bool = False,
-    is_plain: bool = True,
+    extended: bool = False,
 ) -> AsyncIterator[list[CommandSession]]:
     """Open a link, and yield a session for each vehicle that --vehicle names.
 
@@ -226,7 +231,7 @@ async def sessions(
         writes: whether several vehicles are an error, unless --vehicle names one or all.
         policy: as in `ParamClient`.
         is_live: read a log in real time; otherwise it is read at full speed, unless its name gives a speed.
-        is_plain: whether plain parameters are used, so that --extended is suggested for a camera.
+        extended: use the extended parameters. Otherwise --extended is suggested for a camera.
 
     Raises:
         UsageError: no such link, or options that exclude each other.
@@ -236,6 +241,8 @@ async def sessions(
     """
     check_link_argument(url)
     choice, deadline = ChosenVehicle.parse(options.vehicle), Deadline(options.timeout)
+    if extended and choice.is_all:
+        raise UsageError("--vehicle all is not possible with --extended; name one vehicle")
     async with ParamClient(
         url if is_live else _at_full_speed(url),
         cache=None if options.place is True else options.place,
@@ -251,16 +258,17 @@ async def sessions(
         found = await _find(client, choice, timeout=timeout, only=writes)
         if writes:
             await wait_for_firmware(found, deadline)
-        for each in found if is_plain else ():
+        for each in () if extended else found:
             if expects_extended(each.identity.vehicle_type, each.component):
                 label = f"{each.system}/{each.component}"
                 say(f"{label} usually has extended parameters: --extended uses them")
-        yield [CommandSession(client, each, deadline, options, choice) for each in found]
+        chosen = [each.ext for each in found] if extended else found
+        yield [CommandSession(client, each, deadline, options, choice) for each in chosen]
 
 
 @asynccontextmanager
 async def connect(
-    url: str, options: LinkOptions, *, writes: bool = False, is_live: bool = False
+    url: str, options: LinkOptions, *, writes: bool = False, is_live: bool = False, extended: bool = False
 ) -> AsyncIterator[CommandSession]:
     """Open a link, and yield the session of one vehicle; arguments and errors as in `sessions`.
 
@@ -269,7 +277,7 @@ async def connect(
     """
     if ChosenVehicle.parse(options.vehicle).is_all:
         raise UsageError("--vehicle all is not possible here; name one vehicle")
-    async with sessions(url, options, writes=writes, is_live=is_live, is_plain=False) as found:
+    async with sessions(url, options, writes=writes, is_live=is_live, extended=extended) as found:
         yield found[0]
 
 

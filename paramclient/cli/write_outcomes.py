@@ -151,12 +151,13 @@ def outcome_cells(
     session: CommandSession, outcome: SetOutcome, described: Metadata | None = None
 ) -> tuple[object, ...]:
     """Return the cells of `OUTCOME_COLUMNS` for an outcome; the reported value with its meaning, if known."""
-    actual = _text(outcome.reported, type_of(session, outcome))
+    kind = type_of(session, outcome)
+    actual = _text(outcome.reported, kind)
     if outcome.reported is not None and (meaning := meaning_of(described, outcome.name, outcome.reported)):
         actual = f"{actual} ({meaning})"
     return (
         outcome.name,
-        _text(outcome.requested, ParamType.REAL64),
+        _text(outcome.requested, kind if isinstance(outcome.requested, bytes) else ParamType.REAL64),
         actual,
         Coloured(status_in_words(outcome.status, outcome.error), _STYLES[outcome.status]),
     )

@@ -127,6 +127,11 @@ class Component:
         return self._ext
 
     @property
+    def is_extended(self) -> bool:
+        """Whether these are the extended parameters: whether the component is the `ext` of another one."""
+        return self.session.dialect.has_ack
+
+    @property
     def autopilot(self) -> str:
         """Autopilot of its heartbeat: px4, ardupilot, generic, …; "unknown" before the first heartbeat."""
         number = self.node.identification.autopilot
@@ -297,7 +302,7 @@ class Component:
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link failed, or the client was closed.
         """
-        ((name, checked),) = check_writes([(name, value)], extended=self.session.dialect.has_ack)
+        ((name, checked),) = check_writes([(name, value)], extended=self.is_extended)
         settle, by = check_settle(settle), check_author(author)
         await self._check_may_write(durable=durable)
         with self.limited(timeout, f"the acknowledgement of {name} by {self.system}/{self.component}"):
@@ -340,7 +345,7 @@ class Component:
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link had failed already, or the client was closed.
         """
-        pairs = check_writes(values, extended=self.session.dialect.has_ack)
+        pairs = check_writes(values, extended=self.is_extended)
         settle, by = check_settle(settle), check_author(author)
         await self._check_may_write(durable=durable)
         began = anyio.current_time()

@@ -107,6 +107,11 @@ def _bytes(sets: list[ParamSet], file_format: FileFormat, around: ParamFile) -> 
             f"the format {file_format} holds one component, and there are {components}; choose one"
         )
     _check(sets)
+    if any(each.is_extended for each in sets):
+        if file_format is not FileFormat.JSON:
+            raise UsageError(f"the format {file_format} cannot hold extended parameters; write .json")
+        if len(sets) > 1:
+            raise UsageError("a file of extended parameters holds one component, and no plain parameters")
     match file_format:
         case FileFormat.PCK:
             return param_pck.write_packed(sets[0])

@@ -51,10 +51,7 @@ from paramclient.model.values import (
 )
 
 __all__ = [
-    "ext_param_of_fields",
-    "read_ext_json",
     "read_json",
-    "write_ext_json",
     "write_json",
 ]
 
@@ -79,16 +76,16 @@ _bits: Final = re.compile(r"[0-9a-fA-F]{8}(?:[0-9a-fA-F]{8})?").fullmatch
 
 
 def read_json(text: str, source: str, params_max: int | None = None) -> ParamFile:
-    """Read a document of plain parameters.
+    """Read a document of plain or of extended parameters.
 
     Raises:
         TooManyParams: the document has more parameters than `params_max`.
         FileError: invalid JSON, a repeated key, or not a valid document. The error names up to 20 problems.
     """
     content = read_json_text(text, source)
-    if isinstance(content, dict) and _EXT_KEY in content:
-        raise FileError("it has extended parameters, and plain ones are expected", source=source)
     reader = Reader(text, source)
+    if isinstance(content, dict) and _EXT_KEY in content:
+        return ParamFile((_ext_set(reader, content, params_max),), FileFormat.JSON, source)
     document = reader.fields(content, (), _DOCUMENT, {_KEY, "sets"})
     raw_sets = document.get("sets", [])
     named = [each.get("params") for each in raw_sets if isinstance(each, dict)]
@@ -100,29 +97,23 @@ def read_json(text: str, source: str, params_max: int | None = None) -> ParamFil
     return ParamFile(sets, FileFormat.JSON, source, tuple(document.get("header", [])))
 
 
-def read_ext_json(text: str, source: str) -> ParamSet:
-    """Read a document of extended parameters.
-
-    Raises:
-        FileError: as `read_json`.
-    """
-    content = read_json_text(text, source)
-    if not isinstance(content, dict) or _EXT_KEY not in content:
-        raise FileError(f"no extended parameters: the key {_EXT_KEY} is missing", source=source)
-    reader = Reader(text, source)
+def _ext_set(reader: Reader, content: Mapping[str, object], params_max: int | None) -> ParamSet:
+    """Return the set of a document of extended parameters."""
+    source = reader.problems.source
     known = {key: each for key, each in content.items() if key in _EXT_DOCUMENT}
     head = reader.fields(known, (), _EXT_DOCUMENT, {"params"})
+    TooManyParams.check(len(head.get("params", {})), params_max, source)
     params = {}
     for name, fields in head.get("params", {}).items():
         try:
-            params[name] = ext_param_of_fields(name, fields)
+            params[name] = _ext_param(name, fields)
         except ValueError as error:
             reader.problem(("params", name), str(error))
     reader.problems.raise_if_any()
     if not params:
         raise FileError("the file contains no parameters", source=source)
     ids = head.get("component"), head.get("system")
-    return ParamSet(params, *ids, None, head.get("at"), source)
+    return ParamSet(params, *ids, None, head.get("at"), source, is_extended=True)
 
 
 def _set(reader: Reader, content: object, place: Place) -> ParamSet:
@@ -160,7 +151,7 @@ def _param(reader: Reader, name: str, content: object, place: Place) -> WrittenP
         return None
 
 
-def ext_param_of_fields(name: str, fields: object) -> WrittenParam:
+def _ext_param(name: str, fields: object) -> WrittenParam:
     """Return the parameter that a document has under a name: `value` or `hex`, and `type`.
 
     Raises:
@@ -288,11 +279,14 @@ _EXT_DOCUMENT: Final[Checks] = {
 
 
 def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
-    """Generate the lines of a document of plain parameters.
+    """Generate the lines of a document: of one set of extended parameters, or of sets of plain ones.
 
     Raises:
         UsageError: a NaN with payload bits has no type.
     """
+    if sets[0].is_extended:
+        yield from _ext_lines(sets[0])
+        return
     header = [_encodable(line) for line in (*around.header, *around.footer)]
     yield "{"
     yield f'  "{_KEY}": {VERSION},'
@@ -313,7 +307,7 @@ def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
     yield "}"
 
 
-def write_ext_json(content: ParamSet) -> Iterator[str]:
+def _ext_lines(content: ParamSet) -> Iterator[str]:
     """Generate the lines of a document of extended parameters."""
     yield "{"
     for key, each in {_EXT_KEY: VERSION, **_about(content)}.items():

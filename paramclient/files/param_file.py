@@ -35,6 +35,11 @@ class ParamFile:
     footer: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
+    @property
+    def is_extended(self) -> bool:
+        """Whether the file has extended parameters."""
+        return any(each.is_extended for each in self.sets)
+
     def choose(self, component: int | None = None, *, system: int | None = None) -> ParamSet:
         """Return the set of a component.
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 __all__ = [
+    "HEX",
     "WIRE_SIZE",
     "Encoding",
     "TYPES_BY_NAME",
@@ -57,6 +58,8 @@ number of the type (see `Param.is_raw`)."""
 Settable: TypeAlias = SupportsIndex | SupportsFloat | str | bytes
 """A value that can be set: a number, also of another library, or the four wire bytes."""
 
+HEX: Final = "hex:"
+"""Begins the text of a value that is bytes, in hexadecimal."""
 WIRE_SIZE: Final = 4
 """Bytes of the value in PARAM_VALUE and PARAM_SET, of any type."""
 NAME_LENGTH = 16
@@ -490,11 +493,11 @@ def same_bits(number: int, a: int, b: int) -> bool:
 
 
 def format_value(value: WireValue, number: int = ParamType.REAL32) -> str:
-    """Return the shortest text that parses to the same value: floats as float32, raw bytes as hexadecimal."""
+    """Return the shortest text that parses to the same value: floats as float32, raw bytes as hexadecimal,
+    bytes of a CUSTOM value as `hex:ff00fe`."""
     if isinstance(value, bytes):
-        return (
-            f"0x{value.hex()}" if number == ParamType.CUSTOM else f"0x{int.from_bytes(value, 'little'):08x}"
-        )
+        is_custom = number == ParamType.CUSTOM
+        return f"{HEX}{value.hex()}" if is_custom else f"0x{int.from_bytes(value, 'little'):08x}"
     if isinstance(value, int | str):
         return str(value)
     return repr(shortest_float(value) if number == ParamType.REAL32 else value)

@@ -160,10 +160,11 @@ class ApplyRun:
         """Inspect the vehicle, plan, and store its state. A failure is raised before the first write."""
         if self._options.durable and self._component.core.cache is None:
             raise UsageError("durable needs a cache, and the client keeps none")
-        check_component(self._wanted, self._component.component)
+        component = self._component
+        check_component(self._wanted, component.component, is_extended=component.is_extended)
         plan({}, self._wanted, include=self._options.include, autopilot=self._component.autopilot)
         await wait_for_identity(self._component)
-        self._rules = rules_for(self._component.autopilot)
+        self._rules = rules_for(component.autopilot, is_extended=component.is_extended)
         planned, own = self._plan_identity, self._component.identity
         if planned is not None and not planned.is_same_vehicle(own):
             raise UsageError(f"the plan is for another vehicle: {planned}; this vehicle is {own}")
@@ -572,6 +573,7 @@ class ApplyRun:
                         hash=inspection.hash,
                         complete=inspection.complete,
                         is_of_operation=True,
+                        extended=component.is_extended,
                     )
                 )
             except CacheError as error:

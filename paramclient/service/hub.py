@@ -253,7 +253,7 @@ class Hub:
             async for change in target.parameters(ext=ext).changes():
                 if change.kind != "first":
                     members = documents.change(change, target, ext=ext)
-                    self.feed.publish("extended_change" if ext else "change", **target.address, **members)
+                    self.feed.publish("change", **target.address, **members)
 
     async def _check_regularly(self, link: ServiceLink) -> None:
         while True:

@@ -17,6 +17,7 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Param, ParamType, WireValue, check_name, from_bits, type_name
 
 if TYPE_CHECKING:
+    from paramclient.client.component import Component
     from paramclient.service.targets import Target
 
 __all__ = [
@@ -55,11 +56,11 @@ class Body(BaseModel):
 class Bits(Body):
     """A value by its bits, as in the member `bits` of a parameter."""
 
-    bits: Annotated[str, Field(pattern="^[0-9a-fA-F]{1,16}$")]
+    bits: Annotated[str, Field(pattern="^[0-9a-fA-F]{1,256}$")]
 
 
 class Hex(Body):
-    """The bytes of an extended parameter, as in its member `hex`."""
+    """The bytes of a value: of an extended parameter, or the four of the message of a plain one."""
 
     hex: Annotated[str, Field(pattern="^([0-9a-fA-F]{2}){0,128}$")]
 
@@ -246,11 +247,11 @@ async def values_set(values: dict[str, GivenValue], target: Target, *, ext: bool
     for name, given in values.items():
         value = await resolve_value(target, name, given, ext=ext)
         if ext:
-            number = (await _known_extended(target, name)).type_number
+            number = (await _known(target, name, ext=True)).type_number
             found[name] = WrittenParam.of(ext_param(name, encode_ext_value(value, number), number))
         else:
             found[name] = WrittenParam(check_name(name), value)
-    return ParamSet(found)
+    return ParamSet(found, is_extended=ext)
 
 
 async def resolve_value(target: Target, name: str, given: GivenValue, *, ext: bool) -> WireValue:
@@ -261,16 +262,12 @@ async def resolve_value(target: Target, name: str, given: GivenValue, *, ext: bo
         ParamClientError: the component did not send the type of an extended parameter.
     """
     if isinstance(given, Hex):
-        if not ext:
-            raise UsageError(f'{name}: {{"hex": …}} is for extended parameters')
         return bytes.fromhex(given.hex)
     if isinstance(given, Bits):
-        if ext:
-            raise UsageError(f'{name}: {{"bits": …}} is for plain parameters; give {{"hex": …}}')
-        return _value_of_bits(target, name, int(given.bits, 16))
+        return _value_of_bits(target.parameters(ext=ext), name, int(given.bits, 16))
     if not isinstance(given, str):
         return check_ext_value(given) if ext else given
-    if ext and (await _known_extended(target, name)).type == ParamType.CUSTOM:
+    if ext and (await _known(target, name, ext=True)).type == ParamType.CUSTOM:
         return check_ext_value(given)
     number = number_of(given)
     if number is not None:
@@ -281,17 +278,18 @@ async def resolve_value(target: Target, name: str, given: GivenValue, *, ext: bo
     return info.parse(given)
 
 
-def _value_of_bits(target: Target, name: str, bits: int) -> WireValue:
-    known = target.component.params.get(name)
+def _value_of_bits(component: Component, name: str, bits: int) -> WireValue:
+    known = component.params.get(name)
     if known is None:
         raise UsageError(f"{name}: the type is not known; read the parameter first")
-    if bits >> (32 if known.is_raw else 8 * known.type.size):
+    if known.type != ParamType.CUSTOM and bits >> (32 if known.is_raw else 8 * known.type.size):
         raise UsageError(f"{name}: {bits:x} has more bits than {type_name(known.type_number)}")
     return from_bits(bits, known.type_number, is_raw=known.is_raw)
 
 
-async def _known_extended(target: Target, name: str) -> Param:
-    return target.component.ext.params.get(name) or await target.component.ext.get(name)
+async def _known(target: Target, name: str, *, ext: bool) -> Param:
+    component = target.parameters(ext=ext)
+    return component.params.get(name) or await component.get(name)
 
 
 def range_faults(target: Target, values: dict[str, WireValue], *, ext: bool) -> dict[str, str]:

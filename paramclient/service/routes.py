@@ -201,12 +201,12 @@ async def params(
     if when is not None:
         place = source.key, source.component, when
         state = await hub.read_cache(lambda cache: cache.state_at(*place, extended=ext))
-        return JSONResponse({**position, "params": _chosen(documents.param_set(state, ext=ext), names)})
+        return JSONResponse({**position, "params": _chosen(documents.param_set(state), names)})
     described, known = await _known_params(hub, source, ext=ext)
     chosen = _chosen(known, names).values()
 
     def encode() -> Response:
-        found = documents.params(chosen, described, whole=metadata, ext=ext)
+        found = documents.params(chosen, described, whole=metadata)
         return JSONResponse({**position, "params": found})
 
     return await anyio.to_thread.run_sync(encode)
@@ -219,7 +219,7 @@ async def _known_params(hub: Hub, source: Source, *, ext: bool) -> tuple[Metadat
         NotInCache: the cache has no such table.
     """
     if source.target is not None:
-        return source.target.metadata, dict(source.target.parameters(ext=ext).params)
+        return source.target.described_by(ext=ext), dict(source.target.parameters(ext=ext).params)
     key, component, store = source.key, source.component, hub.metadata_store
     table = await hub.read_cache(lambda cache: cache.load(key, component, extended=ext))
     if table is None:
@@ -248,7 +248,7 @@ async def param(
         why = f"no value of {name} has been received yet.{did_you_mean(nearest)}"
         ids = {"system": component.system, "component": component.component}
         raise UnknownParameter(why, **ids, name=name, index=None, nearest=nearest)
-    return documents.param(known, target.metadata, ext=ext)
+    return documents.param(known, target.described_by(ext=ext))
 
 
 @writing.put(f"{VEHICLE}/params/{{name:path}}")

@@ -19,16 +19,7 @@ from paramclient.files import FileFormat, dumps
 from paramclient.files.formats import ENDINGS
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
-from paramclient.provision import (
-    ApplyProgress,
-    apply,
-    apply_extended,
-    load_extended_state,
-    prepare,
-    restore,
-    restore_extended,
-    verify_extended,
-)
+from paramclient.provision import ApplyProgress, apply, prepare, restore
 from paramclient.provision.apply_restore import restore_categories
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.restore_point import load_state_before_apply
@@ -135,14 +126,9 @@ async def apply_(
 
     async def work() -> dict[str, Any]:
         wanted = await _wanted(hub, target, body, ext=ext)
-        if ext:
-            ended = await apply_extended(
-                target.component, wanted, durable=body.durable, timeout=body.timeout_s, author=author
-            )
-            return documents.ext_apply_result(ended, target)
-        options = _options(hub, target, body, author)
+        component, options = target.parameters(ext=ext), _options(hub, target, body, author, ext=ext)
         result = await apply(
-            target.component, wanted, skip_invalid=body.skip_invalid, durable=body.durable, **options
+            component, wanted, skip_invalid=body.skip_invalid, durable=body.durable, **options
         )
         return documents.apply_result(result, target)
 
@@ -158,15 +144,12 @@ async def restore_(
     author = author_of(request)
 
     async def work() -> dict[str, Any]:
-        component = target.component
+        component = target.parameters(ext=ext)
         state = await _earlier_state(hub, target, body.when, ext=ext)
         if body.dry_run:
-            categories = () if ext else await restore_categories(component, state)
+            categories = await restore_categories(component, state)
             return await _plan(target, state, (*categories, *body.include), force=body.force, ext=ext)
-        if ext:
-            ended = await restore_extended(component, state, timeout=body.timeout_s, author=author)
-            return documents.ext_apply_result(ended, target)
-        result = await restore(component, state, **_options(hub, target, body, author))
+        result = await restore(component, state, **_options(hub, target, body, author, ext=ext))
         return documents.apply_result(result, target)
 
     with _only_setup(target, author):
@@ -176,17 +159,18 @@ async def restore_(
 async def _plan(
     target: Target, wanted: ParamSet, include: Iterable[str], *, force: bool, ext: bool
 ) -> dict[str, Any]:
-    if ext:
-        return documents.ext_plan(await verify_extended(target.component, wanted))
-    found = await prepare(target.component, wanted, include=include, info=target.metadata, force=force)
+    component, info = target.parameters(ext=ext), target.described_by(ext=ext)
+    found = await prepare(component, wanted, include=include, info=info, force=force)
     return documents.plan(found, target)
 
 
-def _options(hub: Hub, target: Target, body: ApplyRequest | RestoreRequest, author: str) -> dict[str, Any]:
+def _options(
+    hub: Hub, target: Target, body: ApplyRequest | RestoreRequest, author: str, *, ext: bool
+) -> dict[str, Any]:
     """Return the arguments that `apply` and `restore` have in common."""
     return {
         "include": body.include,
-        "info": target.metadata,
+        "info": target.described_by(ext=ext),
         "reboot": body.reboot,
         "allow_armed": body.allow_armed,
         "force": body.force,
@@ -215,7 +199,7 @@ async def create_snapshot(
     await wait_for_identity(component)
     if not shown.params:
         raise UsageError("no parameter of the vehicle is known")
-    table = set_maker(component, f"link {target.link.name}")(list(shown.params.values()))
+    table = set_maker(shown, f"link {target.link.name}")(list(shown.params.values()))
     complete = shown.count is not None and len(shown.params) >= shown.count
     kept = await hub.read_cache(
         lambda cache: cache.store_snapshot(
@@ -243,15 +227,13 @@ async def history(
     """Return the newest changes of values, the newest last."""
     which = source.key, source.component, name, limit, since
     entries = await hub.read_cache(lambda cache: cache.history(*which, extended=ext))
-    return JSONResponse(documents.history(entries, ext=ext))
+    return JSONResponse(documents.history(entries))
 
 
 async def _wanted(hub: Hub, target: Target, body: PlanRequest, *, ext: bool) -> ParamSet:
     """Return the wanted parameters of a request."""
     upload, snapshot = body.file, body.snapshot
     if upload is not None:
-        if ext:
-            raise UsageError("extended parameters are given in `values` or `snapshot`, not in a file")
         found = await anyio.to_thread.run_sync(lambda: upload.read_set(target))
     elif snapshot is not None:
         found = await _earlier_state(hub, target, snapshot, ext=ext)
@@ -264,10 +246,10 @@ async def _earlier_state(hub: Hub, target: Target, when: float | None, *, ext: b
     """Return a state of a component from the cache; None for that before the last apply."""
     await wait_for_identity(target.component)
     key, component = target.component.identity.key, target.component.component
-    if when is None and ext:
-        return await load_extended_state(target.component)
     if when is None:
-        return await hub.read_cache(lambda cache: load_state_before_apply(cache, key, component))
+        return await hub.read_cache(
+            lambda cache: load_state_before_apply(cache, key, component, extended=ext)
+        )
     return await hub.read_cache(lambda cache: cache.state_at(key, component, when, extended=ext))
 
 

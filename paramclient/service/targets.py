@@ -52,9 +52,14 @@ class Target:
         """Return the component with its extended or its plain parameters."""
         return self.component.ext if ext else self.component
 
-    def info(self, name: str, *, ext: bool = False) -> ParamInfo | None:
-        """Return the metadata of a parameter, or None; extended parameters have none."""
-        return None if ext or self.metadata is None else self.metadata.find(name)
+    def described_by(self, *, ext: bool) -> Metadata | None:
+        """Return the metadata of the parameters, or None; extended parameters have none."""
+        return None if ext else self.metadata
+
+    def info(self, name: str, *, ext: bool) -> ParamInfo | None:
+        """Return the metadata of a parameter, or None."""
+        metadata = self.described_by(ext=ext)
+        return None if metadata is None else metadata.find(name)
 
 
 @dataclass(eq=False)

@@ -26,7 +26,6 @@ from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.watch import SyncState
-from paramclient.provision.extended import ExtApplyResult, ExtPlan
 from paramclient.provision.planning import ParamInfo, Plan
 from paramclient.provision.results import ApplyProgress, ApplyResult, FleetApplied, FleetVerified
 from paramclient.sim import Endpoint
@@ -47,16 +46,12 @@ __all__ = [
     "Wanted",
     "apply",
     "apply_all",
-    "apply_extended",
-    "load_extended_state",
     "metadata_of",
     "prepare",
     "restore",
     "restore_all",
-    "restore_extended",
     "verify",
     "verify_all",
-    "verify_extended",
 ]
 
 class Ftp:
@@ -85,6 +80,9 @@ class Component:
     @property
     def ext(self) -> Component:
         """The extended parameters of the component (PARAM_EXT_*), whose values are also text and bytes."""
+    @property
+    def is_extended(self) -> bool:
+        """Whether these are the extended parameters: whether the component is the `ext` of another one."""
     @property
     def autopilot(self) -> str:
         """Autopilot of its heartbeat: px4, ardupilot, generic, …; "unknown" before the first heartbeat."""
@@ -417,38 +415,6 @@ def restore_all(
     before_writing: Callable[[Component], object] | None = None,
 ) -> FleetApplied:
     """`restore` several vehicles concurrently. A failure of one vehicle does not stop the others."""
-
-def apply_extended(
-    component: Component,
-    wanted: ParamSet,
-    *,
-    durable: bool = False,
-    backup: str | os.PathLike[str] | None = None,
-    timeout: float | None = None,
-    author: str | None = None,
-    progress: Callable[[SetOutcome], None] | None = None,
-    before_writing: Callable[[], object] | None = None,
-) -> ExtApplyResult:
-    """Write the wanted values that differ to a component, and verify them by another download."""
-
-def verify_extended(component: Component, wanted: ParamSet, *, timeout: float | None = None) -> ExtPlan:
-    """Compare wanted extended parameters with those of a component, after a download. Writes nothing."""
-
-def restore_extended(
-    component: Component,
-    state: ParamSet,
-    *,
-    durable: bool = False,
-    backup: str | os.PathLike[str] | None = None,
-    timeout: float | None = None,
-    author: str | None = None,
-    progress: Callable[[SetOutcome], None] | None = None,
-    before_writing: Callable[[], object] | None = None,
-) -> ExtApplyResult:
-    """Restore an earlier state of a component: `apply_extended` with a snapshot *before restore*."""
-
-def load_extended_state(component: Component, when: float | None = None) -> ParamSet:
-    """Return an earlier state of the extended parameters of a component, from the cache."""
 
 def metadata_of(
     component: Component,

@@ -155,7 +155,7 @@ def test_a_simulated_camera_is_fetched_and_written_over_udp(live_command: Comman
         assert found.code == 0, found.err
         assert (found.json["count"], found.json["missing"]) == (16, [])
         assert live_command("set", url, *camera, "CAM_NAME", "Rear", "CAM_CLOCK", 2**62 + 1).code == 0
-        params = live_command("get", url, *camera, "CAM_NAME", "CAM_CLOCK", "--json").json["extended"]
+        params = live_command("get", url, *camera, "CAM_NAME", "CAM_CLOCK", "--json").json["params"]
         assert [each["value"] for each in params.values()] == ["Rear", 2**62 + 1]
 
 
