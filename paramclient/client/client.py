@@ -16,7 +16,7 @@ from paramclient.client import events
 from paramclient.client.arguments import COMPONENT_TIMEOUT, address_in_words
 from paramclient.client.cache_writer import CacheWriter, choose_cache
 from paramclient.client.component import Component
-from paramclient.client.core import ClientCore, ClientTask
+from paramclient.client.core import ClientCore
 from paramclient.client.events import Events
 from paramclient.client.files import Ftp
 from paramclient.client.fleet_fetch import FetchedAll, fetch_components
@@ -137,8 +137,6 @@ class ParamClient:
         self._components: dict[Address, Component] = {}
         self._by_session: dict[Session, Component] = {}
         self._events: Subscribers[events.Event] = Subscribers()
-        self._task: ClientTask | None = None
-        self._is_entered = False
         signing = Signing(signing) if isinstance(signing, SigningKey) else signing
         cutter = FrameCutter(stream=opened.is_stream)
         forwarder = None if forward is None else Forwarder(create_link(forward))
@@ -171,17 +169,12 @@ class ParamClient:
         return f"<ParamClient {self.link.name} {self.core.state}, {count}>"
 
     async def __aenter__(self) -> Self:
-        await self.core.open()
-        self._is_entered = True
-        return self
+        return await self.open()
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
-            await self.core.close()
-        finally:
-            self._is_entered = False
+        await self.aclose()
 
     async def open(self) -> Self:
         """Open the client without an `async with`, until `aclose`. Return the client.
@@ -195,24 +188,12 @@ class ParamClient:
             LinkError: the link, or the link to the other program, cannot be opened.
             ClientClosed: `aclose` was called meanwhile.
         """
-        task = ClientTask(self.core)
-        if self._task is None and not self._is_entered:
-            self._task = task
-        await task.open()
+        await self.core.open()
         return self
 
     async def aclose(self) -> None:
-        """Close a client that `open` has opened, as on exit from an `async with`. Any task may call it.
-
-        Raises:
-            UsageError: the client was entered with `async with`, which closes it on exit.
-        """
-        if self._is_entered:
-            raise UsageError(
-                "the client was opened by `async with`, which closes it at its end; do not call aclose"
-            )
-        if self._task is not None:
-            await self._task.close()
+        """Close the client, as on exit from an `async with`. Any task may call it."""
+        await self.core.close()
 
     @property
     def components(self) -> Mapping[Address, Component]:
