@@ -99,7 +99,8 @@ class ParamClient:
         cache: cache of the tables, or None.
 
     Raises:
-        UsageError: the link name, an id, the interval or the policy is not valid. On entering: the client was
+        UsageError: the link name, an id, the interval or the policy is not valid, or one of the latter two is
+            given with `listen_only`. On entering: the client was
             entered before, or the telemetry log exists or cannot be created.
         LinkError: on entering: the link, or the link to the other program, cannot be opened.
     """
@@ -130,6 +131,8 @@ class ParamClient:
             self._policy = Policy(policy)
         except ValueError:
             raise UsageError(f"policy must be one of {', '.join(Policy)}, not {policy!r}") from None
+        if listen_only and (watch_interval or self._policy is not Policy.AUTO):
+            raise UsageError("the client only listens: it takes no policy, and no watch_interval but 0")
         opened = create_link(link)
         is_log = isinstance(opened, ReplayLink)
         self.cache = choose_cache(cache, is_log=is_log)
@@ -422,6 +425,8 @@ class ParamClient:
             NoReply: no component was found, or none responded.
             LinkError: the link failed, or the client was closed.
         """
+        if refresh:
+            self.core.check_may_send()
         deadline = math.inf if timeout is None else anyio.current_time() + timeout
         await self._wait_for(
             lambda: next((n for n in self.core.station.nodes.values() if system in (None, n.system)), None),
@@ -472,13 +477,16 @@ class ParamClient:
         def emit(event: protocol.Resynced) -> None:
             self._emit(node, event)
 
-        watch = Watch(session, node.presence, emit, interval=self._interval, policy=self._policy)
+        policy = Policy.CACHE_ONLY if self.listens_only else self._policy
+        watch = Watch(session, node.presence, emit, interval=self._interval, policy=policy)
         session.table.recounted = watch.doubt
         component = self._by_session[session] = Component(
             self.core, node, session, watch, self._components, self.successor
         )
         component.policy = self._policy
-        if not self.listens_only:
+        if self.listens_only:
+            session.contradicted = watch.doubt
+        else:
             self.core.spawn(watch.run)
         return component
 

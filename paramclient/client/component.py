@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -36,6 +37,7 @@ from paramclient.model.params import ParamMap
 from paramclient.model.values import Encoding, Param, Settable, Trust, WireValue
 from paramclient.protocol import commands
 from paramclient.protocol.addresses import Address, PeerAddress, peer_in_words
+from paramclient.protocol.digest import is_current
 from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all, result_of
 from paramclient.protocol.node import Node
@@ -62,6 +64,8 @@ SETUP_SIGNING_COUNT: Final = 3
 SETUP_SIGNING_INTERVAL: Final = 0.1
 """Seconds after each SETUP_SIGNING message."""
 TIMEOUT_NOTE: Final = "The fetch ended at its timeout."
+
+logger = logging.getLogger(__name__)
 
 
 class ComponentState(StrEnum):
@@ -245,7 +249,7 @@ class Component:
             LinkError: the link failed, or the client was closed.
         """
         check_requested_name(name)
-        self._check_may_send()
+        self.core.check_may_send()
         with self.limited(timeout, f"parameter {name} of {self.system}/{self.component}"):
             message = await read(self.session, name)
         known = self.session.table.params.get(message.param_id)
@@ -458,7 +462,7 @@ class Component:
         self.core.check_open()
         if refresh and (self.policy is not Policy.AUTO or self.core.station.listens_only):
             is_auto = self.policy is Policy.AUTO
-            why = "this client only listens" if is_auto else f"the policy is {self.policy}"
+            why = "the client only listens" if is_auto else f"the policy is {self.policy}"
             raise UsageError(f"refresh needs a download, and {why}")
         began = anyio.current_time()
         is_log = isinstance(self.core.link, ReplayLink)
@@ -473,26 +477,41 @@ class Component:
                 result = await fetch_all(self.session, refresh=refresh, policy=self.policy, progress=progress)
             return self._fetched(replace(result, elapsed=anyio.current_time() - began))
         if self.session.table.count is None:
-            waited = anyio.current_time() - began
             with self._explained(began):
-                raise NoReply(f"the parameters of {self.system}/{self.component}", attempts=0, waited=waited)
-        is_confirmed = any(each.trust is Trust.VERIFIED for each in self.session.table.params.values())
+                raise self._nothing(began)
+        is_confirmed = _has(self.params, Trust.VERIFIED)
         return result_of(self.session, "cache" if is_confirmed else "stream", began, [TIMEOUT_NOTE])
 
     async def _listen(self, began: float) -> FetchResult:
         """Wait until the table is complete by what other stations request, or until a log has ended."""
         table, is_log = self.session.table, isinstance(self.core.link, ReplayLink)
-        while not self.core.is_over and (is_log or not table.is_complete):
+        while not self.core.is_over and (is_log or not self._is_heard()):
             await self.core.link_task.activity.wait()
             self.core.check_open()
         if not table.params:
-            what = f"the parameters of {self.system}/{self.component}"
-            raise NoReply(what, attempts=0, waited=anyio.current_time() - began)
-        self.session.confirm_announced()
-        return result_of(self.session, "stream", began, [])
+            raise self._nothing(began)
+        is_cached = self._is_heard() and _has(table.params, Trust.CACHED)
+        if not is_cached:
+            self.session.confirm_announced()
+        return result_of(self.session, "cache" if is_cached else "stream", began, [])
+
+    def _is_heard(self) -> bool:
+        """Return whether all values were received, or the hash of the cached ones was."""
+        table = self.session.table
+        is_confirmed = is_current(self.session, self.session.announced)
+        if is_confirmed:
+            table.verify()
+        return is_confirmed or (table.is_complete and not _has(table.params, Trust.CACHED))
+
+    def _nothing(self, began: float) -> NoReply:
+        what = f"the parameters of {self.system}/{self.component}"
+        if self.core.station.listens_only and not isinstance(self.core.link, ReplayLink):
+            what += ", which no other station has requested"
+        return NoReply(what, attempts=0, waited=anyio.current_time() - began)
 
     def _fetched(self, result: FetchResult) -> FetchResult:
         self._last = result
+        logger.debug("%s: %r", self.core.link.name, result)
         if not result.params and self.policy is not Policy.AUTO:
             raise CacheError(
                 f"nothing is cached of {self.system}/{self.component}, and nothing may be downloaded"
@@ -514,7 +533,8 @@ class Component:
             link_is_safe: that no other party can read the link, such as USB.
 
         Raises:
-            UsageError: `link_is_safe` is not given, or the component uses MAVLink 1, which has no signing.
+            UsageError: `link_is_safe` is not given, the client only listens, or the component uses MAVLink 1,
+                which has no signing.
             LinkError: the link failed, or the client was closed.
         """
         if not link_is_safe:
@@ -525,7 +545,7 @@ class Component:
         if self.node.version == 1:
             raise UsageError(f"{self.system}/{self.component} uses MAVLink 1, which has no signing")
         for _ in range(SETUP_SIGNING_COUNT):
-            self.core.check_open()
+            self.core.check_may_send()
             self.core.station.send_setup_signing(self.node, key, 0 if key is None else timestamp_now())
             await anyio.sleep(SETUP_SIGNING_INTERVAL)
 
@@ -545,7 +565,7 @@ class Component:
             NoReply: it did not answer, or did not come back in time.
             LinkError: the link failed, or the client was closed.
         """
-        self._check_may_send()
+        self.core.check_may_send()
         moves = system is not None and system != self.system
         with self.limited(timeout, f"{self.system}/{self.component} to be back after its reboot"):
             await commands.reboot(self.node, returns=not moves)
@@ -588,13 +608,8 @@ class Component:
         """Take the component with the extended parameters."""
         self._ext = ext
 
-    def _check_may_send(self) -> None:
-        self.core.check_open()
-        if self.core.station.listens_only:
-            raise UsageError("this client only listens, and sends no requests")
-
     async def _check_may_write(self, *, durable: bool) -> None:
-        self._check_may_send()
+        self.core.check_may_send()
         if self.node.has_rival(anyio.current_time()):
             words = node_in_words(self.node)
             raise AmbiguousVehicle(
@@ -636,6 +651,10 @@ class Component:
 def _ended(outcome: SetOutcome, error: ParamClientError) -> SetOutcome:
     is_open = outcome.status in (SetStatus.NOT_TRIED, SetStatus.UNKNOWN) and outcome.error is None
     return replace(outcome, error=error) if is_open else outcome
+
+
+def _has(params: Mapping[str, Param], trust: Trust) -> bool:
+    return any(param.trust is trust for param in params.values())
 
 
 def _hinted(error: ParamClientError | None, hint: str) -> ParamClientError | None:

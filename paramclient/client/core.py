@@ -98,6 +98,16 @@ class ClientCore:
         if self._work is None:
             raise ClientClosed("the client is not open; use `async with` or `open`", link=self.link.name)
 
+    def check_may_send(self) -> None:
+        """Check that the client is open, and does not only listen.
+
+        Raises:
+            UsageError, LinkError.
+        """
+        self.check_open()
+        if self.station.listens_only:
+            raise UsageError("the client only listens, and sends no requests")
+
     def spawn(self, work: Callable[..., Any], *arguments: Any) -> None:
         """Run a function in the background. Its errors are logged, and never end the link."""
         if self._work is not None and not self._work.cancel_scope.cancel_called:
@@ -176,6 +186,7 @@ class ClientCore:
                 await tap.open()
             if self._keeper is not None:
                 self.station.begin_signing(*await self._keeper.open())
+            logger.debug("%s: open", self.link.name)
             self.station.listening_since = anyio.current_time()
             async with anyio.create_task_group() as io:
                 io.start_soon(self.link_task.read, name="paramclient reader")
@@ -190,6 +201,7 @@ class ClientCore:
                         self.spawn(self.station.send_heartbeats)
                         self._is_opened.set()
                         await self._is_to_close.wait()
+                        logger.debug("%s: closing", self.link.name)
                         self._work.cancel_scope.cancel()
                 finally:
                     self._work = None

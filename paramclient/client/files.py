@@ -46,7 +46,7 @@ class Ftp:
             timeout: seconds; None waits as long as the component answers.
 
         Raises:
-            UsageError: the path is not valid.
+            UsageError: the path is not valid, or the client only listens.
             FileTransferError: the component refused it, or the file is larger than `size_max`.
             NoReply: it does not answer.
             LinkError: the link failed, or the client was closed.
@@ -78,6 +78,6 @@ class Ftp:
     def _channel(self, path: str, timeout: float | None) -> Iterator[Channel]:
         """Raise NoReply at the timeout."""
         component = self._component
-        component.core.check_open()
+        component.core.check_may_send()
         with component.limited(timeout, f"{path} of {component.system}/{component.component}"):
             yield component.node.channel

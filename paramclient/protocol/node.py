@@ -127,7 +127,7 @@ class Node:
             case ParamValue():
                 self.plain.receive(message, now)
                 if message.param_id == HASH_CHECK:
-                    self.plain.announced = Digest.of(message)
+                    self.plain.announce(Digest.of(message))
             case ParamExtValue():
                 self.extended.table.store(message, now)
             case ParamExtAck(param_id=name, raw=raw, param_type=number, param_result=result):

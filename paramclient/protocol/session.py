@@ -142,6 +142,7 @@ class Session:
         announced: the last PX4 hash that was received, also in another station's list, or None.
         written_at: when the last write ended; minus infinity before the first.
         replaced: by name, the values before writes that have just ended.
+        contradicted: called when a hash is received that is not the table's.
         observers: called with the parameters received and their number, while a fetch runs.
     """
 
@@ -165,6 +166,7 @@ class Session:
         self.announced: Digest | None = None
         self.written_at = -math.inf
         self.replaced: defaultdict[str, list[ReplacedValue]] = defaultdict(list)
+        self.contradicted: Callable[[], None] = lambda: None
         self.observers: set[Callable[[int, int | None], None]] = set()
         self._locks: dict[str, anyio.Lock] = {}
         self._foreign_sets: dict[str, tuple[str, float]] = {}
@@ -194,6 +196,12 @@ class Session:
         if len(self._locks) > 2 * len(self.table.params) + 16:
             self._locks = {each: lock for each, lock in self._locks.items() if lock.locked()}
         return self._locks.setdefault(name, anyio.Lock())
+
+    def announce(self, digest: Digest) -> None:
+        """Take a hash that was received."""
+        self.announced = digest
+        if self.table.is_complete and self.table.hash not in (None, digest.hash):
+            self.contradicted()
 
     def confirm_announced(self) -> None:
         """Confirm a complete table by the hash that was received last, if it is of as many parameters."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
@@ -45,7 +46,9 @@ from paramclient.wire.signing import Signer, SigningKey, Verifier
 __all__ = ["Peer", "Station"]
 
 SEEK_INTERVAL: Final = 0.25
-"""Seconds between two requests for a heartbeat, while no component is known."""
+"""Seconds between two requests for the heartbeat of an unknown component."""
+SEEK_MAX: Final = 20
+"""Requests for the heartbeat of one system: it may be no vehicle, or serve no such request."""
 HEARTBEAT_INTERVAL: Final = 1.0
 """Seconds between two heartbeats of ours, by the standard."""
 COMPONENTS_MAX: Final = 1_000
@@ -123,6 +126,7 @@ class Station:
         self._ended_peers: set[Peer] = set()  # of components: another connection may take their ids
         self._sequence = 0
         self._seek_at = -math.inf  # when the next heartbeat may be requested
+        self._sought: Counter[int] = Counter()  # requests by system
         self._signer: Signer | None = None
 
     @property
@@ -153,21 +157,19 @@ class Station:
             self._take(frame, peer, now)
         if not data:
             self._ended_peers.update(node.peer for node in self.nodes.values() if node.peer == peer)
-        if not self.nodes and now >= self._seek_at:
-            self._request_heartbeat(data, peer, now)
 
-    def _request_heartbeat(self, data: bytes, peer: Peer, now: float) -> None:
-        """Request the heartbeat of an autopilot that sends other messages, before any component is known.
+    def _seek(self, frame: Frame, peer: Peer, now: float) -> None:
+        """Request the heartbeat of an autopilot of which only other messages were received.
 
         A heartbeat is due once a second only; the command brings it in one round trip (measured on PX4).
         """
-        for frame in Framer(stream=False).receive(data):
-            address = (frame.system, frame.component)
-            if frame.component == AUTOPILOT_COMPONENT and frame.system != 0 and address != self.own_address:
-                self._seek_at = now + SEEK_INTERVAL
-                request = CommandLong(*address, MAV_CMD_REQUEST_MESSAGE, float(message_id(Heartbeat)))
-                self.transmit(request, peer, frame.version)
-                return
+        requests = self._sought[frame.system]
+        if frame.component == AUTOPILOT_COMPONENT and now >= self._seek_at and requests < SEEK_MAX:
+            self._seek_at = now + SEEK_INTERVAL
+            self._sought[frame.system] += 1
+            target = (frame.system, frame.component)
+            request = CommandLong(*target, MAV_CMD_REQUEST_MESSAGE, float(message_id(Heartbeat)))
+            self.transmit(request, peer, frame.version)
 
     def overhear(self, data: bytes, now: float) -> None:
         """Take a frame that another program sends to the vehicles over this link: it may be a PARAM_SET."""
@@ -181,6 +183,8 @@ class Station:
         if self.listens_only:
             return
         system, component = self.own_address
+        if not isinstance(message, Heartbeat):
+            logger.debug("%s: to %s: %r", self.link, "all" if peer is None else peer_in_words(peer), message)
         if isinstance(message, _MAVLINK2_REQUESTS):
             version = 2
         data = encode(message, system=system, component=component, sequence=self._sequence, version=version)
@@ -243,14 +247,16 @@ class Station:
         address = PeerAddress(system, component, peer) if self._splits_peers else (system, component)
         node = self.nodes.get(address)
         message = decode(frame)
+        is_own = (system, component) == self.own_address and not self.listens_only
+        if is_own or system == 0:
+            return
         if message is None:
-            if node is not None and peer == node.peer:
+            if node is None:
+                self._seek(frame, peer, now)
+            elif peer == node.peer:
                 at = BOOT_CLOCK_OFFSETS[frame.message_id]
                 boot_ms = int.from_bytes(frame.payload[at : at + 4], "little")
                 node.boot_clock(frame.message_id, boot_ms, now)
-            return
-        is_own = (system, component) == self.own_address and not self.listens_only
-        if is_own or system == 0:
             return
         if isinstance(message, ParamSet | ParamExtSet):
             self._take_foreign_set(message, frame, now)

@@ -111,8 +111,11 @@ class Watch:
             self._holds -= 1
 
     def doubt(self) -> None:
-        """Check the table soon: there is a sign of change."""
-        if self._is_fetched:
+        """Check the table soon, where the policy allows it: there is a sign of change."""
+        if self._is_fetched and self._policy is not Policy.AUTO:
+            self._session.table.doubt()
+            self._is_fetched = False
+        elif self._is_fetched:
             if not self._is_doubted:
                 self._before = self._session.table.view()
             self._is_doubted = self._is_due = True
