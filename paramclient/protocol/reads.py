@@ -39,7 +39,8 @@ async def read(session: Session, which: str | int) -> ReportedValue:
     """Read one parameter, by name or index. Its value is in the table then.
 
     A component that leaves this read unanswered and answers another one has no such parameter: PX4 before
-    1.18 and ArduPilot before 4.7 say nothing of an unknown name.
+    1.18 and ArduPilot before 4.7 say nothing of an unknown name. A read of what another caller is reading
+    awaits the answer to that request first.
 
     Raises:
         UnknownParameter: the component has no such parameter.
@@ -63,19 +64,30 @@ async def read(session: Session, which: str | int) -> ReportedValue:
         return await channel.exchange(request, inbox, accept, what=what, attempts=attempts, timeout_min=wait)
 
     async with channel.window:
-        with channel.inbox((dialect.value, which)) as inbox:
-            try:
-                return await ask(inbox)
-            except NoReply:
-                if which == HASH_CHECK or channel.is_lost(anyio.current_time()):
-                    raise
-                control = await _control_read(session, which)
-                if control is None:
-                    raise
-            if control.param_id == which:
-                return control
-            with suppress(NoReply):  # it answers by now, and may only have been busy
-                return await ask(inbox)
+        is_first = which not in session.reading
+        session.reading.add(which)
+        try:
+            with channel.inbox((dialect.value, which)) as inbox:
+                if not is_first:
+                    now, wait = anyio.current_time(), _queue_time(session)
+                    answer: ReportedValue | None = await channel.wait_for(inbox, accept, now, 0, wait)
+                    if answer is not None:
+                        return answer
+                try:
+                    return await ask(inbox)
+                except NoReply:
+                    if which == HASH_CHECK or channel.is_lost(anyio.current_time()):
+                        raise
+                    control = await _control_read(session, which)
+                    if control is None:
+                        raise
+                if control.param_id == which:
+                    return control
+                with suppress(NoReply):  # it answers by now, and may only have been busy
+                    return await ask(inbox)
+        finally:
+            if is_first:
+                session.reading.discard(which)
     raise _unknown(session, which, ": it does not respond to reads of this name, but to others")
 
 

@@ -137,6 +137,7 @@ class Session:
     Attributes:
         table: the current values.
         fetching: the fetch that is in progress, shared by all callers.
+        reading: names and indices whose reads are in progress.
         writing: the authors of the writes in progress, by name.
         serves_file: whether the parameter file was served on this link; None while unknown.
         announced: the last PX4 hash that was received, also in another station's list, or None.
@@ -161,6 +162,7 @@ class Session:
         self.table = Table(dialect, changed)
         self.table.author_of = self._author_of
         self.fetching: Shared[Any] = Shared(spawn, channel.gate)
+        self.reading: set[str | int] = set()
         self.writing: dict[str, str] = {}
         self.serves_file: bool | None = None
         self.announced: Digest | None = None

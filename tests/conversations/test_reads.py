@@ -11,6 +11,7 @@ import pytest
 
 from paramclient.errors import LinkError, NoReply, ParamErrorCode, Refused, UnknownParameter
 from paramclient.model.values import ParamType, Trust
+from paramclient.protocol.dialect import ReportedValue
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read, read_many
 from paramclient.protocol.writes import write
@@ -215,6 +216,32 @@ async def test_reads_wait_while_the_link_is_down_and_end_when_it_fails() -> None
         with pytest.raises(LinkError):
             await read(session, "MC_ROLL_P")
         assert len(raised) == 1
+
+
+@virtual_on_both
+@pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
+async def test_equal_reads_at_once_are_one_request_and_a_cancelled_one_ends_only_its_wait(
+    make: type[PX4Vehicle],
+) -> None:
+    vehicle = make()
+    name = vehicle.listed[5].name
+    async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
+        session = (await conversation.node()).plain
+        await read(session, vehicle.listed[0].name)
+        values: list[ReportedValue] = []
+
+        async def ask(seconds: float) -> None:
+            with anyio.move_on_after(seconds):
+                values.append(await read(session, name))
+
+        before = vehicle.requests["PARAM_REQUEST_READ"]
+        async with anyio.create_task_group() as tasks:
+            for number in range(8):
+                tasks.start_soon(ask, 9.0 if number else 0.01)
+        assert len(values) == 7
+        assert vehicle.requests["PARAM_REQUEST_READ"] - before == 1
+        await read(session, name)
+        assert vehicle.requests["PARAM_REQUEST_READ"] - before == 2
 
 
 @virtual_on_both

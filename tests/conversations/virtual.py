@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 
 import anyio
 import pytest
+import sniffio
+import trio
 from trio.testing import MockClock
 
 from paramclient.links.sim import SimLink
@@ -45,11 +47,11 @@ class _JumpingSelector(selectors.SelectSelector):
 
 class _VirtualLoop(asyncio.SelectorEventLoop):
     def __init__(self) -> None:
-        self._jumps = _JumpingSelector()
-        super().__init__(self._jumps)
+        self.jumps = _JumpingSelector()
+        super().__init__(self.jumps)
 
     def time(self) -> float:
-        return self._jumps.passed
+        return self.jumps.passed
 
 
 def run(test: Callable[..., Awaitable[T]], *arguments: Any, backend: str = "trio") -> T:
@@ -64,6 +66,18 @@ def run(test: Callable[..., Awaitable[T]], *arguments: Any, backend: str = "trio
     else:
         options = {"loop_factory": _VirtualLoop}
     return anyio.run(limited, backend=backend, backend_options=options)
+
+
+def jump(seconds: float) -> None:
+    """Let the clock jump, as after a suspend of the computer."""
+    if sniffio.current_async_library() == "trio":
+        clock = trio.lowlevel.current_clock()
+        assert isinstance(clock, MockClock)
+        clock.jump(seconds)
+    else:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, _VirtualLoop)
+        loop.jumps.passed += seconds
 
 
 def virtual(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:
