@@ -218,6 +218,7 @@ class ClientCore:
             self.link_task.end_streams()
             closing: list[Callable[[], Awaitable[None]]] = [
                 partial(self.cache_writer.close, self.station.nodes.values()),
+                self.link_task.flush,  # the last messages of conversations that were ended
                 *(tap.close for tap in self._taps),
                 self.link.close,
             ]

@@ -12,7 +12,7 @@ import anyio
 import anyio.lowlevel
 
 from paramclient.client.taps import FrameCutter, Tap
-from paramclient.errors import LinkError
+from paramclient.errors import ClientClosed, LinkError
 from paramclient.links import Link
 from paramclient.protocol.station import Peer, Station
 
@@ -124,20 +124,27 @@ class LinkTask:
 
     async def send(self) -> None:
         """Send queued frames, those of another program after those of this one, until cancelled."""
-        while True:
-            self._something_to_send = anyio.Event()
-            sent = 0
-            while self._queue or self._forwarded:
-                data, peer = self._queue.popleft() if self._queue else (self._forwarded.popleft(), None)
-                self.bytes_sent += len(data)
-                for tap in self._taps:
-                    tap.sent(data)
-                with suppress(LinkError):  # the reader reconnects; unanswered requests are repeated
-                    await self._link.send(data, peer)
-                sent += 1
-                if not sent % FRAMES_PER_TURN:
-                    await anyio.lowlevel.checkpoint()
-            await self._something_to_send.wait()
+        try:
+            while True:
+                self._something_to_send = anyio.Event()
+                await self.flush()
+                await self._something_to_send.wait()
+        finally:  # the event loop may cancel all tasks at once: no conversation waits for an answer then
+            self.station.fail(ClientClosed("the client was closed", link=self._link.name), for_good=True)
+
+    async def flush(self) -> None:
+        """Send all queued frames."""
+        sent = 0
+        while self._queue or self._forwarded:
+            data, peer = self._queue.popleft() if self._queue else (self._forwarded.popleft(), None)
+            self.bytes_sent += len(data)
+            for tap in self._taps:
+                tap.sent(data)
+            with suppress(LinkError):  # the reader reconnects; unanswered requests are repeated
+                await self._link.send(data, peer)
+            sent += 1
+            if not sent % FRAMES_PER_TURN:
+                await anyio.lowlevel.checkpoint()
 
     def end_streams(self) -> None:
         """End the unfinished frames: the link is down, or closed."""

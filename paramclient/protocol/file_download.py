@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Final
 
 import anyio
@@ -90,14 +91,21 @@ async def download_file(session: Session) -> int:
 
 async def _read(session: Session, path: str) -> bytes:
     channel = session.channel
+    total = session.table.count
+
+    def begun(head: bytes) -> None:
+        nonlocal total
+        with suppress(PackError):
+            total = decode_prefix(head)[0].total
 
     def report(received: int, size: int | None) -> None:
-        total = session.table.count
         if size and total:
             session.report(min(received * total // size, total), total)
 
     attempts = max(channel.timing.attempts_for(OPEN_LOST), OPEN_ATTEMPTS_MIN)
-    return await read_file(channel, path, size_max=PACK_SIZE_MAX, open_attempts=attempts, progress=report)
+    return await read_file(
+        channel, path, size_max=PACK_SIZE_MAX, open_attempts=attempts, progress=report, begun=begun
+    )
 
 
 def _store_beginning(session: Session, prefix: bytes, requested_at: float) -> None:

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 import anyio
 
-from paramclient.errors import FileErrorCode, FileTransferError, NoReply, UsageError
+from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoReply, UsageError
 from paramclient.protocol.channel import Channel, Inbox
 from paramclient.wire.messages import FileTransfer, Message
 
@@ -144,6 +144,7 @@ async def read_file(
     size_max: int = FILE_SIZE_MAX,
     open_attempts: int | None = None,
     progress: Callable[[int, int | None], None] | None = None,
+    begun: Callable[[bytes], None] = lambda head: None,
 ) -> bytes:
     """Read a file from the component. Its session on board is closed, whatever happens.
 
@@ -155,6 +156,7 @@ async def read_file(
         open_attempts: to open the file, where there is another way without it; None for as many as loss
             explains.
         progress: called with the bytes received and the size, which is an estimate for generated files.
+        begun: called with the first bytes of the file.
 
     Raises:
         FileTransferError: the component refused it, or the file is larger than `size_max`.
@@ -164,6 +166,7 @@ async def read_file(
     async with channel.ftp, _opened(channel, path, open_attempts) as (session, size, inbox):
         reader = _FileReader(channel, inbox, session, path, read_size, size_max)
         reader.progress = None if progress is None else (lambda received: progress(received, size))
+        reader.begun = begun
         try:
             return await reader.read()
         except NoReply as error:
@@ -311,10 +314,12 @@ async def _opened(
             yield session, size, inbox
         finally:
             if session is not None or is_requested:
-                with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT) as closing:
+                is_closed = False
+                with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT), suppress(LinkError):
                     await _close(channel, inbox, path, session, sequence)
-                if closing.cancelled_caught and session is None:  # the opening may just have been repeated
-                    last = Packet(channel.next_ftp_sequence(), 0, Opcode.TERMINATE_SESSION)
+                    is_closed = True
+                if not is_closed:  # the opening may just have been repeated, or nothing is received any more
+                    last = Packet(channel.next_ftp_sequence(), session or 0, Opcode.TERMINATE_SESSION)
                     channel.send(FileTransfer(0, *channel.target, last.pack()))
 
 
@@ -397,6 +402,7 @@ class _FileReader:
         self, channel: Channel, inbox: Inbox, session: int, path: str, read_size: int, size_max: int
     ) -> None:
         self.progress: Callable[[int], None] | None = None
+        self.begun: Callable[[bytes], None] = lambda head: None
         self._channel = channel
         self._inbox = inbox
         self._session = session
@@ -558,6 +564,8 @@ class _FileReader:
                 path=self._path,
                 code=FileErrorCode.INVALID_DATA_SIZE,
             )
+        if packet.offset == 0:
+            self.begun(packet.data)
         self._pieces.take(packet.offset, packet.data)
         self._blocks += 1
         self._last = anyio.current_time()

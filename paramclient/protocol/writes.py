@@ -326,6 +326,8 @@ class _Write:
         number = message.param_type
         if number == ParamType.REAL32 and self.before.type_number != number:
             number = self._known_type(message.raw)
+        elif message.raw == self._raw:  # this value, and not the rounded form of the one before
+            self.session.table.store(message, anyio.current_time(), is_exact=True)
         return self.session.dialect.param(self.name, message.raw, number, None, encoding)
 
     def _known_type(self, raw: bytes) -> int:
