@@ -21,7 +21,6 @@ from paramclient.client.component import Component, ComponentState
 from paramclient.client.events import Discovered, Event, Events, Found, Lost, Rebooted, Resynced
 from paramclient.client.files import Ftp
 from paramclient.client.fleet_fetch import FetchedAll
-from paramclient.client.reset import ResetResult
 from paramclient.client.signing import Signing, read_key
 from paramclient.client.streams import Changes
 from paramclient.errors import (
@@ -58,6 +57,7 @@ from paramclient.model.values import Encoding, Param, ParamType, Settable, Trust
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress
+from paramclient.protocol.reset import ResetResult
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
 from paramclient.protocol.watch import SyncState
 from paramclient.version import __version__

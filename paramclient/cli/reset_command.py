@@ -42,7 +42,6 @@ from paramclient.cli.write_outcomes import (
     writes_json,
 )
 from paramclient.client.arguments import SETTLE_MAX
-from paramclient.client.reset import ResetChoice, read_unconfirmed
 from paramclient.errors import NoReply, ParamClientError, UsageError, VehicleError
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import DefaultSource, default_of
@@ -51,6 +50,7 @@ from paramclient.model.notation import typed, value_json
 from paramclient.model.patterns import is_pattern
 from paramclient.model.values import Param, format_value
 from paramclient.model.wording import counted, first_of
+from paramclient.protocol.reset import ResetChoice, read_unconfirmed
 from paramclient.protocol.set_results import SetOutcome
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
 

@@ -20,7 +20,6 @@ from paramclient.client.arguments import (
     check_writes,
 )
 from paramclient.client.core import ClientCore
-from paramclient.client.reset import ResetChoice, ResetResult, read_unconfirmed
 from paramclient.client.signing import timestamp_now
 from paramclient.client.streams import Changes, Subscribers
 from paramclient.errors import (
@@ -41,12 +40,13 @@ from paramclient.protocol.digest import is_current
 from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all, result_of
 from paramclient.protocol.node import Node
-from paramclient.protocol.reads import read
+from paramclient.protocol.reads import read_param
+from paramclient.protocol.reset import ResetChoice, ResetResult, read_unconfirmed
 from paramclient.protocol.selection import hint_of_node, node_in_words, vehicle_of
 from paramclient.protocol.session import Session
-from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
+from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.watch import SyncState, Watch
-from paramclient.protocol.writes import write, write_many
+from paramclient.protocol.writes import write, write_all
 from paramclient.wire.messages import MAV_MODE_FLAG_SAFETY_ARMED
 from paramclient.wire.signing import SigningKey
 
@@ -59,10 +59,6 @@ REBOOT_TIMEOUT: Final = 60.0
 seconds, and boards that calibrate sensors first a little longer."""
 PASSIVE_TIMEOUT: Final = 20.0
 """Seconds of a fetch where nothing is sent, by default: another station may never request a list."""
-SETUP_SIGNING_COUNT: Final = 3
-"""SETUP_SIGNING messages that are sent: they have no acknowledgement, and a frame may be lost."""
-SETUP_SIGNING_INTERVAL: Final = 0.1
-"""Seconds after each SETUP_SIGNING message."""
 TIMEOUT_NOTE: Final = "The fetch ended at its timeout."
 
 logger = logging.getLogger(__name__)
@@ -251,13 +247,8 @@ class Component:
         check_requested_name(name)
         self.core.check_may_send()
         with self.limited(timeout, f"parameter {name} of {self.system}/{self.component}"):
-            message = await read(self.session, name)
-        known = self.session.table.params.get(message.param_id)
-        if known is not None and (isinstance(name, str) or known.index == name):
-            return known
-        index = message.param_index if message.param_index < message.param_count else None
-        fields = (message.param_id, message.raw, message.param_type, index)
-        return self.session.dialect.param(*fields, self.encoding)
+            return await read_param(self.session, name)
+        raise AssertionError("the timeout has raised")
 
     async def set(
         self,
@@ -352,23 +343,12 @@ class Component:
         pairs = check_writes(values, extended=self.is_extended)
         settle, by = check_settle(settle), check_author(author)
         await self._check_may_write(durable=durable)
-        began = anyio.current_time()
-        outcomes: list[SetOutcome] = []
-        error: ParamClientError | None = None
-        with anyio.move_on_after(timeout) as scope:
-            report = (lambda outcome: None) if progress is None else progress
-            error = await write_many(
-                self.session, pairs, outcomes, report, settle=settle, force=force, author=by
-            )
-        elapsed = anyio.current_time() - began
-        if scope.cancelled_caught:
-            error = NoReply(
-                f"{len(pairs)} writes to {self.system}/{self.component}", attempts=0, waited=elapsed
-            )
-            outcomes = [_ended(outcome, error) for outcome in outcomes]
+        result = await write_all(
+            self.session, pairs, progress=progress, timeout=timeout, settle=settle, force=force, author=by
+        )
         hint = hint_of_node(self.core.station, self.node, anyio.current_time())
-        outcomes = [replace(each, error=_hinted(each.error, hint)) for each in outcomes]
-        error = _hinted(error, hint)
+        outcomes = [replace(each, error=_hinted(each.error, hint)) for each in result.outcomes]
+        error = _hinted(result.error, hint)
         names = [outcome.name for outcome in outcomes if outcome.is_set]
         if durable and names:
             try:
@@ -376,7 +356,7 @@ class Component:
             except NotDurable as failure:
                 error = error or failure
                 outcomes = [replace(each, error=failure) if each.is_set else each for each in outcomes]
-        return SetManyResult(self.system, self.component, tuple(outcomes), error, elapsed)
+        return replace(result, outcomes=tuple(outcomes), error=error)
 
     async def reset(
         self,
@@ -544,10 +524,8 @@ class Component:
             )
         if self.node.version == 1:
             raise UsageError(f"{self.system}/{self.component} uses MAVLink 1, which has no signing")
-        for _ in range(SETUP_SIGNING_COUNT):
-            self.core.check_may_send()
-            self.core.station.send_setup_signing(self.node, key, 0 if key is None else timestamp_now())
-            await anyio.sleep(SETUP_SIGNING_INTERVAL)
+        self.core.check_may_send()
+        await self.core.station.set_up_signing(self.node, key, 0 if key is None else timestamp_now())
 
     async def reboot(self, *, system: int | None = None, timeout: float | None = REBOOT_TIMEOUT) -> Component:
         """Reboot the vehicle, and wait until it is back and identified. Written values are saved before.
@@ -646,11 +624,6 @@ class Component:
         except NoReply as error:
             hint = hint_of_node(self.core.station, self.node, anyio.current_time())
             raise error.with_hint(hint) from None
-
-
-def _ended(outcome: SetOutcome, error: ParamClientError) -> SetOutcome:
-    is_open = outcome.status in (SetStatus.NOT_TRIED, SetStatus.UNKNOWN) and outcome.error is None
-    return replace(outcome, error=error) if is_open else outcome
 
 
 def _has(params: Mapping[str, Param], trust: Trust) -> bool:

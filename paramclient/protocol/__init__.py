@@ -4,7 +4,7 @@
 - `channel`, `timing`: requests of one component, and the messages that answer them; round trip and loss.
 - `dialect`: the messages of the plain and of the extended protocol.
 - `table`: the values of a component with their trust, the count, the hash.
-- `reads`, `writes`, `set_results`: single reads; writes, and their results.
+- `reads`, `writes`, `set_results`, `reset`: single reads; writes, and their results; resets to defaults.
 - `fetch`, `list_download`, `file_download`: all parameters: from the cache, by list, as a file.
 - `ftp`, `param_pck`: MAVFTP; the packed parameter file.
 - `digest`, `watch`: whether the table is current; checks that keep it in sync.

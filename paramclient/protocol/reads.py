@@ -23,7 +23,7 @@ from paramclient.protocol.dialect import ReportedValue
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK, Message, ParamError
 
-__all__ = ["read", "read_many", "refusal"]
+__all__ = ["read", "read_many", "read_param", "refusal"]
 
 CONTROL_LOST: Final = 1e-4
 """Probability that all attempts of the control read are lost, which decides whether a component answers
@@ -89,6 +89,21 @@ async def read(session: Session, which: str | int) -> ReportedValue:
             if is_first:
                 session.reading.discard(which)
     raise _unknown(session, which, ": it does not respond to reads of this name, but to others")
+
+
+async def read_param(session: Session, which: str | int) -> Param:
+    """Read one parameter, and return it as the component has reported it.
+
+    Raises:
+        UnknownParameter, Refused, NoReply, LinkError: as from `read`.
+    """
+    message = await read(session, which)
+    known = session.table.params.get(message.param_id)
+    if known is not None and (isinstance(which, str) or known.index == which):
+        return known
+    index = message.param_index if message.param_index < message.param_count else None
+    fields = (message.param_id, message.raw, message.param_type, index)
+    return session.dialect.param(*fields, session.table.encoding)
 
 
 async def read_many(

@@ -57,6 +57,10 @@ STREAM_PEERS_MAX: Final = 256
 """Peers of a stream with an unfinished frame."""
 RIVAL_TIME: Final = 5.0
 """Seconds of silence after which another peer may take the ids of a component: its heartbeat timeout."""
+SETUP_SIGNING_COUNT: Final = 3
+"""SETUP_SIGNING messages that are sent: they have no acknowledgement, and a frame may be lost."""
+SETUP_SIGNING_INTERVAL: Final = 0.1
+"""Seconds after each SETUP_SIGNING message."""
 _MAVLINK2_REQUESTS: Final = (ParamExtRequestRead, ParamExtRequestList, ParamExtSet)
 """Requests that exist in MAVLink 2 only: a component that has sent MAVLink 1 so far may understand them."""
 
@@ -193,10 +197,17 @@ class Station:
             data = sign_frame(data, self._signer)
         self._send(data, peer)
 
-    def send_setup_signing(self, node: Node, key: SigningKey | None, timestamp: int) -> None:
+    async def set_up_signing(self, node: Node, key: SigningKey | None, timestamp: int) -> None:
         """Give a vehicle its signing key, in clear, or with None disable signing. There is no
-        acknowledgement."""
-        self.transmit(SetupSigning(node.system, node.component, key, timestamp), node.peer, 2)
+        acknowledgement.
+
+        Raises:
+            LinkError: the link failed.
+        """
+        for _ in range(SETUP_SIGNING_COUNT):
+            self.gate.check()
+            self.transmit(SetupSigning(node.system, node.component, key, timestamp), node.peer, 2)
+            await anyio.sleep(SETUP_SIGNING_INTERVAL)
 
     async def send_heartbeats(self) -> None:
         """Send our heartbeat once a second."""

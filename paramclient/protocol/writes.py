@@ -36,10 +36,10 @@ from paramclient.model.values import (
 from paramclient.protocol.channel import Inbox
 from paramclient.protocol.reads import read, refusal
 from paramclient.protocol.session import ReplacedValue, Session
-from paramclient.protocol.set_results import SetOutcome, SetResult, SetStatus
+from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
 from paramclient.wire.messages import Message, ParamError, ParamExtAck, StatusText
 
-__all__ = ["write", "write_many"]
+__all__ = ["write", "write_all", "write_many"]
 
 UNCHANGED_MAX: Final = 5
 """Sets that leave the old value, after which the vehicle has not applied it: a PARAM_SET can be lost."""
@@ -193,6 +193,40 @@ async def write_many(
         outcomes[place] = replace(outcomes[place], error=failures[0])
         done(outcomes[place])
     return failures[0] if failures else None
+
+
+async def write_all(
+    session: Session,
+    pairs: Sequence[tuple[str, WireValue]],
+    *,
+    progress: Callable[[SetOutcome], None] | None = None,
+    timeout: float | None = None,
+    settle: float = 0.0,
+    force: bool = False,
+    author: str = "us",
+) -> SetManyResult:
+    """Set several parameters as `write_many` does, and return what is known of each at the end or timeout.
+
+    Args:
+        session, pairs, settle, force, author: as for `write_many`.
+        progress: called with each outcome, as it is known.
+        timeout: seconds; None for no limit.
+    """
+    began, system, component = anyio.current_time(), *session.channel.target
+    outcomes: list[SetOutcome] = []
+    error: ParamClientError | None = None
+    done = progress or (lambda outcome: None)
+    with anyio.move_on_after(timeout) as scope:
+        error = await write_many(session, pairs, outcomes, done, settle=settle, force=force, author=author)
+    elapsed = anyio.current_time() - began
+    if scope.cancelled_caught:
+        error = NoReply(f"{len(pairs)} writes to {system}/{component}", attempts=0, waited=elapsed)
+        open_states = (SetStatus.NOT_TRIED, SetStatus.UNKNOWN)
+        outcomes = [
+            replace(each, error=error) if each.status in open_states and each.error is None else each
+            for each in outcomes
+        ]
+    return SetManyResult(system, component, tuple(outcomes), error, elapsed)
 
 
 class _Write:

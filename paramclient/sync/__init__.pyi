@@ -9,7 +9,6 @@ from paramclient.cache import ParamCache
 from paramclient.client.arguments import COMPONENT_TIMEOUT
 from paramclient.client.component import REBOOT_TIMEOUT, ComponentState
 from paramclient.client.fleet_fetch import FetchedAll
-from paramclient.client.reset import ResetResult
 from paramclient.client.signing import Signing
 from paramclient.client.traffic import TrafficReport
 from paramclient.links import Link
@@ -24,6 +23,7 @@ from paramclient.protocol import ftp
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress
+from paramclient.protocol.reset import ResetResult
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.watch import SyncState
 from paramclient.provision.planning import ParamInfo, Plan

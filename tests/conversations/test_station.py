@@ -540,7 +540,7 @@ async def test_setup_signing_is_obeyed_and_another_key_is_not_understood() -> No
     vehicle = PX4Vehicle()
     async with converse(vehicle) as conversation:
         node = await conversation.node()
-        conversation.station.send_setup_signing(node, KEY, NOW)
+        await conversation.station.set_up_signing(node, KEY, NOW)
         await anyio.sleep(0.5)
         assert vehicle.signing_key == KEY
         with pytest.raises(NoReply):
