@@ -660,6 +660,8 @@ class ApplyRun:
         if name not in self.sent:
             return row(ApplyStatus.FAILED, "not reached")
         if not self._is_verified:
+            held = self._component.params.get(name) if name in self.written else None
+            actual = actual if held is None else held.settable
             return row(ApplyStatus.UNPROVEN, f"{answered}, and not read back")
         if self._is_action(name):
             return row(ApplyStatus.SET, "done by the vehicle")
