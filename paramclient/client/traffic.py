@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import struct
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
@@ -25,12 +26,6 @@ RATE_SLICE: Final = 0.5
 """Seconds between two snapshots of the counts in that time."""
 RATE_TIME_MIN: Final = 1.0
 """Seconds, at least, over which a rate is computed."""
-COUNTED_COMPONENTS_MAX: Final = 1_000
-"""Components that are counted separately; frames of further ones count for the link only."""
-COUNTS_MAX: Final = 500
-"""Counts of a component, most of them by message id; the dialect has fewer."""
-COUNTED_PEERS_MAX: Final = 256
-"""Peers of one component with sequence numbers."""
 RADIO_STATUS_IDS: Final = frozenset({109, 166})
 """RADIO_STATUS, and RADIO from older firmware of SiK radios; both have the same layout."""
 
@@ -149,28 +144,27 @@ class Traffic(Tap):
         self._cutter = cutter
         self._counts = _Counts()
         self._sources: dict[Address, _Source] = {}
-        self._began: float | None = None
 
     def received(self, frames: Sequence[SeenFrame], size: int, peer: Hashable) -> None:
         """Count a received chunk and its frames."""
-        now = self._add({"received": size, "frames": len(frames)})
+        now = anyio.current_time()
+        unknown = sum(not each.is_known for each in frames)
+        self._counts.add({"received": size, "frames": len(frames), "unknown": unknown}, now)
         for each in frames:
             address = (each.frame.system, each.frame.component)
-            if not each.is_known:
-                self._add({"unknown": 1})
-            elif len(self._sources) < COUNTED_COMPONENTS_MAX:
-                self._sources.setdefault(address, _Source())
+            if each.is_known and address not in self._sources:
+                self._sources[address] = _Source()
             if address in self._sources:  # an address that no checksum proves does not count
                 self._sources[address].receive(each, peer, now)
 
     def sent(self, frame: bytes) -> None:
         """Count a sent frame."""
-        self._add({"sent": len(frame)})
+        self._counts.add({"sent": len(frame)}, anyio.current_time())
 
     def report(self, now: float) -> TrafficReport:
         """Return the present counts."""
-        began = now if self._began is None else self._began
-        window = _window(began, now)
+        began = min(self._counts.began, now)
+        window = max(now - max(_first_slice(now) * RATE_SLICE, began), RATE_TIME_MIN)
         totals, recent = self._counts.totals, self._counts.recent(now)
         return TrafficReport(
             seconds=now - began,
@@ -187,21 +181,13 @@ class Traffic(Tap):
             other_bytes=self._cutter.other_bytes,
         )
 
-    def _add(self, amounts: Mapping[_What, int]) -> float:
-        """Add to the counts of the link, and return the present time."""
-        now = anyio.current_time()
-        if self._began is None:
-            self._began = now
-        self._counts.add(amounts, now)
-        return now
-
 
 class _Source:
     """One component's frames."""
 
     def __init__(self) -> None:
         self._counts = _Counts()
-        self._checks: dict[Hashable, SequenceCheck] = {}
+        self._checks: defaultdict[Hashable, SequenceCheck] = defaultdict(SequenceCheck)  # by peer
         self._version = 1
         self._received_at = 0.0
         self._heartbeat: Heartbeat | None = None
@@ -213,23 +199,12 @@ class _Source:
         frame = seen.frame
         self._received_at = now
         self._version = frame.version
-        check = self._checks.setdefault(peer, SequenceCheck())
-        if len(self._checks) > COUNTED_PEERS_MAX:
-            del self._checks[next(iter(self._checks))]
-        lost, repeated, late = check.lost, check.repeated, check.late
+        check = self._checks[peer]
+        before = (check.lost, check.repeated)
         check.receive(frame.sequence, now)
-        self._counts.add(
-            {
-                "frames": 1,
-                "bytes": seen.size,
-                "signed": seen.is_signed,
-                "lost": check.lost - lost,
-                "repeated": check.repeated - repeated,
-                "late": check.late - late,
-                frame.message_id: 1,
-            },
-            now,
-        )
+        lost, repeated = check.lost - before[0], check.repeated - before[1]
+        amounts: dict[_What, int] = {"lost": lost, "repeated": repeated, "signed": seen.is_signed}
+        self._counts.add(amounts | {"frames": 1, "bytes": seen.size, frame.message_id: 1}, now)
         if frame.message_id in RADIO_STATUS_IDS:
             self._radio = _radio_status(frame.payload)
         elif seen.is_known and isinstance(message := decode(frame), Heartbeat):
@@ -258,7 +233,7 @@ class _Source:
             lost=totals["lost"],
             loss=lost / (received + lost) if received > 0 else None,
             repeated=totals["repeated"],
-            late=totals["late"],
+            late=sum(check.late for check in self._checks.values()),
             signed=totals["signed"],
             messages=tuple(sorted(messages, key=lambda each: (-each.rate, -each.count, each.name))),
             radio=self._radio,
@@ -273,27 +248,21 @@ class _Counts:
 
     def __init__(self) -> None:
         self.totals: Counter[_What] = Counter()
+        self.began = math.inf
         # the counts before each of the last slices in which something was counted
         self._snapshots: deque[tuple[int, Counter[_What]]] = deque(maxlen=round(RATE_WINDOW / RATE_SLICE))
 
     def add(self, amounts: Mapping[_What, int], now: float) -> None:
+        self.began = min(self.began, now)
         number = int(now / RATE_SLICE)
         if not self._snapshots or self._snapshots[-1][0] != number:
             self._snapshots.append((number, self.totals.copy()))
-        if len(self.totals) < COUNTS_MAX:
-            self.totals.update(amounts)
-        else:
-            self.totals.update({what: amount for what, amount in amounts.items() if what in self.totals})
+        self.totals.update(amounts)
 
     def recent(self, now: float) -> Counter[_What]:
         first = _first_slice(now)
         before = next((totals for number, totals in self._snapshots if number >= first), self.totals)
         return Counter({what: count - before[what] for what, count in self.totals.items()})
-
-
-def _window(began: float, now: float) -> float:
-    """Return the seconds in which recent counts were counted."""
-    return max(now - max(_first_slice(now) * RATE_SLICE, began), RATE_TIME_MIN)
 
 
 def _first_slice(now: float) -> int:
