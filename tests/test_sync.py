@@ -72,7 +72,7 @@ def test_a_whole_session(tmp_path: Path) -> None:
             client.ftp(vehicle).read("/no/such/file")
     assert next(changes).name == NAME, "what was queued"
     with pytest.raises(ClientClosed):
-        next(changes)
+        changes.next(timeout=1.0)
     with pytest.raises(ClientClosed):
         vehicle.get(NAME)
     assert vehicle.params[NAME].value == 7.0

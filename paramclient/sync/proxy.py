@@ -10,11 +10,11 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent import futures
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import replace
 from functools import partial, wraps
 from queue import Empty, SimpleQueue
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 from typing import Any, Final, Self
 
 import anyio
@@ -115,8 +115,16 @@ class _Session:
         return self._end.alive
 
     def read(self, function: Callable[[], Any]) -> Any:
-        """Call a function that does not wait: in the event loop, or after its end in this thread."""
-        return self.run(function) if self.is_open else self.shown(function())
+        """Call a function in the event loop, or after its end, when nothing waits, in this thread."""
+        if self.is_open:
+            return self.run(function)
+        result = function()
+        if inspect.iscoroutine(result):
+            try:
+                result.send(None)
+            except StopIteration as end:
+                result = end.value
+        return self.shown(result)
 
     def shown(self, value: Any) -> Any:
         """Return a value of the client as the caller is to see it."""
@@ -219,9 +227,7 @@ class ParamClient(Proxy):
     def __enter__(self) -> Self:
         return self.open()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
@@ -261,21 +267,10 @@ class Stream(Proxy):
                 raise StopIteration from None
         return self._session.shown(taken.popleft())
 
-    def _take(self, taken: deque[Any], timeout: float | None) -> Any:
+    async def _take(self, taken: deque[Any], timeout: float | None) -> None:
         """Move one item into `taken`; a closed client has no event loop, and its streams do not wait."""
-
-        async def take() -> None:
+        with anyio.fail_after(timeout) if self._session.is_open else nullcontext():
             taken.append(await anext(self._target))
-
-        async def take_in_time() -> None:
-            with anyio.fail_after(timeout):
-                await take()
-
-        if self._session.is_open:
-            return take_in_time()
-        with suppress(StopIteration):
-            take().send(None)
-        return None
 
 
 class Changes(Stream):
