@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Final, NamedTuple
 
 import anyio
 
-from paramclient.protocol.channel import LATE_GRACE, LATE_WAKE_UP, Inbox
+from paramclient.protocol.channel import LATE_GRACE, LATE_WAKE_UP, UNANSWERED_MAX, Inbox
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK, Message
@@ -33,6 +35,8 @@ READS_PER_SECOND_ARDUPILOT: Final = 49.0
 """Reads that an ArduPilot serves in a second: five in every 100 ms."""
 PASS_OVERHEAD: Final = 0.15
 """Seconds that another pass of the list takes beside its values."""
+FRUITLESS_PASSES_MAX: Final = 5
+"""Passes in a row without a new value, after which the count may be false: a request can be lost."""
 GAPS_INTERVAL: Final = 0.02
 """Seconds after which gaps are looked at again without a new value."""
 
@@ -139,13 +143,16 @@ class _Download:
         else:
             while not self._is_over():
                 await self._take_for(GAPS_INTERVAL)
+            fruitless = 0
             while (missing := self._missing()) and not self._is_silent():
                 seconds_left = len(self.table.names) / self._rate() + PASS_OVERHEAD
-                if len(missing) / READS_PER_SECOND_ARDUPILOT <= seconds_left:
+                is_slower = len(missing) / READS_PER_SECOND_ARDUPILOT > seconds_left
+                if not is_slower or fruitless >= FRUITLESS_PASSES_MAX:
                     await self._read_gaps()
                     break
                 self.result.lost += len(missing)
                 await self._next_pass(seconds_left)
+                fruitless = fruitless + 1 if self._missing() == missing else 0
         self.result.missing = self._missing()
 
     async def _next_pass(self, seconds: float) -> None:
@@ -156,34 +163,40 @@ class _Download:
         self._skipped.clear()
         self._last = anyio.current_time()
         with anyio.move_on_after(seconds + self.channel.timing.timeout(0)):
-            while self._missing() and not self._is_over():
+            while len(self._received) < (self._count or 0) and not self._is_over():
                 await self._take_for(GAPS_INTERVAL)
 
     async def _read_gaps(self) -> None:
-        """Read what is missing, each index again when its time is over; several copies of the last ones."""
+        """Read what is missing, each index again when its time is over; several copies of the last ones.
+
+        Where no value arrives for seconds, and a window of reads is given up, the count is false: the
+        component has none of the others.
+        """
         channel, timing = self.channel, self.channel.timing
         while True:
             now = anyio.current_time()
+            given_up = sum(self._is_given_up(index, now) for index in self._reads)
             for index in [index for index in self._reads if index in self._received]:
                 read = self._reads.pop(index)
                 timing.answered(read.attempts)
                 if read.attempts == 1 and self._is_over():
                     timing.measure(now - read.sent)
-            gaps = self._gaps()
-            if (not gaps and self._is_over()) or self._is_silent():
+            missing = (self._count or 0) - len(self._received)
+            is_fruitless = now - self._last >= UNANSWERED_MAX and given_up >= channel.window_size
+            is_ended = given_up >= missing or is_fruitless
+            if (is_ended and self._is_over()) or self._is_silent():
                 return
-            self._request(gaps, now)
-            if self._is_over() and all(self._is_given_up(index, now) for index in gaps):
-                return
+            self._request(now)
             await channel.gate.wait()
             await self._take_for(GAPS_INTERVAL)
 
-    def _request(self, gaps: list[int], now: float) -> None:
+    def _request(self, now: float) -> None:
         """Send the reads that are due, as many as the window holds."""
         timing, window = self.channel.timing, self.channel.window_size
         in_flight = sum(read.due > now for read in self._reads.values())
-        copies = timing.copies if len(gaps) <= window and self._is_over() else 1
-        for index in gaps:
+        is_tail = (self._count or 0) - len(self._received) <= window and self._is_over()
+        copies = timing.copies if is_tail else 1
+        for index in self._gaps():
             attempts, _, due = self._reads.get(index, _NO_READ)
             if due > now or attempts >= timing.attempts_max:
                 continue
@@ -203,10 +216,11 @@ class _Download:
         """Return the indices that are missing."""
         return [index for index in range(self._count or 0) if index not in self._received]
 
-    def _gaps(self) -> list[int]:
+    def _gaps(self) -> Iterable[int]:
         """Return the indices that are missing, below the end of the list so far."""
         if self._is_over():
-            return sorted(self._skipped) + list(range(self._reached + 1, self._count or 0))
+            rest = range(self._reached + 1, self._count or 0)
+            return chain(sorted(self._skipped), (each for each in rest if each not in self._received))
         return sorted(index for index in self._skipped if index <= self._reached - TAIL)
 
     def _is_over(self) -> bool:

@@ -251,6 +251,16 @@ async def test_a_count_that_is_one_too_high_leaves_one_missing_and_an_end() -> N
 
 
 @virtual
+async def test_a_false_large_count_ends_within_seconds_and_a_few_hundred_reads() -> None:
+    for count in (30_000, 65_535):
+        async with converse(component([f"P{number}" for number in range(8)], count=count)) as conversation:
+            result = await fetch_all((await conversation.node()).plain)
+            assert (len(result.params), result.complete) == (8, False)
+            assert result.elapsed < 20.0
+            assert len(conversation.sent) < 1000
+
+
+@virtual
 async def test_names_that_no_file_can_hold_leave_the_others_whole() -> None:
     async with converse(component(["A", b"RC MAP", "B", b"\xff\x01"])) as conversation:
         result = await fetch_all((await conversation.node()).plain)
