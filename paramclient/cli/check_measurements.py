@@ -24,8 +24,9 @@ from paramclient.errors import (
 )
 from paramclient.model.notation import hash_text, rounded
 from paramclient.protocol import param_pck
-from paramclient.protocol.file_download import PARAM_FILE, WITH_DEFAULTS
+from paramclient.protocol.file_download import WITH_DEFAULTS
 from paramclient.protocol.list_download import ListResult, download_list
+from paramclient.protocol.param_pck import PARAM_FILE
 from paramclient.wire.frames import enum_word
 from paramclient.wire.messages import (
     HASH_CHECK,

@@ -499,7 +499,7 @@ class Component:
         if result.source == "cache" and result.hash is None:
             self.watch.unconfirmed()
         elif result.complete:
-            self.watch.fetched(None if result.source == "cache" else result.elapsed)
+            self.watch.fetched()
             self.core.cache_writer.fetched(self.node, self.session, result)
         return result
 

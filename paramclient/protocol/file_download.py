@@ -9,13 +9,11 @@ import anyio
 
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError
 from paramclient.protocol.ftp import FileCutOff, read_file
-from paramclient.protocol.param_pck import PACK_SIZE_MAX, Pack, decode, decode_prefix
+from paramclient.protocol.param_pck import PACK_SIZE_MAX, PARAM_FILE, Pack, decode, decode_prefix
 from paramclient.protocol.session import Session
 
 __all__ = ["FileUnavailable", "download_file"]
 
-PARAM_FILE: Final = "@PARAM/param.pck"
-"""The path of the file in MAVFTP."""
 WITH_DEFAULTS: Final = "?withdefaults=1"
 """Requests the defaults too; a server that does not know it may report that there is no such file."""
 ARDUPILOT_WITH_DEFAULTS: Final = 0x04040000

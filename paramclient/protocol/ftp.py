@@ -173,8 +173,13 @@ async def read_file(
             raise FileCutOff(error, reader.prefix) from None
 
 
-async def checksum(channel: Channel, path: str) -> int:
+async def checksum(channel: Channel, path: str, *, attempts: int | None = None) -> int:
     """Return the CRC-32 of a file, computed by the component: PX4's, see `crc32_px4`. Opens no session.
+
+    Args:
+        channel: the component's.
+        path: of the file.
+        attempts: at most; None for as many as loss explains.
 
     Raises:
         FileTransferError: the component does not compute it, or refused the file.
@@ -182,7 +187,8 @@ async def checksum(channel: Channel, path: str) -> int:
         LinkError: the link is closed for good.
     """
     with channel.inbox(FileTransfer) as inbox:
-        answer = await _request(channel, inbox, Opcode.CALC_FILE_CRC32, path, path_bytes(path))
+        data = path_bytes(path)
+        answer = await _request(channel, inbox, Opcode.CALC_FILE_CRC32, path, data, attempts=attempts)
     if len(answer.data) < 4:
         raise _error(channel, path, FileErrorCode.INVALID_DATA_SIZE)
     return int.from_bytes(answer.data[:4], "little")

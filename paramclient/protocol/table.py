@@ -133,8 +133,7 @@ class Table:
         if place is None and old is not None and index == NO_INDEX:
             place = old.index
         elif place is not None:
-            self.names[place] = name
-            self._outdated.discard(name)
+            self._take_place(name, place)
         self.moments[name] = now
         if old is None:
             if len(self.params) >= NAMES_MAX:
@@ -168,8 +167,7 @@ class Table:
         if not self._may_store(name):
             return None
         old = self.params.get(name)
-        self.names[index] = name
-        self._outdated.discard(name)
+        self._take_place(name, index)
         default_bits = entry.default if entry.default is not None else entry.bits if with_defaults else None
         default = None if default_bits is None else from_bits(default_bits, entry.type)
         new = Param(
@@ -184,6 +182,13 @@ class Table:
         self.moments[name] = now
         self._wire[name] = (raw, entry.type)
         return self._put(name, old, new)
+
+    def _take_place(self, name: str, index: int) -> None:
+        before = self.names.get(index, name)
+        if before != name and before in self.params and self.params[before].index == index:
+            self._outdated.add(before)
+        self.names[index] = name
+        self._outdated.discard(name)
 
     def _may_store(self, name: str) -> bool:
         if is_portable_name(name):
@@ -281,6 +286,13 @@ class Table:
             return
         for name, param in self.params.items():
             if param.trust is Trust.CACHED and param.index is not None and name not in self.volatile:
+                self.params[name] = param.with_trust(Trust.VERIFIED)
+
+    def prove(self, checksum: int) -> None:
+        """Take a checksum that covers the whole table, and mark the cached values as verified."""
+        self._hash, self._hash_is_stale = checksum, False
+        for name, param in self.params.items():
+            if param.trust is Trust.CACHED and param.index is not None:
                 self.params[name] = param.with_trust(Trust.VERIFIED)
 
     def unverified(self) -> list[str]:

@@ -12,12 +12,10 @@ from paramclient.errors import FileErrorCode, UsageError
 from paramclient.model.px4_hash import crc32_px4
 from paramclient.protocol import param_pck
 from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
-from paramclient.protocol.param_pck import PackedParam
+from paramclient.protocol.param_pck import PARAM_FILE, PackedParam
 
-__all__ = ["PARAM_FILE", "Address", "FileServer"]
+__all__ = ["Address", "FileServer"]
 
-PARAM_FILE: Final = "@PARAM/param.pck"
-"""Path of the packed parameter file in MAVFTP."""
 IDLE_LIMIT: Final = 3.0
 """Seconds without a response after which ArduPilot reassigns the session; each response restarts the time."""
 PX4_IDLE_LIMIT: Final = 11.0

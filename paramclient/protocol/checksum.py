@@ -1,0 +1,226 @@
+"""ArduPilot's answer to "is the table current?": the checksum of its parameter file.
+
+MAVFTP's CalcFileCRC32 returns the CRC-32 of `@PARAM/param.pck`, of all parameters or of a range, in one round
+trip and without opening the file. The same file is encoded from the table. A CRC-32 behind known bytes
+determines the last four: the checksum of one parameter **is** its value. Values that move by themselves are
+read that way, and so are those that were found changed. Nothing is taken over until the checksum of the whole
+file, which covers all names, types, values and the count, agrees.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+import anyio
+
+from paramclient.errors import FileErrorCode, FileTransferError, NoReply
+from paramclient.model.px4_hash import crc32_px4, crc32_px4_before
+from paramclient.model.values import Encoding, ParamType, as_reported, bits_of, bits_of_wire, from_bits
+from paramclient.protocol.ftp import checksum
+from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode
+from paramclient.protocol.session import Session
+from paramclient.protocol.table import Table
+
+__all__ = ["ChecksumUnavailable", "prove"]
+
+READ_SIZE: Final = 64
+"""Bytes that ArduPilot reads at a time for a checksum: the padding of the file depends on it (measured)."""
+AT_ONCE: Final = 5
+"""Requests sent at once: ArduPilot's queue has 5 places, and drops the surplus silently (measured)."""
+INTERVAL: Final = 0.01
+"""Seconds between further requests: ArduPilot answers one in 6 to 12 ms (measured)."""
+LOST: Final = 1e-3
+"""Probability that all first requests are lost, at which MAVFTP counts as silent."""
+FLOAT32_EXACT: Final = 2**24
+"""The largest integer up to which float32 holds all."""
+BOOT_COUNT: Final = "STAT_BOOTCNT"
+MOVING: Final = frozenset({"STAT_RUNTIME", BOOT_COUNT})
+"""Names that have another value at almost every connection: the seconds and the number of runs."""
+MEASURED: Final = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|BARO\d_GND_PRESS|ARSPD\d?_OFFSET")
+"""Names that each start of the vehicle measures again (measured: ten of 1,382)."""
+MOVING_MAX: Final = 12
+"""Values that are read one by one for their own sake; a table with more of them is downloaded."""
+PASSES_MAX: Final = 4
+"""Searches for changed values; each finds one at least."""
+PARTS_MAX: Final = 12
+"""Parts of a range that one search compares at once."""
+SEARCH_ROUND_TRIP_MAX: Final = 0.15
+"""Seconds of round trip above which the file is downloaded quicker than changes are searched: three round
+trips and 0.3 s."""
+
+
+class ChecksumUnavailable(Exception):
+    """The checksum cannot prove the table.
+
+    Attributes:
+        reason: why, as a sentence for the notes of a fetch.
+        is_silent: whether MAVFTP did not answer at all.
+    """
+
+    def __init__(self, reason: str, *, is_silent: bool = False) -> None:
+        super().__init__(reason)
+        self.reason = reason
+        self.is_silent = is_silent
+
+
+async def prove(session: Session) -> tuple[str, ...]:
+    """Prove a complete table by the vehicle's checksum, after reading the values that have changed.
+
+    Returns:
+        The names whose values have changed, except for those that move by themselves.
+
+    Raises:
+        ChecksumUnavailable: the vehicle computes no checksum now, or its table is too different.
+        LinkError: the link is closed for good.
+    """
+    table = session.table
+    rows = [_row(table, table.names[index]) for index in range(table.count or 0)]
+    async with session.channel.ftp:
+        proof = _Proof(session, rows)
+        try:
+            await proof.run()
+        except FileTransferError as error:
+            if error.code == FileErrorCode.UNKNOWN_COMMAND:
+                session.serves_checksum = False
+            raise ChecksumUnavailable(f"the checksum was refused: {error.reason}") from None
+        except NoReply:
+            is_silent = session.serves_checksum is None
+            raise ChecksumUnavailable("MAVFTP did not answer", is_silent=is_silent) from None
+    return proof.take_over()
+
+
+class _Proof:
+    """One proof: the file as the vehicle must have it, which is brought in line with its checksums."""
+
+    def __init__(self, session: Session, rows: list[PackedParam]) -> None:
+        self._session = session
+        self._rows = rows
+        self._changed: dict[int, float] = {}  # by index, when the checksum was requested
+        self._checksum = 0
+        self._round_trip = math.inf
+
+    async def run(self) -> None:
+        """Compare, and read what differs.
+
+        Raises:
+            ChecksumUnavailable: the tables are too different.
+        """
+        if await self._agrees([]):
+            return
+        moving = list(self._moving())
+        if len(moving) > MOVING_MAX:
+            raise ChecksumUnavailable(f"{len(moving)} values of the cached table are not exact")
+        if await self._agrees(moving):
+            return
+        boot_count = next((at for at, row in enumerate(self._rows) if row.name == BOOT_COUNT), None)
+        if boot_count is None or boot_count in self._changed:
+            measured = [at for at, row in enumerate(self._rows) if MEASURED.fullmatch(row.name)]
+            if await self._agrees(measured):
+                return
+        for _ in range(PASSES_MAX if self._round_trip <= SEARCH_ROUND_TRIP_MAX else 0):
+            await self._search(range(len(self._rows)))
+            if await self._agrees([]):
+                return
+        raise ChecksumUnavailable("more has changed than is worth searching for")
+
+    def _moving(self) -> Iterator[int]:
+        """Return the indices of values that probably are others, or that may be rounded."""
+        learnt = self._session.table.volatile
+        for at, row in enumerate(self._rows):
+            is_learnt = row.name in learnt and not MEASURED.fullmatch(row.name)
+            if is_learnt or row.name in MOVING or _may_be_rounded(row):
+                yield at
+
+    async def _agrees(self, single: Sequence[int]) -> bool:
+        """Take over the values at some indices, and return whether the whole file agrees then."""
+        began = anyio.current_time()
+        self._checksum, *found = await self._request([None, *(range(at, at + 1) for at in single)])
+        self._round_trip = min(self._round_trip, anyio.current_time() - began)
+        for at, each in zip(single, found, strict=True):
+            self._solve(at, each, began)
+        return self._checksum == self._computed(range(len(self._rows)))
+
+    async def _search(self, place: range) -> None:
+        """Take over at least one of the values in a range that differs."""
+        if len(place) == 1:
+            began = anyio.current_time()
+            (value,) = await self._request([place])
+            self._solve(place.start, value, began)
+            return
+        count = min(1 + max(1, int(self._round_trip / INTERVAL)), PARTS_MAX, len(place))
+        size = -(-len(place) // count)
+        *parts, last = (place[at : at + size] for at in range(0, len(place), size))
+        found = await self._request(parts)
+        differing = [part for part, each in zip(parts, found, strict=True) if each != self._computed(part)]
+        for part in differing or [last]:
+            await self._search(part)
+
+    def _solve(self, at: int, found: int, requested_at: float) -> None:
+        """Take over the one value with which the file of one parameter has this checksum."""
+        row = self._rows[at]
+        difference = crc32_px4_before(found ^ self._computed(range(at, at + 1)), row.type.size)
+        if difference >> 8 * row.type.size:
+            raise ChecksumUnavailable("the vehicle has other parameters than the cached table")
+        if difference:
+            self._rows[at] = row._replace(bits=row.bits ^ difference)
+            self._changed[at] = requested_at
+
+    def _computed(self, place: range) -> int:
+        rows = self._rows[place.start : place.stop]
+        return crc32_px4(encode(rows, total=len(self._rows), read_size=READ_SIZE))
+
+    async def _request(self, places: Sequence[range | None]) -> list[int]:
+        """Return the vehicle's checksums of some ranges, or with None, of all."""
+        session = self._session
+        answers: dict[int, int] = {}
+        errors: list[FileTransferError | NoReply] = []
+        attempts = session.channel.timing.attempts_for(LOST) if session.serves_checksum is None else None
+
+        async def request(number: int, place: range | None) -> None:
+            query = "" if place is None else f"?start={place.start}&count={len(place)}"
+            try:
+                answers[number] = await checksum(session.channel, PARAM_FILE + query, attempts=attempts)
+            except (FileTransferError, NoReply) as error:
+                errors.append(error)
+                tasks.cancel_scope.cancel()
+
+        async with anyio.create_task_group() as tasks:
+            for number, place in enumerate(places):
+                if number >= AT_ONCE:
+                    await anyio.sleep(INTERVAL)
+                tasks.start_soon(request, number, place)
+        if errors:
+            raise errors[0]
+        session.serves_checksum = True
+        return [answers[number] for number in range(len(places))]
+
+    def take_over(self) -> tuple[str, ...]:
+        """Put the proven file into the table; return the names of changed values that do not move."""
+        table = self._session.table
+        names = [self._rows[at].name for at in self._changed]
+        moving = MOVING | table.volatile
+        if names:
+            table.volatile = frozenset(names)
+        for at, moment in self._changed.items():
+            table.store_entry(self._rows[at], at, moment, with_defaults=False)
+        table.prove(self._checksum)
+        return tuple(name for name in names if name not in moving and not MEASURED.fullmatch(name))
+
+
+def _row(table: Table, name: str) -> PackedParam:
+    param = table.params[name]
+    if param.is_raw or param.type_number not in PACKABLE:
+        raise ChecksumUnavailable(f"the cached table has {name}, which no parameter file can have")
+    default = None if param.default is None else bits_of(param.default, param.type_number)
+    return PackedParam(name, ParamType(param.type_number), param.bits, default)
+
+
+def _may_be_rounded(row: PackedParam) -> bool:
+    """Return whether the integer may stand for others, as a C-cast PARAM_VALUE rounds them to float32."""
+    if row.type is not ParamType.INT32 or abs(int(from_bits(row.bits, row.type))) <= FLOAT32_EXACT:
+        return False
+    bits, _ = bits_of_wire(as_reported(row.bits, row.type, Encoding.C_CAST), row.type, Encoding.C_CAST)
+    return bits == row.bits
