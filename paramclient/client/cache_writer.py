@@ -184,7 +184,7 @@ class CacheWriter:
             params, ahead = cached.params.values(), self._seconds_ahead()
             session.table.load(
                 params if is_same_firmware else [replace(each, default=None) for each in params],
-                count=cached.count if cached.complete else None,
+                count=cached.count if cached.complete and is_same_firmware else None,
                 hash=cached.hash,
                 volatile=cached.volatile,
                 volatile_is_known=cached.volatile_known,

@@ -36,7 +36,6 @@ from paramclient.model.params import ParamMap
 from paramclient.model.values import Encoding, Param, Settable, Trust, WireValue
 from paramclient.protocol import commands
 from paramclient.protocol.addresses import Address, PeerAddress, peer_in_words
-from paramclient.protocol.digest import is_current
 from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all, result_of
 from paramclient.protocol.node import Node
@@ -478,7 +477,7 @@ class Component:
     def _is_heard(self) -> bool:
         """Return whether all values were received, or the hash of the cached ones was."""
         table = self.session.table
-        is_confirmed = is_current(self.session, self.session.announced)
+        is_confirmed = table.agrees_with(self.session.announced)
         if is_confirmed:
             table.verify()
         return is_confirmed or (table.is_complete and not _has(table.params, Trust.CACHED))

@@ -48,16 +48,15 @@ async def ask(session: Session) -> Answer:
     Raises:
         LinkError: the link is closed for good.
     """
-    table = session.table
     if _may_prove(session):
         try:
             return Answer(is_current=True, changed=await prove(session))
         except ChecksumUnavailable as error:
             return Answer(reason=error.reason, is_silent=error.is_silent)
     digest = await request_digest(session)
-    if digest is None or not table.is_complete or (table.hash, table.count) != (digest.hash, digest.count):
+    if not session.table.agrees_with(digest):
         return Answer(digest=digest)
-    table.verify()
+    session.table.verify()
     return Answer(is_current=True, digest=digest)
 
 

@@ -16,7 +16,7 @@ from paramclient.model.values import (
     from_bits,
     is_portable_name,
 )
-from paramclient.protocol.dialect import PLAIN, Dialect, ReportedValue
+from paramclient.protocol.dialect import PLAIN, Dialect, Digest, ReportedValue
 from paramclient.protocol.events import Change
 from paramclient.protocol.param_pck import PackedParam
 from paramclient.wire.messages import HASH_CHECK, NO_INDEX, PARAMETERS_MAX
@@ -354,6 +354,11 @@ class Table:
             self._was_complete = self.is_complete
 
     # PX4's hash
+
+    def agrees_with(self, digest: Digest | None) -> bool:
+        """Return whether a hash that the vehicle announced is that of the complete table."""
+        is_same = digest is not None and (self.hash, self.count) == (digest.hash, digest.count)
+        return is_same and self.is_complete
 
     def confirm(self, announced: int) -> bool:
         """Take a hash that the vehicle announced for exactly this table, and return whether it is proven.

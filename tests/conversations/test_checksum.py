@@ -27,7 +27,8 @@ async def with_cached_table(conversation: Conversation, cached: dict[str, Param]
     node = await conversation.node()
     await node.identification.settled()
     count_ = sum(param.index is not None for param in cached.values())
-    known = {"volatile": (), "volatile_is_known": False, "hash": None, "count": count_} | options
+    known = {"volatile": (), "volatile_is_known": False, "hash": None, "count": count_}
+    known |= {"moments": dict.fromkeys(cached, -1.0)} | options
     node.plain.table.load(cached.values(), **known)  # type: ignore[arg-type]  # a mapping of options
     return node
 
