@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter, defaultdict, deque
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -148,18 +148,22 @@ class Traffic(Tap):
     def received(self, frames: Sequence[SeenFrame], size: int, peer: Hashable) -> None:
         """Count a received chunk and its frames."""
         now = anyio.current_time()
-        unknown = sum(not each.is_known for each in frames)
-        self._counts.add({"received": size, "frames": len(frames), "unknown": unknown}, now)
+        counts = self._counts.at(now)
+        counts["received"] += size
+        counts["frames"] += len(frames)
         for each in frames:
             address = (each.frame.system, each.frame.component)
-            if each.is_known and address not in self._sources:
-                self._sources[address] = _Source()
-            if address in self._sources:  # an address that no checksum proves does not count
-                self._sources[address].receive(each, peer, now)
+            counts["unknown"] += not each.is_known
+            source = self._sources.get(address)
+            if source is None:
+                if not each.is_known:
+                    continue  # an address that no checksum proves does not count
+                source = self._sources[address] = _Source()
+            source.receive(each, peer, now)
 
     def sent(self, frame: bytes) -> None:
         """Count a sent frame."""
-        self._counts.add({"sent": len(frame)}, anyio.current_time())
+        self._counts.at(anyio.current_time())["sent"] += len(frame)
 
     def report(self, now: float) -> TrafficReport:
         """Return the present counts."""
@@ -200,11 +204,15 @@ class _Source:
         self._received_at = now
         self._version = frame.version
         check = self._checks[peer]
-        before = (check.lost, check.repeated)
+        lost, repeated = check.lost, check.repeated
         check.receive(frame.sequence, now)
-        lost, repeated = check.lost - before[0], check.repeated - before[1]
-        amounts: dict[_What, int] = {"lost": lost, "repeated": repeated, "signed": seen.is_signed}
-        self._counts.add(amounts | {"frames": 1, "bytes": seen.size, frame.message_id: 1}, now)
+        counts = self._counts.at(now)
+        counts["frames"] += 1
+        counts["bytes"] += seen.size
+        counts["signed"] += seen.is_signed
+        counts["lost"] += check.lost - lost
+        counts["repeated"] += check.repeated - repeated
+        counts[frame.message_id] += 1
         if frame.message_id in RADIO_STATUS_IDS:
             self._radio = _radio_status(frame.payload)
         elif seen.is_known and isinstance(message := decode(frame), Heartbeat):
@@ -252,12 +260,13 @@ class _Counts:
         # the counts before each of the last slices in which something was counted
         self._snapshots: deque[tuple[int, Counter[_What]]] = deque(maxlen=round(RATE_WINDOW / RATE_SLICE))
 
-    def add(self, amounts: Mapping[_What, int], now: float) -> None:
-        self.began = min(self.began, now)
+    def at(self, now: float) -> Counter[_What]:
+        """Return the counts, to be increased at this time."""
         number = int(now / RATE_SLICE)
         if not self._snapshots or self._snapshots[-1][0] != number:
+            self.began = min(self.began, now)
             self._snapshots.append((number, self.totals.copy()))
-        self.totals.update(amounts)
+        return self.totals
 
     def recent(self, now: float) -> Counter[_What]:
         first = _first_slice(now)
