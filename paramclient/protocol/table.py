@@ -10,7 +10,6 @@ from paramclient.model.px4_hash import find_volatile, hash_bits
 from paramclient.model.values import (
     Encoding,
     Param,
-    ParamType,
     Trust,
     as_reported,
     from_bits,
@@ -66,7 +65,7 @@ class Table:
         self._changed = changed
         self._held: dict[str, Change] | None = {} if dialect is PLAIN else None
         self._encoding = Encoding.BYTEWISE
-        self._wire: dict[str, tuple[bytes, int]] = {}  # as received, to decode again in another encoding
+        self._wire: dict[str, tuple[bytes, int]] = {}  # as received, until the encoding is certain
         self._was_complete = False
         self._outdated: set[str] = set()  # names whose index belongs to an earlier count
         self._hash: int | None = None
@@ -87,7 +86,10 @@ class Table:
 
     @property
     def encoding(self) -> Encoding:
-        """How the component encodes values; a change decodes all received values again."""
+        """How the component encodes values; a change decodes all received values again.
+
+        Later than `report_held`, a change is against all evidence: the values are forgotten.
+        """
         return self._encoding
 
     @encoding.setter
@@ -95,6 +97,8 @@ class Table:
         if encoding is self._encoding:
             return
         self._encoding = encoding
+        if self._held is None:
+            self.clear()
         for name, (raw, number) in self._wire.items():
             old = self.params[name]
             new = self.dialect.param(name, raw, number, old.index, encoding)
@@ -139,15 +143,14 @@ class Table:
             if len(self.params) >= NAMES_MAX:
                 return None
             new = self.dialect.param(name, raw, number, place, self._encoding)
-        elif (self._wire.get(name) == (raw, number) and not is_exact) or (
-            not is_exact and self._is_rounded(old, raw, number)
-        ):
+        elif not is_exact and self._is_reported(old, raw, number):
             new = self._placed(old, place)
         else:
             new = self.dialect.param(name, raw, number, place, self._encoding)
             if new.type_number == old.type_number:
                 new = replace(new, default=old.default)
-        self._wire[name] = (raw, number)
+        if self._held is not None:
+            self._wire[name] = (raw, number)
         return self._put(name, old, new)
 
     def store_entry(
@@ -174,13 +177,13 @@ class Table:
             name, from_bits(entry.bits, entry.type), entry.type, index, entry.bits, Trust.LIVE, default
         )
         raw = as_reported(entry.bits, entry.type, self._encoding)
-        if old is not None and self.moments.get(name, -1.0) > now and old.trust is Trust.LIVE:
-            wire = self._wire.get(name)
-            if wire is not None and wire != (raw, entry.type):
-                self.params[name] = replace(old, index=index, default=default)
-                return None
+        is_newer = old is not None and self.moments[name] > now and old.trust is Trust.LIVE
+        if old is not None and is_newer and not self._is_reported(old, raw, entry.type):
+            self.params[name] = replace(old, index=index, default=default)
+            return None
         self.moments[name] = now
-        self._wire[name] = (raw, entry.type)
+        if self._held is not None:
+            self._wire[name] = (raw, entry.type)
         return self._put(name, old, new)
 
     def _take_place(self, name: str, index: int) -> None:
@@ -236,15 +239,13 @@ class Table:
             return param
         return replace(param, index=place, trust=Trust.LIVE)
 
-    def _is_rounded(self, old: Param, raw: bytes, number: int) -> bool:
-        """Return whether these bytes are a C-casting vehicle's form of a known exact integer."""
-        return (
-            self._encoding is Encoding.C_CAST
-            and old.type_number == number
-            and isinstance(old.type, ParamType)
-            and old.type.is_integer
-            and as_reported(old.bits, number, self._encoding) == raw
-        )
+    def _is_reported(self, known: Param, raw: bytes, number: int) -> bool:
+        """Return whether these bytes are the component's form of a known value, which may be rounded."""
+        if known.type_number != number or self.dialect is not PLAIN:
+            return False
+        if known.is_raw:
+            return int.from_bytes(raw, "little") == known.bits
+        return as_reported(known.bits, number, self._encoding) == raw
 
     def _put(self, name: str, old: Param | None, new: Param) -> Change | None:
         self.params[name] = new
@@ -269,6 +270,7 @@ class Table:
     def report_held(self) -> None:
         """Report the changes that waited until the encoding was certain, with the values in that encoding."""
         held, self._held = self._held or {}, None
+        self._wire.clear()
         for name, change in held.items():
             if change.new is not None and name in self.params:
                 self._changed(replace(change, new=self.params[name]))
