@@ -324,7 +324,7 @@ class Channel:
         accept: Callable[[Message], T | None],
         *,
         what: str,
-        attempts: int | None = None,
+        attempts: int | Callable[[], int] | None = None,
         copies: int = 1,
         timeout_min: float = 0.0,
     ) -> T:
@@ -336,7 +336,7 @@ class Channel:
             accept: returns the answer in a message, or None for a message that is none. It may raise the
                 error that the message tells.
             what: names the request in the error.
-            attempts: at most; None for as many as loss explains.
+            attempts: at most, or a function that returns them; None for as many as loss explains.
             copies: of the request in each attempt after the first.
             timeout_min: seconds to wait in each attempt, at least.
 
@@ -358,7 +358,7 @@ class Channel:
             if answer is not None:
                 self._measure(attempt, now - sent, now - began)
                 return answer
-            if self.is_hopeless(attempt, began, now, attempts):
+            if self.is_hopeless(attempt, began, now, attempts() if callable(attempts) else attempts):
                 raise NoReply(what, attempts=attempt, waited=now - began)
 
     async def wait_for(

@@ -59,8 +59,11 @@ async def read(session: Session, which: str | int) -> ReportedValue:
 
     request = dialect.request_read(channel.target, which)
 
-    async def ask(inbox: Inbox) -> ReportedValue:
-        attempts, wait = channel.timing.attempts_max, _queue_time(session)
+    def attempts_max() -> int:
+        return channel.timing.attempts_max  # of this moment: the loss is better known with each answer
+
+    async def ask(inbox: Inbox, attempts: int | Callable[[], int] = attempts_max) -> ReportedValue:
+        wait = _queue_time(session)
         return await channel.exchange(request, inbox, accept, what=what, attempts=attempts, timeout_min=wait)
 
     async with channel.window:
@@ -84,7 +87,7 @@ async def read(session: Session, which: str | int) -> ReportedValue:
                 if control.param_id == which:
                     return control
                 with suppress(NoReply):  # it answers by now, and may only have been busy
-                    return await ask(inbox)
+                    return await ask(inbox, channel.timing.attempts_for(CONTROL_LOST))
         finally:
             if is_first:
                 session.reading.discard(which)

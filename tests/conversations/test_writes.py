@@ -444,7 +444,7 @@ async def test_many_values_are_set_each_with_its_outcome(maker: type[PX4Vehicle]
         pairs.insert(70, ("NO_SUCH", 1))
         began = anyio.current_time()
         outcomes = await many(session, pairs)
-        assert anyio.current_time() - began < (40.0 if loss else 15.0)  # the unknown name is asked for twice
+        assert anyio.current_time() - began < (30.0 if loss else 8.0)
         assert [each.name for each in outcomes] == [name for name, _ in pairs]
         refused = outcomes.pop(70)
         assert (refused.status, type(refused.error)) == (SetStatus.REFUSED, UnknownParameter)
