@@ -464,14 +464,13 @@ class ParamClient:
 
     def _meet(self, node: Node) -> None:
         """Follow a new component."""
-        ways = [self._new_component(node, session) for session in node.sessions]
-        component, ext = ways
-        component.is_extended_by(ext)
+        ext = self._new_component(node, node.extended, None)
+        component = self._new_component(node, node.plain, ext)
         self._components[component.address] = component
         self._events.push(events.Discovered(component))
         self.core.spawn(self._join_vehicle, node)
 
-    def _new_component(self, node: Node, session: Session) -> Component:
+    def _new_component(self, node: Node, session: Session, ext: Component | None) -> Component:
         def emit(event: protocol.Resynced) -> None:
             self._emit(node, event)
 
@@ -479,7 +478,7 @@ class ParamClient:
         watch = Watch(session, node.presence, emit, interval=self._interval, policy=policy)
         session.table.recounted = watch.doubt
         component = self._by_session[session] = Component(
-            self.core, node, session, watch, self._components, self.successor
+            self.core, node, session, watch, ext, self._components, self.successor
         )
         component.policy = self._policy
         if self.listens_only:

@@ -100,6 +100,7 @@ class Component:
         node: Node,
         session: Session,
         watch: Watch,
+        ext: Component | None,
         siblings: Mapping[Address, Component],
         successor: Callable[..., Awaitable[Component]],
     ) -> None:
@@ -115,7 +116,7 @@ class Component:
         self.policy = Policy.AUTO
         self.cache_is_read = anyio.Event()
         self.successor = successor
-        self._ext: Component | None = None
+        self._ext = ext
         self._last: FetchResult | None = None
 
     @property
@@ -580,10 +581,6 @@ class Component:
             with anyio.CancelScope(deadline=self.node.since + CACHE_TIMEOUT):
                 await self.cache_is_read.wait()
             self.core.check_open()
-
-    def is_extended_by(self, ext: Component) -> None:
-        """Take the component with the extended parameters."""
-        self._ext = ext
 
     async def _check_may_write(self, *, durable: bool) -> None:
         self.core.check_may_send()

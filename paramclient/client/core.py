@@ -16,7 +16,7 @@ from paramclient.client.cache_writer import CacheWriter
 from paramclient.client.link_task import LinkTask
 from paramclient.client.signing import TimestampKeeper
 from paramclient.client.taps import FrameCutter, Tap
-from paramclient.errors import ClientClosed, LinkError, ParamClientError, UsageError
+from paramclient.errors import ClientClosed, ParamClientError, UsageError
 from paramclient.links import Link
 from paramclient.protocol.station import Station
 
@@ -167,7 +167,11 @@ class ClientCore:
             with scope:
                 await self._live()
         except Exception as error:
-            self._keep(error)
+            self._error = error  # for the caller of `open` or `close`, and as the cause of ClientClosed
+            if self._is_opened.is_set() and not self._is_to_close.is_set():
+                logger.error("%s: an unexpected error has ended the client", self.link.name, exc_info=error)
+            if self.station.gate.error is not None:
+                self.station.gate.error.__cause__ = error
         finally:
             self._is_opened.set()
             self._is_closed.set()
@@ -236,18 +240,6 @@ class ClientCore:
             for node in self.station.nodes.values():
                 node.presence.is_over = True
         self._ended()
-
-    def _keep(self, error: Exception) -> None:
-        """Keep an error for the caller of `open` or `close`, and make it the cause of ClientClosed."""
-        self._error = error
-        if not self._is_opened.is_set():
-            return
-        if not self._is_to_close.is_set():
-            logger.error("%s: an unexpected error has ended the client", self.link.name, exc_info=error)
-        try:
-            self.station.gate.check()
-        except LinkError as ended:
-            ended.__cause__ = error
 
     def _raise_error(self) -> None:
         error, self._error = self._error, None
