@@ -354,7 +354,8 @@ class CacheWriter:
             at=time.time(),
             table=state,
             params=[
-                StoredParam.of(each.param, each.at + ahead, each.volatile, each.by) for each in observations
+                StoredParam.of(table.with_default(param), at + ahead, volatile, by)
+                for param, at, volatile, by in observations
             ],
             removed={name: at + ahead for name, at in pending.removed.items()},
             replace=pending.is_whole and table.is_complete,

@@ -31,8 +31,10 @@ from paramclient.wire.messages import (
     message_id,
 )
 
-__all__ = ["Identification", "judge_encoding"]
+__all__ = ["HEARTBEAT_WAIT", "Identification", "judge_encoding"]
 
+HEARTBEAT_WAIT: Final = 1.2
+"""Seconds in which a component's first heartbeat is awaited: its interval, and a fifth of it for jitter."""
 PX4_WITH_FILE: Final = 0x01120000
 """flight_sw_version of the first PX4 that serves the packed parameter file: 1.18."""
 VERSION_ATTEMPTS_MAX: Final = 12
@@ -100,6 +102,7 @@ class Identification:
         self.is_confirmed = True
         self._chosen = chosen
         self._listens_only = listens_only
+        self._has_no_heartbeat = False
         self._changed = anyio.Event()
 
     @property
@@ -137,9 +140,14 @@ class Identification:
     @property
     def is_encoding_certain(self) -> bool:
         """Whether no further message can change the encoding."""
-        if self._chosen is not None or self.is_px4 or self.is_ardupilot or self.is_settled:
+        if self._chosen is not None or self.is_px4 or self.is_ardupilot:
             return True
-        return self._listens_only and self.autopilot is not None
+        if self.autopilot is None:  # an ArduPilot shows itself by its heartbeat alone
+            bits = (self.capabilities or 0) & (
+                CAPABILITY_PARAM_ENCODE_BYTEWISE | CAPABILITY_PARAM_ENCODE_C_CAST
+            )
+            return self.is_settled and (bool(bits) or self._has_no_heartbeat)
+        return self.is_settled or self._listens_only
 
     async def settled(self) -> None:
         """Wait until the identity is as complete as it gets."""
@@ -161,6 +169,11 @@ class Identification:
         self.identity = replace(self.identity, autopilot=message.autopilot, vehicle_type=message.type)
         self._derive()
         return before != (None, None)
+
+    def miss_heartbeat(self) -> None:
+        """Take note that the component sends no heartbeat."""
+        self._has_no_heartbeat = True
+        self._derive()
 
     def version(self, message: AutopilotVersion) -> bool:
         """Take an AUTOPILOT_VERSION, and return whether it is another vehicle's than the last one."""

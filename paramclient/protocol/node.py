@@ -21,7 +21,7 @@ from paramclient.protocol.events import (
     Rebooted,
     Replaced,
 )
-from paramclient.protocol.identity import Identification
+from paramclient.protocol.identity import HEARTBEAT_WAIT, Identification
 from paramclient.protocol.presence import Presence
 from paramclient.protocol.session import Session, Shared, Spawn
 from paramclient.wire.messages import (
@@ -218,6 +218,10 @@ class Node:
         self._settle_encoding()
         if not was_settled and self.identification.capabilities is None:
             self._emit(Identified())
+        if not self.identification.is_encoding_certain:
+            await anyio.sleep(HEARTBEAT_WAIT)
+            self.identification.miss_heartbeat()
+            self._settle_encoding()
         if not self.channel.answered.is_set():  # requests may not reach it yet
             await self.channel.answered.wait()
             await self.identified()

@@ -20,6 +20,7 @@ from paramclient.model.similar_names import did_you_mean, nearest_names
 from paramclient.model.values import Param, Trust
 from paramclient.protocol.channel import Inbox
 from paramclient.protocol.dialect import ReportedValue
+from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK, Message, ParamError
 
@@ -101,6 +102,9 @@ async def read_param(session: Session, which: str | int) -> Param:
         UnknownParameter, Refused, NoReply, LinkError: as from `read`.
     """
     message = await read(session, which)
+    if session.identification.autopilot is None and not session.dialect.has_ack:
+        with anyio.move_on_after(HEARTBEAT_WAIT):  # it tells the encoding
+            await session.identification.encoding_certain()
     known = session.table.params.get(message.param_id)
     if known is not None and (isinstance(which, str) or known.index == which):
         return known

@@ -275,6 +275,12 @@ class Table:
             if change.new is not None and name in self.params:
                 self._changed(replace(change, new=self.params[name]))
 
+    def with_default(self, param: Param) -> Param:
+        """Return a parameter that was received earlier with the default that is known by now."""
+        now = self.params.get(param.name, param)
+        is_new = param.default is None and now.default is not None and now.type_number == param.type_number
+        return replace(param, default=now.default) if is_new else param
+
     # trust
 
     def doubt(self) -> None:

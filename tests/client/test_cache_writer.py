@@ -812,6 +812,19 @@ async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Pa
     assert said(path) == (0, None)
 
 
+@in_simulated_time
+async def test_a_value_before_the_first_heartbeat_is_right_and_keeps_its_default(path: Path) -> None:
+    """An ArduPilot shows its encoding by its heartbeat alone."""
+    vehicle = ArduPilotVehicle(live_period=0)
+    await session(vehicle, path)
+    vehicle.set_param("RTL_ALT", 1234)
+    async with ParamClient(Air.symmetric([vehicle], delay=0.1), cache=path) as client:
+        await until(lambda: client.components)
+        assert (await client.components[1, 1].get("RTL_ALT")).value == 1234
+    assert said(path) == (1382, True)
+    assert kept(path) == bits(vehicle.params)
+
+
 @pytest.mark.parametrize("kind", ["no file", "silent"])
 @in_simulated_time
 async def test_a_vehicle_without_the_parameter_file_is_remembered_for_its_firmware(
