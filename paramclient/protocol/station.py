@@ -187,7 +187,7 @@ class Station:
         if self.listens_only:
             return
         system, component = self.own_address
-        if not isinstance(message, Heartbeat):
+        if logger.isEnabledFor(logging.DEBUG) and not isinstance(message, Heartbeat):
             logger.debug("%s: to %s: %r", self.link, "all" if peer is None else peer_in_words(peer), message)
         if isinstance(message, _MAVLINK2_REQUESTS):
             version = 2
