@@ -140,23 +140,23 @@ def param_file(file: ParamFile) -> dict[str, Any]:
     return {"file": file.source, "format": file.file_format, "notes": list(file.notes), "components": sets}
 
 
-def change(found: Change, target: Target, *, ext: bool) -> dict[str, Any]:
+def change(found: Change, target: Target) -> dict[str, Any]:
     """Return the members of an event about a changed, added or removed parameter."""
 
     def shown(each: Param | None) -> dict[str, Any] | None:
-        return None if each is None else param(each, target.described_by(ext=ext), whole=False)
+        return None if each is None else param(each, target.metadata, whole=False)
 
     old, new = shown(found.old), shown(found.new)
     about = {"name": found.name, "old": old, "new": new, "by": found.by, "kind": found.kind}
-    return {**about, "extended": ext}
+    return {**about, "extended": target.component.is_extended}
 
 
 # Fetches, writes and set-ups
 
 
-def fetch_result(result: FetchResult, target: Target, *, ext: bool) -> dict[str, Any]:
+def fetch_result(result: FetchResult, target: Target) -> dict[str, Any]:
     """Return the result of a fetch, without the parameters."""
-    client, component = target.link.client, target.parameters(ext=ext)
+    client, component = target.link.client, target.component
     found: dict[str, Any] = as_json(
         FetchJson.of(
             component,
@@ -173,19 +173,19 @@ def fetch_result(result: FetchResult, target: Target, *, ext: bool) -> dict[str,
     return found | {"notes": list(result.notes)}
 
 
-def write(outcome: SetOutcome, target: Target, *, ext: bool) -> dict[str, Any]:
+def write(outcome: SetOutcome, target: Target) -> dict[str, Any]:
     """Return the outcome of a write, with the `bits` of a value that was set."""
-    known = target.parameters(ext=ext).params.get(outcome.name)
+    known = target.component.params.get(outcome.name)
     kind = ParamType.REAL64 if known is None else known.type_number
-    found = dict(as_json(WriteJson.of(outcome, kind, target.info(outcome.name, ext=ext))))
+    found = dict(as_json(WriteJson.of(outcome, kind, target.info(outcome.name))))
     return found if outcome.result is None else found | {"bits": bits_text(outcome.result.param)}
 
 
-def writes(result: SetManyResult, target: Target, *, ext: bool) -> dict[str, Any]:
+def writes(result: SetManyResult, target: Target) -> dict[str, Any]:
     """Return the outcomes of several writes in order; `error` says why not all were tried."""
     return {
         "vehicle": as_json(VehicleJson.of(target.component)),
-        "results": [write(outcome, target, ext=ext) for outcome in result.outcomes],
+        "results": [write(outcome, target) for outcome in result.outcomes],
         "error": None if result.error is None else str(result.error),
     }
 

@@ -337,6 +337,9 @@ async def test_extended_parameters_are_set_up_and_restored(tmp_path: Path) -> No
         await asyncio.sleep(1)
         history = (await browser.get(f"{CAMERA}/history", params=EXT)).json()["history"]
         assert [each["new"] for each in history] == ["Rear", before]
+        saved = await browser.get(f"{CAMERA}/file", params={**EXT, "format": "json"})
+        given = {"file": {"name": "camera.json", "text": saved.text}, "only": [text]}
+        assert (await browser.post(f"{CAMERA}/plan", params=EXT, json=given)).json()["params"] == {}
         made = await browser.post(f"{CAMERA}/snapshots", params=EXT, json={"reason": "by hand"})
         *_, kept = (await browser.get(f"{CAMERA}/snapshots", params=EXT)).json()["snapshots"]
         assert (made.json(), kept["reason"]) == ({"id": kept["id"]}, "by hand")
