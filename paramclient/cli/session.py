@@ -133,8 +133,8 @@ class ChosenVehicle:
                 "at least 6 digits of its hardware id, or as all"
             )
         ids = [int(each) for each in found.groups() if each is not None]
-        if not all(1 <= each <= 255 for each in ids):
-            raise UsageError(f"--vehicle {text}: system and component ids are 1 to 255")
+        if not all(each <= 255 for each in ids) or ids[0] == 0:
+            raise UsageError(f"--vehicle {text}: system ids are 1 to 255, component ids 0 to 255")
         return cls(system=ids[0], component=ids[1] if len(ids) > 1 else None)
 
     @property

@@ -56,6 +56,9 @@ __all__ = ["ParamClient"]
 VEHICLES_LISTENING_TIME: Final = 3.0
 """Seconds after the first autopilot in which further ones are looked for: three heartbeats, two of which may
 be lost."""
+PROBE_INTERVAL: Final = 0.5
+"""Seconds between two requests to a component that is named in full and was not heard; the first one after
+`LOOK_TIME`, in which a component with heartbeats is heard."""
 LISTENING_TIME: Final = 1.2
 """Seconds after the client was opened in which components are waited for, by a fetch of all."""
 
@@ -264,6 +267,9 @@ class ParamClient:
         several vehicles, the result may be a different vehicle at the next start. Use it in programs that
         only read, or if the link has only one vehicle. Programs that write use `only_component`.
 
+        A component that is named in full and was not heard is asked for a value: DroneCAN nodes and WiFi
+        bridges send no heartbeat, and some routers pass none on.
+
         On return, a cached table is in `params`, unless the vehicle does not report its identity.
 
         Args:
@@ -280,6 +286,7 @@ class ParamClient:
             lambda: find(self.core.station.nodes.values(), system, component, peer),
             address_in_words(system, component, peer),
             timeout,
+            asked=(system, component),
         )
 
     async def find_autopilots(
@@ -361,7 +368,7 @@ class ParamClient:
             return node
 
         awaited = address_in_words(system, component)
-        return await self._wait_for(choose, awaited, timeout, until=lambda: due)
+        return await self._wait_for(choose, awaited, timeout, until=lambda: due, asked=(system, component))
 
     async def successor(
         self, component: Component, system: int, *, timeout: float | None = COMPONENT_TIMEOUT
@@ -551,6 +558,7 @@ class ParamClient:
         timeout: float | None,
         *,
         until: Callable[[], float | None] = lambda: None,
+        asked: tuple[int | None, int | None] = (None, None),
     ) -> Component:
         """Wait until a choice is made, and its cached table is loaded.
 
@@ -559,16 +567,30 @@ class ParamClient:
             awaited: for the error.
             timeout: seconds; None waits without limit.
             until: returns when the choice may change without a message, or None.
+            asked: system and component to which requests are sent; nothing is, without both.
         """
         self.core.check_open()
         began = anyio.current_time()
-        node: Node | None = None
+        station, node = self.core.station, None
+        system, component = asked
+        probed_at = -math.inf
         with anyio.move_on_after(timeout):
             while (node := choose()) is None and not self.core.is_over:
+                now = anyio.current_time()
                 due = until()
-                with anyio.move_on_after(None if due is None else due - anyio.current_time()):
+                wake_at = math.inf if due is None else due
+                if system and component:
+                    probe_at = max(probed_at + PROBE_INTERVAL, station.listening_since + LOOK_TIME)
+                    if now >= probe_at:
+                        station.probe(system, component)
+                        probed_at, probe_at = now, now + PROBE_INTERVAL
+                    wake_at = min(wake_at, probe_at)
+                with anyio.move_on_after(wake_at - now):
                     await self._activity()
             if node is not None:
+                if node.identification.autopilot is None:
+                    with anyio.move_on_after(LOOK_TIME):
+                        await node.identification.encoding_certain()
                 await self._by_session[node.plain].wait_for_cache()
         if node is not None:
             return self._by_session[node.plain]

@@ -176,12 +176,12 @@ def _check(sets: list[ParamSet]) -> None:
     distinguishes them."""
     seen = set()
     for each in sets:
-        for number in (each.system, each.component):
-            if number is not None and not 1 <= number <= 255:
-                raise UsageError(f"systems and components have ids from 1 to 255, not {number}")
+        for number, least in ((each.system, 1), (each.component, 0)):
+            if number is not None and not least <= number <= 255:
+                raise UsageError(f"systems have ids from 1 to 255, components from 0 to 255, not {number}")
         for param in each.values():
             check_name(param.name)
-        ids = (each.system, each.component or AUTOPILOT)
+        ids = (each.system, AUTOPILOT if each.component is None else each.component)
         if ids in seen:
             raise UsageError(f"two sets have the same component, {address(each)}")
         seen.add(ids)

@@ -183,6 +183,7 @@ _list: Final = typed(list, "a list")
 _object: Final = typed(dict, "an object")
 _count: Final = between(0, math.inf, "a whole number from 0")
 _id: Final = between(1, 255, "an id from 1 to 255")
+_component: Final = between(0, 255, "an id from 0 to 255")
 _version: Final = between(VERSION, VERSION, f"{VERSION}, the version of the format")
 
 
@@ -244,7 +245,7 @@ def _with_bits(value: WireValue, kind: ParamType | int | None, text: str) -> Wir
 _DOCUMENT: Final[Checks] = {_KEY: _version, "header": _texts, "sets": _list}
 _SET: Final[Checks] = {
     "system": _id,
-    "component": _id,
+    "component": _component,
     "identity": _object,
     "at": _time,
     "source": _text,
@@ -269,7 +270,7 @@ _PARAM: Final[Checks] = {
 _EXT_DOCUMENT: Final[Checks] = {
     _EXT_KEY: _version,
     "system": _id,
-    "component": _id,
+    "component": _component,
     "at": _time,
     "params": _object,
 }

@@ -38,6 +38,7 @@ __all__ = [
     "check_value",
     "decode_value",
     "encode_value",
+    "encoding_of",
     "format_value",
     "from_bits",
     "is_portable_name",
@@ -354,6 +355,21 @@ def bits_of_wire(raw: bytes, number: int, encoding: Encoding) -> tuple[int, bool
         if low <= whole <= high:
             return whole & (high - low), False  # high - low has as many ones as the type has bits
     return bits, True
+
+
+def encoding_of(raw: bytes, number: int) -> Encoding | None:
+    """Return the encoding that the four wire bytes of an integer show; None of 0, and of other types.
+
+    A whole float32 that fits the type is cast: as bytes, it would be a number beyond 1,000,000,000. All else
+    is byte by byte: as a float32, it would be a fraction, too large or no number.
+    """
+    bounds = _BOUNDS.get(number)
+    if bounds is None or number >= ParamType.UINT64 or raw == bytes(WIRE_SIZE):
+        return None
+    number32: float = _FLOAT32.unpack(raw)[0]
+    low, high = bounds
+    is_cast = low <= number32 <= high + 1 and number32.is_integer()  # float32 rounds the largest up
+    return Encoding.C_CAST if is_cast else Encoding.BYTEWISE
 
 
 def encode_value(value: WireValue, number: int, encoding: Encoding) -> bytes:

@@ -26,7 +26,7 @@ from paramclient.wire.messages import (
     ParamValue,
 )
 
-__all__ = ["Channel", "Gate", "Inbox", "keys_of"]
+__all__ = ["PATIENCE_MIN", "Channel", "Gate", "Inbox", "keys_of"]
 
 T = TypeVar("T")
 
@@ -206,6 +206,8 @@ class Channel:
         presence: when the component was heard.
 
     Attributes:
+        target: the component's address.
+        reads_from: where reads and lists are sent to: the address, or all components of the system.
         timing: round trip and loss.
         window: limits the reads in flight; it follows what the vehicle serves.
         window_size: of the window.
@@ -224,7 +226,7 @@ class Channel:
     ) -> None:
         self.system = system
         self.component = component
-        self.target = (system, component)
+        self.target = self.reads_from = (system, component)
         self.timing = Timing()
         self.gate = gate
         self.is_streaming = False
@@ -305,7 +307,9 @@ class Channel:
 
         Without `attempts_max`, loss must not explain the silence, and the component must have had time.
         """
-        if self.silence_since(began, now) >= self.silence_max:
+        silence = now - self._presence.received_at
+        was_silent = silence - (now - began) >= self.silence_max
+        if silence >= self.silence_max and (not was_silent or now - began >= self.silence_max):
             return True
         if not self.answered.is_set() and now - began >= UNANSWERED_MAX:
             return True

@@ -231,6 +231,8 @@ class _Fetch:
         self.listed = await download_list(session)
         if self._is_silent and not self.listed.missing and not self.listed.lost:  # loss does not explain it
             session.serves_file = False
+        with session.channel.gate.until_closed(or_failed=True):
+            await session.identification.encoding_certain()
         self.table.complete()
         return "stream"
 
@@ -272,6 +274,8 @@ class _Fetch:
     def _result(self, source: FetchSource) -> FetchResult:
         lost, repeated = self.listed.lost, self.listed.repeated
         self.notes += [LEFT_OUT.format(repr(name)) for name in self.table.left_out]
+        if doubt := self.session.encoding_doubt:
+            self.notes.append(doubt)
         result = result_of(self.session, source, self._began, self.notes, lost=lost, repeated=repeated)
         return replace(result, changed=self._changed)
 

@@ -106,6 +106,18 @@ class Identification:
         self._changed = anyio.Event()
 
     @property
+    def is_chosen(self) -> bool:
+        """Whether the user has chosen the encoding."""
+        return self._chosen is not None
+
+    @property
+    def is_encoding_known(self) -> bool:
+        """Whether the user, or the component's AUTOPILOT_VERSION, names the encoding."""
+        bits = CAPABILITY_PARAM_ENCODE_BYTEWISE | CAPABILITY_PARAM_ENCODE_C_CAST
+        has_bit = bool((self.capabilities or 0) & bits)
+        return self.is_chosen or has_bit or (self.is_ardupilot and self.capabilities is not None)
+
+    @property
     def is_px4(self) -> bool:
         """Whether the component is a PX4."""
         return self.autopilot == MAV_AUTOPILOT_PX4

@@ -63,8 +63,8 @@ async def download_list(session: Session) -> ListResult:
 
     PX4 answers reads beside its list at once, so gaps are read while it runs. An ArduPilot's list almost
     stands still while it serves reads, so its gaps are read when it is over, or by another pass of the list
-    where that is quicker. A list that runs is not requested again. Ends with what was received when the
-    component is lost.
+    where that is quicker, or where reads are not answered. A list that runs is not requested again. Ends with
+    what was received when the component is lost.
 
     Raises:
         NoReply: the list does not begin.
@@ -107,6 +107,7 @@ class _Download:
         self._reached = -1  # the highest index
         self._skipped: set[int] = set()  # missing indices below the highest one
         self._reads: dict[int, _Read] = {}
+        self._has_answer = False  # to a read
 
     async def begin(self) -> None:
         """Request the list until its first value arrives."""
@@ -115,7 +116,7 @@ class _Download:
 
         def request(attempt: int) -> Message:
             self.session.report(0, self.table.count)
-            return self.session.dialect.request_list(channel.target)
+            return self.session.dialect.request_list(channel.reads_from)
 
         first: Message = await channel.exchange(
             request,
@@ -131,7 +132,7 @@ class _Download:
     def _first(self, message: Message) -> Message | None:
         """Return the first value of the list; PX4's hash comes before it, and says nothing of its end."""
         assert isinstance(message, self.session.dialect.value)
-        if message.param_index < message.param_count:
+        if message.param_index <= message.param_count:
             return message
         self._take(message)
         return None
@@ -149,6 +150,8 @@ class _Download:
                 is_slower = len(missing) / READS_PER_SECOND_ARDUPILOT > seconds_left
                 if not is_slower or fruitless >= FRUITLESS_PASSES_MAX:
                     await self._read_gaps()
+                    if not self._has_answer and self._missing() and not self._is_silent():
+                        await self._next_pass(seconds_left)  # some firmware serves no reads
                     break
                 self.result.lost += len(missing)
                 await self._next_pass(seconds_left)
@@ -158,7 +161,7 @@ class _Download:
     async def _next_pass(self, seconds: float) -> None:
         """Request the list once more, where that is quicker than reads, and receive it."""
         await self.channel.gate.wait()
-        self.channel.send(self.session.dialect.request_list(self.channel.target))
+        self.channel.send(self.session.dialect.request_list(self.channel.reads_from))
         self._reached = -1
         self._skipped.clear()
         self._last = anyio.current_time()
@@ -178,6 +181,7 @@ class _Download:
             given_up = sum(self._is_given_up(index, now) for index in self._reads)
             for index in [index for index in self._reads if index in self._received]:
                 read = self._reads.pop(index)
+                self._has_answer = True
                 timing.answered(read.attempts)
                 if read.attempts == 1 and self._is_over():
                     timing.measure(now - read.sent)
@@ -204,7 +208,7 @@ class _Download:
                 return
             self.result.lost += attempts == 0
             for _ in range(copies):
-                self.channel.send(self.session.dialect.request_read(self.channel.target, index))
+                self.channel.send(self.session.dialect.request_read(self.channel.reads_from, index))
             self._reads[index] = _Read(attempts + 1, now, now + timing.timeout(attempts))
             in_flight += 1
 
@@ -214,7 +218,13 @@ class _Download:
 
     def _missing(self) -> list[int]:
         """Return the indices that are missing."""
-        return [index for index in range(self._count or 0) if index not in self._received]
+        return [index for index in self._indices() if index not in self._received]
+
+    def _indices(self) -> range:
+        """Return the indices of the list: they begin at 1 if the count itself is one, and 0 is none."""
+        count = self._count or 0
+        first = int(count in self._received and 0 not in self._received)
+        return range(first, first + count)
 
     def _gaps(self) -> Iterable[int]:
         """Return the indices that are missing, below the end of the list so far."""
@@ -225,10 +235,11 @@ class _Download:
 
     def _is_over(self) -> bool:
         """Return whether the list has ended: by its last index, or by a pause."""
-        if self._count is not None and self._reached >= self._count - 1:
+        count = None if self.table.is_growing else self._count
+        if count is not None and self._reached >= count - 1:
             return True
         pause = PAUSE_PX4 if self.reads_beside else PAUSE_OTHERS
-        if self._count is not None and self._reached >= self._count - TAIL:
+        if count is not None and self._reached >= count - TAIL:
             pause = PAUSE_TAIL
         if self._received:
             pause = max(pause, PAUSE_INTERVALS * (self._last - self._began) / len(self._received))
@@ -259,9 +270,11 @@ class _Download:
         self._last = anyio.current_time()
         if message.param_id == HASH_CHECK:
             self.result.digest = Digest.of(message)
-        if index >= count:
+        if index > count:
             return
-        if count != self._count:
+        if self.table.is_growing:
+            self._count = self.table.count
+        elif count != self._count:
             self._count = count
             self._received = {each for each in self._received if each in self.table.names}
             self._skipped.clear()

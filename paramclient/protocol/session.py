@@ -10,7 +10,7 @@ from typing import Any, Final, Generic, TypeVar
 
 import anyio
 
-from paramclient.model.values import Param
+from paramclient.model.values import Encoding, Param
 from paramclient.protocol.channel import Channel, Gate
 from paramclient.protocol.dialect import Dialect, Digest, ReportedValue
 from paramclient.protocol.events import Change
@@ -145,6 +145,9 @@ class Session:
         written_at: when the last write ended; minus infinity before the first.
         replaced: by name, the values before writes that have just ended.
         contradicted: called when a hash is received that is not the table's.
+        reads_names, reads_indices: whether reads by name, and by index, are answered; None while unknown.
+        listing: the list that is downloaded in place of reads that are not answered.
+        acknowledging: names whose next value may acknowledge a set, in another type than the parameter's.
         observers: called with the parameters received and their number, while a fetch runs.
     """
 
@@ -171,6 +174,10 @@ class Session:
         self.written_at = -math.inf
         self.replaced: defaultdict[str, list[ReplacedValue]] = defaultdict(list)
         self.contradicted: Callable[[], None] = lambda: None
+        self.reads_names: bool | None = None
+        self.reads_indices: bool | None = None
+        self.listing: Shared[Any] = Shared(spawn, channel.gate)
+        self.acknowledging: set[str] = set()
         self.observers: set[Callable[[int, int | None], None]] = set()
         self._locks: dict[str, anyio.Lock] = {}
         self._foreign_sets: dict[str, tuple[str, float]] = {}
@@ -185,6 +192,10 @@ class Session:
             param = self.dialect.param(name, raw, number, None, self.table.encoding)
             if now <= each.until and param.same_value(each.param):
                 each.was_received = True
+                return
+        if name in self.acknowledging and self.table.encoding is Encoding.BYTEWISE:
+            known = self.table.params.get(name)
+            if known is not None and known.type_number != number:
                 return
         self.table.store(message, now)
 
@@ -212,6 +223,13 @@ class Session:
         table, announced = self.table, self.announced
         if announced is not None and announced.count == table.count and table.is_complete:
             table.confirm(announced.hash)
+
+    @property
+    def encoding_doubt(self) -> str:
+        """Why the encoding is probably wrong, as a sentence; "" without evidence, or by the user's choice."""
+        why = "" if self.identification.is_chosen else self.table.contradicts
+        address = f"{self.channel.system}/{self.channel.component}"
+        return why and f"The encoding of {address} is probably wrong: {why}. Choose it (--encoding)."
 
     def report(self, received: int, total: int | None) -> None:
         """Report the progress of a fetch."""

@@ -14,6 +14,7 @@ from paramclient.errors import LinkError
 from paramclient.model.values import Encoding
 from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_words
 from paramclient.protocol.channel import Gate
+from paramclient.protocol.dialect import EXTENDED, PLAIN
 from paramclient.protocol.events import Change, ComponentEvent
 from paramclient.protocol.node import Node
 from paramclient.protocol.session import Session, Spawn
@@ -92,6 +93,7 @@ class Station:
         gate: whether the link carries messages.
         listening_since: since when everything on the link is received.
         verifier: verifies signatures; None without a key.
+        broadcaster: the last heartbeat with the system id 0, which no vehicle may have; None without one.
     """
 
     def __init__(
@@ -117,6 +119,7 @@ class Station:
         self.listens_only = listens_only
         self.listening_since = -math.inf
         self.verifier: Verifier | None = None
+        self.broadcaster: Heartbeat | None = None
         self._is_stream = is_stream
         self._send = send
         self._spawn = spawn
@@ -132,6 +135,7 @@ class Station:
         self._seek_at = -math.inf  # when the next heartbeat may be requested
         self._sought: Counter[int] = Counter()  # requests by system
         self._signer: Signer | None = None
+        self._asked: dict[Address, int] = {}  # probes to components that were not heard
 
     @property
     def is_waiting(self) -> bool:
@@ -174,6 +178,22 @@ class Station:
             target = (frame.system, frame.component)
             request = CommandLong(*target, MAV_CMD_REQUEST_MESSAGE, float(message_id(Heartbeat)))
             self.transmit(request, peer, frame.version)
+
+    def probe(self, system: int, component: int) -> None:
+        """Request a value of a component that was not heard: it may send no heartbeat.
+
+        By turns a plain and an extended parameter, and the list for firmware without reads; then of all
+        components of the system, as some answer under another id than they are asked under.
+        """
+        number = self._asked[system, component] = self._asked.get((system, component), -1) + 1
+        target = (system, component if number % 6 < 3 else COMP_ID_ALL)
+        version = next((node.version for node in self.nodes.values()), 2)
+        requests = (
+            PLAIN.request_read(target, 0),
+            EXTENDED.request_read(target, 0),
+            PLAIN.request_list(target),
+        )
+        self.transmit(requests[number % 3], None, version)
 
     def overhear(self, data: bytes, now: float) -> None:
         """Take a frame that another program sends to the vehicles over this link: it may be a PARAM_SET."""
@@ -259,6 +279,8 @@ class Station:
         node = self.nodes.get(address)
         message = decode(frame)
         is_own = (system, component) == self.own_address and not self.listens_only
+        if system == 0 and isinstance(message, Heartbeat):
+            self.broadcaster = message
         if is_own or system == 0:
             return
         if message is None:
@@ -330,6 +352,8 @@ class Station:
             emit=lambda event: self._emit(node, event),
             changed=lambda session, change: self._changed(node, session, change),
         )
+        if self._asked.get((node.system, node.component), 0) > 2:
+            node.channel.reads_from = (node.system, COMP_ID_ALL)
         self.nodes[address] = node
         self._discovered(node)
         self._spawn(node.watch_presence)

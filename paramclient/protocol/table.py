@@ -12,6 +12,8 @@ from paramclient.model.values import (
     Param,
     Trust,
     as_reported,
+    encoding_of,
+    format_value,
     from_bits,
     is_portable_name,
 )
@@ -46,6 +48,8 @@ class Table:
         volatile: names outside the vehicle's hash, as far as known.
         author_of: returns the author of a change of a name.
         left_out: received names that no parameter file can contain, and that are not stored.
+        is_growing: whether each value so far was the last one by its own param_count: a component that counts
+            what it has sent, and whose list ends by a pause.
         recounted: called when the count of a complete table changes, or may have changed.
     """
 
@@ -60,12 +64,14 @@ class Table:
         self.volatile: frozenset[str] = frozenset()
         self.volatile_is_known = False
         self.left_out: set[str] = set()
+        self.is_growing = True
         self.author_of: Callable[[str], str] = lambda name: "vehicle"
         self.recounted: Callable[[], None] = lambda: None
         self._changed = changed
         self._held: dict[str, Change] | None = {} if dialect is PLAIN else None
         self._encoding = Encoding.BYTEWISE
         self._wire: dict[str, tuple[bytes, int]] = {}  # as received, until the encoding is certain
+        self._evidence: dict[Encoding, tuple[str, bytes, int]] = {}  # an integer that shows the encoding
         self._was_complete = False
         self._outdated: set[str] = set()  # names whose index belongs to an earlier count
         self._hash: int | None = None
@@ -76,13 +82,17 @@ class Table:
     @property
     def is_complete(self) -> bool:
         """Whether every index below the count has a parameter."""
-        return self.count is not None and len(self.names) >= self.count
+        if self.count is None:
+            return False
+        has_both_ends = self.count in self.names and 0 in self.names
+        return len(self.names) - has_both_ends >= self.count
 
-    def missing(self, below: int | None = None) -> list[int]:
-        """Return the indices without a parameter, below the count or a smaller number."""
-        end = self.count or 0 if below is None else below
-        names = self.names
-        return [index for index in range(end) if index not in names]
+    def missing(self) -> list[int]:
+        """Return the indices without a parameter. They begin at 1 if the count itself is one, and 0 is
+        none."""
+        count, names = self.count or 0, self.names
+        first = int(count in names and 0 not in names)
+        return [index for index in range(first, first + count) if index not in names]
 
     @property
     def encoding(self) -> Encoding:
@@ -128,11 +138,20 @@ class Table:
                 of a known integer.
         """
         name, raw, number, count, index = message
-        if name == HASH_CHECK or not self._may_store(name):
+        if name == HASH_CHECK:
             return None
+        is_last = index == count - 1
         if count != self.count and 0 < count <= PARAMETERS_MAX:
-            self.recount(count)
-        place = index if index < count <= PARAMETERS_MAX else None
+            if self.is_growing and is_last:
+                self.count = max(count, self.count or 0)
+            else:
+                self.recount(count)
+        self.is_growing = is_last and (self.is_growing or not self.names)
+        place = index if index <= count <= PARAMETERS_MAX else None
+        if not self._may_store(name):
+            if place is not None:
+                self.names[place] = name
+            return None
         old = self.params.get(name)
         if place is None and old is not None and index == NO_INDEX:
             place = old.index
@@ -143,15 +162,41 @@ class Table:
             if len(self.params) >= NAMES_MAX:
                 return None
             new = self.dialect.param(name, raw, number, place, self._encoding)
+            self._take_evidence(name, raw, number)
         elif not is_exact and self._is_reported(old, raw, number):
             new = self._placed(old, place)
         else:
             new = self.dialect.param(name, raw, number, place, self._encoding)
+            self._take_evidence(name, raw, number)
             if new.type_number == old.type_number:
                 new = replace(new, default=old.default)
         if self._held is not None:
             self._wire[name] = (raw, number)
         return self._put(name, old, new)
+
+    def _take_evidence(self, name: str, raw: bytes, number: int) -> None:
+        if self.dialect is PLAIN and len(self._evidence) < len(Encoding):
+            encoding = encoding_of(raw, number)
+            if encoding is not None:
+                self._evidence.setdefault(encoding, (name, raw, number))
+
+    @property
+    def has_evidence(self) -> bool:
+        """Whether any value shows an encoding."""
+        return bool(self._evidence)
+
+    @property
+    def contradicts(self) -> str:
+        """The evidence of the values against their encoding, in words; "" without any, or with any for it."""
+        if not self._evidence or self._encoding in self._evidence:
+            return ""
+        ((against, (name, raw, number)),) = self._evidence.items()
+        looks = "bytes, not a float32" if against is Encoding.BYTEWISE else "a float32"
+        values = [
+            format_value(self.dialect.param(name, raw, number, None, each).settable, number)
+            for each in (self._encoding, against)
+        ]
+        return f"each integer looks like {looks}; {name} = {values[0]} is {values[1]} in {against}"
 
     def store_entry(
         self, entry: PackedParam, index: int, now: float, *, with_defaults: bool
@@ -168,6 +213,7 @@ class Table:
         """
         name = entry.name
         if not self._may_store(name):
+            self.names[index] = name
             return None
         old = self.params.get(name)
         self._take_place(name, index)
@@ -311,6 +357,7 @@ class Table:
         """Forget everything: another vehicle uses the address."""
         for each in (self.params, self.names, self.moments, self._wire, self._outdated, self.left_out):
             each.clear()
+        self._evidence.clear()
         self.count = None
         self.volatile, self.volatile_is_known = frozenset(), False
         self._was_complete = False
@@ -356,6 +403,7 @@ class Table:
         if self.count is None:
             self.count = count
         if self.count == count:
+            self.is_growing = False
             self._hash, self._hash_is_stale = hash, False
             self.volatile = frozenset(volatile)
             self.volatile_is_known = volatile_is_known

@@ -43,6 +43,12 @@ __all__ = ["write", "write_all", "write_many"]
 
 UNCHANGED_MAX: Final = 5
 """Sets that leave the old value, after which the vehicle has not applied it: a PARAM_SET can be lost."""
+SILENT_SETS_MAX: Final = 3
+"""Sets without an acknowledgement, after which a read shows the value: some firmware acknowledges none."""
+SETS_MAX: Final = 12
+"""Sets without an acknowledgement that leave the old value: at 55 % loss, one in a thousand."""
+EVIDENCE_READS: Final = 8
+"""Indices that are read for evidence of the encoding: few components begin with more zeros and floats."""
 EXT_PROGRESS_TIMEOUT: Final = 60.0
 """Seconds for a component that reports progress to finish: a camera formats a card meanwhile."""
 BATCH_SIZE: Final = 20
@@ -67,10 +73,11 @@ async def write(
 ) -> SetResult:
     """Set one parameter, and prove its value by what the component reports.
 
-    Nothing is sent before the encoding is certain and the type is known: an integer in the wrong encoding
+    No set is sent before the encoding is certain and the type is known: an integer in the wrong encoding
     would be taken as another number. Only the wanted value proves success. Another value may be the answer to
     an old read, a part of a list, or an adjustment by the vehicle: it is read once more, and counts when a
-    second set leads to it again. A set whose caller is cancelled may still take effect.
+    second set leads to it again. A set that is not acknowledged is proven by a read too. A set whose caller
+    is cancelled may still take effect.
 
     Args:
         session: the component's.
@@ -92,8 +99,6 @@ async def write(
         LinkError: the link is closed for good.
     """
     gate = session.channel.gate
-    with gate.until_closed(or_failed=True):
-        await session.identification.encoding_certain()
     name = session.spelled(name)
     async with session.lock(name):
         session.writing[name] = author
@@ -101,6 +106,7 @@ async def write(
             _check_finite(session, name, value, force=force)
             async with turn or nullcontext():
                 await _learn_type(session, name)
+                await _check_encoding(session, name)
                 before = session.table.params[name]
                 await gate.wait()
                 sending()
@@ -122,6 +128,7 @@ async def write(
                     result = replace(result, status="adjusted", param=now)
             return result
         finally:
+            session.acknowledging.discard(name)
             del session.writing[name]
             session.written_at = anyio.current_time()
 
@@ -267,16 +274,21 @@ class _Write:
                 await channel.gate.wait()
                 sent = anyio.current_time()
                 number = self.before.type_number
+                self.session.acknowledging.add(self.name)
                 channel.send(self.session.dialect.request_set(channel.target, self.name, self._raw, number))
                 self.attempts += 1
                 answer = await self._answer(inbox, sent)
-                now = anyio.current_time()
+                is_silent = answer is None
                 if answer is None:
                     unanswered += 1
-                    if channel.is_hopeless(unanswered, began, now):
+                    if unanswered < SILENT_SETS_MAX:
+                        continue
+                    try:
+                        answer = await self._read()
+                    except NoReply:
                         what = f"the acknowledgement of {self.name} by {channel.system}/{channel.component}"
-                        raise NoReply(what, attempts=self.attempts, waited=now - began)
-                    continue
+                        waited = anyio.current_time() - began
+                        raise NoReply(what, attempts=self.attempts, waited=waited) from None
                 if answer.type_number != number:
                     self._retype(answer)
                     continue
@@ -287,8 +299,8 @@ class _Write:
                 if not answer.same_value(self.before):
                     adjusted = answer
                     continue
-                unchanged += 1
-                if unchanged >= UNCHANGED_MAX:
+                unchanged += not is_silent
+                if unchanged >= UNCHANGED_MAX or self.attempts >= SETS_MAX:
                     raise self._not_applied(answer)
 
     def _encode(self) -> None:
@@ -318,10 +330,10 @@ class _Write:
             return answer
         if not other:
             return None
-        await read(self.session, self.name)
+        param = await self._read()
         while inbox:
             self._take(await inbox.next())  # a refusal that came behind the value
-        return self.session.table.params[self.name]
+        return param
 
     async def _ext_answer(self, inbox: Inbox, sent: float) -> Param | None:
         """Wait for PARAM_EXT_ACK, as long as the component reports progress; then read the value."""
@@ -334,8 +346,7 @@ class _Write:
         if ack is None:
             return None
         if ack.param_result == ExtAckResult.ACCEPTED:
-            await read(self.session, self.name)
-            return self.session.table.params[self.name]
+            return await self._read()
         system, component = self.channel.target
         kind = ValueUnsupported if ack.param_result == ExtAckResult.VALUE_UNSUPPORTED else SetFailed
         reason = ExtAckResult.name_of(ack.param_result)
@@ -346,6 +357,14 @@ class _Write:
             code=ack.param_result,
             name=self.name,
         )
+
+    async def _read(
+        self,
+    ) -> Param:
+        """Return the parameter as the component reports it now."""
+        self.session.acknowledging.discard(self.name)
+        await read(self.session, self.name)
+        return self.session.table.params[self.name]
 
     def _take(self, message: Message) -> Param | None:
         """Return the parameter in a value, and raise the error in a refusal."""
@@ -436,6 +455,27 @@ async def _learn_type(session: Session, name: str) -> None:
     known = session.table.params.get(name)
     if known is None or known.trust is Trust.CACHED:
         await read(session, name)
+
+
+async def _check_encoding(session: Session, name: str) -> None:
+    """Wait until the encoding of an integer is certain, and raise UsageError if the values contradict it.
+
+    Where neither the component nor the user names the encoding, and 0 shows none, other values are read.
+    """
+    channel, identification, table = session.channel, session.identification, session.table
+    with channel.gate.until_closed(or_failed=True):
+        await identification.encoding_certain()
+    kind = table.params[name].type
+    if session.dialect.has_ack or not (isinstance(kind, ParamType) and kind.is_integer):
+        return
+    if not (identification.is_encoding_known or table.has_evidence):
+        with channel.inbox(session.dialect.value) as inbox, anyio.move_on_after(channel.timing.timeout(0)):
+            for index in range(EVIDENCE_READS):
+                channel.send(session.dialect.request_read(channel.reads_from, index))
+            while not table.has_evidence:
+                await inbox.next()
+    if doubt := session.encoding_doubt:
+        raise UsageError(f"{name} was not written. {doubt}")
 
 
 async def _ignore_late_answers(session: Session, late: ReplacedValue) -> None:
