@@ -178,7 +178,7 @@ def _check(sets: list[ParamSet]) -> None:
     for each in sets:
         for number, least in ((each.system, 1), (each.component, 0)):
             if number is not None and not least <= number <= 255:
-                raise UsageError(f"systems have ids from 1 to 255, components from 0 to 255, not {number}")
+                raise UsageError(f"a system or component has an id from {least} to 255, not {number}")
         for param in each.values():
             check_name(param.name)
         ids = (each.system, AUTOPILOT if each.component is None else each.component)

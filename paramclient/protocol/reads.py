@@ -18,7 +18,7 @@ from paramclient.errors import (
     VehicleError,
 )
 from paramclient.model.similar_names import did_you_mean, nearest_names
-from paramclient.model.values import Param
+from paramclient.model.values import Param, Trust
 from paramclient.protocol.channel import Inbox
 from paramclient.protocol.dialect import ReportedValue
 from paramclient.protocol.identity import HEARTBEAT_WAIT
@@ -203,6 +203,15 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
 
     That is the same parameter by its index, where that is known: some components answer no read by name.
     """
+    px4 = session.identification.is_px4
+    live = {name: param.index for name, param in session.table.params.items() if param.trust is Trust.LIVE}
+    same = live.pop(which, None) if isinstance(which, str) else None
+    control = await _try(session, HASH_CHECK if px4 else next(iter(live), 0) if same is None else same)
+    if control is None and px4 and same is not None:
+        control = await _try(session, same)
+    if control is None or not isinstance(which, str) or session.reads_names or control.param_id == which:
+        return control
+    return await _try(session, control.param_id)
 
 
 async def _try(session: Session, which: str | int) -> ReportedValue | None:
