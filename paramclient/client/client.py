@@ -588,9 +588,6 @@ class ParamClient:
                 with anyio.move_on_after(wake_at - now):
                     await self._activity()
             if node is not None:
-                if node.identification.autopilot is None:
-                    with anyio.move_on_after(LOOK_TIME):
-                        await node.identification.encoding_certain()
                 await self._by_session[node.plain].wait_for_cache()
         if node is not None:
             return self._by_session[node.plain]
