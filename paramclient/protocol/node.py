@@ -22,11 +22,13 @@ from paramclient.protocol.events import (
     Replaced,
 )
 from paramclient.protocol.identity import HEARTBEAT_WAIT, Identification
-from paramclient.protocol.presence import Presence
+from paramclient.protocol.presence import SYSTEM_TIME, Presence
 from paramclient.protocol.session import Session, Shared, Spawn
 from paramclient.wire.messages import (
     HASH_CHECK,
+    MAV_CMD_REQUEST_MESSAGE,
     AutopilotVersion,
+    CommandLong,
     Heartbeat,
     HighLatency2,
     Message,
@@ -34,18 +36,24 @@ from paramclient.wire.messages import (
     ParamExtValue,
     ParamValue,
     SystemTime,
-    message_id,
 )
 
 __all__ = ["Node"]
 
 RIVAL_TIME: Final = 5.0
 """Seconds after its last message for which another peer with the same ids counts as live."""
+REBOOT_SILENCE_MIN: Final = 1.25
+"""Seconds without a message after which an ArduPilot may have rebooted (measured)."""
+CLOCK_DELAY: Final = 2.0
+"""Seconds from the identification until the clock of an ArduPilot without telemetry is requested."""
+CLOCK_REQUESTS: Final = 2
+"""Requests for it: one may be lost, and nothing waits for the answer."""
+CLOCK_INTERVAL: Final = 1.0
+"""Seconds between them."""
 WINDOW_PX4: Final = 60
 """Requests in flight to a PX4, which answers each at once."""
 ACCEPTED: Final = 0
 """PARAM_ACK_ACCEPTED in PARAM_EXT_ACK."""
-_SYSTEM_TIME: Final = message_id(SystemTime)
 
 
 class Node:
@@ -123,6 +131,8 @@ class Node:
             presence.is_lost = False
             self._emit(Found(silence))
             self._spawn(self.identify)
+        elif silence > REBOOT_SILENCE_MIN and self.identification.is_settled:
+            self._spawn(self._request_clock)
         match message:
             case ParamValue():
                 self.plain.receive(message, now)
@@ -147,7 +157,7 @@ class Node:
                 self.identification.heartbeat(message)
                 self._settle_encoding()
             case SystemTime(time_boot_ms=boot_ms):
-                self.boot_clock(_SYSTEM_TIME, boot_ms, now)
+                self.boot_clock(SYSTEM_TIME, boot_ms, now)
             case AutopilotVersion():
                 if self.identification.version(message):
                     self._replace()
@@ -226,6 +236,16 @@ class Node:
             await self.channel.answered.wait()
             await self.identified()
             self._settle_encoding()
+        await anyio.sleep(CLOCK_DELAY)
+        await self._request_clock()
+
+    async def _request_clock(self) -> None:
+        """Request the time since boot: a reboot of an ArduCopter without telemetry shows in nothing else."""
+        request = CommandLong(*self.channel.target, MAV_CMD_REQUEST_MESSAGE, float(SYSTEM_TIME))
+        for _ in range(CLOCK_REQUESTS):
+            if self.identification.is_ardupilot and not self.presence.has_telemetry:
+                self.channel.send(request)
+            await anyio.sleep(CLOCK_INTERVAL)
 
     async def watch_presence(self) -> None:
         """Mark the component as lost when it is silent for its timeout."""

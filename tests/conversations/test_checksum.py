@@ -241,10 +241,9 @@ async def test_a_watch_finds_a_lost_announcement_for_one_request() -> None:
         watch.fetched()
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(watch.run)
-            sent = len(conversation.sent)
+            before = len(conversation.sent_of(FileTransfer))
             await anyio.sleep(31.0)
-            asked = [each for each in conversation.sent[sent:] if len(each) > 30]
-            assert len(asked) == 1
+            assert len(conversation.sent_of(FileTransfer)) - before == 1
             vehicle.load({"ATC_RAT_RLL_P": 0.25})
             await anyio.sleep(31.0)
             assert node.plain.table.params["ATC_RAT_RLL_P"].value == 0.25

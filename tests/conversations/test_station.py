@@ -44,6 +44,7 @@ from paramclient.wire.messages import (
     StatusText,
     SystemTime,
     encode,
+    message_id,
 )
 from paramclient.wire.signing import Refusal, Signer, SigningKey, Verifier
 from tests.conversations.virtual import (
@@ -113,7 +114,9 @@ async def test_vehicles_are_identified(loss: float) -> None:
             assert conversation.of(Identified)
             asked = len(conversation.sent_of(CommandLong))
             await anyio.sleep(20.0)
-            assert len(conversation.sent_of(CommandLong)) == asked
+            further = conversation.sent_of(CommandLong)[asked:]
+            assert {each.param1 for each in further} <= {message_id(SystemTime)}
+            assert loss or len(further) == 2 * (name == "ardupilot")
 
 
 @pytest.mark.parametrize("refuses", [True, False])
@@ -223,7 +226,7 @@ async def test_nothing_is_requested_from_a_lost_component() -> None:
         node = await conversation.node()
         await fetch_all(node.plain)
         watch = Watch(node.plain, node.presence, lambda event: None, interval=5.0)
-        watch.fetched(0.1)
+        watch.fetched()
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(watch.run)
             endpoint.at = anyio.current_time()
@@ -300,6 +303,19 @@ async def test_clocks_of_different_messages_are_not_compared_and_two_signs_are_o
         conversation.hear(Heartbeat(2, 12, system_status=MAV_STATE_BOOT))
         assert len(conversation.of(Rebooted)) == 1
         assert str(node.plain.table.params["A"].trust) == "cached"
+
+
+@virtual
+async def test_a_reboot_of_an_ardupilot_that_sends_heartbeats_only_is_seen_by_its_clock() -> None:
+    vehicle = ArduPilotVehicle()
+    async with converse(vehicle) as conversation:
+        node = await conversation.node()
+        await read(node.plain, "RTL_ALT")
+        await anyio.sleep(10.0)
+        vehicle.reboot(down=1.5)
+        await anyio.sleep(8.0)
+        assert [type(event) for event in conversation.events].count(Rebooted) == 1
+        assert node.plain.table.params["RTL_ALT"].trust == "cached"
 
 
 @virtual
