@@ -24,7 +24,6 @@ from paramclient.client.forwarding import Forwarder
 from paramclient.client.recording import Capture
 from paramclient.client.signing import Signing, TimestampKeeper, refused_in_words
 from paramclient.client.streams import Subscribers
-from paramclient.client.taps import FrameCutter
 from paramclient.client.traffic import Traffic, TrafficReport
 from paramclient.errors import AnotherVehicle, NoReply, ParamClientError, UsageError
 from paramclient.links import Link, ReplayLink, SimLink, create_link
@@ -144,15 +143,13 @@ class ParamClient:
         self._by_session: dict[Session, Component] = {}
         self._events: Subscribers[events.Event] = Subscribers()
         signing = Signing(signing) if isinstance(signing, SigningKey) else signing
-        cutter = FrameCutter(stream=opened.is_stream)
         forwarder = None if forward is None else Forwarder(create_link(forward))
         capture = None if tlog is None else Capture(tlog)
-        self._traffic = Traffic(cutter) if traffic else None
+        self._traffic = Traffic() if traffic else None
         self.core = ClientCore(
             opened,
             CacheWriter(self.cache, owned=self.cache is not cache),
             [tap for tap in (forwarder, capture, self._traffic) if tap is not None],
-            cutter,
             None if signing is None else TimestampKeeper(signing),
             partial(
                 Station,
@@ -457,7 +454,7 @@ class ParamClient:
         if self._traffic is None:
             raise UsageError("this client does not count traffic; use ParamClient(..., traffic=True)")
         self.core.check_open()
-        return self._traffic.report(anyio.current_time())
+        return self._traffic.report(anyio.current_time(), self.core.link_task.cutter)
 
     def signing_report(self) -> SigningReport | None:
         """Return the signing statistics of the link: signed frames, and refused frames with the reasons.

@@ -448,16 +448,18 @@ class Component:
         is_log = isinstance(self.core.link, ReplayLink)
         if timeout is None and self.core.station.listens_only and not is_log:
             timeout = PASSIVE_TIMEOUT
-        with anyio.move_on_after(timeout), self._explained(began):
-            if not refresh:
-                await self.wait_for_cache()
-            if self.core.station.listens_only:
-                result = await self._listen(began)
-            else:
-                result = await fetch_all(self.session, refresh=refresh, policy=self.policy, progress=progress)
-            return self._fetched(replace(result, elapsed=anyio.current_time() - began))
-        if self.session.table.count is None:
-            with self._explained(began):
+        with self.limited(None, "all parameters"):
+            with anyio.move_on_after(timeout):
+                if not refresh:
+                    await self.wait_for_cache()
+                if self.core.station.listens_only:
+                    result = await self._listen(began)
+                else:
+                    result = await fetch_all(
+                        self.session, refresh=refresh, policy=self.policy, progress=progress
+                    )
+                return self._fetched(replace(result, elapsed=anyio.current_time() - began))
+            if self.session.table.count is None:
                 raise self._nothing(began)
         is_confirmed = _has(self.params, Trust.VERIFIED)
         return result_of(self.session, "cache" if is_confirmed else "stream", began, [TIMEOUT_NOTE])
@@ -604,19 +606,13 @@ class Component:
 
     @contextmanager
     def limited(self, timeout: float | None, what: str) -> Iterator[None]:
-        """Raise NoReply at a timeout, with what was received meanwhile."""
+        """Raise NoReply at a timeout, and add to each NoReply what was received meanwhile."""
         began = anyio.current_time()
-        with self._explained(began):
+        try:
             with anyio.move_on_after(timeout) as scope:
                 yield
             if scope.cancelled_caught:
                 raise NoReply(what, attempts=0, waited=anyio.current_time() - began)
-
-    @contextmanager
-    def _explained(self, began: float) -> Iterator[None]:
-        """Add to a NoReply what was received on the link meanwhile."""
-        try:
-            yield
         except NoReply as error:
             hint = hint_of_node(self.core.station, self.node, anyio.current_time())
             raise error.with_hint(hint) from None

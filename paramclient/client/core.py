@@ -15,7 +15,7 @@ import anyio.lowlevel
 from paramclient.client.cache_writer import CacheWriter
 from paramclient.client.link_task import LinkTask
 from paramclient.client.signing import TimestampKeeper
-from paramclient.client.taps import FrameCutter, Tap
+from paramclient.client.taps import Tap
 from paramclient.errors import ClientClosed, ParamClientError, UsageError
 from paramclient.links import Link
 from paramclient.protocol.station import Station
@@ -42,7 +42,6 @@ class ClientCore:
         link: the link, not open.
         cache_writer: writes tables to the cache.
         taps: receivers of all frames of the link.
-        cutter: cuts received data for the taps.
         keeper: stores the signature timestamps; None without a key.
         new_station: makes the station, of functions that queue bytes and start background work.
         ended: called when the streams end: with a log, with a link that has failed for good, or at closing.
@@ -58,7 +57,6 @@ class ClientCore:
         link: Link,
         cache_writer: CacheWriter,
         taps: Sequence[Tap],
-        cutter: FrameCutter,
         keeper: TimestampKeeper | None,
         new_station: Callable[..., Station],
         ended: Callable[[], None],
@@ -67,7 +65,7 @@ class ClientCore:
         self.cache_writer = cache_writer
         self.cache = cache_writer.cache
         self.is_over = False
-        self.link_task = LinkTask(link, taps=taps, cutter=cutter, ended=self._link_ended)
+        self.link_task = LinkTask(link, taps=taps, ended=self._link_ended)
         self.station = self.link_task.station = new_station(send=self.link_task.queue, spawn=self.spawn)
         self._taps = taps
         self._keeper = keeper

@@ -49,7 +49,6 @@ class LinkTask:
     Args:
         link: an open link.
         taps: receivers of all frames on the link.
-        cutter: cuts the received data for them.
         ended: called when a log has ended, or the link has failed for good.
 
     Attributes:
@@ -57,19 +56,18 @@ class LinkTask:
         is_disconnected: whether the link is disconnected and being reopened.
         activity: set, and replaced, when data was received, and when the link drops or has failed.
         bytes_received, bytes_sent: on this link.
+        cutter: cuts the received data for the taps.
     """
 
     station: Station
 
-    def __init__(
-        self, link: Link, *, taps: Sequence[Tap], cutter: FrameCutter, ended: Callable[[], None]
-    ) -> None:
+    def __init__(self, link: Link, *, taps: Sequence[Tap], ended: Callable[[], None]) -> None:
         self.is_disconnected = False
         self.activity = anyio.Event()
         self.bytes_received = self.bytes_sent = 0
+        self.cutter = FrameCutter(stream=link.is_stream)
         self._link = link
         self._taps = taps
-        self._cutter = cutter
         self._ended = ended
         self._queue: deque[tuple[bytes, Peer | None]] = deque()
         self._forwarded: deque[bytes] = deque()
@@ -148,13 +146,13 @@ class LinkTask:
 
     def end_streams(self) -> None:
         """End the unfinished frames: the link is down, or closed."""
-        for peer in self._cutter.unfinished:
+        for peer in self.cutter.unfinished:
             self._show(b"", peer)
 
     def _show(self, data: bytes, peer: Peer) -> None:
         """Pass received data to the taps."""
         if self._taps:
-            frames = self._cutter.cut(data, peer)
+            frames = self.cutter.cut(data, peer)
             for tap in self._taps:
                 tap.received(frames, len(data), peer)
 

@@ -134,14 +134,9 @@ class TrafficReport:
 
 
 class Traffic(Tap):
-    """Counts all traffic of a link, as a tap; on request only: an ordinary client does without.
+    """Counts all traffic of a link, as a tap; on request only: an ordinary client does without."""
 
-    Args:
-        cutter: cuts the received data.
-    """
-
-    def __init__(self, cutter: FrameCutter) -> None:
-        self._cutter = cutter
+    def __init__(self) -> None:
         self._counts = _Counts()
         self._sources: dict[Address, _Source] = {}
 
@@ -165,8 +160,8 @@ class Traffic(Tap):
         """Count a sent frame."""
         self._counts.at(anyio.current_time())["sent"] += len(frame)
 
-    def report(self, now: float) -> TrafficReport:
-        """Return the present counts."""
+    def report(self, now: float, cutter: FrameCutter) -> TrafficReport:
+        """Return the present counts, and those of the cutter of the received data."""
         began = min(self._counts.began, now)
         window = max(now - max(_first_slice(now) * RATE_SLICE, began), RATE_TIME_MIN)
         totals, recent = self._counts.totals, self._counts.recent(now)
@@ -180,9 +175,9 @@ class Traffic(Tap):
             received_rate=recent["received"] / window,
             sent_rate=recent["sent"] / window,
             frames=totals["frames"],
-            damaged=self._cutter.damaged,
+            damaged=cutter.damaged,
             unknown=totals["unknown"],
-            other_bytes=self._cutter.other_bytes,
+            other_bytes=cutter.other_bytes,
         )
 
 
