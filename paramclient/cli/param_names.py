@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
@@ -22,6 +23,7 @@ __all__ = [
     "ChosenNames",
     "cached_names",
     "check_given",
+    "learn_spelling",
     "may_appear",
     "spelling",
     "suggest",
@@ -62,6 +64,20 @@ class ChosenNames:
             if not chosen:
                 errors[text] = _no_match(text, component)
         return cls(list(names), errors)
+
+
+async def learn_spelling(component: Component, given: Iterable[str]) -> None:
+    """Read names in lower case of which it is not known how the vehicle spells them."""
+    known = {each.upper() for each in component.params}
+    for name in given:
+        upper = name.upper()
+        if name == upper or upper in known or is_pattern(name) or component.autopilot not in _CAPITALS:
+            continue
+        with suppress(ParamClientError):
+            try:
+                await component.get(upper)
+            except UnknownParameter:
+                await component.get(name)
 
 
 def check_given(given: Iterable[str]) -> list[str]:

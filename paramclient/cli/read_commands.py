@@ -33,7 +33,7 @@ from paramclient.cli.output import (
     report,
     say,
 )
-from paramclient.cli.param_names import ChosenNames, check_given, suggest
+from paramclient.cli.param_names import ChosenNames, check_given, learn_spelling, suggest
 from paramclient.cli.session import (
     CommandSession,
     Done,
@@ -357,6 +357,8 @@ def _show_read(done: Sequence[Done[_Read]], options: LinkOptions) -> int:
         _print_params(rows, DESCRIBED_COLUMNS if is_described else (), is_all=is_all)
     code = report_failures(done)
     for each in found:
+        if doubt := each.session.component.session.encoding_doubt:
+            report(f"{each.session.prefix}{doubt}")
         code = max(code, report_all(each.errors.values(), each.session.prefix))
     return code
 
@@ -372,6 +374,7 @@ async def get_chosen(
     has_pattern = any(map(is_pattern, name_patterns))
     if has_pattern:
         await fetch_table(session)
+    await learn_spelling(component, name_patterns)
     chosen = ChosenNames.of(component, name_patterns)
     known = {
         name: component.params[name] for name in chosen.names if has_pattern and name in component.params

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -34,7 +34,7 @@ from paramclient.cli.sources import (
     open_file,
     whole_table,
 )
-from paramclient.errors import UsageError
+from paramclient.errors import UsageError, VehicleError
 from paramclient.files import FileFormat, write_file
 from paramclient.files.formats import format_of_name
 from paramclient.files.param_file import AUTOPILOT, address
@@ -50,6 +50,8 @@ __all__ = ["save"]
 SaveFormat: TypeAlias = Literal["qgc", "parm", "mission-planner", "pck", "json"]
 """The file formats that can be written."""
 
+INCOMPLETE_HINT: Final = "--incomplete writes what was received"
+"""What to do with a table that is not complete."""
 _DEFAULTS: Final = LinkOptions()
 
 
@@ -62,16 +64,17 @@ async def save(
     changed: bool = False,
     only: tuple[str, ...] = (),
     refresh: bool = False,
+    incomplete: bool = False,
     metadata: MetadataChoice = None,
     extended: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Write the parameters of a vehicle to a file, in the file format of any ground station.
 
-    An existing file is replaced once the new one is completely on the disk. An incomplete table is not
-    written. Exit code 1: the table is incomplete, or with --changed, no parameter differs or the defaults are
-    not known. With --vehicle all, a file with {system} or {uid} in its name becomes a file for each vehicle;
-    otherwise the file format must be able to hold several components.
+    An existing file is replaced once the new one is completely on the disk. An incomplete table is written
+    with --incomplete only. Exit code 1: the table is incomplete, or with --changed, no parameter differs or
+    the defaults are not known. With --vehicle all, a file with {system} or {uid} in its name becomes a file
+    for each vehicle; otherwise the file format must be able to hold several components.
 
     Args:
         where: The link, such as udpin:0.0.0.0:14550 or sim:px4; an on-board log (.bin, .ulg), for the values
@@ -83,6 +86,7 @@ async def save(
             those of its metadata.
         only: Write only this name or pattern, such as "MC_*". May be given several times.
         refresh: Download all parameters even if the cache is up to date.
+        incomplete: Write the parameters that were received where others were not; the file names these.
         metadata: With --changed, a file with the firmware's defaults; or vehicle, to download the vehicle's
             own metadata. Default: the stored metadata of the firmware; else that of the vehicle if it can be
             downloaded in 2 s.
@@ -97,10 +101,11 @@ async def save(
     selection = _Selection(changed, STORED_DEFAULTS_HINT if is_offline else DEFAULTS_HINT)
     given = from_file(metadata, offline=is_offline)
     if is_offline:
-        _add_offline(selection, where, given, options, extended=extended)
+        _add_offline(selection, where, given, options, incomplete=incomplete, extended=extended)
     else:
         check_link(where)
-        await _add_link(selection, where, metadata, given, options, refresh=refresh, extended=extended)
+        fetch = partial(_fetch, refresh=refresh, incomplete=incomplete)
+        await _add_link(selection, where, metadata, given, options, fetch, extended=extended)
     for fault in selection.faults:
         report(fault)
     sets = _chosen(selection.sets, only) if only else selection.sets
@@ -150,17 +155,12 @@ async def _add_link(
     choice: str | None,
     given: Metadata | None,
     options: LinkOptions,
+    fetch: Callable[[CommandSession], Awaitable[ParamSet]],
     *,
-    refresh: bool,
     extended: bool,
 ) -> None:
     """Add the parameters of the vehicles on a link that were received or confirmed in this session."""
     async with sessions(url, options, extended=extended) as found:
-        draws = not found[0].choice.is_all
-
-        async def fetch(session: CommandSession) -> ParamSet:
-            return await whole_table(session, draws=draws, refresh=refresh)
-
         for done in await run_on_all(found, fetch):
             if done.result is None:
                 selection.faults.append(f"{done.session.address}: {done.error}")
@@ -174,8 +174,25 @@ async def _add_link(
         await report_others(found)
 
 
+async def _fetch(session: CommandSession, *, refresh: bool, incomplete: bool) -> ParamSet:
+    """Return the whole table of a vehicle, or with `incomplete` what was received of it."""
+    draws = not session.choice.is_all
+    try:
+        return await whole_table(session, draws=draws, refresh=refresh, partial=incomplete)
+    except VehicleError as error:
+        raise VehicleError(
+            f"{error}; {INCOMPLETE_HINT}", system=error.system, component=error.component
+        ) from None
+
+
 def _add_offline(
-    selection: _Selection, where: str, given: Metadata | None, options: LinkOptions, *, extended: bool
+    selection: _Selection,
+    where: str,
+    given: Metadata | None,
+    options: LinkOptions,
+    *,
+    incomplete: bool,
+    extended: bool,
 ) -> None:
     """Add the parameters of a file, of an on-board log, or of a vehicle in the cache."""
     choice = ChosenVehicle.parse(options.vehicle)
@@ -192,14 +209,16 @@ def _add_offline(
                 known = ", ".join(f"{table.system}/{table.component}" for table in tables)
                 raise UsageError(f"no autopilot is among {known}; name one of them, or use --vehicle all")
             tables = pilots
+        sets = []
         for table in tables:
-            if not table.complete:
-                of = "" if table.count is None else f" of {table.count}"
-                selection.faults.append(
-                    f"{table.system}/{table.component} is incomplete: {table.size}{of} parameters are in the "
-                    "cache"
-                )
-        sets = [cached_param_set(table, extended=extended) for table in tables if table.complete]
+            each = cached_param_set(table, extended=extended)
+            of = "" if table.count is None else f" of {table.count}"
+            are = f"{table.size}{of} parameters are in the cache"
+            if table.complete or incomplete:
+                sets.append(each if table.complete else replace(each, source=f"{each.source}: {are}"))
+            else:
+                fault = f"{table.system}/{table.component} is incomplete: {are}; {INCOMPLETE_HINT}"
+                selection.faults.append(fault)
     metadata = [given] * len(sets)
     if selection.is_changed and given is None:
         metadata = known_of_sets(sets, options)

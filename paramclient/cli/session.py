@@ -27,7 +27,7 @@ from paramclient.model.identity import version_text
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.fetch import Policy
 from paramclient.protocol.kinds import expects_extended, kind_in_words
-from paramclient.protocol.selection import LOOK_TIME, hint_of_link
+from paramclient.protocol.selection import LOOK_TIME, hint_of_link, node_in_words
 from paramclient.wire.messages import MAV_AUTOPILOT_INVALID
 
 __all__ = [
@@ -167,8 +167,10 @@ class CommandSession:
 
     @property
     def label(self) -> str:
-        """The component in words: `1/1 px4`."""
-        return f"{self.address} {self.component.autopilot}"
+        """The component in words: `1/1 px4`; one that names no autopilot by its kind: `1/100 camera`."""
+        autopilot = self.component.autopilot
+        is_named = autopilot not in ("unknown", "no autopilot", "generic")
+        return f"{self.address} {autopilot}" if is_named else node_in_words(self.component.node)
 
     @property
     def prefix(self) -> str:
@@ -447,8 +449,7 @@ def receiver_in_words(component: Component) -> str:
 
 def vehicle_in_words(component: Component) -> str:
     """Return address and kind of a component: `1/1 PX4 quadrotor`."""
-    kind = kind_in_words(component.identity.autopilot, component.identity.vehicle_type)
-    return f"{component.system}/{component.component} {kind}".rstrip()
+    return node_in_words(component.node)
 
 
 async def _find(

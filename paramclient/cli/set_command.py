@@ -26,7 +26,7 @@ from paramclient.cli.metadata import (
 )
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_json, print_table, printable, report, say
-from paramclient.cli.param_names import spelling
+from paramclient.cli.param_names import learn_spelling, spelling
 from paramclient.cli.read_commands import get_chosen
 from paramclient.cli.session import (
     CommandSession,
@@ -152,6 +152,7 @@ async def _prepare(
     """Return names and values as the vehicle and its metadata have them."""
     if session.component.is_extended:
         return _Job(session, await _extended_values(session, wanted), None)
+    await learn_spelling(session.component, [name for name, _ in wanted])
     wanted = [(spelling(name, session.component), value) for name, value in wanted]
     if described is None:
         named = [f"{name}: {value!r} is not a number" for name, value in wanted if isinstance(value, str)]

@@ -12,6 +12,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Final
 
@@ -30,8 +31,14 @@ from paramclient.links import FORMS, parse_link
 from paramclient.logs.onboard import is_onboard_log, read_onboard_log
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
+from paramclient.model.wording import first_of
 from paramclient.provision.inspection import wait_for_identity
-from paramclient.provision.vehicle_params import collect_set, incomplete_error, load_cached_set
+from paramclient.provision.vehicle_params import (
+    NAMES_SHOWN_MAX,
+    collect_set,
+    incomplete_error,
+    load_cached_set,
+)
 
 __all__ = [
     "check_link",
@@ -134,13 +141,16 @@ async def resolve_all(
     return [found[text] for text in texts]
 
 
-async def whole_table(session: CommandSession, *, draws: bool, refresh: bool = False) -> ParamSet:
+async def whole_table(
+    session: CommandSession, *, draws: bool, refresh: bool = False, partial: bool = False
+) -> ParamSet:
     """Fetch the table of a session's component; return the values received or confirmed in this session.
 
     Args:
         session: the session.
         draws: whether the progress is drawn; two bars at a time would mix.
         refresh: as in `Component.fetch_all`.
+        partial: whether a set of some parameters is returned; its source names the others.
 
     Raises:
         VehicleError: some parameters were not received; the message names them.
@@ -152,9 +162,13 @@ async def whole_table(session: CommandSession, *, draws: bool, refresh: bool = F
     for note in result.notes:
         report(f"{session.label} on {link}: {note}")
     found = await collect_set(component, result, source=f"link {link}")
-    if found.missing:
+    if found.missing and not partial:
         raise incomplete_error(component, found.missing)
-    return found.set
+    left_out = [*found.missing, *map(repr, sorted(component.session.table.left_out))]
+    if not left_out:
+        return found.set
+    missing = first_of(left_out, NAMES_SHOWN_MAX)
+    return replace(found.set, source=f"{found.set.source}, without {missing}")
 
 
 def is_file(text: str) -> bool:

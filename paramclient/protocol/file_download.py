@@ -112,7 +112,7 @@ def _store_beginning(session: Session, prefix: bytes, requested_at: float) -> No
         pack, number = decode_prefix(prefix)
     except PackError:
         return
-    if number == pack.total:
+    if pack.entries and number == pack.total:
         _store(session, pack, requested_at)
 
 

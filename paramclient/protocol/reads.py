@@ -54,8 +54,15 @@ async def read(session: Session, which: str | int) -> ReportedValue:
         NoReply: it answered nothing.
         LinkError: the link is closed for good.
     """
+    spelled = session.spelled(which) if isinstance(which, str) else which
+    if spelled != which:
+        with suppress(UnknownParameter):
+            return await _read(session, spelled)
+    return await _read(session, which)
+
+
+async def _read(session: Session, which: str | int) -> ReportedValue:
     channel = session.channel
-    which = session.spelled(which) if isinstance(which, str) else which
     async with channel.window:
         is_first = which not in session.reading
         session.reading.add(which)

@@ -16,6 +16,7 @@ from paramclient.protocol.dialect import Dialect, Digest, ReportedValue
 from paramclient.protocol.events import Change
 from paramclient.protocol.identity import Identification
 from paramclient.protocol.table import Table
+from paramclient.wire.messages import NO_INDEX
 
 __all__ = ["ReplacedValue", "Session", "Shared", "Spawn"]
 
@@ -184,9 +185,9 @@ class Session:
 
     def receive(self, message: ReportedValue, now: float) -> None:
         """Store a value, unless it may be the answer to a read from before a write."""
-        name = self.spelled(message.param_id)
-        if name != message.param_id:
-            message = message._replace(param_id=name)
+        name, spelled = message.param_id, self.spelled(message.param_id)
+        if name != spelled and (message.param_index == NO_INDEX or spelled in self.table.params):
+            name, message = spelled, message._replace(param_id=spelled)
         _, raw, number, _, _ = message
         for each in self.replaced.get(name, ()):
             param = self.dialect.param(name, raw, number, None, self.table.encoding)
@@ -202,9 +203,11 @@ class Session:
     def spelled(self, name: str) -> str:
         """Return a name as the vehicle spells it.
 
-        An ArduPilot takes any case, and answers a read in the requested one, but a set in capitals.
+        An ArduPilot takes any case, and answers a read in the requested one, but a set in capitals. A name
+        that is listed in lower case stays.
         """
-        return name.upper() if self.identification.is_ardupilot and name.isascii() else name
+        is_open = self.identification.is_ardupilot and name.isascii() and name not in self.table.params
+        return name.upper() if is_open else name
 
     def lock(self, name: str) -> anyio.Lock:
         """Return the lock of the writes to one name: they run one after the other."""

@@ -99,11 +99,12 @@ async def write(
         LinkError: the link is closed for good.
     """
     gate = session.channel.gate
-    name = session.spelled(name)
+    _check_finite(session, name, value, force=force)
+    if session.spelled(name) != name:
+        name = (await read(session, name)).param_id
     async with session.lock(name):
         session.writing[name] = author
         try:
-            _check_finite(session, name, value, force=force)
             async with turn or nullcontext():
                 await _learn_type(session, name)
                 await _check_encoding(session, name)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BEFORE_APPLY",
+    "NAMES_SHOWN_MAX",
     "NO_DEFAULTS",
     "FetchedSet",
     "set_maker",
@@ -137,8 +138,9 @@ def incomplete_error(component: Component, missing: Sequence[str]) -> VehicleErr
     """Return the error for a component some of whose parameters were not received."""
     vehicle = f"{component.system}/{component.component} {component.autopilot}"
     names = first_of(missing, NAMES_SHOWN_MAX)
+    was = "was" if len(missing) == 1 else "were"
     return VehicleError(
-        f"{vehicle} on {component.identity.link} is incomplete: {names} were not received",
+        f"{vehicle} on {component.identity.link} is incomplete: {names} {was} not received",
         system=component.system,
         component=component.component,
     )

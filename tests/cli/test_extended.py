@@ -50,7 +50,7 @@ def test_fetch_finds_them(command: Command, put: Put) -> None:
         ["CAM_KEY", "hex:ff00fe", "CUSTOM", "2", "live"],
         ["CAM_EV", "0.5", "REAL32", "3", "live"],
     ]
-    assert done.err.startswith("4 extended parameters of 1/100 no autopilot from stream in 0.")
+    assert done.err.startswith("4 extended parameters of 1/100 camera from stream in 0.")
     document = command("fetch", url, *CAMERA, "--json").json
     assert (document["count"], document["missing"], document["component"]) == (4, [], 100)
     assert document["params"]["CAM_KEY"]["value"] == "hex:ff00fe"
@@ -190,7 +190,7 @@ def test_restore_from_the_cache(command: Command, put: Put, tmp_path: Path) -> N
     assert (kept[0], kept[2:4], kept[-1]) == ("1", ["100", "4"], "before apply")
     dry = command("restore", url, *CAMERA, "--dry-run")
     assert (dry.code, dry.rows[1][1:4]) == (0, ["CAM_NAME", "Rear", "Front"])
-    assert "the state: 4 extended parameters of 1/100 no autopilot from snapshot 1 of " in dry.err
+    assert "the state: 4 extended parameters of 1/100 camera from snapshot 1 of " in dry.err
     restored = command("restore", url, *CAMERA)
     assert (restored.code, camera.ext_values) == (0, before), restored.err
     assert restored.rows[1:] == [["CAM_NAME", "Rear", "Front", "Front", "set"]]
@@ -284,7 +284,7 @@ def changing() -> Camera:
 
 def test_watch_prints_changes(command: Command, put: Put) -> None:
     watched = command("watch", put(changing()), *CAMERA, "--timeout", 10)
-    assert (watched.code, watched.err) == (0, "watching 3 extended parameters of 1/100 no autopilot\n")
+    assert (watched.code, watched.err) == (0, "watching 3 extended parameters of 1/100 camera\n")
     assert [line.split("  ", 1)[1] for line in watched.out.splitlines()] == [
         "CAM_NAME  Front -> Rear  (vehicle)",
         "CAM_KEY  hex:ff00fe -> hex:ff  (vehicle)",
@@ -296,7 +296,7 @@ def test_watch_checks_its_names(command: Command, put: Put) -> None:
     unknown = command("watch", url, "NO_SUCH", *CAMERA, "--timeout", 10)
     assert (unknown.code, unknown.out, "NO_SUCH" in unknown.err) == (1, "", True)
     one = command("watch", url, "CAM_MODE", *CAMERA, "--timeout", 10)
-    assert (one.code, one.out, one.err) == (0, "", "watching CAM_MODE of 1/100 no autopilot\n")
+    assert (one.code, one.out, one.err) == (0, "", "watching CAM_MODE of 1/100 camera\n")
     assert command("watch", url, *CAMERA, "--plain").code == 2
 
 
