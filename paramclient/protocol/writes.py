@@ -178,7 +178,7 @@ async def write_many(
             result = await write(session, name, value, turn=turn(), sending=sending, **options)
         except (NoReply, LinkError) as error:
             failures.append(error)
-            outcomes[place] = replace(outcomes[place], error=failures[0])
+            outcomes[place] = replace(outcomes[place], error=error)
         except ParamClientError as error:
             outcomes[place] = replace(outcomes[place], status=SetStatus.REFUSED, error=error)
         else:
