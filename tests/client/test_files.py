@@ -193,7 +193,7 @@ async def test_the_file_is_closed_when_its_content_is_given() -> None:
         component = await client.component()
         for _ in range(3):
             began = anyio.current_time()
-            assert (await component.fetch_all()).source == "ftp"
+            assert (await component.fetch_all(refresh=True)).source == "ftp"
             assert not vehicle.open_files
             assert anyio.current_time() - began < 0.55
         assert await client.ftp(component).read("/APM/a.txt") == b"hello"
