@@ -63,7 +63,11 @@ async def read(session: Session, which: str | int) -> ReportedValue:
 
 async def _read(session: Session, which: str | int) -> ReportedValue:
     channel = session.channel
+    began, must_wait = anyio.current_time(), channel.window.value == 0
     async with channel.window:
+        now = anyio.current_time()
+        if must_wait and channel.is_lost(now):  # while others were read
+            raise NoReply(_what(session, which), attempts=0, waited=now - began)
         is_first = which not in session.reading
         session.reading.add(which)
         try:
@@ -75,7 +79,8 @@ async def _read(session: Session, which: str | int) -> ReportedValue:
                         raise
                     control = await _control_read(session, which)
                     if control is None:
-                        answer = await _read_list(session, inbox, which)
+                        is_lost = channel.is_lost(anyio.current_time())
+                        answer = None if is_lost else await _read_list(session, inbox, which)
                         if answer is None:
                             raise
                         return answer
@@ -117,8 +122,7 @@ async def _ask(
         answer: ReportedValue | None = await channel.wait_for(inbox, accept, anyio.current_time(), 0, wait)
         if answer is not None:
             return answer
-    what = f"parameter {which} of {channel.system}/{channel.component}"
-    request = dialect.request_read(channel.reads_from, which)
+    request, what = dialect.request_read(channel.reads_from, which), _what(session, which)
     received: ReportedValue = await channel.exchange(
         request, inbox, accept, what=what, attempts=attempts or attempts_max, timeout_min=wait
     )
@@ -127,6 +131,10 @@ async def _ask(
     else:
         session.reads_indices = True
     return received
+
+
+def _what(session: Session, which: str | int) -> str:
+    return f"parameter {which} of {session.channel.system}/{session.channel.component}"
 
 
 async def read_param(session: Session, which: str | int) -> Param:
