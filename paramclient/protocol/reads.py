@@ -99,8 +99,8 @@ async def _ask(
 ) -> ReportedValue:
     """Request a parameter until it is received, and learn whether such reads are answered.
 
-    Few attempts suffice where another way is left: before anything was ever answered, and where such reads
-    were not answered before. One that is asked for already is awaited first.
+    Few attempts suffice where another way is left: before anything was ever answered, where such reads were
+    not answered before, and for a hash beside other answers. One that is asked for already is awaited first.
     """
     channel, dialect = session.channel, session.dialect
     is_served = session.reads_names if isinstance(which, str) else session.reads_indices
@@ -116,7 +116,7 @@ async def _ask(
     wait = _queue_time(session)
     if is_served is False:
         attempts = 1
-    elif is_served is None and channel.timing.round_trip is None and which != HASH_CHECK:
+    elif is_served is None and (channel.timing.round_trip is None) != (which == HASH_CHECK):
         attempts = min(attempts or FIRST_ATTEMPTS, FIRST_ATTEMPTS)
     if is_asked:
         answer: ReportedValue | None = await channel.wait_for(inbox, accept, anyio.current_time(), 0, wait)

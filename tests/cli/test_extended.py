@@ -190,7 +190,7 @@ def test_restore_from_the_cache(command: Command, put: Put, tmp_path: Path) -> N
     assert (kept[0], kept[2:4], kept[-1]) == ("1", ["100", "4"], "before apply")
     dry = command("restore", url, *CAMERA, "--dry-run")
     assert (dry.code, dry.rows[1][1:4]) == (0, ["CAM_NAME", "Rear", "Front"])
-    assert "the state: 4 extended parameters of 1/100 camera from snapshot 1 of " in dry.err
+    assert "the state: 4 extended parameters of 1/100 no autopilot from snapshot 1 of " in dry.err
     restored = command("restore", url, *CAMERA)
     assert (restored.code, camera.ext_values) == (0, before), restored.err
     assert restored.rows[1:] == [["CAM_NAME", "Rear", "Front", "Front", "set"]]
