@@ -26,7 +26,7 @@ from paramclient.protocol.table import Table
 
 __all__ = ["ChecksumUnavailable", "prove"]
 
-READ_SIZE: Final = 64
+CHECKED_READ_SIZE: Final = 64
 """Bytes that ArduPilot reads at a time for a checksum: the padding of the file depends on it (measured)."""
 AT_ONCE: Final = 5
 """Requests sent at once: ArduPilot's queue has 5 places, and drops the surplus silently (measured)."""
@@ -170,7 +170,7 @@ class _Proof:
 
     def _computed(self, place: range) -> int:
         rows = self._rows[place.start : place.stop]
-        return crc32_px4(encode(rows, total=len(self._rows), read_size=READ_SIZE))
+        return crc32_px4(encode(rows, total=len(self._rows), read_size=CHECKED_READ_SIZE))
 
     async def _request(self, places: Sequence[range | None]) -> list[int]:
         """Return the vehicle's checksums of some ranges, or with None, of all."""
