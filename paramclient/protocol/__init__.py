@@ -7,7 +7,7 @@
 - `reads`, `writes`, `set_results`, `reset`: single reads; writes, and their results; resets to defaults.
 - `fetch`, `list_download`, `file_download`: all parameters: from the cache, by list, as a file.
 - `ftp`, `param_pck`: MAVFTP; the packed parameter file.
-- `digest`, `checksum`, `watch`: whether the table is current, by hash or checksum; checks that keep it in sync.
+- `digest`, `checksum`, `watch`: whether the table is current, by hash or checksum; checks of it.
 - `identity`, `presence`, `kinds`: who the vehicle is; lost, found, rebooted; names of kinds.
 - `commands`: COMMAND_LONG, requested messages, reboots.
 - `selection`: the vehicle that a call without an address means.
