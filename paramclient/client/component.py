@@ -45,7 +45,7 @@ from paramclient.protocol.selection import hint_of_node, node_in_words, vehicle_
 from paramclient.protocol.session import Session
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.watch import SyncState, Watch
-from paramclient.protocol.writes import write, write_all
+from paramclient.protocol.writes import write, write_many
 from paramclient.wire.messages import MAV_MODE_FLAG_SAFETY_ARMED
 from paramclient.wire.signing import SigningKey
 
@@ -343,7 +343,7 @@ class Component:
         pairs = check_writes(values, extended=self.is_extended)
         settle, by = check_settle(settle), check_author(author)
         await self._check_may_write(durable=durable)
-        result = await write_all(
+        result = await write_many(
             self.session, pairs, progress=progress, timeout=timeout, settle=settle, force=force, author=by
         )
         hint = hint_of_node(self.core.station, self.node, anyio.current_time())

@@ -39,7 +39,7 @@ from paramclient.protocol.session import ReplacedValue, Session
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
 from paramclient.wire.messages import Message, ParamError, ParamExtAck, StatusText
 
-__all__ = ["write", "write_all", "write_many"]
+__all__ = ["write", "write_many"]
 
 UNCHANGED_MAX: Final = 5
 """Sets that leave the old value, after which the vehicle has not applied it: a PARAM_SET can be lost."""
@@ -137,26 +137,28 @@ async def write(
 async def write_many(
     session: Session,
     pairs: Sequence[tuple[str, WireValue]],
-    outcomes: list[SetOutcome],
-    done: Callable[[SetOutcome], None],
     *,
+    progress: Callable[[SetOutcome], None] | None = None,
+    timeout: float | None = None,
     settle: float = 0.0,
     force: bool = False,
     author: str = "us",
-) -> ParamClientError | None:
+) -> SetManyResult:
     """Set several parameters, as many at once as the component serves.
 
     A parameter that shows or hides others (`*_ENABLE`) is set alone, after those before it. When the link
-    fails, or the component does not answer any more, the other parameters are not tried, and the error is
-    returned.
+    fails, the component does not answer any more, or the timeout expires, the other parameters are not tried,
+    and the result has the error.
 
     Args:
         session, settle, force, author: as for `write`.
         pairs: names and values, in order.
-        outcomes: gets one outcome for each pair, in order; complete also if the call is cancelled.
-        done: called with each outcome, as it is known.
+        progress: called with each outcome, as it is known.
+        timeout: seconds; None for no limit.
     """
-    outcomes[:] = [SetOutcome(name, value, SetStatus.NOT_TRIED) for name, value in pairs]
+    began, system, component = anyio.current_time(), *session.channel.target
+    done = progress or (lambda outcome: None)
+    outcomes = [SetOutcome(name, value, SetStatus.NOT_TRIED) for name, value in pairs]
     limiter = anyio.CapacityLimiter(BATCH_SIZE)
     failures: list[ParamClientError] = []
 
@@ -187,54 +189,30 @@ async def write_many(
 
     autopilot = autopilot_name(session.identification.autopilot or 0)
     places = list(range(len(pairs)))
-    while places and not failures:
-        switches = (at for at, place in enumerate(places) if is_group_switch(pairs[place][0], autopilot))
-        together = max(next(switches, len(places)), 1)
-        try:
-            async with anyio.create_task_group() as tasks:
-                for place in places[:together]:
-                    tasks.start_soon(write_one, place)
-        except ExceptionGroup as group:  # of `done`
-            raise group.exceptions[0] from None
-        del places[:together]
-    for place in places:  # behind a failure
-        outcomes[place] = replace(outcomes[place], error=failures[0])
-        done(outcomes[place])
-    return failures[0] if failures else None
-
-
-async def write_all(
-    session: Session,
-    pairs: Sequence[tuple[str, WireValue]],
-    *,
-    progress: Callable[[SetOutcome], None] | None = None,
-    timeout: float | None = None,
-    settle: float = 0.0,
-    force: bool = False,
-    author: str = "us",
-) -> SetManyResult:
-    """Set several parameters as `write_many` does, and return what is known of each at the end or timeout.
-
-    Args:
-        session, pairs, settle, force, author: as for `write_many`.
-        progress: called with each outcome, as it is known.
-        timeout: seconds; None for no limit.
-    """
-    began, system, component = anyio.current_time(), *session.channel.target
-    outcomes: list[SetOutcome] = []
-    error: ParamClientError | None = None
-    done = progress or (lambda outcome: None)
     with anyio.move_on_after(timeout) as scope:
-        error = await write_many(session, pairs, outcomes, done, settle=settle, force=force, author=author)
+        while places and not failures:
+            switches = (at for at, place in enumerate(places) if is_group_switch(pairs[place][0], autopilot))
+            together = max(next(switches, len(places)), 1)
+            try:
+                async with anyio.create_task_group() as tasks:
+                    for place in places[:together]:
+                        tasks.start_soon(write_one, place)
+            except ExceptionGroup as group:  # of `done`
+                raise group.exceptions[0] from None
+            del places[:together]
+        for place in places:  # behind a failure
+            outcomes[place] = replace(outcomes[place], error=failures[0])
+            done(outcomes[place])
     elapsed = anyio.current_time() - began
     if scope.cancelled_caught:
         error = NoReply(f"{len(pairs)} writes to {system}/{component}", attempts=0, waited=elapsed)
+        failures.insert(0, error)
         open_states = (SetStatus.NOT_TRIED, SetStatus.UNKNOWN)
         outcomes = [
             replace(each, error=error) if each.status in open_states and each.error is None else each
             for each in outcomes
         ]
-    return SetManyResult(system, component, tuple(outcomes), error, elapsed)
+    return SetManyResult(system, component, tuple(outcomes), failures[0] if failures else None, elapsed)
 
 
 class _Write:

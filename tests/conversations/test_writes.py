@@ -24,7 +24,7 @@ from paramclient.model.values import ParamType, Trust, WireValue
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
-from paramclient.protocol.set_results import SetOutcome, SetStatus
+from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetStatus
 from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, OtherStation, PX4Vehicle, SimParam
 from paramclient.wire.messages import (
@@ -51,9 +51,9 @@ EVERY_TYPE = {
 
 async def many(session: Session, pairs: Iterable[tuple[str, WireValue]]) -> list[SetOutcome]:
     """Set several values; return the outcomes, after checking that each was reported once."""
-    outcomes: list[SetOutcome] = []
     done: list[SetOutcome] = []
-    error = await write_many(session, list(pairs), outcomes, done.append)
+    result = await write_many(session, list(pairs), progress=done.append)
+    outcomes, error = list(result.outcomes), result.error
     assert sorted(each.name for each in done if each.status is not SetStatus.NOT_TRIED) == sorted(
         each.name for each in outcomes if each.status is not SetStatus.NOT_TRIED
     )
@@ -503,16 +503,15 @@ async def test_a_link_that_fails_ends_a_batch_and_the_others_are_not_tried() -> 
     async with converse(Air.symmetric([vehicle], delay=0.3)) as conversation:
         session = (await conversation.node()).plain
         names = [each.name for each in vehicle.listed if each.type is ParamType.REAL32][:60]
-        outcomes: list[SetOutcome] = []
         pairs: list[tuple[str, WireValue]] = [(name, 0.25) for name in names]
-        errors: list[object] = []
+        results: list[SetManyResult] = []
 
         async def set_all() -> None:
-            errors.append(await write_many(session, pairs, outcomes, lambda outcome: None))
+            results.append(await write_many(session, pairs))
 
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(set_all)
             await anyio.sleep(2.0)
             conversation.station.fail(LinkError("gone", link="x"), for_good=True)
-        assert isinstance(errors[0], LinkError)
-        assert {each.status for each in outcomes} >= {SetStatus.UNKNOWN, SetStatus.NOT_TRIED}
+        assert isinstance(results[0].error, LinkError)
+        assert {each.status for each in results[0].outcomes} >= {SetStatus.UNKNOWN, SetStatus.NOT_TRIED}
