@@ -20,7 +20,6 @@ from paramclient.links.clock_offset import seconds_ahead
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param
 from paramclient.protocol.events import Change
-from paramclient.protocol.fetch import FetchResult
 from paramclient.protocol.node import Node
 from paramclient.protocol.selection import vehicle_of
 from paramclient.protocol.session import Session
@@ -218,11 +217,11 @@ class CacheWriter:
             pending.is_whole = True
         self._wake()
 
-    def fetched(self, node: Node, session: Session, result: FetchResult) -> None:
-        """Take note of a complete fetch."""
+    def fetched(self, node: Node, session: Session, *, is_whole: bool) -> None:
+        """Take note of a complete fetch; `is_whole`: indices may have changed without values."""
         pending = self._pending_of(node, session)
         self._fetched_at[session] = anyio.current_time()
-        pending.is_whole = pending.is_whole or result.source != "cache"
+        pending.is_whole = pending.is_whole or is_whole
         self._wake()
 
     def _pending_of(self, node: Node, session: Session) -> _Pending:

@@ -476,6 +476,7 @@ class ParamClient:
 
     def _new_component(self, node: Node, session: Session, ext: Component | None) -> Component:
         def emit(event: protocol.Resynced) -> None:
+            self.core.cache_writer.fetched(node, session, is_whole=True)
             self._emit(node, event)
 
         policy = Policy.CACHE_ONLY if self.listens_only else self._policy

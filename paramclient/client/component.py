@@ -502,7 +502,7 @@ class Component:
             self.watch.unconfirmed()
         elif result.complete:
             self.watch.fetched()
-            self.core.cache_writer.fetched(self.node, self.session, result)
+            self.core.cache_writer.fetched(self.node, self.session, is_whole=result.source != "cache")
         return result
 
     async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:

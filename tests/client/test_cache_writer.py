@@ -208,6 +208,20 @@ async def test_a_parameter_that_the_vehicle_no_longer_has_leaves_the_cache(path:
 
 
 @in_simulated_time
+async def test_a_table_that_the_client_has_synced_by_itself_is_cached_whole(path: Path) -> None:
+    """Without PARAM_02, all later parameters have other indices, and the same values."""
+    larger, smaller = PX4Vehicle(table=VALUES), PX4Vehicle(table=VALUES, not_in_use=["PARAM_02"])
+    smaller.reboot(simulated_time_loop().time(), down=math.inf)
+    async with ParamClient(Air([larger, smaller]), cache=path) as client:
+        await (await client.component()).fetch_all()
+        larger.reboot(anyio.current_time(), down=math.inf)
+        smaller.reboot(anyio.current_time(), down=7.0)
+        await asyncio.sleep(12.0)
+    assert kept(path) == bits(smaller.params)
+    assert (await session(smaller, path)).source == "cache"
+
+
+@in_simulated_time
 async def test_a_vehicle_without_a_hash_is_shown_from_the_cache_and_downloaded(path: Path) -> None:
     vehicle = ArduPilotVehicle(ftp=False, live=())
     await session(vehicle, path)
