@@ -391,15 +391,18 @@ class Table:
 
         `moments`: when the values arrived in earlier sessions, by the event loop's clock.
         """
+        has_indices = count is not None and self.count in (None, count)
         for param in params:
             old = self.params.get(param.name)
             if old is None:
                 self.params[param.name] = param.with_trust(Trust.CACHED)
                 self.moments[param.name] = moments[param.name]
-                if param.index is not None and count is not None and self.count in (None, count):
-                    self.names.setdefault(param.index, param.name)
-            elif old.default is None and old.type_number == param.type_number and param.default is not None:
-                self.params[param.name] = replace(old, default=param.default)
+            elif old.type_number == param.type_number:
+                index = old.index if old.index is not None or not has_indices else param.index
+                default = old.default if old.default is not None else param.default
+                self.params[param.name] = replace(old, index=index, default=default)
+            if param.index is not None and has_indices:
+                self.names.setdefault(param.index, param.name)
         if self.count is None:
             self.count = count
         if self.count == count:
