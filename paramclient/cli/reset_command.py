@@ -111,8 +111,9 @@ async def reset(
         if fetched.missing and any(map(is_pattern, name_patterns or "*")):
             report(f"incomplete: {counted(len(fetched.missing), 'parameter')} were not received")
             code = ExitCode.INCOMPLETE
+        component, deadline = session.component, session.deadline
         params = await read_unconfirmed(
-            session.component.params, session.component.get, chosen, timeout=session.deadline.left()
+            component.params, lambda name: component.get(name, timeout=deadline.left()), chosen
         )
         if described is None:
             described = await _known(session, metadata, params)

@@ -397,7 +397,7 @@ class Component:
 
         await self.fetch_all(timeout=timeout)
         present = await read_unconfirmed(
-            self.params, self.get, map(check_portable_name, names), timeout=left()
+            self.params, lambda name: self.get(name, timeout=left()), map(check_portable_name, names)
         )
         choice = ResetChoice.of(present, defaults or {})
         written = await self.set_many(

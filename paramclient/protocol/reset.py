@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
 
-import anyio
-
 from paramclient.errors import UsageError
 from paramclient.model.values import Param, Trust, WireValue, bits_of, same_bits
 from paramclient.protocol.set_results import SetManyResult
@@ -78,31 +76,24 @@ class ResetResult:
 
 
 async def read_unconfirmed(
-    table: Mapping[str, Param],
-    read: Callable[..., Awaitable[Param]],
-    names: Iterable[str],
-    *,
-    timeout: float | None = None,
+    table: Mapping[str, Param], read: Callable[[str], Awaitable[Param]], names: Iterable[str]
 ) -> list[Param]:
     """Return parameters of a fetched table in the order of the names; read those that are only cached.
 
     Args:
         table: `Component.params`.
-        read: `Component.get` of the same component.
+        read: reads a parameter into the table.
         names: param_ids; of equal ones the first counts.
-        timeout: seconds for all reads; None for no limit besides the number of attempts.
 
     Raises:
         UnknownParameter: the vehicle has no parameter with one of the names.
         ParamClientError: as from `Component.get`.
     """
-    until = None if timeout is None else anyio.current_time() + timeout
     params = []
     for name in dict.fromkeys(names):
         param = table.get(name)
         if param is None or param.trust is Trust.CACHED:
-            left = None if until is None else max(until - anyio.current_time(), 0.0)
-            await read(name, timeout=left)
+            await read(name)
             param = table[name]
         params.append(param)
     return params
