@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 
 import anyio
@@ -16,7 +17,7 @@ from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.node import Node
 from paramclient.protocol.watch import Watch
 from paramclient.sim import Air, ArduPilotVehicle
-from paramclient.wire.messages import FileTransfer, Message, ParamRequestList, encode
+from paramclient.wire.messages import NO_INDEX, FileTransfer, Message, ParamRequestList, ParamValue, encode
 from tests.conversations.virtual import Conversation, Tap, converse, run, virtual, virtual_on_both
 
 MOVED = ("INS_GYROFFS_X", "INS_GYR2OFFS_Z", "BARO1_GND_PRESS", "STAT_RUNTIME", "STAT_BOOTCNT")
@@ -78,8 +79,8 @@ async def test_an_announcement_before_the_cached_table_takes_no_index_away() -> 
     vehicle = ArduPilotVehicle(live_period=0.0)
     async with converse(vehicle) as conversation:
         node = await conversation.node()
-        vehicle.set_param("STAT_RUNTIME", 31)
-        await anyio.sleep(0.5)
+        value = struct.pack("<f", 31.0)
+        conversation.hear(ParamValue("STAT_RUNTIME", value, ParamType.INT32, 1382, NO_INDEX))
         assert node.plain.table.params["STAT_RUNTIME"].index is None
         await with_cached_table(conversation, vehicle.params)
         result = await fetch_all(node.plain)
