@@ -83,6 +83,7 @@ async def _read(session: Session, which: str | int) -> ReportedValue:
                         answer = None if is_lost else await _read_list(session, inbox, which)
                         if answer is None:
                             raise
+                        _miss(session, which)
                         return answer
                 if control.param_id == which:
                     return control
@@ -237,11 +238,17 @@ async def _try(session: Session, which: str | int) -> ReportedValue | None:
         try:
             return await _ask(session, inbox, which, attempts)
         except (NoReply, VehicleError):
-            if isinstance(which, int):
-                session.reads_indices = session.reads_indices or False
-            elif which != HASH_CHECK:
-                session.reads_names = session.reads_names or False
+            if which != HASH_CHECK:
+                _miss(session, which)
             return None
+
+
+def _miss(session: Session, which: str | int) -> None:
+    """Remember that such a read was not answered."""
+    if isinstance(which, str):
+        session.reads_names = session.reads_names or False
+    else:
+        session.reads_indices = session.reads_indices or False
 
 
 async def _read_list(session: Session, inbox: Inbox, which: str | int) -> ReportedValue | None:

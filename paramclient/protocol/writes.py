@@ -46,7 +46,8 @@ UNCHANGED_MAX: Final = 5
 SILENT_SETS_MAX: Final = 3
 """Sets without an acknowledgement, after which a read shows the value: some firmware acknowledges none."""
 SETS_MAX: Final = 12
-"""Sets without an acknowledgement that leave the old value: at 55 % loss, one in a thousand."""
+SETS_LOST: Final = 1e-4
+"""Probability that sets without an acknowledgement, which leave the old value, are lost."""
 EVIDENCE_READS: Final = 8
 """Indices that are read for evidence of the encoding: few components begin with more zeros and floats."""
 EXT_PROGRESS_TIMEOUT: Final = 60.0
@@ -279,7 +280,8 @@ class _Write:
                     adjusted = answer
                     continue
                 unchanged += not is_silent
-                if unchanged >= UNCHANGED_MAX or self.attempts >= SETS_MAX:
+                sets_max = min(max(channel.timing.attempts_for(SETS_LOST), UNCHANGED_MAX), SETS_MAX)
+                if unchanged >= UNCHANGED_MAX or self.attempts >= sets_max:
                     raise self._not_applied(answer)
 
     def _encode(self) -> None:
@@ -306,7 +308,8 @@ class _Write:
         if answer is not None:
             if self.attempts == 1 and not self.channel.is_streaming:
                 self.channel.timing.measure(anyio.current_time() - sent)
-            return answer
+            is_typed = answer.type_number == self.before.type_number
+            return answer if is_typed else await self._read()  # only a read shows that the type has changed
         if not other:
             return None
         param = await self._read()
@@ -358,7 +361,10 @@ class _Write:
         number = message.param_type
         if number == ParamType.REAL32 and self.before.type_number != number:
             number = self._known_type(message.raw)
-        elif message.raw == self._raw:  # this value, and not the rounded form of the one before
+        elif (number, message.raw) == (
+            self.before.type_number,
+            self._raw,
+        ):  # this value, and not the rounded form of the one before
             self.session.table.store(message, anyio.current_time(), is_exact=True)
         return self.session.dialect.param(self.name, message.raw, number, None, encoding)
 
