@@ -7,9 +7,10 @@ from typing import Final
 
 import anyio
 
-from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError
+from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError, VehicleError
 from paramclient.protocol.ftp import FileCutOff, read_file
 from paramclient.protocol.param_pck import PACK_SIZE_MAX, PARAM_FILE, Pack, decode, decode_prefix
+from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
 
 __all__ = ["FileUnavailable", "download_file"]
@@ -81,10 +82,22 @@ async def download_file(session: Session) -> int:
             reason = f"the parameter file has {len(pack.entries)} of {pack.total} parameters"
             attempts += 1
             continue
+        known = session.table.count
+        if known not in (None, pack.total) and await _count(session) == known:
+            reason = f"the parameter file has {pack.total} parameters, and the vehicle {known}"
+            attempts += 1
+            continue
         session.serves_file = True
         _store(session, pack, requested_at)
         return pack.total
     raise FileUnavailable(reason)
+
+
+async def _count(session: Session) -> int | None:
+    """Return the number of parameters by another message than the file; None if it is not answered."""
+    with suppress(NoReply, VehicleError):
+        return (await read(session, 0)).param_count
+    return None
 
 
 async def _read(session: Session, path: str) -> bytes:

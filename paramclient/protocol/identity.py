@@ -155,10 +155,7 @@ class Identification:
         if self._chosen is not None or self.is_px4 or self.is_ardupilot:
             return True
         if self.autopilot is None:  # an ArduPilot shows itself by its heartbeat alone
-            bits = (self.capabilities or 0) & (
-                CAPABILITY_PARAM_ENCODE_BYTEWISE | CAPABILITY_PARAM_ENCODE_C_CAST
-            )
-            return self.is_settled and (bool(bits) or self._has_no_heartbeat)
+            return self.is_settled and (self.is_encoding_known or self._has_no_heartbeat)
         return self.is_settled or self._listens_only
 
     async def settled(self) -> None:

@@ -274,7 +274,7 @@ class _Write:
                     continue
                 if self._is_wanted(answer) or self._is_converted(answer):
                     return self._result(answer)
-                if adjusted is not None and adjusted.same_value(answer):
+                if adjusted is not None and (adjusted.same_value(answer) or self.attempts >= SETS_MAX):
                     return self._result(answer)
                 if not answer.same_value(self.before):
                     adjusted = answer
@@ -361,10 +361,8 @@ class _Write:
         number = message.param_type
         if number == ParamType.REAL32 and self.before.type_number != number:
             number = self._known_type(message.raw)
-        elif (number, message.raw) == (
-            self.before.type_number,
-            self._raw,
-        ):  # this value, and not the rounded form of the one before
+        elif (number, message.raw) == (self.before.type_number, self._raw):
+            # this value, and not the rounded form of the one before
             self.session.table.store(message, anyio.current_time(), is_exact=True)
         return self.session.dialect.param(self.name, message.raw, number, None, encoding)
 

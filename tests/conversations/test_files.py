@@ -12,6 +12,7 @@ import pytest
 
 from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoReply, UsageError
 from paramclient.model.px4_hash import crc32_px4
+from paramclient.model.values import ParamType
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.ftp import (
     DirectoryEntry,
@@ -313,6 +314,7 @@ def pack_of(vehicle: ArduPilotVehicle, number: int | None = None) -> bytes:
     "content",
     [
         pytest.param(encode([]), id="empty"),
+        pytest.param(encode([PackedParam("RTL_ALT", ParamType.INT16, 1500)]), id="short"),
         pytest.param(b"no parameter file", id="other"),
         pytest.param(b"", id="none"),
         pytest.param(None, id="cut off"),
