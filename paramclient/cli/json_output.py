@@ -351,7 +351,10 @@ class SetJson(OriginJson):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FetchJson(Json):
-    """A fetched table. `missing` are indices, `cached` names whose values are not confirmed."""
+    """A fetched table. `missing` are indices, `cached` names whose values are not confirmed.
+
+    `changed` are names whose cached values an ArduPilot did not confirm, and which were read.
+    """
 
     system: int
     component: int
@@ -363,6 +366,7 @@ class FetchJson(Json):
     hash: str | None
     missing: list[int]
     cached: list[str]
+    changed: tuple[str, ...]
     lost: int
     repeated: int
     round_trip_s: float | None

@@ -42,7 +42,7 @@ ESCAPE = "\x1b"
 
 FETCH_KEYS = [
     *("system", "component", "autopilot", "uid", "count", "received", "source", "hash", "missing"),
-    *("cached", "lost", "repeated", "round_trip_s"),
+    *("cached", "changed", "lost", "repeated", "round_trip_s"),
     *("elapsed_s", "bytes_received", "bytes_sent", "params"),
 ]
 PARAM_KEYS = ["value", "type", "index", "bits"]
@@ -414,6 +414,20 @@ def test_fetch_obeys_the_policy(
         assert found["cached"] == ["A", "CAL_ACC0_XOFF"]
         assert found["hash"] is None
         assert vehicle.requests["PARAM_REQUEST_READ"] == 0
+
+
+def test_fetch_names_what_has_changed_since_an_ardupilot_was_cached(
+    command: Command, put: Put, tmp_path: Path
+) -> None:
+    vehicle = ArduPilotVehicle()
+    fetch = ("fetch", put(vehicle), "--cache", tmp_path / "cache.sqlite3", "--only", "RTL_ALT")
+    assert command(*fetch).code == 0
+    vehicle.load({"RTL_ALT": 2000})
+    assert "Changed since they were cached: RTL_ALT." in command(*fetch).err
+    vehicle.load({"RTL_ALT": 2500})
+    found = command(*fetch, "--json").json
+    assert (found["source"], found["changed"]) == ("cache", ["RTL_ALT"])
+    assert found["params"]["RTL_ALT"]["value"] == 2500
     assert vehicle.requests["PARAM_REQUEST_LIST"] == 0
     shown = command("fetch", url, "--cache", cache, "--policy", policy)
     assert [row[-1] for row in shown.words[1:]] == [
