@@ -414,6 +414,12 @@ def test_fetch_obeys_the_policy(
         assert found["cached"] == ["A", "CAL_ACC0_XOFF"]
         assert found["hash"] is None
         assert vehicle.requests["PARAM_REQUEST_READ"] == 0
+    assert vehicle.requests["PARAM_REQUEST_LIST"] == 0
+    shown = command("fetch", url, "--cache", cache, "--policy", policy)
+    assert [row[-1] for row in shown.words[1:]] == [
+        "verified" if policy == "hash-only" else "cached",
+        "cached",
+    ]
 
 
 def test_fetch_names_what_has_changed_since_an_ardupilot_was_cached(
@@ -428,12 +434,6 @@ def test_fetch_names_what_has_changed_since_an_ardupilot_was_cached(
     found = command(*fetch, "--json").json
     assert (found["source"], found["changed"]) == ("cache", ["RTL_ALT"])
     assert found["params"]["RTL_ALT"]["value"] == 2500
-    assert vehicle.requests["PARAM_REQUEST_LIST"] == 0
-    shown = command("fetch", url, "--cache", cache, "--policy", policy)
-    assert [row[-1] for row in shown.words[1:]] == [
-        "verified" if policy == "hash-only" else "cached",
-        "cached",
-    ]
 
 
 # Differences from the defaults
