@@ -232,7 +232,7 @@ class Session:
         """Why the encoding is probably wrong, as a sentence; "" without evidence, or by the user's choice."""
         why = "" if self.identification.is_chosen else self.table.contradicts
         address = f"{self.channel.system}/{self.channel.component}"
-        return why and f"The encoding of {address} is probably wrong: {why}. Choose it (--encoding)."
+        return why and f"The encoding of {address} is probably wrong: {why}."
 
     def report(self, received: int, total: int | None) -> None:
         """Report the progress of a fetch."""

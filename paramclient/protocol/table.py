@@ -191,12 +191,14 @@ class Table:
         if not self._evidence or self._encoding in self._evidence:
             return ""
         ((against, (name, raw, number)),) = self._evidence.items()
-        looks = "bytes, not a float32" if against is Encoding.BYTEWISE else "a float32"
+        looks = "bytes (a denormal float32)" if against is Encoding.BYTEWISE else "a float32"
         values = [
             format_value(self.dialect.param(name, raw, number, None, each).settable, number)
             for each in (self._encoding, against)
         ]
-        return f"each integer looks like {looks}; {name} = {values[0]} is {values[1]} in {against}"
+        return (
+            f"each integer looks like {looks}; {name} = {values[0]} is {values[1]} with --encoding {against}"
+        )
 
     def store_entry(
         self, entry: PackedParam, index: int, now: float, *, with_defaults: bool

@@ -26,8 +26,8 @@ from paramclient import (
     ParamClient,
     ParamType,
     Progress,
-    TypeMismatch,
     UsageError,
+    ValueNotApplied,
 )
 from paramclient.client import arguments, link_task
 from paramclient.links import create_link, serve_endpoint
@@ -366,10 +366,10 @@ class Retyping(GenericVehicle):
 
 
 @in_simulated_time
-async def test_a_vehicle_that_changes_the_type() -> None:
+async def test_a_vehicle_that_acknowledges_in_another_type_has_not_changed_the_type() -> None:
     async with a_client(Retyping(VALUES)) as client:
         component = await client.component()
-        with pytest.raises(TypeMismatch):
+        with pytest.raises(ValueNotApplied):
             await component.set("PARAM_01", 9)
         assert not residue(component)
 

@@ -172,11 +172,11 @@ async def test_integers_in_another_encoding_are_told_and_not_written(
     vehicle = Partial(table, heartbeat=heartbeat, encoding=encoding)
     async with converse(vehicle) as conversation:
         session = (await conversation.node()).plain
-        with pytest.raises(UsageError, match=rf"was not written.*in {encoding}"):
+        with pytest.raises(UsageError, match=rf"was not written.*--encoding {encoding}"):
             await write(session, name, 9)
         assert (await write(session, "GAIN_1", 2.5)).status == "accepted"
         assert vehicle.number_of(ParamSet) == 1
-        assert any(f"in {encoding}" in note for note in (await fetch_all(session)).notes)
+        assert any(f"--encoding {encoding}" in note for note in (await fetch_all(session)).notes)
     async with converse(vehicle, encoding=encoding) as conversation:
         session = (await conversation.node()).plain
         assert (await write(session, name, 9)).status == "accepted"
