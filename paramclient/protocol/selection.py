@@ -165,7 +165,7 @@ def hint_of_node(station: Station, node: Node, now: float) -> str:
     others = [
         f"{each.system}/{each.component}"
         for each in station.nodes.values()
-        if each.system == node.system and each is not node and each.plain.table.moments
+        if each.system == node.system and each.plain.table.moments and not each.presence.has_beaten
     ]
     if others and not node.plain.table.moments:
         return f"{does}, but no values; values came from {first_of(others, LISTED_MAX)}, which may be meant."

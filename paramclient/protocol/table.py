@@ -192,13 +192,11 @@ class Table:
             return ""
         ((against, (name, raw, number)),) = self._evidence.items()
         looks = "bytes (a denormal float32)" if against is Encoding.BYTEWISE else "a float32"
-        values = [
+        read, meant = (
             format_value(self.dialect.param(name, raw, number, None, each).settable, number)
             for each in (self._encoding, against)
-        ]
-        return (
-            f"each integer looks like {looks}; {name} = {values[0]} is {values[1]} with --encoding {against}"
         )
+        return f"each integer looks like {looks}; {name} = {read} is {meant} with --encoding {against}"
 
     def store_entry(
         self, entry: PackedParam, index: int, now: float, *, with_defaults: bool
