@@ -82,6 +82,7 @@ class Identification:
 
     Attributes:
         identity: the vehicle's identity; without a hardware id until AUTOPILOT_VERSION is received.
+        chosen: as given.
         autopilot, vehicle_type: of the heartbeat; None before the first.
         capabilities: of AUTOPILOT_VERSION; None before it.
         encoding, encoding_reason: the parameter encoding and its evidence.
@@ -100,22 +101,17 @@ class Identification:
         self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
         self.is_settled = False
         self.is_confirmed = True
-        self._chosen = chosen
+        self.chosen = chosen
         self._listens_only = listens_only
         self._has_no_heartbeat = False
         self._changed = anyio.Event()
-
-    @property
-    def is_chosen(self) -> bool:
-        """Whether the user has chosen the encoding."""
-        return self._chosen is not None
 
     @property
     def is_encoding_known(self) -> bool:
         """Whether the user, or the component's AUTOPILOT_VERSION, names the encoding."""
         bits = CAPABILITY_PARAM_ENCODE_BYTEWISE | CAPABILITY_PARAM_ENCODE_C_CAST
         has_bit = bool((self.capabilities or 0) & bits)
-        return self.is_chosen or has_bit or (self.is_ardupilot and self.capabilities is not None)
+        return self.chosen is not None or has_bit or (self.is_ardupilot and self.capabilities is not None)
 
     @property
     def is_px4(self) -> bool:
@@ -152,7 +148,7 @@ class Identification:
     @property
     def is_encoding_certain(self) -> bool:
         """Whether no further message can change the encoding."""
-        if self._chosen is not None or self.is_px4 or self.is_ardupilot:
+        if self.chosen is not None or self.is_px4 or self.is_ardupilot:
             return True
         if self.autopilot is None:  # an ArduPilot shows itself by its heartbeat alone
             return self.is_settled and (self.is_encoding_known or self._has_no_heartbeat)
@@ -263,6 +259,6 @@ class Identification:
         self.settle()
 
     def _derive(self) -> None:
-        self.encoding, self.encoding_reason = judge_encoding(self._chosen, self.capabilities, self.autopilot)
+        self.encoding, self.encoding_reason = judge_encoding(self.chosen, self.capabilities, self.autopilot)
         self._changed.set()
         self._changed = anyio.Event()

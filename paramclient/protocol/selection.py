@@ -185,7 +185,13 @@ def _autopilots(nodes: Iterable[Node]) -> list[Node]:
     vehicles = [each for each in nodes if not _is_peripheral(each)]
     found = [each for each in vehicles if each.identification.is_autopilot]
     systems = {each.system for each in found}
-    found += [each for each in vehicles if each.system not in systems and _is_unnamed_autopilot(each)]
+    found += [
+        each
+        for each in vehicles
+        if each.system not in systems
+        and (each.component, each.identification.autopilot) == (AUTOPILOT_COMPONENT, MAV_AUTOPILOT_INVALID)
+        and each.identification.has_parameters
+    ]
     return [each for each in found if not each.presence.is_lost] or found
 
 
@@ -208,9 +214,3 @@ def _is_at(node: Node, peer: str | None) -> bool:
 
 def _is_peripheral(node: Node) -> bool:
     return node.component >= PERIPHERAL_IDS_MIN or node.identification.vehicle_type in _PERIPHERALS
-
-
-def _is_unnamed_autopilot(node: Node) -> bool:
-    identification = node.identification
-    is_unnamed = identification.autopilot == MAV_AUTOPILOT_INVALID and identification.has_parameters
-    return is_unnamed and node.component == AUTOPILOT_COMPONENT

@@ -230,7 +230,7 @@ class Session:
     @property
     def encoding_doubt(self) -> str:
         """Why the encoding is probably wrong, as a sentence; "" without evidence, or by the user's choice."""
-        why = "" if self.identification.is_chosen else self.table.contradicts
+        why = self.table.contradicts if self.identification.chosen is None else ""
         address = f"{self.channel.system}/{self.channel.component}"
         return why and f"The encoding of {address} is probably wrong: {why}."
 

@@ -48,6 +48,7 @@ class Table:
         volatile: names outside the vehicle's hash, as far as known.
         author_of: returns the author of a change of a name.
         left_out: received names that no parameter file can contain, and that are not stored.
+        evidence: for each encoding, a value that shows it: name, bytes and type.
         is_growing: whether each value so far was the last one by its own param_count: a component that counts
             what it has sent, and whose list ends by a pause.
         recounted: called when the count of a complete table changes, or may have changed.
@@ -71,7 +72,7 @@ class Table:
         self._held: dict[str, Change] | None = {} if dialect is PLAIN else None
         self._encoding = Encoding.BYTEWISE
         self._wire: dict[str, tuple[bytes, int]] = {}  # as received, until the encoding is certain
-        self._evidence: dict[Encoding, tuple[str, bytes, int]] = {}  # an integer that shows the encoding
+        self.evidence: dict[Encoding, tuple[str, bytes, int]] = {}
         self._was_complete = False
         self._outdated: set[str] = set()  # names whose index belongs to an earlier count
         self._hash: int | None = None
@@ -175,22 +176,17 @@ class Table:
         return self._put(name, old, new)
 
     def _take_evidence(self, name: str, raw: bytes, number: int) -> None:
-        if self.dialect is PLAIN and len(self._evidence) < len(Encoding):
+        if self.dialect is PLAIN and len(self.evidence) < len(Encoding):
             encoding = encoding_of(raw, number)
             if encoding is not None:
-                self._evidence.setdefault(encoding, (name, raw, number))
-
-    @property
-    def has_evidence(self) -> bool:
-        """Whether any value shows an encoding."""
-        return bool(self._evidence)
+                self.evidence.setdefault(encoding, (name, raw, number))
 
     @property
     def contradicts(self) -> str:
         """The evidence of the values against their encoding, in words; "" without any, or with any for it."""
-        if not self._evidence or self._encoding in self._evidence:
+        if not self.evidence or self._encoding in self.evidence:
             return ""
-        ((against, (name, raw, number)),) = self._evidence.items()
+        ((against, (name, raw, number)),) = self.evidence.items()
         looks = "bytes (a denormal float32)" if against is Encoding.BYTEWISE else "a float32"
         read, meant = (
             format_value(self.dialect.param(name, raw, number, None, each).settable, number)
@@ -357,7 +353,7 @@ class Table:
         """Forget everything: another vehicle uses the address."""
         for each in (self.params, self.names, self.moments, self._wire, self._outdated, self.left_out):
             each.clear()
-        self._evidence.clear()
+        self.evidence.clear()
         self.count = None
         self.volatile, self.volatile_is_known = frozenset(), False
         self._was_complete = False

@@ -451,11 +451,11 @@ async def _check_encoding(session: Session, name: str) -> None:
     kind = table.params[name].type
     if session.dialect.has_ack or not (isinstance(kind, ParamType) and kind.is_integer):
         return
-    if not (identification.is_encoding_known or table.has_evidence):
+    if not (identification.is_encoding_known or table.evidence):
         with channel.inbox(session.dialect.value) as inbox, anyio.move_on_after(channel.timing.timeout(0)):
             for index in range(EVIDENCE_READS):
                 channel.send(session.dialect.request_read(channel.reads_from, index))
-            while not table.has_evidence:
+            while not table.evidence:
                 await inbox.next()
     if doubt := session.encoding_doubt:
         raise UsageError(f"{name} was not written. {doubt}")
