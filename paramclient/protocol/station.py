@@ -182,18 +182,19 @@ class Station:
     def probe(self, system: int, component: int) -> None:
         """Request a value of a component that was not heard: it may send no heartbeat.
 
-        By turns a plain and an extended parameter, and the list for firmware without reads; then of all
-        components of the system, as some answer under another id than they are asked under.
+        By turns a plain and an extended parameter, and the list for firmware without reads; then a parameter
+        of all components of the system, as some answer under another id than they are asked under.
         """
         number = self._asked[system, component] = self._asked.get((system, component), -1) + 1
-        target = (system, component if number % 6 < 3 else COMP_ID_ALL)
-        version = next((node.version for node in self.nodes.values()), 2)
-        requests = (
+        target = (system, component)
+        ways = (
             PLAIN.request_read(target, 0),
             EXTENDED.request_read(target, 0),
             PLAIN.request_list(target),
+            PLAIN.request_read((system, COMP_ID_ALL), 0),
         )
-        self.transmit(requests[number % 3], None, version)
+        version = next((node.version for node in self.nodes.values()), 2)
+        self.transmit(ways[number % len(ways)], None, version)
 
     def overhear(self, data: bytes, now: float) -> None:
         """Take a frame that another program sends to the vehicles over this link: it may be a PARAM_SET."""
