@@ -22,7 +22,7 @@ from paramclient.client.files import Ftp
 from paramclient.client.fleet_fetch import FetchedAll, fetch_components
 from paramclient.client.forwarding import Forwarder
 from paramclient.client.recording import Capture
-from paramclient.client.signing import Signing, TimestampKeeper, refused_in_words
+from paramclient.client.signing import Signing, refused_in_words
 from paramclient.client.streams import Subscribers
 from paramclient.client.traffic import Traffic, TrafficReport
 from paramclient.errors import AnotherVehicle, NoReply, ParamClientError, UsageError
@@ -142,7 +142,6 @@ class ParamClient:
         self._components: dict[Address, Component] = {}
         self._by_session: dict[Session, Component] = {}
         self._events: Subscribers[events.Event] = Subscribers()
-        signing = Signing(signing) if isinstance(signing, SigningKey) else signing
         forwarder = None if forward is None else Forwarder(create_link(forward))
         capture = None if tlog is None else Capture(tlog)
         self._traffic = Traffic() if traffic else None
@@ -150,7 +149,7 @@ class ParamClient:
             opened,
             CacheWriter(self.cache, owned=self.cache is not cache),
             [tap for tap in (forwarder, capture, self._traffic) if tap is not None],
-            None if signing is None else TimestampKeeper(signing),
+            Signing(signing) if isinstance(signing, SigningKey) else signing,
             partial(
                 Station,
                 link=opened.name,
