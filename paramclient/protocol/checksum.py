@@ -24,7 +24,7 @@ from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, en
 from paramclient.protocol.session import Session
 from paramclient.protocol.table import Table
 
-__all__ = ["ChecksumUnavailable", "prove"]
+__all__ = ["ChecksumUnavailable", "TableDiffers", "prove"]
 
 CHECKED_READ_SIZE: Final = 64
 """Bytes that ArduPilot reads at a time for a checksum: the padding of the file depends on it (measured)."""
@@ -72,6 +72,10 @@ class ChecksumUnavailable(Exception):
         self.is_silent = is_silent
 
 
+class TableDiffers(ChecksumUnavailable):
+    """The vehicle's table is another one, and a search is not worth it."""
+
+
 async def prove(session: Session) -> tuple[str, ...]:
     """Prove a complete table by the vehicle's checksum, after reading the values that have changed.
 
@@ -79,7 +83,8 @@ async def prove(session: Session) -> tuple[str, ...]:
         The names whose values have changed, except for those that move by themselves.
 
     Raises:
-        ChecksumUnavailable: the vehicle computes no checksum now, or its table is too different.
+        ChecksumUnavailable: the vehicle computes no checksum now.
+        TableDiffers: its table is too different.
         LinkError: the link is closed for good.
     """
     table = session.table
@@ -114,13 +119,13 @@ class _Proof:
         """Compare, and read what differs.
 
         Raises:
-            ChecksumUnavailable: the tables are too different.
+            TableDiffers: the tables are too different.
         """
         if await self._agrees():
             return
         moving = list(self._moving())
         if len(moving) > MOVING_MAX:
-            raise ChecksumUnavailable(f"{len(moving)} values of the cached table are not exact")
+            raise TableDiffers(f"{len(moving)} values of the cached table are not exact")
         await self._read(moving)
         boot_count = next((at for at, row in enumerate(self._rows) if row.name == BOOT_COUNT), None)
         if boot_count is None or boot_count in self._changed:
@@ -131,7 +136,7 @@ class _Proof:
             await self._search()
         if self._is_equal() or await self._agrees():
             return
-        raise ChecksumUnavailable(TOO_MANY)
+        raise TableDiffers(TOO_MANY)
 
     def _moving(self) -> Iterator[int]:
         """Return the indices of values that probably are others, or that may be rounded."""
@@ -161,7 +166,7 @@ class _Proof:
         places = [range(len(self._rows))]
         while places:
             if len(places) > PLACES_MAX:
-                raise ChecksumUnavailable(TOO_MANY)
+                raise TableDiffers(TOO_MANY)
             began = anyio.current_time()
             splits = [self._split(place) for place in places]
             asked = [part for parts in splits for part in parts[:-1] or parts]
@@ -185,7 +190,7 @@ class _Proof:
         row = self._rows[at]
         difference = crc32_px4_before(found ^ self._computed(range(at, at + 1)), row.type.size)
         if difference >> 8 * row.type.size:
-            raise ChecksumUnavailable("the vehicle has other parameters than the cached table")
+            raise TableDiffers("the vehicle has other parameters than the cached table")
         if difference:
             self._rows[at] = row._replace(bits=row.bits ^ difference)
             self._changed[at] = requested_at
