@@ -75,7 +75,7 @@ async def fetch(
     extended: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
-    """Fetch all parameters. Uses the cache if the vehicle's hash matches, otherwise downloads.
+    """Fetch all parameters. Uses the cache if the vehicle confirms it, otherwise downloads.
 
     Args:
         url: The link: udpin:0.0.0.0:14550, tcp:HOST:PORT, serial:PATH, sim:px4.
@@ -122,7 +122,7 @@ async def get(
     Args:
         url: The link.
         name: The parameter, in upper or lower case, or a pattern such as "MC_*": then the whole table is
-            fetched, from the cache if the vehicle's hash matches.
+            fetched, from the cache if the vehicle confirms it.
         names: Further parameters and patterns.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
         extended: Extended parameters (PARAM_EXT_*), such as a camera's.

@@ -79,7 +79,7 @@ async def resolve(
 ) -> ParamSet:
     """Return the parameters of the source that an argument names: a file, a vehicle in the cache, or a link.
 
-    Opens a link and fetches the whole table, from the cache if the vehicle's hash matches.
+    Opens a link and fetches the whole table, from the cache if the vehicle confirms it.
 
     Args:
         text: the argument; see the docstring of this module.

@@ -83,7 +83,7 @@ class ParamClient:
         system, component: MAVLink ids of this client, 1 to 255.
         encoding: parameter encoding of all components; None detects it for each component.
         watch_interval: seconds between two checks of each fetched table against the vehicle, at least 1.
-            None: every 30 s for a vehicle with a hash, and for others if a download takes no more than 1.5 s.
+            None: every 30 s for a vehicle with a hash or checksum (PX4, ArduPilot), never for others.
             0 disables the checks. See `Component.sync_state`.
         policy: which requests may update tables, see `Policy`: "auto", "hash-only" or "cache-only". Any value
             but "auto" also disables the checks of `watch_interval`.

@@ -163,7 +163,7 @@ class Component:
 
     @property
     def hash(self) -> int | None:
-        """The PX4 hash (`_HASH_CHECK`) of the complete table; None if it is not known."""
+        """PX4's hash or ArduPilot's checksum of the complete table; None if it is not known."""
         return self.session.table.hash if self.session.table.is_complete else None
 
     @property
@@ -414,10 +414,11 @@ class Component:
     ) -> FetchResult:
         """Fetch all parameters. Uses the cache if the vehicle confirms it, otherwise downloads.
 
-        If the cache has a table and the vehicle a hash, the client requests the hash first. If it matches,
-        nothing is downloaded but the values outside the hash. Otherwise the client downloads the packed file
-        `param.pck` over MAVFTP if the component serves it: it is faster than the list, exact, and has the
-        firmware's defaults. If not, it downloads the list. `source` and `notes` of the result tell which.
+        If the cache has a table, the client first requests PX4's hash or ArduPilot's checksum. If it matches,
+        nothing is downloaded but the values outside the hash. Values that ArduPilot has changed are found by
+        checksums of ranges, and named in `changed` of the result. Otherwise the client downloads the packed
+        file `param.pck` over MAVFTP if the component serves it: it is faster than the list, exact, and has
+        the firmware's defaults. If not, it downloads the list. `source` and `notes` of the result tell which.
 
         The fetch always ends: indices without a response after all attempts are in `missing`, and a vehicle
         that is lost ends it with the values that arrived. Concurrent calls share one fetch. Cancellation
@@ -425,7 +426,7 @@ class Component:
         station requests.
 
         Args:
-            refresh: download even if the hash would confirm the cached table.
+            refresh: download even if the vehicle would confirm the cached table.
             timeout: seconds after which the partial table is returned with `missing`; None: no limit, except
                 20 s if the client only listens.
             progress: called as values arrive.

@@ -100,7 +100,7 @@ class Component:
         """The `param_count` of the component; None before its first value."""
     @property
     def hash(self) -> int | None:
-        """The PX4 hash (`_HASH_CHECK`) of the complete table; None if it is not known."""
+        """PX4's hash or ArduPilot's checksum of the complete table; None if it is not known."""
     @property
     def state(self) -> ComponentState:
         """State of the table."""
