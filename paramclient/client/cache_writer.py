@@ -16,7 +16,6 @@ import anyio.to_thread
 
 from paramclient.cache import BY_VEHICLE, ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.errors import CacheError, UsageError
-from paramclient.links.clock_offset import seconds_ahead
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param
 from paramclient.protocol.events import Change
@@ -34,6 +33,10 @@ PENDING_MAX: Final = 4_096
 """Observations of one table that wait for the cache: above it, the whole table is written later."""
 CLOCK_STEP: Final = 1.0
 """Seconds by which the computer's clock must differ to count as set, or as suspended."""
+CLOCK_READ_TIME_MAX: Final = 20e-6
+"""Seconds between two reads of one clock within which the read of the other was not interrupted."""
+CLOCK_READS_MAX: Final = 8
+"""Reads of both clocks, after which the least interrupted one is used."""
 CLOSE_WAIT_MAX: Final = 6.0
 """Seconds for which `close` waits for the cache: longer than another process may lock a file."""
 
@@ -374,7 +377,7 @@ class CacheWriter:
 
         The two clocks are compared once, and again where the computer's clock was set or was suspended.
         """
-        ahead = seconds_ahead(time.time, anyio.current_time)
+        ahead = _clock_offset(time.time, anyio.current_time)
         if not abs(ahead - self._ahead) <= CLOCK_STEP:  # also where the clock is NaN
             self._ahead = ahead
         return self._ahead
@@ -416,3 +419,22 @@ def choose_cache(
 
 def _firmware(identity: Identity) -> tuple[int, str]:
     return identity.firmware, identity.git_hash
+
+
+def _clock_offset(clock: Callable[[], float], other: Callable[[], float]) -> float:
+    """Return the seconds by which a clock is ahead of another.
+
+    On a busy machine, the operating system may suspend the process between the reads of the two clocks for
+    tens of milliseconds.
+
+    Args:
+        clock, other: functions that return the time in seconds.
+    """
+    shortest, ahead = math.inf, 0.0
+    for _ in range(CLOCK_READS_MAX):
+        before, at, after = other(), clock(), other()
+        if after - before < shortest:
+            shortest, ahead = after - before, at - (before + after) / 2
+        if shortest <= CLOCK_READ_TIME_MAX:
+            break
+    return ahead
