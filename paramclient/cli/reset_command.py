@@ -41,7 +41,7 @@ from paramclient.cli.write_outcomes import (
     write_all,
     writes_json,
 )
-from paramclient.client.arguments import SETTLE_MAX
+from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import NoReply, ParamClientError, UsageError, VehicleError
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import DefaultSource, default_of

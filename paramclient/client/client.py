@@ -13,7 +13,6 @@ import anyio
 
 from paramclient.cache import ParamCache
 from paramclient.client import events
-from paramclient.client.arguments import COMPONENT_TIMEOUT, address_in_words
 from paramclient.client.cache_writer import CacheWriter, choose_cache
 from paramclient.client.component import Component
 from paramclient.client.core import ClientCore
@@ -35,6 +34,7 @@ from paramclient.protocol.fetch import Policy, Progress
 from paramclient.protocol.node import Node
 from paramclient.protocol.selection import (
     LOOK_TIME,
+    address_in_words,
     autopilots_of,
     find,
     hint_of_link,
@@ -50,8 +50,10 @@ from paramclient.wire.signing import SigningKey, SigningReport
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint
 
-__all__ = ["ParamClient"]
+__all__ = ["COMPONENT_TIMEOUT", "ParamClient"]
 
+COMPONENT_TIMEOUT: Final = 10.0
+"""Default timeout in seconds for the first component on a link."""
 VEHICLES_LISTENING_TIME: Final = 3.0
 """Seconds after the first autopilot in which further ones are looked for: three heartbeats, two of which may
 be lost."""

@@ -12,13 +12,7 @@ from typing import Final
 
 import anyio
 
-from paramclient.client.arguments import (
-    check_author,
-    check_portable_name,
-    check_requested_name,
-    check_settle,
-    check_writes,
-)
+from paramclient.cache import check_author
 from paramclient.client.core import ClientCore
 from paramclient.client.signing import timestamp_now
 from paramclient.client.streams import Changes, Subscribers
@@ -31,9 +25,18 @@ from paramclient.errors import (
     UsageError,
 )
 from paramclient.links.replay import ReplayLink
+from paramclient.model.ext_values import check_ext_value
 from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.params import ParamMap
-from paramclient.model.values import Encoding, Param, Settable, Trust, WireValue
+from paramclient.model.values import (
+    Encoding,
+    Param,
+    Settable,
+    Trust,
+    WireValue,
+    check_portable_name,
+    check_value,
+)
 from paramclient.protocol import commands
 from paramclient.protocol.addresses import Address, PeerAddress, peer_in_words
 from paramclient.protocol.events import Change
@@ -46,16 +49,18 @@ from paramclient.protocol.session import Session
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.watch import SyncState, Watch
 from paramclient.protocol.writes import write, write_many
-from paramclient.wire.messages import MAV_MODE_FLAG_SAFETY_ARMED
+from paramclient.wire.messages import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, PARAMETERS_MAX
 from paramclient.wire.signing import SigningKey
 
-__all__ = ["Component", "ComponentState"]
+__all__ = ["SETTLE_MAX", "Component", "ComponentState"]
 
 CACHE_TIMEOUT: Final = 1.5
 """Seconds to wait for the identity of a component, without which its cached table cannot be loaded."""
 REBOOT_TIMEOUT: Final = 60.0
 """Seconds for a vehicle to reboot and report its identity, by default: small autopilot boards take up to 30
 seconds, and boards that calibrate sensors first a little longer."""
+SETTLE_MAX: Final = 60.0
+"""Maximum `settle` in seconds: further writes to the same name wait for it."""
 PASSIVE_TIMEOUT: Final = 20.0
 """Seconds of a fetch where nothing is sent, by default: another station may never request a list."""
 TIMEOUT_NOTE: Final = "The fetch ended at its timeout."
@@ -244,7 +249,7 @@ class Component:
             NoReply: the vehicle did not respond in time.
             LinkError: the link failed, or the client was closed.
         """
-        check_requested_name(name)
+        _check_requested(name)
         self.core.check_may_send()
         with self.limited(timeout, f"parameter {name} of {self.system}/{self.component}"):
             return await read_param(self.session, name)
@@ -297,8 +302,8 @@ class Component:
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link failed, or the client was closed.
         """
-        ((name, checked),) = check_writes([(name, value)], extended=self.is_extended)
-        settle, by = check_settle(settle), check_author(author)
+        ((name, checked),) = _check_writes([(name, value)], extended=self.is_extended)
+        settle, by = _check_settle(settle), check_author(author)
         await self._check_may_write(durable=durable)
         with self.limited(timeout, f"the acknowledgement of {name} by {self.system}/{self.component}"):
             result = await write(self.session, name, checked, settle=settle, force=force, author=by)
@@ -340,8 +345,8 @@ class Component:
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link had failed already, or the client was closed.
         """
-        pairs = check_writes(values, extended=self.is_extended)
-        settle, by = check_settle(settle), check_author(author)
+        pairs = _check_writes(values, extended=self.is_extended)
+        settle, by = _check_settle(settle), check_author(author)
         await self._check_may_write(durable=durable)
         result = await write_many(
             self.session, pairs, progress=progress, timeout=timeout, settle=settle, force=force, author=by
@@ -625,3 +630,43 @@ def _has(params: Mapping[str, Param], trust: Trust) -> bool:
 
 def _hinted(error: ParamClientError | None, hint: str) -> ParamClientError | None:
     return error.with_hint(hint) if isinstance(error, NoReply) else error
+
+
+def _check_requested(name: str | int) -> None:
+    """Check that a parameter can have this name or index.
+
+    Raises:
+        UsageError: the name is not portable, or the index is out of range.
+    """
+    if isinstance(name, str):
+        check_portable_name(name)
+    elif not isinstance(name, int) or not 0 <= name < PARAMETERS_MAX:
+        raise UsageError(f"parameter index {name}: indices are 0 to {PARAMETERS_MAX - 1}")
+
+
+def _check_writes(
+    values: Mapping[str, Settable] | Iterable[tuple[str, Settable]], *, extended: bool = False
+) -> list[tuple[str, WireValue]]:
+    """Check names and values to write, and return them as pairs.
+
+    Raises:
+        UsageError: a name is not valid or is that of the hash, or a value is not valid.
+    """
+    pairs = values.items() if isinstance(values, Mapping) else values
+    checked = []
+    for name, value in pairs:
+        if check_portable_name(name) == HASH_CHECK:
+            raise UsageError(f"{HASH_CHECK} is read-only: it is the hash of the parameters, not a parameter")
+        checked.append((name, check_ext_value(value) if extended else check_value(value)))
+    return checked
+
+
+def _check_settle(settle: float) -> float:
+    """Check and return `settle`, the seconds for which a value is watched after a write.
+
+    Raises:
+        UsageError: the number is outside 0 to `SETTLE_MAX`.
+    """
+    if not 0.0 <= settle <= SETTLE_MAX:
+        raise UsageError(f"settle must be 0 to {SETTLE_MAX:g} seconds, not {settle}")
+    return float(settle)

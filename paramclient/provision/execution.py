@@ -11,7 +11,7 @@ from typing import Final
 
 import anyio
 
-from paramclient.client.arguments import check_author
+from paramclient.cache import check_author
 from paramclient.client.component import Component
 from paramclient.errors import (
     AnotherVehicle,

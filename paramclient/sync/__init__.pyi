@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Self, TypeAlias
 
 from paramclient.cache import ParamCache
-from paramclient.client.arguments import COMPONENT_TIMEOUT
+from paramclient.client.client import COMPONENT_TIMEOUT
 from paramclient.client.component import REBOOT_TIMEOUT, ComponentState
 from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.signing import Signing

@@ -29,7 +29,8 @@ from paramclient import (
     UsageError,
     ValueNotApplied,
 )
-from paramclient.client import arguments, link_task
+from paramclient.client import link_task
+from paramclient.client.client import COMPONENT_TIMEOUT
 from paramclient.links import create_link, serve_endpoint
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
 from paramclient.wire import frames, messages
@@ -292,7 +293,7 @@ async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str)
         began = anyio.current_time()
         with pytest.raises(NoReply):
             await client.component(**wanted)
-        assert round(anyio.current_time() - began, 3) == arguments.COMPONENT_TIMEOUT
+        assert round(anyio.current_time() - began, 3) == COMPONENT_TIMEOUT
 
 
 # Reading and writing

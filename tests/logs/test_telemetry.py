@@ -152,7 +152,7 @@ async def test_requests_to_a_log_fail(tmp_path: Path) -> None:
             lambda: component.fetch_all(refresh=True),
         )
         for call in calls:
-            with pytest.raises(UsageError, match="only listens|may not request"):
+            with pytest.raises(UsageError, match=r"only listens|may not request"):
                 await call()
         began = anyio.current_time()
         with pytest.raises(NoReply, match="component 9/9"):
