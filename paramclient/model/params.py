@@ -18,8 +18,7 @@ T = TypeVar("T")
 class ParamMap(Mapping[str, Param]):
     """Parameters by name: a read-only view of a table that may still change.
 
-    Copy the view, `dict(params)`, before iterating over it across an `await`: names may be added and removed
-    meanwhile.
+    An iteration is over the names at its start.
 
     Args:
         params: the table. It is not copied; its order is kept.
@@ -50,7 +49,7 @@ class ParamMap(Mapping[str, Param]):
         return name in self._params
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._params)
+        return iter(tuple(self._params))
 
     def __len__(self) -> int:
         return len(self._params)
