@@ -32,6 +32,7 @@ from paramclient.cli.output import (
     progress_bar,
     report,
     say,
+    while_waiting,
 )
 from paramclient.cli.param_names import ChosenNames, check_given, learn_spelling, suggest
 from paramclient.cli.session import (
@@ -43,12 +44,11 @@ from paramclient.cli.session import (
     run_on_all,
     sessions,
 )
-from paramclient.cli.waiting import while_waiting
 from paramclient.errors import ParamClientError, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import Default, add_default, default_of
+from paramclient.model.names import NameChoice, is_pattern
 from paramclient.model.notation import hash_text
-from paramclient.model.patterns import NameChoice, is_pattern
 from paramclient.model.values import Param, Trust, format_value, type_name
 from paramclient.model.wording import first_of
 from paramclient.protocol.fetch import FetchResult, Policy

@@ -45,9 +45,8 @@ from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import NoReply, ParamClientError, UsageError, VehicleError
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import DefaultSource, default_of
-from paramclient.model.group_switches import is_group_switch
+from paramclient.model.names import is_group_switch, is_pattern
 from paramclient.model.notation import typed, value_json
-from paramclient.model.patterns import is_pattern
 from paramclient.model.values import Param, format_value
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.reset import ResetChoice, read_unconfirmed

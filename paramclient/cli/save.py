@@ -40,8 +40,8 @@ from paramclient.files.formats import format_of_name
 from paramclient.files.param_file import AUTOPILOT, address
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import default_of
+from paramclient.model.names import NameChoice
 from paramclient.model.paramset import ParamSet
-from paramclient.model.patterns import NameChoice
 from paramclient.model.wording import counted
 from paramclient.provision.vehicle_params import NO_DEFAULTS, cached_param_set, select_non_defaults
 

@@ -16,8 +16,13 @@ import anyio.to_thread
 from paramclient.cache import CachedSummary
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import LinkOptions, TrafficOptions
-from paramclient.cli.output import local_time, printable, report, say
-from paramclient.cli.waiting import while_waiting
+from paramclient.cli.output import (
+    local_time,
+    printable,
+    report,
+    say,
+    while_waiting,
+)
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, ParamClientError, UsageError

@@ -13,8 +13,7 @@ import anyio.to_thread
 from paramclient.cache import ParamCache, StoredParam, TableUpdate
 from paramclient.errors import FileError, UsageError
 from paramclient.files.param_file import AUTOPILOT
-from paramclient.logs.imported_table import ImportedTable
-from paramclient.logs.logged_params import OnboardLog
+from paramclient.logs.logged_params import ImportedTable, OnboardLog
 from paramclient.logs.onboard import read_onboard_log
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import Param, ParamType, Trust, bits_of, from_bits

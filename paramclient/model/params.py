@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import TypeVar, overload
 
 from paramclient.model.defaults import add_default
-from paramclient.model.similar_names import unknown_name
+from paramclient.model.names import unknown_name
 from paramclient.model.values import Param, WireValue
 from paramclient.model.wording import counted
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
@@ -31,7 +31,6 @@ from paramclient.model.renames import Renames
 from paramclient.model.values import WireValue
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
-from paramclient.provision.callbacks import call_and_wait
 from paramclient.provision.inspection import (
     POLL_INTERVAL,
     Inspection,
@@ -177,7 +176,7 @@ class ApplyRun:
             if self._options.before_writing is None:
                 await self._store_state()
         if self._options.before_writing is not None:
-            await call_and_wait(self._options.before_writing)
+            await _call_and_wait(self._options.before_writing)
             await self._store_state()
 
     def _check_plan(self) -> None:
@@ -666,3 +665,10 @@ class ApplyRun:
         if self._is_action(name):
             return row(ApplyStatus.SET, "done by the vehicle")
         return row(ApplyStatus.ADJUSTED, "the vehicle acknowledged it, and changed it afterwards")
+
+
+async def _call_and_wait(function: Callable[[], object]) -> None:
+    """Call a function; if it is asynchronous, wait for its end."""
+    result = function()
+    if isinstance(result, Awaitable):
+        await result

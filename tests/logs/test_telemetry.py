@@ -21,7 +21,7 @@ from paramclient import (
 from paramclient.cache import BY_US, StoredParam, TableUpdate
 from paramclient.links import LinkKind, ReplayLink, create_link, parse_link
 from paramclient.links.replay import PAUSE_MAX
-from paramclient.logs.imported_table import ImportedTable
+from paramclient.logs.logged_params import ImportedTable
 from paramclient.logs.telemetry import import_log
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param
