@@ -10,7 +10,8 @@
 - `metadata`, `default_sources`: descriptions and defaults that a subcommand uses.
 - `write_outcomes`, `setup_results`, `confirmation`: outcomes of writes, and the question before them.
 - `check_measurements`: what check measures.
-- `output`: tables, lines, progress, what a command waits for. `json_output`, `json_cache`, `json_setup`: JSON. `file_output`: files.
+- `output`: tables, lines, progress, what a command waits for. `file_output`: files.
+- `json_output`, `json_cache`, `json_setup`: JSON.
 - `exit_codes`, `signals`: exit codes; SIGINT and SIGTERM.
 """
 
