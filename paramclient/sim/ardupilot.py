@@ -66,7 +66,7 @@ class ArduPilotVehicle(Vehicle):
       only on request. It is not sent before the main loop runs, 1.4 s after the first heartbeat; an earlier
       request is acknowledged, and SYSTEM_TIME sent then.
     - After every start but the first, the vehicle measures gyroscopes and barometers again (INS_GYR*OFFS_*,
-      INS_GYR*_CALTEMP, BARO*_GND_PRESS of existing sensors) when the main loop starts, and counts the start
+      INS_GYR2_CALTEMP, BARO*_GND_PRESS of existing sensors) when the main loop starts, and counts the start
       (STAT_BOOTCNT), without announcement.
     - Some values change on their own and are sent unsolicited, index 65535.
 
@@ -462,10 +462,10 @@ class ArduPilotVehicle(Vehicle):
 
 
 _INTERNAL = re.compile(r"MIS_TOTAL|BARO\d_(GND_PRESS|DEVID)|ARSPD\d?_DEVID|MNT\d_DEVID")
-_MEASURED = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|BARO\d_GND_PRESS")
+_MEASURED = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR2_CALTEMP|BARO\d_GND_PRESS")
 _NO_SENSOR = -300.0
-_BOOT_COUNT = "STAT_BOOTCNT"
 """Calibration temperature without a sensor, in °C."""
+_BOOT_COUNT = "STAT_BOOTCNT"
 _SYSTEM_ID = "SYSID_THISMAV"
 _STANDBY = 3
 _CALIBRATING = 2
