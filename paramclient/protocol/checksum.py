@@ -30,7 +30,7 @@ CHECKED_READ_SIZE: Final = 64
 """Bytes that ArduPilot reads at a time for a checksum: the padding of the file depends on it (measured)."""
 AT_ONCE: Final = 5
 """Requests sent at once: ArduPilot's queue has 5 places, and drops the surplus silently (measured)."""
-INTERVAL: Final = 0.004
+INTERVAL: Final = 0.005
 """Seconds between further requests: ArduPilot keeps up with one in 3 ms (measured)."""
 LOST: Final = 1e-3
 """Probability that all first requests are lost, at which MAVFTP counts as silent."""
@@ -44,7 +44,7 @@ MEASURED: Final = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|ARSPD\d?_O
 """Names that each start of the vehicle measures again (measured)."""
 MOVING_MAX: Final = 12
 """Values that are read one by one for their own sake; a table with more of them is downloaded."""
-PASSES_MAX: Final = 4
+SEARCHES_MAX: Final = 4
 """Searches for changed values; each finds one at least."""
 PLACES_MAX: Final = 4
 """Ranges that differ, at most, for a search to go on."""
@@ -54,7 +54,9 @@ PARTS_MAX: Final = 12
 PART_TIME: Final = 0.01
 """Seconds of round trip for each further part: on a quick link halving takes the fewest bytes, and on a slow
 one many parts take the fewest round trips."""
-SEARCH_TIME_MAX: Final = 0.2
+QUICK_ROUND_TRIP: Final = 0.05
+"""Seconds of round trip up to which values that move are read before anything is searched."""
+SEARCH_TIME_MAX: Final = 0.3
 """Seconds that the last requests took, above which a download of the file is quicker than a search."""
 
 
@@ -126,14 +128,17 @@ class _Proof:
         moving = list(self._moving())
         if len(moving) > MOVING_MAX:
             raise TableDiffers(f"{len(moving)} values of the cached table are not exact")
-        await self._read(moving)
+        whole = range(len(self._rows))
+        places = await self._round([whole] if self._round_trip > QUICK_ROUND_TRIP else [], moving)
         boot_count = next((at for at, row in enumerate(self._rows) if row.name == BOOT_COUNT), None)
         if boot_count is None or boot_count in self._changed:
-            await self._read([at for at, row in enumerate(self._rows) if MEASURED.fullmatch(row.name)])
-        for _ in range(PASSES_MAX):
-            if self._is_equal() or self._last_time > SEARCH_TIME_MAX:
-                break
-            await self._search()
+            places = await self._round(
+                [], [at for at, row in enumerate(self._rows) if MEASURED.fullmatch(row.name)]
+            )
+        searches = 0
+        while not self._is_equal() and self._last_time <= SEARCH_TIME_MAX and searches < SEARCHES_MAX:
+            places = await self._round(places or [whole])
+            searches += not places
         if self._is_equal() or await self._agrees():
             return
         raise TableDiffers(TOO_MANY)
@@ -154,31 +159,30 @@ class _Proof:
     def _is_equal(self) -> bool:
         return self._checksum == self._computed(range(len(self._rows)))
 
-    async def _read(self, indices: Sequence[int]) -> None:
-        """Take over the values at some indices."""
-        began = anyio.current_time()
-        found = await self._request([range(at, at + 1) for at in indices])
-        for at, each in zip(indices, found, strict=True):
-            self._solve(at, each, began)
+    async def _round(self, places: list[range], indices: Sequence[int] = ()) -> list[range]:
+        """Take over the values at some indices, and ask for the parts of ranges that differ.
 
-    async def _search(self) -> None:
-        """Take over at least one value that differs: split what differs, until single ones are left."""
-        places = [range(len(self._rows))]
-        while places:
-            if len(places) > PLACES_MAX:
-                raise TableDiffers(TOO_MANY)
-            began = anyio.current_time()
-            splits = [self._split(place) for place in places]
-            asked = [part for parts in splits for part in parts[:-1] or parts]
-            found = dict(zip(asked, await self._request(asked), strict=True))
-            places.clear()
-            for parts in splits:
-                differing = [part for part in parts if part in found and found[part] != self._computed(part)]
-                for part in differing or parts[-1:]:  # if no other one does, the last one differs
-                    if len(part) == 1 and part in found:
-                        self._solve(part.start, found[part], began)
-                    else:
-                        places.append(part)
+        Returns:
+            The parts that differ; the value of a part of one parameter is taken over instead.
+        """
+        if len(places) > PLACES_MAX:
+            raise TableDiffers(TOO_MANY)
+        began = anyio.current_time()
+        single = [range(at, at + 1) for at in indices]
+        splits = [self._split(place) for place in places]
+        asked = [*single, *(part for parts in splits for part in parts[:-1] or parts)]
+        found = dict(zip(asked, await self._request(asked), strict=True))
+        for part in single:
+            self._solve(part.start, found[part], began)
+        remaining = []
+        for parts in splits:
+            differing = [part for part in parts if part in found and found[part] != self._computed(part)]
+            for part in differing or parts[-1:]:  # if no other one does, the last one differs
+                if len(part) == 1 and part in found:
+                    self._solve(part.start, found[part], began)
+                else:
+                    remaining.append(part)
+        return remaining
 
     def _split(self, place: range) -> list[range]:
         count = min(1 + max(1, int(self._round_trip / PART_TIME)), PARTS_MAX)
