@@ -212,9 +212,10 @@ def _lines(downloads: list[Download], look: dict[str, str]) -> Iterator[str]:
         )
     others = dict.fromkeys(each.client for each in downloads if ", " in each.client)
     notes = [each.replace(", ", ": ", 1) for each in others]
-    notes.append("By file: the vehicle's MAVFTP parameter file. All other bars: the parameter list")
+    notes.append("By file: the vehicle's MAVFTP parameter file")
     if any(each.way == "warm" for each in downloads):
-        notes.append("Warm: the vehicle proves the cached table")
+        notes.append("Warm: a proven cache")
+    notes.append("All other bars: the parameter list")
     yield f'<text class="quiet" x="0" y="{height - 5}">{escape(". ".join(notes))}.</text>'
     yield "</svg>"
 

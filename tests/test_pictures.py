@@ -35,7 +35,7 @@ def test_a_warm_start_is_a_bar_of_its_own(pictures: ModuleType) -> None:
     assert [each.label for each in downloads if each.way == "warm"] == ["paramclient, warm"]
     drawn = pictures.draw(downloads, "light")
     assert ">paramclient, warm<" in drawn
-    assert "Warm: the vehicle proves the cached table" in drawn
+    assert "Warm: a proven cache" in drawn
 
 
 def test_both_pages_show_the_pictures_with_their_figures_as_text(pictures: ModuleType) -> None:
