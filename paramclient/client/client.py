@@ -44,7 +44,7 @@ from paramclient.protocol.selection import (
 )
 from paramclient.protocol.session import Session
 from paramclient.protocol.station import Station
-from paramclient.protocol.watch import INTERVAL_MIN, Watch
+from paramclient.protocol.watch import INTERVAL_MIN
 from paramclient.wire.signing import SigningKey, SigningReport
 
 if TYPE_CHECKING:
@@ -132,15 +132,15 @@ class ParamClient:
         if watch_interval is not None and watch_interval != 0 and not watch_interval >= INTERVAL_MIN:
             raise UsageError(f"watch_interval must be 0 or at least {INTERVAL_MIN:g} s, not {watch_interval}")
         try:
-            self._policy = Policy(policy)
+            self.policy = Policy(policy)
         except ValueError:
             raise UsageError(f"policy must be one of {', '.join(Policy)}, not {policy!r}") from None
-        if listen_only and (watch_interval or self._policy is not Policy.AUTO):
+        if listen_only and (watch_interval or self.policy is not Policy.AUTO):
             raise UsageError("the client only listens: it takes no policy, and no watch_interval but 0")
         opened = create_link(link)
         is_log = isinstance(opened, ReplayLink)
         self.cache = choose_cache(cache, is_log=is_log)
-        self._interval = watch_interval
+        self.watch_interval = watch_interval
         self._components: dict[Address, Component] = {}
         self._by_session: dict[Session, Component] = {}
         self._events: Subscribers[events.Event] = Subscribers()
@@ -162,7 +162,7 @@ class ParamClient:
                 listens_only=listen_only or is_log,
                 split_peers=split_peers,
                 discovered=self._meet,
-                emit=self._emit,
+                emit=self.emit,
                 changed=self._changed,
             ),
             self._end_streams,
@@ -280,8 +280,9 @@ class ParamClient:
             NoReply: no message of the component arrived in time.
             LinkError: the link failed, or the client was closed.
         """
+        nodes = self.core.station.nodes
         return await self._wait_for(
-            lambda: find(self.core.station.nodes.values(), system, component, peer),
+            lambda: (find(nodes.values(), system, component, peer), None),
             address_in_words(system, component, peer),
             timeout,
             asked=(system, component),
@@ -310,16 +311,16 @@ class ParamClient:
             raise UsageError(f"expect must be a number of vehicles from 1 up, not {expect}")
         began = anyio.current_time()
         await self.component(timeout=timeout)
-        if expect is None:
-            await anyio.sleep(VEHICLES_LISTENING_TIME)
-        else:
-            with anyio.move_on_after(None if timeout is None else began + timeout - anyio.current_time()):
-                while len(self.autopilots) < expect:
-                    await self._activity()
-            if len(self.autopilots) < expect:
-                heard = ", ".join(node_in_words(each.node) for each in self.autopilots)
-                waited = anyio.current_time() - began
-                raise NoReply(f"{expect} vehicles; heard only {heard}", attempts=0, waited=waited)
+        wait = VEHICLES_LISTENING_TIME
+        if expect is not None:
+            wait = math.inf if timeout is None else began + timeout - anyio.current_time()
+        with anyio.move_on_after(wait):
+            while expect is None or len(self.autopilots) < expect:
+                await self._activity()
+        if expect is not None and len(self.autopilots) < expect:
+            heard = ", ".join(node_in_words(each.node) for each in self.autopilots)
+            waited = anyio.current_time() - began
+            raise NoReply(f"{expect} vehicles; heard only {heard}", attempts=0, waited=waited)
         for each in self.autopilots:
             await each.wait_for_cache()
         return self.autopilots
@@ -355,18 +356,18 @@ class ParamClient:
         if self.listens_only or (isinstance(link, SimLink) and link.has_one_vehicle) or peer is not None:
             return await self.component(system, component, peer=peer, timeout=timeout)
         station = self.core.station
-        due: float | None = None
-
-        def choose() -> Node | None:
-            nonlocal due
-            since = station.listening_since
-            node, due = only_vehicle(
-                station.nodes.values(), system, component, anyio.current_time(), listening_since=since
-            )
-            return node
-
-        awaited = address_in_words(system, component)
-        return await self._wait_for(choose, awaited, timeout, until=lambda: due, asked=(system, component))
+        return await self._wait_for(
+            lambda: only_vehicle(
+                station.nodes.values(),
+                system,
+                component,
+                anyio.current_time(),
+                listening_since=station.listening_since,
+            ),
+            address_in_words(system, component),
+            timeout,
+            asked=(system, component),
+        )
 
     async def successor(
         self, component: Component, system: int, *, timeout: float | None = COMPONENT_TIMEOUT
@@ -389,12 +390,11 @@ class ParamClient:
         """
         before, began = component.identity, anyio.current_time()
 
-        def choose() -> Node | None:
+        def choose() -> tuple[Node | None, None]:
             node = find(self.core.station.nodes.values(), system, component.component, None)
-            return node if node is not None and node.presence.received_at > began else None
+            return node if node is not None and node.presence.received_at > began else None, None
 
-        awaited = address_in_words(system, component.component)
-        found = await self._wait_for(choose, awaited, timeout)
+        found = await self._wait_for(choose, address_in_words(system, component.component), timeout)
         with anyio.move_on_after(timeout), self.core.station.gate.until_closed():
             await found.node.identification.settled()
         if not before.is_same_vehicle(found.identity):
@@ -430,9 +430,10 @@ class ParamClient:
         """
         if refresh:
             self.core.check_may_send()
+        nodes = self.core.station.nodes
         deadline = math.inf if timeout is None else anyio.current_time() + timeout
         await self._wait_for(
-            lambda: next((n for n in self.core.station.nodes.values() if system in (None, n.system)), None),
+            lambda: (next((each for each in nodes.values() if system in (None, each.system)), None), None),
             "a component" if system is None else f"a component of system {system}",
             COMPONENT_TIMEOUT if timeout is None else timeout,
         )
@@ -469,31 +470,15 @@ class ParamClient:
 
     def _meet(self, node: Node) -> None:
         """Follow a new component."""
-        ext = self._new_component(node, node.extended, None)
-        component = self._new_component(node, node.plain, ext)
+        ext = Component(self, node, node.extended, None)
+        component = Component(self, node, node.plain, ext)
+        self._by_session |= {node.extended: ext, node.plain: component}
         self._components[component.address] = component
         self._events.push(events.Discovered(component))
         self.core.spawn(self._join_vehicle, node)
 
-    def _new_component(self, node: Node, session: Session, ext: Component | None) -> Component:
-        def emit(event: protocol.Resynced) -> None:
-            self.core.cache_writer.fetched(node, session, is_whole=True)
-            self._emit(node, event)
-
-        policy = Policy.CACHE_ONLY if self.listens_only else self._policy
-        watch = Watch(session, node.presence, emit, interval=self._interval, policy=policy)
-        session.table.recounted = watch.doubt
-        component = self._by_session[session] = Component(
-            self.core, node, session, watch, ext, self._components, self.successor
-        )
-        component.policy = self._policy
-        if self.listens_only:
-            session.contradicted = watch.doubt
-        else:
-            self.core.spawn(watch.run)
-        return component
-
-    def _emit(self, node: Node, event: protocol.ComponentEvent) -> None:
+    def emit(self, node: Node, event: protocol.ComponentEvent) -> None:
+        """Tell the subscribers and the cache what has happened to a component."""
         component = self._by_session[node.plain]
         match event:
             case protocol.Identified():
@@ -552,47 +537,42 @@ class ParamClient:
 
     async def _wait_for(
         self,
-        choose: Callable[[], Node | None],
+        choose: Callable[[], tuple[Node | None, float | None]],
         awaited: str,
         timeout: float | None,
         *,
-        until: Callable[[], float | None] = lambda: None,
         asked: tuple[int | None, int | None] = (None, None),
     ) -> Component:
         """Wait until a choice is made, and its cached table is loaded.
 
         Args:
-            choose: called after each message, and at the time of `until`.
+            choose: called after each message; returns the choice, or when it may change without a message.
             awaited: for the error.
             timeout: seconds; None waits without limit.
-            until: returns when the choice may change without a message, or None.
             asked: system and component to which requests are sent; nothing is, without both.
         """
         self.core.check_open()
         began = anyio.current_time()
-        station, node = self.core.station, None
+        station = self.core.station
         system, component = asked
-        probed_at = -math.inf
+        probe_at = 0.0 if system and component else math.inf
+        node, due = choose()
         with anyio.move_on_after(timeout):
-            while (node := choose()) is None and not self.core.is_over:
+            while node is None and not self.core.is_over:
                 now = anyio.current_time()
-                due = until()
-                wake_at = math.inf if due is None else due
-                if system and component:
-                    probe_at = max(probed_at + PROBE_INTERVAL, station.listening_since + LOOK_TIME)
-                    if now >= probe_at:
-                        station.probe(system, component)
-                        probed_at, probe_at = now, now + PROBE_INTERVAL
-                    wake_at = min(wake_at, probe_at)
-                with anyio.move_on_after(wake_at - now):
+                probe_at = max(probe_at, station.listening_since + LOOK_TIME)
+                if system and component and now >= probe_at:
+                    station.probe(system, component)
+                    probe_at = now + PROBE_INTERVAL
+                with anyio.move_on_after(min(probe_at, math.inf if due is None else due) - now):
                     await self._activity()
+                node, due = choose()
             if node is not None:
                 await self._by_session[node.plain].wait_for_cache()
         if node is not None:
             return self._by_session[node.plain]
         refused = refused_in_words(self.signing_report())
-        hint = "" if refused else hint_of_link(self.core.station, self.bytes_received)
-        if (due := until()) is not None:
+        hint = "" if refused else hint_of_link(station, self.bytes_received)
+        if due is not None:
             hint, awaited = "", f"{awaited}, then {LOOK_TIME} s without another vehicle"
-        waited = anyio.current_time() - began
-        raise NoReply(f"{awaited}{refused}", attempts=0, waited=waited, hint=hint)
+        raise NoReply(f"{awaited}{refused}", attempts=0, waited=anyio.current_time() - began, hint=hint)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import anyio
 
 from paramclient.cache import check_author
-from paramclient.client.core import ClientCore
 from paramclient.client.signing import timestamp_now
 from paramclient.client.streams import Changes, Subscribers
 from paramclient.errors import (
@@ -39,7 +38,7 @@ from paramclient.model.values import (
 )
 from paramclient.protocol import commands
 from paramclient.protocol.addresses import Address, PeerAddress, peer_in_words
-from paramclient.protocol.events import Change
+from paramclient.protocol.events import Change, Resynced
 from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all, result_of
 from paramclient.protocol.node import Node
 from paramclient.protocol.reads import read_param
@@ -51,6 +50,9 @@ from paramclient.protocol.watch import SyncState, Watch
 from paramclient.protocol.writes import write, write_many
 from paramclient.wire.messages import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, PARAMETERS_MAX
 from paramclient.wire.signing import SigningKey
+
+if TYPE_CHECKING:
+    from paramclient.client.client import ParamClient
 
 __all__ = ["SETTLE_MAX", "Component", "ComponentState"]
 
@@ -99,30 +101,27 @@ class Component:
             and follows the received messages.
     """
 
-    def __init__(
-        self,
-        core: ClientCore,
-        node: Node,
-        session: Session,
-        watch: Watch,
-        ext: Component | None,
-        siblings: Mapping[Address, Component],
-        successor: Callable[..., Awaitable[Component]],
-    ) -> None:
-        self.core = core
+    def __init__(self, client: ParamClient, node: Node, session: Session, ext: Component | None) -> None:
+        self.client = client
+        self.core = client.core
         self.node = node
         self.session = session
-        self.watch = watch
-        self.siblings = siblings  # all components of the client, this one included
         self.system = node.system
         self.component = node.component
         self.params = ParamMap(session.table.params)
         self.subscribers: Subscribers[Change] = Subscribers()
-        self.policy = Policy.AUTO
+        self.policy = Policy.CACHE_ONLY if client.listens_only else client.policy
+        self.watch = Watch(
+            session, node.presence, self._resynced, interval=client.watch_interval, policy=self.policy
+        )
         self.cache_is_read = anyio.Event()
-        self.successor = successor
         self._ext = ext
         self._last: FetchResult | None = None
+        session.table.recounted = self.watch.doubt
+        if client.listens_only:
+            session.contradicted = self.watch.doubt
+        else:
+            self.core.spawn(self.watch.run)
 
     @property
     def ext(self) -> Component:
@@ -249,7 +248,10 @@ class Component:
             NoReply: the vehicle did not respond in time.
             LinkError: the link failed, or the client was closed.
         """
-        _check_requested(name)
+        if isinstance(name, str):
+            check_portable_name(name)
+        elif not isinstance(name, int) or not 0 <= name < PARAMETERS_MAX:
+            raise UsageError(f"parameter index {name}: indices are 0 to {PARAMETERS_MAX - 1}")
         self.core.check_may_send()
         with self.limited(timeout, f"parameter {name} of {self.system}/{self.component}"):
             return await read_param(self.session, name)
@@ -302,9 +304,8 @@ class Component:
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link failed, or the client was closed.
         """
-        ((name, checked),) = _check_writes([(name, value)], extended=self.is_extended)
-        settle, by = _check_settle(settle), check_author(author)
-        await self._check_may_write(durable=durable)
+        by = check_author(author)
+        ((name, checked),) = await self._check_writes([(name, value)], settle, durable=durable)
         with self.limited(timeout, f"the acknowledgement of {name} by {self.system}/{self.component}"):
             result = await write(self.session, name, checked, settle=settle, force=force, author=by)
         if durable:
@@ -345,9 +346,8 @@ class Component:
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link had failed already, or the client was closed.
         """
-        pairs = _check_writes(values, extended=self.is_extended)
-        settle, by = _check_settle(settle), check_author(author)
-        await self._check_may_write(durable=durable)
+        by = check_author(author)
+        pairs = await self._check_writes(values, settle, durable=durable)
         result = await write_many(
             self.session, pairs, progress=progress, timeout=timeout, settle=settle, force=force, author=by
         )
@@ -446,13 +446,12 @@ class Component:
             LinkError: the link failed, or the client was closed.
         """
         self.core.check_open()
-        if refresh and (self.policy is not Policy.AUTO or self.core.station.listens_only):
-            is_auto = self.policy is Policy.AUTO
-            why = "the client only listens" if is_auto else f"the policy is {self.policy}"
-            raise UsageError(f"refresh needs a download, and {why}")
+        if refresh:
+            self.core.check_may_send()
+            if self.policy is not Policy.AUTO:
+                raise UsageError(f"refresh needs a download, and the policy is {self.policy}")
         began = anyio.current_time()
-        is_log = isinstance(self.core.link, ReplayLink)
-        if timeout is None and self.core.station.listens_only and not is_log:
+        if timeout is None and self._waits_for_others:
             timeout = PASSIVE_TIMEOUT
         with self.limited(None, "all parameters"):
             with anyio.move_on_after(timeout):
@@ -472,8 +471,8 @@ class Component:
 
     async def _listen(self, began: float) -> FetchResult:
         """Wait until the table is complete by what other stations request, or until a log has ended."""
-        table, is_log = self.session.table, isinstance(self.core.link, ReplayLink)
-        while not self.core.is_over and (is_log or not self._is_heard()):
+        table = self.session.table
+        while not self.core.is_over and not (self._waits_for_others and self._is_heard()):
             await self.core.link_task.activity.wait()
             self.core.check_open()
         if not table.params:
@@ -491,9 +490,14 @@ class Component:
             table.verify()
         return is_confirmed or (table.is_complete and not _has(table.params, Trust.CACHED))
 
+    @property
+    def _waits_for_others(self) -> bool:
+        """Whether only other stations request values, on a link that is no log."""
+        return self.core.station.listens_only and not isinstance(self.core.link, ReplayLink)
+
     def _nothing(self, began: float) -> NoReply:
         what = f"the parameters of {self.system}/{self.component}"
-        if self.core.station.listens_only and not isinstance(self.core.link, ReplayLink):
+        if self._waits_for_others:
             what += ", which no other station has requested"
         return NoReply(what, attempts=0, waited=anyio.current_time() - began)
 
@@ -510,6 +514,10 @@ class Component:
             self.watch.fetched()
             self.core.cache_writer.fetched(self.node, self.session, is_whole=result.source != "cache")
         return result
+
+    def _resynced(self, event: Resynced) -> None:
+        self.core.cache_writer.fetched(self.node, self.session, is_whole=True)
+        self.client.emit(self.node, event)
 
     async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
         """Give the vehicle a signing key with SETUP_SIGNING, or with None, disable its signing.
@@ -557,7 +565,7 @@ class Component:
             await commands.reboot(self.node, returns=not moves)
             if system is None or not moves:
                 return self
-            return await self.successor(self, system, timeout=None)
+            return await self.client.successor(self, system, timeout=None)
         raise AssertionError("the timeout has raised")
 
     def changes(self) -> Changes:
@@ -590,7 +598,25 @@ class Component:
                 await self.cache_is_read.wait()
             self.core.check_open()
 
-    async def _check_may_write(self, *, durable: bool) -> None:
+    async def _check_writes(
+        self,
+        values: Mapping[str, Settable] | Iterable[tuple[str, Settable]],
+        settle: float,
+        *,
+        durable: bool,
+    ) -> list[tuple[str, WireValue]]:
+        """Check that values may be written, and return them with their names.
+
+        Raises:
+            UsageError, AmbiguousVehicle, CacheError, LinkError: as from `set_many`.
+        """
+        check = check_ext_value if self.is_extended else check_value
+        pairs = values.items() if isinstance(values, Mapping) else values
+        checked = [(check_portable_name(name), check(value)) for name, value in pairs]
+        if any(name == HASH_CHECK for name, _ in checked):
+            raise UsageError(f"{HASH_CHECK} is read-only: it is the hash of the parameters, not a parameter")
+        if not 0.0 <= settle <= SETTLE_MAX:
+            raise UsageError(f"settle must be 0 to {SETTLE_MAX:g} seconds, not {settle}")
         self.core.check_may_send()
         if self.node.has_rival(anyio.current_time()):
             words = node_in_words(self.node)
@@ -602,6 +628,7 @@ class Component:
                 with anyio.move_on_after(CACHE_TIMEOUT):
                     await self.cache_is_read.wait()
             self.core.cache_writer.check_kept(self.node)
+        return checked
 
     async def _write_durably(self, what: str) -> None:
         try:
@@ -630,43 +657,3 @@ def _has(params: Mapping[str, Param], trust: Trust) -> bool:
 
 def _hinted(error: ParamClientError | None, hint: str) -> ParamClientError | None:
     return error.with_hint(hint) if isinstance(error, NoReply) else error
-
-
-def _check_requested(name: str | int) -> None:
-    """Check that a parameter can have this name or index.
-
-    Raises:
-        UsageError: the name is not portable, or the index is out of range.
-    """
-    if isinstance(name, str):
-        check_portable_name(name)
-    elif not isinstance(name, int) or not 0 <= name < PARAMETERS_MAX:
-        raise UsageError(f"parameter index {name}: indices are 0 to {PARAMETERS_MAX - 1}")
-
-
-def _check_writes(
-    values: Mapping[str, Settable] | Iterable[tuple[str, Settable]], *, extended: bool = False
-) -> list[tuple[str, WireValue]]:
-    """Check names and values to write, and return them as pairs.
-
-    Raises:
-        UsageError: a name is not valid or is that of the hash, or a value is not valid.
-    """
-    pairs = values.items() if isinstance(values, Mapping) else values
-    checked = []
-    for name, value in pairs:
-        if check_portable_name(name) == HASH_CHECK:
-            raise UsageError(f"{HASH_CHECK} is read-only: it is the hash of the parameters, not a parameter")
-        checked.append((name, check_ext_value(value) if extended else check_value(value)))
-    return checked
-
-
-def _check_settle(settle: float) -> float:
-    """Check and return `settle`, the seconds for which a value is watched after a write.
-
-    Raises:
-        UsageError: the number is outside 0 to `SETTLE_MAX`.
-    """
-    if not 0.0 <= settle <= SETTLE_MAX:
-        raise UsageError(f"settle must be 0 to {SETTLE_MAX:g} seconds, not {settle}")
-    return float(settle)

@@ -416,7 +416,9 @@ class ApplyRun:
     async def _write_system_id(self, step: Step) -> None:
         """Set the system id, and continue with the vehicle under its new one."""
         system = int(step.value) if not isinstance(step.value, bytes) else 0
-        if any(self._is_other_vehicle_with(system, known) for known in self._component.siblings.values()):
+        if any(
+            self._is_other_vehicle_with(system, known) for known in self._component.client.components.values()
+        ):
             reason = f"another vehicle on this link has system id {system}"
             self._record(step, ApplyStatus.SKIPPED, step.before, reason, WRONG)
             return
@@ -439,7 +441,7 @@ class ApplyRun:
         async with anyio.create_task_group() as sending:
             sending.start_soon(cancel_if_id_is_kept)
             try:
-                self._component = await self._component.successor(
+                self._component = await self._component.client.successor(
                     self._component, system, timeout=SYSTEM_CHANGE_TIMEOUT
                 )
             except ParamClientError as error:  # raised here, the task group would wrap it in a group
@@ -526,7 +528,7 @@ class ApplyRun:
         with anyio.move_on_after(ARMED_STATE_TIMEOUT):
             while component.is_armed is None and component.state != "lost":  # noqa: ASYNC110 - no event
                 await anyio.sleep(POLL_INTERVAL)
-        own = [each for each in component.siblings.values() if each.system == component.system]
+        own = [each for each in component.client.components.values() if each.system == component.system]
         if any(each.is_armed for each in own):
             message = f"{self._address} is armed; nothing is set then"
         elif component.is_armed is None and component.state != "lost":
