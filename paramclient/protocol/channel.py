@@ -321,6 +321,7 @@ class Channel:
         is_streaming: whether a list runs: an answer to a read may be a part of it, and measures nothing.
         ftp: taken for each use of MAVFTP: servers have one session.
         answered: set when the component has answered its first request.
+        inboxes: those of the conversations that wait, by key.
     """
 
     def __init__(
@@ -342,7 +343,7 @@ class Channel:
         self._ftp_sequence: int | None = None
         self._transmit = transmit
         self._presence = presence
-        self._inboxes: dict[Key, list[Inbox]] = {}
+        self.inboxes: dict[Key, list[Inbox]] = {}
         self._waits: dict[anyio.CancelScope, tuple[float, int]] = {}
         self.window = anyio.Semaphore(WINDOW)
         self.window_size = WINDOW
@@ -371,18 +372,18 @@ class Channel:
     @property
     def is_waiting(self) -> bool:
         """Whether a conversation waits for a message."""
-        return bool(self._inboxes)
+        return bool(self.inboxes)
 
     def dispatch(self, message: Message) -> None:
         """Wake the conversations that wait for a message."""
-        if self._inboxes:
+        if self.inboxes:
             for key in keys_of(message):
-                for inbox in self._inboxes.get(key, ()):
+                for inbox in self.inboxes.get(key, ()):
                     inbox.put(message)
 
     def fail(self, error: LinkError) -> None:
         """End all conversations that wait, as the link has failed."""
-        for inboxes in list(self._inboxes.values()):
+        for inboxes in list(self.inboxes.values()):
             for inbox in inboxes:
                 inbox.fail(error)
 
@@ -391,14 +392,14 @@ class Channel:
         """Collect the messages with some keys for one conversation, without a gap between its steps."""
         inbox = Inbox()
         for key in keys:
-            self._inboxes.setdefault(key, []).append(inbox)
+            self.inboxes.setdefault(key, []).append(inbox)
         try:
             yield inbox
         finally:
             for key in keys:
-                self._inboxes[key].remove(inbox)
-                if not self._inboxes[key]:
-                    del self._inboxes[key]
+                self.inboxes[key].remove(inbox)
+                if not self.inboxes[key]:
+                    del self.inboxes[key]
 
     def silence_since(self, began: float, now: float) -> float:
         """Return the seconds since the component was heard, but at most those since `began`."""

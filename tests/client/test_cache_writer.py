@@ -98,7 +98,7 @@ async def test_an_unchanged_vehicle_is_not_downloaded_again(
     path: Path, make: Callable[[], PX4Vehicle]
 ) -> None:
     vehicle = make()
-    volatile = {name for name in vehicle.params if vehicle._entry(name).volatile}
+    volatile = {entry.name for entry in vehicle.entries if entry.volatile and entry.name in vehicle.params}
     first = await session(vehicle, path)
     assert first.source == "stream"
     tap = Tap(vehicle)
@@ -661,7 +661,7 @@ async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Pa
         component = await client.component()
         assert {name: param.default for name, param in component.params.items()} == defaults
         assert len(component.params.changed()) == 41
-    vehicle._version = replace(vehicle._version, git_hash=b"01234567")
+    vehicle.version = replace(vehicle.version, git_hash=b"01234567")
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.component()
         assert component.params.changed() == {}
@@ -692,13 +692,13 @@ async def test_a_vehicle_without_the_parameter_file_is_remembered_for_its_firmwa
     path: Path, kind: str
 ) -> None:
     vehicle = ArduPilotVehicle(live_period=0)
-    server = vehicle._ftp
+    server = vehicle.file_server
     assert server is not None
     rows = server.params
     if kind == "no file":
         server.params = lambda: None
     else:
-        vehicle._ftp = None
+        vehicle.file_server = None
     requested = Tap(vehicle)
     first = await session(requested, path)
     assert (first.source, first.complete) == ("stream", True)
@@ -709,8 +709,8 @@ async def test_a_vehicle_without_the_parameter_file_is_remembered_for_its_firmwa
     second = await session(requested, path)
     assert (second.source, second.notes) == ("stream", ())
     assert not requested.messages(messages.FileTransfer)
-    vehicle._ftp, server.params = server, rows
+    vehicle.file_server, server.params = server, rows
     assert (await session(requested, path)).source == "stream", "nothing was requested"
-    vehicle._version = replace(vehicle._version, flight_sw_version=67502081)
+    vehicle.version = replace(vehicle.version, flight_sw_version=67502081)
     assert (await session(requested, path)).source == "ftp"
     assert said(path)[1] is True

@@ -219,12 +219,12 @@ class Served:
 
     def __init__(self, endpoint: Endpoint, kind: str) -> None:
         self.port = 0
-        self._endpoint = endpoint
+        self.endpoint = endpoint
         self._kind = kind
 
     async def __aenter__(self) -> Served:
         link: Any = create_link(f"{self._kind}:127.0.0.1:{self.port}")
-        self._task = asyncio.create_task(serve_endpoint(self._endpoint, link))
+        self._task = asyncio.create_task(serve_endpoint(self.endpoint, link))
         await until(lambda: link.address is not None)
         self.port = link.address[1]
         return self

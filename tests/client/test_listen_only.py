@@ -200,7 +200,7 @@ async def test_a_cached_table_is_confirmed_by_a_hash_that_others_ask_for(tmp_pat
         assert trusts["PARAM_03"] is Trust.CACHED  # which no hash covers, and must not be requested
         # it changes without a message, and the next hash shows it
         channel.is_mute = True
-        channel._endpoint.set_param("PARAM_01", 77)  # type: ignore[attr-defined]  # of a simulated vehicle
+        channel.endpoint.set_param("PARAM_01", 77)  # type: ignore[attr-defined]  # of a simulated vehicle
         await anyio.sleep(2.0)
         channel.is_mute = False
         channel.ask(HASH)
