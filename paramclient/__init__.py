@@ -57,7 +57,6 @@ from paramclient.model.values import Encoding, Param, ParamType, Settable, Trust
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress
-from paramclient.protocol.reset import ResetResult
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
 from paramclient.protocol.watch import SyncState
 from paramclient.version import __version__
@@ -107,7 +106,6 @@ __all__ = [
     "Progress",
     "Rebooted",
     "Refused",
-    "ResetResult",
     "Resynced",
     "SetManyResult",
     "SetOutcome",

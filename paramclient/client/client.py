@@ -30,7 +30,7 @@ from paramclient.model.values import Encoding
 from paramclient.model.wording import counted
 from paramclient.protocol import events as protocol
 from paramclient.protocol.addresses import Address
-from paramclient.protocol.fetch import Policy, Progress
+from paramclient.protocol.fetch import Policy
 from paramclient.protocol.node import Node
 from paramclient.protocol.selection import (
     LOOK_TIME,
@@ -407,7 +407,6 @@ class ParamClient:
         *,
         refresh: bool = False,
         timeout: float | None = None,
-        progress: Callable[[Mapping[Address, Progress]], None] | None = None,
     ) -> FetchedAll:
         """Update the tables of all components of one system, or of every system on the link.
 
@@ -419,7 +418,6 @@ class ParamClient:
             system: fetch only this system; None for all.
             refresh: as in `Component.fetch_all`.
             timeout: seconds after which partial results are returned; None: no limit.
-            progress: called with the progress by (system, component), as values arrive.
 
         Returns:
             The results by (system, component), and the errors of the components that did not respond.
@@ -444,7 +442,7 @@ class ParamClient:
             if system in (None, each.system) and each.node.identification.has_parameters
         }
         left = None if timeout is None else deadline - anyio.current_time()
-        return await fetch_components(chosen, refresh=refresh, timeout=left, progress=progress)
+        return await fetch_components(chosen, refresh=refresh, timeout=left)
 
     def traffic_report(self) -> TrafficReport:
         """Return the traffic statistics of the link: components, message rates, packet loss.

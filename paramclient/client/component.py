@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -42,7 +41,6 @@ from paramclient.protocol.events import Change, Resynced
 from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all, result_of
 from paramclient.protocol.node import Node
 from paramclient.protocol.reads import read_param
-from paramclient.protocol.reset import ResetChoice, ResetResult, read_unconfirmed
 from paramclient.protocol.selection import hint_of_node, node_in_words, vehicle_of
 from paramclient.protocol.session import Session
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
@@ -362,53 +360,6 @@ class Component:
                 error = error or failure
                 outcomes = [replace(each, error=failure) if each.is_set else each for each in outcomes]
         return replace(result, outcomes=tuple(outcomes), error=error)
-
-    async def reset(
-        self,
-        *names: str,
-        defaults: Mapping[str, WireValue] | None = None,
-        progress: Callable[[SetOutcome], None] | None = None,
-        timeout: float | None = None,
-        settle: float = 0.0,
-        durable: bool = False,
-        author: str | None = None,
-    ) -> ResetResult:
-        """Set parameters to the firmware's defaults, and verify each as `set` does.
-
-        The parameters are fetched first: ArduPilot, and PX4 from 1.18 on, give the defaults in the file
-        `param.pck`. Parameters without a known default, and those that have it already, are not written.
-
-        Args:
-            names: param_ids, at least one.
-            defaults: defaults of parameters whose default the vehicle does not give, by name, such as
-                `Metadata.defaults_of`.
-            progress, settle, durable, author: as in `set_many`.
-            timeout: seconds for the whole call; None: no limit besides the number of attempts.
-
-        Returns:
-            The outcomes of the written values, and the names that were not written.
-
-        Raises:
-            UsageError: no name, or another argument is not valid, or the client only listens.
-            UnknownParameter: the vehicle has no parameter with one of the names. Nothing was written.
-            ParamClientError: as from `fetch_all` and `set_many`.
-        """
-        if not names:
-            raise UsageError("reset needs the name of at least one parameter")
-        deadline = math.inf if timeout is None else anyio.current_time() + timeout
-
-        def left() -> float | None:
-            return None if timeout is None else max(deadline - anyio.current_time(), 0.0)
-
-        await self.fetch_all(timeout=timeout)
-        present = await read_unconfirmed(
-            self.params, lambda name: self.get(name, timeout=left()), map(check_portable_name, names)
-        )
-        choice = ResetChoice.of(present, defaults or {})
-        written = await self.set_many(
-            choice.values, progress=progress, timeout=left(), settle=settle, durable=durable, author=author
-        )
-        return ResetResult(written, choice.unchanged, choice.without_default)
 
     async def fetch_all(
         self,

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 import anyio
@@ -12,7 +11,7 @@ import anyio
 from paramclient.client.component import Component
 from paramclient.errors import CacheError, NoReply, ParamClientError
 from paramclient.protocol.addresses import Address
-from paramclient.protocol.fetch import FetchResult, Progress
+from paramclient.protocol.fetch import FetchResult
 from paramclient.protocol.selection import hint_of_node
 
 __all__ = ["FetchedAll", "fetch_components"]
@@ -46,7 +45,6 @@ async def fetch_components(
     *,
     refresh: bool,
     timeout: float | None,
-    progress: Callable[[Mapping[Address, Progress]], None] | None,
 ) -> FetchedAll:
     """Fetch the tables of components in parallel; see `ParamClient.fetch_all`.
 
@@ -58,20 +56,12 @@ async def fetch_components(
     results: dict[Address, FetchResult] = {}
     silent: dict[Address, NoReply | CacheError] = {}
     failures: list[ParamClientError] = []
-    states: dict[Address, Progress] = {}
     scopes = {address: anyio.CancelScope() for address in components}
-
-    def report(address: Address, state: Progress) -> None:
-        states[address] = state
-        if progress is not None:
-            progress(dict(states))
 
     async def fetch(address: Address, component: Component) -> None:
         try:
             with scopes[address]:
-                results[address] = await component.fetch_all(
-                    refresh=refresh, timeout=timeout, progress=partial(report, address)
-                )
+                results[address] = await component.fetch_all(refresh=refresh, timeout=timeout)
             if scopes[address].cancelled_caught:
                 what = f"the parameters of {component.system}/{component.component}"
                 hint = hint_of_node(component.core.station, component.node, anyio.current_time())

@@ -64,7 +64,7 @@ class ParamMap(Mapping[str, Param]):
                 name, such as `Metadata.defaults_of`. They become the `default` of the returned parameters.
         """
         described = defaults or {}
-        known = (add_default(param, described.get(name)) for name, param in self._params.items())
+        known = (add_default(param, described.get(name)) for name, param in tuple(self._params.items()))
         return {param.name: param for param in known if param.is_changed}
 
     def __repr__(self) -> str:

@@ -1,4 +1,4 @@
-"""Reset of parameters to the firmware's defaults: the values to write, and the result."""
+"""Reset of parameters to the firmware's defaults: the values to write."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 from paramclient.errors import UsageError
 from paramclient.model.values import Param, Trust, WireValue, bits_of, same_bits
-from paramclient.protocol.set_results import SetManyResult
 
-__all__ = ["ResetChoice", "ResetResult", "read_unconfirmed"]
+__all__ = ["ResetChoice", "read_unconfirmed"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,33 +45,6 @@ class ResetChoice:
             else:
                 values[param.name] = default
         return cls(values, tuple(unchanged), tuple(unknown))
-
-
-@dataclass(frozen=True, slots=True)
-class ResetResult:
-    """The result of a reset to the firmware's defaults.
-
-    Attributes:
-        written: the outcomes of the values that were written; see `Component.set_many`.
-        unchanged: names of parameters that had their default already; nothing was written to them.
-        without_default: names of parameters without a known default; nothing was written to them.
-    """
-
-    written: SetManyResult
-    unchanged: tuple[str, ...]
-    without_default: tuple[str, ...]
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether each named parameter has its default now, as far as the vehicle stores it."""
-        return not self.without_default and self.written.is_complete
-
-    def __repr__(self) -> str:
-        counts = ", ".join(f"{count} {status}" for status, count in self.written.counts.items())
-        return (
-            f"<ResetResult {self.written.system}/{self.written.component} {counts or 'nothing written'}, "
-            f"{len(self.unchanged)} unchanged, {len(self.without_default)} without default>"
-        )
 
 
 async def read_unconfirmed(

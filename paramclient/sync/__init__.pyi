@@ -18,12 +18,11 @@ from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
-from paramclient.model.values import Encoding, Param, Settable, WireValue
+from paramclient.model.values import Encoding, Param, Settable
 from paramclient.protocol import ftp
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress
-from paramclient.protocol.reset import ResetResult
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.watch import SyncState
 from paramclient.provision.planning import ParamInfo, Plan
@@ -148,17 +147,6 @@ class Component:
         author: str | None = None,
     ) -> SetManyResult:
         """Write many parameters in one call, and verify each as `set` does."""
-    def reset(
-        self,
-        *names: str,
-        defaults: Mapping[str, WireValue] | None = None,
-        progress: Callable[[SetOutcome], None] | None = None,
-        timeout: float | None = None,
-        settle: float = 0.0,
-        durable: bool = False,
-        author: str | None = None,
-    ) -> ResetResult:
-        """Set parameters to the firmware's defaults, and verify each as `set` does."""
     def fetch_all(
         self,
         *,
@@ -296,12 +284,7 @@ class ParamClient:
     ) -> Component:
         """Return the component of the same vehicle under its new system id, after its first message there."""
     def fetch_all(
-        self,
-        system: int | None = None,
-        *,
-        refresh: bool = False,
-        timeout: float | None = None,
-        progress: Callable[[Mapping[Address, Progress]], None] | None = None,
+        self, system: int | None = None, *, refresh: bool = False, timeout: float | None = None
     ) -> FetchedAll:
         """Update the tables of all components of one system, or of every system on the link."""
     def traffic_report(self) -> TrafficReport:
