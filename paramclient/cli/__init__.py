@@ -2,7 +2,7 @@
 
 - `app`: all subcommands, the main function, signals and errors.
 - Subcommands: `read_commands` (fetch, get), `set_command`, `reset_command`, `watch`, `offline` (show, cache),
-  `logs` (import), `apply`, `restore`, `save`, `diff`, `history`, `search` (search, info), `metadata_files`,
+  `logs` (import), `apply`, `restore`, `save`, `diff`, `history`, `search` (search, info), `metadata`,
   `link`, `check`, `ports`, `signing`, `serve` (serve, token) and `simulate` (sim).
 - `session`: open links with the vehicles of --vehicle, on which a subcommand works. `options`: options.
 - `sources`: the parameters that an argument names: of a file, a link or the cache. `time_arguments`: times.
@@ -12,7 +12,7 @@
 - `check_measurements`: what check measures.
 - `output`: tables, lines, progress, what a command waits for. `file_output`: files.
 - `json_output`, `json_cache`, `json_setup`: JSON.
-- `exit_codes`, `signals`: exit codes; SIGINT and SIGTERM.
+- `exit_codes`: exit codes.
 """
 
 from __future__ import annotations

@@ -9,10 +9,10 @@ from typing import Annotated, Final
 import anyio
 from cyclopts import Parameter
 
+from paramclient.cli.app import on_end_signal
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import SigningOptions
 from paramclient.cli.output import print_line, say
-from paramclient.cli.signals import on_end_signal
 from paramclient.errors import UsageError
 
 __all__ = ["serve", "token"]

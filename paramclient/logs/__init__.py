@@ -1,6 +1,6 @@
 """Telemetry logs and on-board logs as sources of parameters.
 
-- `telemetry`, `onboard_import`: import of both kinds into a cache.
-- `onboard`, `logged_params`: reading of on-board logs, and the content of logs.
+- `telemetry`, `onboard`: both kinds of logs, and their import into a cache.
+- `logged_params`: the content of logs.
 - `dataflash`, `ulog`: one module for each format of on-board logs.
 """
