@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final, Protocol
 
 import anyio
 
 from paramclient.cache import check_author
+from paramclient.client.core import ClientCore
 from paramclient.client.signing import timestamp_now
 from paramclient.client.streams import Changes, Subscribers
 from paramclient.errors import (
@@ -49,9 +50,6 @@ from paramclient.protocol.writes import write, write_many
 from paramclient.wire.messages import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, PARAMETERS_MAX
 from paramclient.wire.signing import SigningKey
 
-if TYPE_CHECKING:
-    from paramclient.client.client import ParamClient
-
 __all__ = ["SETTLE_MAX", "Component", "ComponentState"]
 
 CACHE_TIMEOUT: Final = 1.5
@@ -85,6 +83,26 @@ class ComponentState(StrEnum):
     """The component is lost."""
 
 
+class Owner(Protocol):
+    """What a component and its callers use of its client; see `paramclient.client.client`."""
+
+    core: ClientCore
+    policy: Policy
+    watch_interval: float | None
+
+    @property
+    def listens_only(self) -> bool: ...
+
+    @property
+    def components(self) -> Mapping[Address, Component]: ...
+
+    def emit(self, node: Node, event: Resynced) -> None: ...
+
+    async def successor(
+        self, component: Component, system: int, *, timeout: float | None = ...
+    ) -> Component: ...
+
+
 class Component:
     """One component of a vehicle; see `ParamClient.component`.
 
@@ -99,7 +117,7 @@ class Component:
             and follows the received messages.
     """
 
-    def __init__(self, client: ParamClient, node: Node, session: Session, ext: Component | None) -> None:
+    def __init__(self, client: Owner, node: Node, session: Session, ext: Component | None) -> None:
         self.client = client
         self.core = client.core
         self.node = node
