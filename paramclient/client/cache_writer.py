@@ -338,7 +338,7 @@ class CacheWriter:
                 StoredParam.of(
                     table.with_default(param),
                     at + ahead,
-                    param.name in table.volatile if table.volatile_is_known else None,
+                    param.name in table.volatile if table.volatile or table.volatile_is_known else None,
                     by,
                 )
                 for param, at, by in observations

@@ -236,20 +236,15 @@ class _Proof:
         await anyio.sleep(max(self._turn_at - now, 0.0))
 
     def take_over(self) -> tuple[str, ...]:
-        """Put the proven file into the table; return the names of changed values that do not move."""
+        """Put the proven file into the table, and learn which values change; return their names."""
         table = self._session.table
         names = [self._rows[at].name for at in self._changed]
-        moving = table.volatile
         if names:
             table.volatile = frozenset(names)
         for at, moment in self._changed.items():
             table.store_entry(self._rows[at], at, moment, with_defaults=False)
         table.prove(self._checksum)
-        return tuple(
-            name
-            for name in names
-            if name not in moving and not MOVING.fullmatch(name) and not MEASURED.fullmatch(name)
-        )
+        return tuple(name for name in names if not (MOVING.fullmatch(name) or MEASURED.fullmatch(name)))
 
 
 def _row(table: Table, name: str) -> PackedParam:

@@ -686,6 +686,18 @@ async def test_a_value_before_the_first_heartbeat_is_right_and_keeps_its_default
     assert kept(path) == bits(vehicle.params)
 
 
+@in_simulated_time
+async def test_names_that_change_by_themselves_are_learnt_for_later_sessions(path: Path) -> None:
+    vehicle = ArduPilotVehicle(live_period=0)
+    await session(vehicle, path)
+    vehicle.load({"RTL_ALT": 2100, "STAT_RUNTIME": 60})
+    assert (await session(vehicle, path)).changed == ("RTL_ALT",)
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        assert component.session.table.volatile == {"RTL_ALT", "STAT_RUNTIME"}
+        assert (await component.fetch_all()).source == "cache"
+
+
 @pytest.mark.parametrize("kind", ["no file", "silent"])
 @in_simulated_time
 async def test_a_vehicle_without_the_parameter_file_is_remembered_for_its_firmware(
