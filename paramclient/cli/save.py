@@ -36,8 +36,7 @@ from paramclient.cli.sources import (
 )
 from paramclient.errors import UsageError, VehicleError
 from paramclient.files import FileFormat, write_file
-from paramclient.files.formats import format_of_name
-from paramclient.files.param_file import AUTOPILOT, address
+from paramclient.files.formats import AUTOPILOT, address, format_of_name
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import default_of
 from paramclient.model.names import NameChoice

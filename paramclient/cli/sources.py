@@ -25,8 +25,7 @@ from paramclient.cli.output import progress_bar, report
 from paramclient.cli.session import ChosenVehicle, CommandSession, report_others, sessions
 from paramclient.errors import FileError, NotInCache, UnknownVehicle, UsageError
 from paramclient.files import ParamFile, read_file, read_renames
-from paramclient.files.formats import ENDINGS
-from paramclient.files.param_file import AUTOPILOT
+from paramclient.files.formats import AUTOPILOT, ENDINGS
 from paramclient.links import FORMS, parse_link
 from paramclient.logs.onboard import is_onboard_log, read_onboard_log
 from paramclient.model.paramset import ParamSet

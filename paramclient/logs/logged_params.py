@@ -6,8 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from paramclient.files.formats import LogFormat
-from paramclient.files.param_file import AUTOPILOT
+from paramclient.files.formats import AUTOPILOT, LogFormat
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import WireValue

@@ -16,8 +16,7 @@ import anyio.to_thread
 
 from paramclient.cache import ParamCache, StoredParam, TableUpdate
 from paramclient.errors import FileError, UsageError
-from paramclient.files.formats import LogFormat
-from paramclient.files.param_file import AUTOPILOT
+from paramclient.files.formats import AUTOPILOT, LogFormat
 from paramclient.logs.logged_params import ImportedTable, OnboardLog
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import Param, ParamType, Trust, bits_of, from_bits
