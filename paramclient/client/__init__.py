@@ -1,7 +1,6 @@
 """The client over one link.
 
 - `client`, `component`: `ParamClient`, `Component`.
-- `arguments`: argument defaults and checks.
 - `core`: the tasks of a client, opening and closing.
 - `link_task`: reads, sends, and reopens the link.
 - `cache_writer`: loads cached tables, writes new values in batches, and waits for the disk
