@@ -271,7 +271,6 @@ class Component:
         self.core.check_may_send()
         with self.limited(timeout, f"parameter {name} of {self.system}/{self.component}"):
             return await read_param(self.session, name)
-        raise AssertionError("the timeout has raised")
 
     async def set(
         self,
@@ -535,7 +534,6 @@ class Component:
             if system is None or not moves:
                 return self
             return await self.client.successor(self, system, timeout=None)
-        raise AssertionError("the timeout has raised")
 
     def changes(self) -> Changes:
         """Return a stream of parameter changes from now on: `async for change in component.changes()`.

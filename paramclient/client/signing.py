@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import stat
 import sys
@@ -38,7 +37,7 @@ KEY_FILE_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY_FILE"
 PASSPHRASE_VARIABLE: Final = "PARAMCLIENT_SIGNING_PASSPHRASE"
 """Environment variable with a passphrase from which the key is derived."""
 KEY_FILE_BYTES_MAX: Final = 1_000
-"""Maximum size of a key file in bytes: a binary or text key with some blank lines."""
+"""Bytes that are read of a key file, at most: a binary or text key with some blank lines."""
 CREDENTIALS_VARIABLE: Final = "CREDENTIALS_DIRECTORY"
 """Environment variable with the credentials folder of a systemd unit, which only the unit can access
 (systemd.exec, "Credentials")."""
@@ -81,12 +80,10 @@ def read_key(path: str | os.PathLike[str]) -> SigningKey:
         UsageError: the file cannot be read, has no valid key, belongs to another user, or is accessible to
             other users than its owner (on systems with file modes). The message never includes its content.
     """
-    data = read_private(path, "signing key", KEY_FILE_BYTES_MAX + 1)
+    data = read_private(path, "signing key", KEY_FILE_BYTES_MAX)
     try:
         if len(data) == 32:
             return SigningKey(data)
-        if len(data) > KEY_FILE_BYTES_MAX:
-            raise UsageError(f"a signing key file has at most {KEY_FILE_BYTES_MAX} bytes; this one is larger")
         return SigningKey.from_text(data.decode("ascii", "replace"))
     except UsageError as error:
         raise UsageError(f"{os.fspath(path)}: {error}") from None
@@ -101,15 +98,13 @@ def read_private(path: str | os.PathLike[str], what: str, most: int) -> bytes:
         most: maximum number of bytes to read.
 
     Raises:
-        UsageError: the file cannot be read or is not a regular file, its owner is neither the user of this
+        UsageError: the file cannot be read, its owner is neither the user of this
             process nor root, or it is accessible to other users than its owner (on systems with file modes).
             A process of root also rejects a file of another user, as the owner of a file can change it.
     """
     try:
-        with open(path, "rb", opener=_without_waiting) as file:
+        with Path(path).open("rb") as file:
             status = os.fstat(file.fileno())
-            if not stat.S_ISREG(status.st_mode):
-                raise OSError(errno.EINVAL, "Not a regular file")
             data = file.read(most)
     except OSError as error:
         raise UsageError(f"{os.fspath(path)}: the {what} cannot be read: {error.strerror}") from error
@@ -169,8 +164,3 @@ def refused_in_words(report: SigningReport | None) -> str:
     refused = {} if report is None else report.refused
     reasons = ", ".join(f"{count} for: {reason}" for reason, count in refused.items())
     return f" (frames were refused, {reasons})" if reasons else ""
-
-
-def _without_waiting(path: str, flags: int) -> int:
-    """Open a file, without waiting for a writer of a named pipe."""
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))

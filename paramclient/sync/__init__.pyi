@@ -58,7 +58,6 @@ class Ftp:
         self,
         path: str,
         *,
-        read_size: int = ftp.DATA_SIZE_MAX,
         size_max: int = ftp.FILE_SIZE_MAX,
         progress: Callable[[int, int | None], None] | None = None,
         timeout: float | None = None,
