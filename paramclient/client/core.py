@@ -91,8 +91,6 @@ class ClientCore:
             LinkError: the link failed, or the client is not open.
         """
         self.station.gate.check()
-        if self._is_to_close.is_set() or self._is_closed.is_set():
-            raise ClientClosed("the client was closed", link=self.link.name)
         if self._work is None:
             raise ClientClosed("the client is not open; use `async with` or `open`", link=self.link.name)
 

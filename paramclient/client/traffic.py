@@ -119,12 +119,16 @@ class Traffic(Tap):
     """Counts all traffic of a link, as a tap; on request only: an ordinary client does without."""
 
     def __init__(self) -> None:
-        self._began: float | None = None
+        self._began = 0.0
         self._counts: Counter[tuple[Address | None, _What]] = Counter()  # None: of the link
         self._components: dict[Address, ComponentTraffic] = {}
         self._checks: defaultdict[Hashable, SequenceCheck] = defaultdict(SequenceCheck)  # by address and peer
         # the counts before each of the last slices in which something was counted
         self._before: deque[tuple[int, Counter[tuple[Address | None, _What]]]] = deque(maxlen=RATE_SLICES)
+
+    async def open(self) -> None:
+        """Begin to observe."""
+        self._began = anyio.current_time()
 
     def received(self, frames: Sequence[SeenFrame], size: int, peer: Hashable) -> None:
         """Count a received chunk and its frames."""
@@ -155,9 +159,8 @@ class Traffic(Tap):
 
     def report(self, now: float, cutter: FrameCutter) -> TrafficReport:
         """Return the present counts, and those of the cutter of the received data."""
-        began = now if self._began is None else self._began
         first = int(now / RATE_SLICE) - RATE_SLICES + 1
-        window = max(now - max(first * RATE_SLICE, began), RATE_TIME_MIN)
+        window = max(now - max(first * RATE_SLICE, self._began), RATE_TIME_MIN)
         before = next((counts for number, counts in self._before if number >= first), self._counts)
         totals: defaultdict[Address | None, Counter[_What]] = defaultdict(Counter)
         recent: defaultdict[Address | None, defaultdict[_What, float]]
@@ -167,7 +170,7 @@ class Traffic(Tap):
             recent[whose][what] = (count - before[whose, what]) / window
         return TrafficReport(
             at=now,
-            seconds=now - began,
+            seconds=now - self._began,
             components=tuple(
                 replace(each, totals=totals[address], recent=recent[address])
                 for address, each in sorted(self._components.items())
@@ -181,7 +184,6 @@ class Traffic(Tap):
     def _count(self, whose: Address | None, **increases: int) -> float:
         """Increase counts of a component or of the link. Return the time."""
         now = anyio.current_time()
-        self._began = now if self._began is None else self._began
         number = int(now / RATE_SLICE)
         if not self._before or self._before[-1][0] != number:
             self._before.append((number, self._counts.copy()))
