@@ -47,6 +47,8 @@ BLOCK_INTERVALS: Final = 8
 """Mean intervals between two blocks after which a burst counts as over."""
 READS_AT_ONCE: Final = 4
 """Reads sent at once: ArduPilot's queue of MAVFTP requests has 5 places, and drops the surplus silently."""
+COPIES_AT_ONCE: Final = 16
+"""Reads sent for the last blocks, in several copies: one round trip of 100 ms has room for as many."""
 BLOCK_INTERVAL: Final = 0.006
 """Seconds in which a vehicle serves one read: ArduPilot sends a block every 5.9 ms (measured)."""
 READS_MAX: Final = 64
@@ -514,7 +516,7 @@ class _FileReader:
                 else:
                     continue
                 del in_flight[at]
-            copies = max(1, min(timing.copies, READS_AT_ONCE // max(len(waiting) + len(in_flight), 1)))
+            copies = max(1, min(timing.copies, COPIES_AT_ONCE // max(len(waiting) + len(in_flight), 1)))
             allowed = int(min((now - paced_at) / BLOCK_INTERVAL, READS_AT_ONCE))
             while waiting and allowed > 0 and len(in_flight) < READS_MAX:
                 at = waiting.popleft()
