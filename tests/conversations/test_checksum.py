@@ -17,6 +17,7 @@ from paramclient.protocol.fetch import FetchResult, fetch_all
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.node import Node
 from paramclient.protocol.watch import Watch
+from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle
 from paramclient.wire.messages import NO_INDEX, FileTransfer, Message, ParamRequestList, ParamValue, encode
 from tests.conversations.virtual import Conversation, Tap, converse, run, virtual, virtual_on_both
@@ -304,6 +305,22 @@ async def test_a_change_in_the_middle_of_a_proof_is_not_proven() -> None:
             result = await fetch_all(node.plain)
         assert not result.missing
         assert len(result.params) == 1434
+        check(vehicle, node, result)
+
+
+@virtual
+async def test_an_acknowledgement_as_real32_changes_no_type() -> None:
+    """ArduPilot acknowledges the set of a default as REAL32, whatever the type is."""
+    vehicle = ArduPilotVehicle(live_period=0.0)
+    async with converse(vehicle) as conversation:
+        node = await with_cached_table(conversation, vehicle.params)
+        await fetch_all(node.plain)
+        for name in ("BARO_PROBE_EXT", "LOG_BITMASK", "RTL_ALT", "ARMING_CHECK"):
+            before = vehicle.param(name)
+            await write(node.plain, name, before.value)
+            assert node.plain.table.params[name].same_value(before)
+        result = await fetch_all(node.plain)
+        assert (result.source, result.changed) == ("cache", ())
         check(vehicle, node, result)
 
 
