@@ -37,6 +37,7 @@ from parse import build_stream
 from pymavlink.dialects.v20 import common
 
 from paramclient import ParamClient
+from paramclient.model.values import is_portable_name
 from paramclient.protocol.station import Station
 from paramclient.sim import PX4Vehicle
 from paramclient.wire.frames import Framer
@@ -264,15 +265,14 @@ MEAN_SIZE = statistics.mean(map(len, telemetry()))
 def print_memory(download: Download) -> bool:
     """Print the KiB for 1,000 parameters; return whether the target is met."""
     station = meet(download)
-    gc.collect()
-    text_of.cache_clear()
+    forget_names()
     tracemalloc.start()
     try:
         deliver(station, [download.announcement, *download.values], 1.0)
         check(station.nodes[1, 1].plain.table.is_complete, "the download is not complete")
         gc.collect()
         with_memo, _ = tracemalloc.get_traced_memory()
-        text_of.cache_clear()
+        forget_names()
         used, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -280,8 +280,15 @@ def print_memory(download: Download) -> bool:
     is_met = used * kib <= MEMORY_MAX
     print(f"\nmemory of 1,000 parameters: {used * kib:.0f} KiB (target: {MEMORY_MAX}: {verdict(is_met)})")
     memo = (with_memo - used) * kib
-    print(f"names that the decoder remembers, once for all components: {memo:.0f} KiB more")
+    print(f"names that are remembered, once for all components: {memo:.0f} KiB more")
     return is_met
+
+
+def forget_names() -> None:
+    """Clear what is remembered of names, once for all components, and the free lists of the interpreter."""
+    text_of.cache_clear()
+    is_portable_name.cache_clear()
+    gc.collect()
 
 
 def record_download() -> Download:

@@ -30,7 +30,7 @@ from trio.testing import MockClock
 from paramclient.model.values import Param, ParamType
 from paramclient.protocol.fetch import FetchResult, fetch_all
 from paramclient.protocol.node import Node
-from paramclient.protocol.set_results import SetOutcome, SetStatus
+from paramclient.protocol.set_results import SetStatus
 from paramclient.protocol.station import Station
 from paramclient.protocol.writes import write_many
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
@@ -272,11 +272,10 @@ async def set_values(row: Row, seed: int) -> Run:
         step_size = len(names) / row.values
         chosen = [names[int(number * step_size)] for number in range(row.values)]
         wanted = {name: number + 0.5 for number, name in enumerate(chosen)}
-        outcomes: list[SetOutcome] = []
-        await write_many(session, list(wanted.items()), outcomes, lambda outcome: None)
+        result = await write_many(session, list(wanted.items()))
         ended = anyio.current_time()
     true = vehicle.params
-    is_right = all(outcome.status is SetStatus.ACCEPTED for outcome in outcomes) and all(
+    is_right = all(outcome.status is SetStatus.ACCEPTED for outcome in result.outcomes) and all(
         true[name].value == value for name, value in wanted.items()
     )
     sent = vehicle.requests.total() - requests

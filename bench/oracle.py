@@ -23,8 +23,9 @@ from collections.abc import Callable
 from heapq import heappop, heappush
 from typing import Any, Final
 
-from paramclient.protocol.file_download import PARAM_FILE, WITH_DEFAULTS
+from paramclient.protocol.file_download import WITH_DEFAULTS
 from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
+from paramclient.protocol.param_pck import PARAM_FILE
 from paramclient.sim import Air, Endpoint, FaultyLink
 from paramclient.wire import messages
 from paramclient.wire.frames import Framer

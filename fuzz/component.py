@@ -454,6 +454,7 @@ class _Session:
             hash=self.draw.number(4) if how & 2 else None,
             volatile=[each.name for each in params[: how >> 2 & 3]],
             volatile_is_known=bool(how & 4),
+            moments=dict.fromkeys((each.name for each in params), anyio.current_time()),
         )
 
     def session(self, node: Node) -> Session:

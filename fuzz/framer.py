@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import all as dialect
 from pymavlink.generator.mavcrc import x25crc
 
 from fuzz.draw import Draw
-from paramclient.client.frame_cutter import UNPROVEN_BYTES_MAX, Sniffer
+from paramclient.client.taps import FrameCutter
 from paramclient.wire import messages
 from paramclient.wire.frames import Frame, Framer, build_frame, checksum
 from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier
@@ -38,7 +38,7 @@ def run(data: bytes) -> None:
             chunks.append(b"")
     _check_datagrams(chunks)
     _check_stream(chunks)
-    _check_sniffer(chunks)
+    _check_cutter(chunks)
 
 
 def _check_datagrams(chunks: list[bytes]) -> None:
@@ -69,18 +69,17 @@ def _check_stream(chunks: list[bytes]) -> None:
     assert framer.skipped == sum(map(len, chunks)) - sum(size for _, size in frames)
 
 
-def _check_sniffer(chunks: list[bytes]) -> None:
-    sniffer = Sniffer(stream=True)
+def _check_cutter(chunks: list[bytes]) -> None:
+    cutter = FrameCutter(stream=True)
     seen = []
-    for chunk in chunks:
-        seen += sniffer.receive(chunk)
-        assert len(sniffer._tail) <= UNPROVEN_BYTES_MAX + FRAME_SIZE_MAX
-    seen += sniffer.flush()
+    for chunk in (*filter(None, chunks), b""):
+        seen += cutter.cut(chunk, "vehicle")
+    assert not cutter.unfinished
     data = b"".join(chunks)
     # bytes that cannot be checked may count as a frame, but must not displace a verified frame
-    proven = [Frame(*each[:6]) for each in seen if each.is_known]
+    proven = [each.frame for each in seen if each.is_known]
     assert proven == [frame for frame, _ in _frames_of(data)]
-    assert sum(each.size for each in seen) + sniffer.other_bytes <= len(data)
+    assert sum(each.size for each in seen) + cutter.other_bytes <= len(data)
 
 
 def _check_codec(frame: Frame) -> None:

@@ -21,7 +21,6 @@ from paramclient.client.component import Component, ComponentState
 from paramclient.client.events import Discovered, Event, Events, Found, Lost, Rebooted, Resynced
 from paramclient.client.files import Ftp
 from paramclient.client.fleet_fetch import FetchedAll
-from paramclient.client.reset import ResetResult
 from paramclient.client.signing import Signing, read_key
 from paramclient.client.streams import Changes
 from paramclient.errors import (
@@ -107,7 +106,6 @@ __all__ = [
     "Progress",
     "Rebooted",
     "Refused",
-    "ResetResult",
     "Resynced",
     "SetManyResult",
     "SetOutcome",

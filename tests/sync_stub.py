@@ -17,18 +17,17 @@ from paramclient.provision import fleet
 STUB = Path(__file__).parent.parent / "paramclient" / "sync" / "__init__.pyi"
 
 CLASSES: dict[ModuleType, list[str]] = {
-    streams: ["Changes"],
     files: ["Ftp"],
     component: ["Component"],
     fleet: ["Wanted"],
+    streams: ["Changes"],
     events: ["Discovered", "Lost", "Found", "Rebooted", "Resynced", "Event", "Events"],
     client: ["ParamClient"],
 }
 FUNCTIONS: list[Callable[..., object]] = [
     *(provision.prepare, provision.apply, provision.verify, provision.restore),
     *(provision.apply_all, provision.verify_all, provision.restore_all),
-    *(provision.apply_extended, provision.verify_extended, provision.restore_extended),
-    *(provision.load_extended_state, metadata.metadata_of),
+    metadata.metadata_of,
 ]
 STREAMS = {"Changes": "Change", "Events": "Event"}
 OWN = {name for names in CLASSES.values() for name in names} | {each.__name__ for each in FUNCTIONS}
@@ -37,7 +36,7 @@ ATTRIBUTES = {
     "ParamClient": ("cache: ParamCache | None",),
 }
 """The public attributes that `__init__` sets."""
-INTERNAL = {"is_extended_by", "wait_for_cache", "wait_until_identified"}
+INTERNAL = {"emit", "limited", "wait_for_cache", "wait_until_identified"}
 """Methods for other modules of the asynchronous client."""
 
 

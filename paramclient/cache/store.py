@@ -6,6 +6,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
@@ -21,11 +22,11 @@ from paramclient.cache.records import (
     HistoryEntry,
     SnapshotSummary,
     StoredParam,
+    StoredTable,
     TableUpdate,
 )
-from paramclient.cache.schema import Transaction
-from paramclient.cache.sqlite import SqliteStore
-from paramclient.cache.updates import ensure_table, save_table
+from paramclient.cache.sqlite import SqliteStore, Transaction
+from paramclient.cache.tables import ensure_table, save_table
 from paramclient.errors import NotInCache, UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
@@ -409,18 +410,16 @@ class ParamCache:
                 its beginning, and the nearest snapshots).
         """
 
-        return self._read(
-            lambda tx: (
-                snapshots.load_state(tx, self._table(tx, vehicle, component, extended=extended), when).params
-            )
-        )
+        def work(tx: Transaction) -> ParamSet:
+            table = self._table(tx, vehicle, component, extended=extended)
+            return replace(snapshots.load_state(tx, table, when).params, is_extended=extended)
+
+        return self._read(work)
 
     def _read(self, work: Callable[[Transaction], T]) -> T:
         return self._store.run(work, writing=False)
 
-    def _table(
-        self, tx: Transaction, vehicle: str, component: int, *, extended: bool = False
-    ) -> tables.StoredTable:
+    def _table(self, tx: Transaction, vehicle: str, component: int, *, extended: bool = False) -> StoredTable:
         """Return the table of the only vehicle with this name."""
         key = self._choose(tx, vehicle, component=component)
         table = tables.find_table(tx, key, component, extended=extended)

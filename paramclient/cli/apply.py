@@ -11,7 +11,6 @@ from cyclopts import Parameter
 
 from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import apply_extended, is_extended_source
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import say
@@ -92,21 +91,13 @@ async def apply(
         extended: Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them.
         yes: Do not ask for confirmation.
     """
-    if extended or is_extended_source(file):
-        if include or reboot or over or renames or metadata:
-            raise UsageError(
-                f"{file} has extended parameters; --include, --reboot, --overlay, --renames and --metadata "
-                "are for plain ones"
-            )
-        return await apply_extended(
-            url, file, options, dry_run=dry_run, yes=yes, durable=durable, backup=backup
-        )
     check_pattern("the file of --overlay", over, options)
     check_pattern("the file of --backup", backup, options)
     given, rules = from_file(metadata), read_rules(renames)
     opened = open_file(file) if is_file(file) else None
-    params = await resolve(file, options, writes=True) if opened is None else None
-    async with sessions(url, options, writes=True) as found:
+    params = await resolve(file, options, writes=True, extended=extended) if opened is None else None
+    extended = extended or (opened is not None and opened.is_extended)
+    async with sessions(url, options, writes=True, extended=extended) as found:
         wanted: dict[Address, ParamSet] = {}
         for each in found:
             system, component = each.component.system, each.component.component

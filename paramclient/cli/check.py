@@ -13,6 +13,7 @@ from cyclopts import Parameter
 
 from paramclient.cli.check_measurements import ListCheck, Measurements, Report
 from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.json_output import Json, as_json
 from paramclient.cli.options import Seconds, TrafficOptions
 from paramclient.cli.output import Coloured, milliseconds, print_json, print_line, print_table, say
 from paramclient.cli.session import VEHICLE_TIMEOUT, ChosenVehicle, Deadline, listen, wait_for_vehicle
@@ -75,13 +76,15 @@ async def check(
             "python": platform.python_version(),
             "system": platform.platform(),
         }
-        written = [{"severity": each.severity, "text": each.text, "advice": each.advice} for each in findings]
-        print_json({**report.as_json(), "findings": written, "versions": versions})
+        print_json({**as_json(report), "findings": findings, "versions": versions})
     else:
         print_table(("what", "measured"), _rows(report))
         print_line("")
         if findings:
-            rows = ((each.cell, f"{each.text} {each.advice}".rstrip()) for each in findings)
+            rows = (
+                (Coloured(each.severity, _STYLES[each.severity]), f"{each.text} {each.advice}".rstrip())
+                for each in findings
+            )
             print_table(("severity", "slow or unusual"), rows)
         else:
             print_line("Nothing slow or unusual.")
@@ -132,7 +135,14 @@ def _rows(report: Report) -> Iterator[tuple[str, str]]:
         yield "parameter file", f"{found}, {'with' if files.defaults else 'without'} defaults"
     else:
         yield "parameter file", files.error or "none"
-    yield "hash", none if report.hash is None else report.hash.before or report.hash.error or "none"
+    proof = report.hash
+    title = "checksum" if report.autopilot == "ardupilot" else "hash"
+    if proof is None:
+        yield title, none
+    elif proof.elapsed_s is None:
+        yield title, f"none: {proof.error}"
+    else:
+        yield title, f"{proof.before}, {proof.bytes} bytes in {milliseconds(proof.elapsed_s)}"
     yield "other autopilots", ", ".join(link.autopilots) or "none"
     yield "measured in", f"{report.elapsed_s:.1f} s"
 
@@ -150,17 +160,12 @@ def _list_text(listed: ListCheck) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class _Finding:
+class _Finding(Json):
     """One slow or unusual result, its likely cause, and what to do."""
 
     severity: str
     text: str
     advice: str = ""
-
-    @property
-    def cell(self) -> Coloured:
-        """The severity as a cell of a table."""
-        return Coloured(self.severity, _STYLES.get(self.severity, ""))
 
 
 def _findings(report: Report) -> Iterator[_Finding]:

@@ -6,11 +6,11 @@ from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from statistics import median
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 import anyio
 
-from paramclient.cli.json_output import IdentityJson, Json, as_json
+from paramclient.cli.json_output import IdentityJson, Json
 from paramclient.cli.session import Deadline
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
@@ -24,8 +24,9 @@ from paramclient.errors import (
 )
 from paramclient.model.notation import hash_text, rounded
 from paramclient.protocol import param_pck
-from paramclient.protocol.file_download import PARAM_FILE, WITH_DEFAULTS
+from paramclient.protocol.file_download import WITH_DEFAULTS
 from paramclient.protocol.list_download import ListResult, download_list
+from paramclient.protocol.param_pck import PARAM_FILE
 from paramclient.wire.frames import enum_word
 from paramclient.wire.messages import (
     HASH_CHECK,
@@ -118,9 +119,14 @@ class FileCheck(Json):
 
 @dataclass(frozen=True, slots=True)
 class HashMeasurement(Json):
-    """The vehicle's hash `before` the downloads, or why there is none."""
+    """PX4's hash or ArduPilot's checksum, `before` the downloads, or why there is none.
+
+    `bytes` are those of both directions.
+    """
 
     before: str | None
+    elapsed_s: float | None
+    bytes: int | None
     error: str | None
 
 
@@ -143,11 +149,6 @@ class Report(Json):
     files: FileCheck | None
     hash: HashMeasurement | None
     elapsed_s: float
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the report as objects that `json.dumps` accepts."""
-        written: dict[str, Any] = as_json(self)
-        return written
 
 
 class Measurements:
@@ -256,13 +257,18 @@ class Measurements:
         return RoundTrips(len(found), round(min(found), 4), round(median(found), 4), round(max(found), 4))
 
     async def _read_hash(self) -> HashMeasurement:
-        if self._identification.is_ardupilot:
-            return HashMeasurement(None, "ArduPilot has no parameter hash")
+        client, began = self._client, anyio.current_time()
+        before = client.bytes_sent + client.bytes_received
         try:
-            param = await self._component.get(HASH_CHECK, timeout=self._left())
-        except (NoReply, VehicleError) as error:
-            return HashMeasurement(None, str(error))
-        return HashMeasurement(hash_text(param.bits), None)
+            if self._identification.is_ardupilot:
+                found = await client.ftp(self._component).checksum(PARAM_FILE, timeout=self._left())
+            else:
+                found = (await self._component.get(HASH_CHECK, timeout=self._left())).bits
+        except (FileTransferError, NoReply, VehicleError) as error:
+            return HashMeasurement(None, None, None, str(error))
+        elapsed = round(anyio.current_time() - began, 4)
+        sent = client.bytes_sent + client.bytes_received - before
+        return HashMeasurement(hash_text(found), elapsed, sent, None)
 
     async def _measure_reads(self) -> ReadCheck:
         single = []
@@ -357,8 +363,8 @@ class Measurements:
         report = client.traffic_report()
         address = (component.system, component.component)
         mine = next((each for each in report.components if (each.system, each.component) == address), None)
-        lost = 0 if mine is None else max(mine.lost, 0)
-        sent = 0 if mine is None else mine.frames - mine.repeated + lost
+        lost = 0 if mine is None else max(mine.totals["lost"], 0)
+        sent = 0 if mine is None else mine.totals["frames"] - mine.totals["repeated"] + lost
         others = [
             f"{each.system}/{each.component}"
             for each in report.components

@@ -10,8 +10,6 @@ from cyclopts import Parameter
 
 from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import is_extended_source
-from paramclient.cli.extended_sources import diff_extended
 from paramclient.cli.file_output import described, value_text
 from paramclient.cli.json_setup import DiffJson
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
@@ -70,10 +68,6 @@ async def diff(
         metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
         extended: Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them.
     """
-    if extended or is_extended_source(left) or is_extended_source(right):
-        if base is not None or only or renames is not None or metadata is not None:
-            raise UsageError("--base, --only, --renames and --metadata are for plain parameters")
-        return await diff_extended(left, right, options, partial=partial, everything=everything)
     chosen = from_file(metadata, offline=True)
     rules = read_rules(renames)
     third_source = [] if base is None or base == DEFAULTS else [base]
@@ -82,7 +76,7 @@ async def diff(
             f"both sides are the vehicle on {left}. Two vehicles of one link are compared in the cache: "
             f"`paramclient fetch {left} --vehicle all`, then `paramclient diff 1 2`"
         )
-    first, second, *third = await resolve_all([left, right, *third_source], options)
+    first, second, *third = await resolve_all([left, right, *third_source], options, extended=extended)
     is_right_partial = partial and is_file(right) and not is_file(left)
     if is_right_partial:
         named = second if rules is None else rules.apply_to(second, first)

@@ -10,7 +10,7 @@ from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_output import SetJson
 from paramclient.cli.output import local_time, print_json, print_table, printable, say
 from paramclient.files import ParamFile
-from paramclient.files.param_file import address
+from paramclient.files.formats import address
 from paramclient.metadata import Metadata
 from paramclient.model.comparison import non_defaults
 from paramclient.model.defaults import Default, add_defaults, default_of
@@ -19,7 +19,7 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, WireValue, format_value, type_name
 from paramclient.model.wording import counted
 
-__all__ = ["described", "show_file", "value_text"]
+__all__ = ["described", "noun_of", "show_file", "value_text"]
 
 
 def show_file(
@@ -74,7 +74,12 @@ def described(params: ParamSet) -> str:
         f"from {params.source}" if params.source else "",
     ]
     at = "" if params.at is None else f", {local_time(params.at)}"
-    return " ".join(filter(None, [counted(len(params), "parameter"), *origin])) + at
+    return " ".join(filter(None, [counted(len(params), noun_of(params)), *origin])) + at
+
+
+def noun_of(params: ParamSet) -> str:
+    """Return the parameters of a set in words, in the singular."""
+    return "extended parameter" if params.is_extended else "parameter"
 
 
 def value_text(param: WrittenParam) -> str:

@@ -11,7 +11,6 @@ from cyclopts.validators import Number
 
 from paramclient.cache import HistoryEntry, ParamCache, SnapshotSummary
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended_sources import history_extended
 from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson
 from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import local_time, print_json, print_table, say
@@ -19,8 +18,8 @@ from paramclient.cli.param_names import cached_names, check_given, unmatched_tex
 from paramclient.cli.sources import component_of, tables_in
 from paramclient.cli.time_arguments import parse_time
 from paramclient.errors import NotInCache, UsageError
+from paramclient.model.names import NameChoice
 from paramclient.model.notation import hash_text
-from paramclient.model.patterns import NameChoice
 from paramclient.model.values import Param, format_value
 
 __all__ = ["history"]
@@ -58,23 +57,27 @@ def history(
     name_patterns = check_given(names)
     if snapshots and name_patterns:
         raise UsageError("--snapshots lists whole tables and takes no parameter name")
-    if extended and not snapshots:
-        return history_extended(vehicle, name_patterns, options, limit=limit, since=begin)
     with ParamCache(options.cache) as cache:
-        key, component = tables_in(cache, vehicle)[0].key, component_of(vehicle)
+        key, component = tables_in(cache, vehicle, extended=extended)[0].key, component_of(vehicle)
         if snapshots:
             found = cache.snapshots(key, component, extended=extended)
             kept = [each for each in found if begin is None or each.at >= begin]
             _print_snapshots(kept[-limit:] if limit else kept, options)
         else:
-            entries = _entries(cache, key, component, name_patterns, begin)
+            entries = _entries(cache, key, component, name_patterns, begin, extended=extended)
             entries = entries[-limit:] if limit else entries
             _print_entries(entries, options)
     return ExitCode.DONE
 
 
 def _entries(
-    cache: ParamCache, key: str, component: int | None, name_patterns: Sequence[str], begin: float | None
+    cache: ParamCache,
+    key: str,
+    component: int | None,
+    name_patterns: Sequence[str],
+    begin: float | None,
+    *,
+    extended: bool,
 ) -> list[HistoryEntry]:
     """Return the changes of the parameters that names and patterns choose; of all parameters without any.
 
@@ -82,11 +85,12 @@ def _entries(
         NotInCache: the vehicle has and had no such parameter.
     """
     if not name_patterns:
-        return cache.history(key, component, None, None, begin)
-    entries = cache.history(key, component)
+        return cache.history(key, component, None, None, begin, extended=extended)
+    entries = cache.history(key, component, extended=extended)
     known = {entry.name for entry in entries}
     for each in cache.components(key):
-        table = cache.load(key, each.component) if component in (None, each.component) else None
+        is_meant = component in (None, each.component)
+        table = cache.load(key, each.component, extended=extended) if is_meant else None
         known.update(() if table is None else table.params)
     chosen, unmatched = NameChoice(name_patterns).divide(known)
     if unmatched:

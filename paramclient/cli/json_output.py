@@ -12,7 +12,6 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from paramclient.model.defaults import add_default, default_of
-from paramclient.model.ext_values import encode_ext_value, ext_bytes
 from paramclient.model.identity import Identity, autopilot_name, version_text
 from paramclient.model.notation import (
     Scalar,
@@ -24,8 +23,8 @@ from paramclient.model.notation import (
     value_json,
     value_written,
 )
-from paramclient.model.values import Param, ParamType, WireValue, format_value, type_name
-from paramclient.protocol.kinds import kind_in_words
+from paramclient.model.values import Param, ParamType, format_value, type_name
+from paramclient.protocol.identity import kind_in_words
 
 if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler, TypeAdapter
@@ -38,7 +37,6 @@ if TYPE_CHECKING:
     from paramclient.protocol.set_results import SetOutcome
 
 __all__ = [
-    "ExtParamJson",
     "FetchJson",
     "IdentityJson",
     "InfoJson",
@@ -50,7 +48,6 @@ __all__ = [
     "WriteJson",
     "WrittenJson",
     "as_json",
-    "ext_value_json",
     "short_text",
 ]
 
@@ -257,52 +254,6 @@ class WrittenJson(Json):
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ExtParamJson(Json):
-    """One extended parameter. `value` is null for bytes that are no text; `hex` has all bytes."""
-
-    name: str | None = None
-    value: Scalar | None
-    type: str
-    index: int | None
-    hex: str
-    trust: str | None = None
-    heard_at: float | None = None
-
-    @classmethod
-    def of(cls, param: Param) -> ExtParamJson:
-        """Return a parameter without its name."""
-        return cls(
-            value=ext_value_json(param.value, param.type_number),
-            type=type_name(param.type_number),
-            index=param.index,
-            hex=ext_bytes(param).hex(),
-        )
-
-    @classmethod
-    def written(cls, param: WrittenParam) -> ExtParamJson:
-        """Return a parameter of a set."""
-        number = param.type_number or ParamType.UNKNOWN
-        return cls(
-            value=ext_value_json(param.settable, number),
-            type=type_name(number),
-            index=None,
-            hex=encode_ext_value(param.settable, number).hex(),
-        )
-
-    @classmethod
-    def of_table(cls, param: Param, *, heard_at: float | None = None) -> ExtParamJson:
-        """Return a parameter with its name, its trust, and the unix time in seconds of its reception."""
-        return replace(cls.of(param), name=param.name, trust=param.trust.value, heard_at=heard_at)
-
-
-def ext_value_json(value: WireValue, number: int) -> Scalar | None:
-    """Return an extended value in strict JSON; None for bytes."""
-    if isinstance(value, bytes | str):
-        return value if isinstance(value, str) else None
-    return value_json(value, ParamType.REAL32 if number == ParamType.REAL32 else ParamType.REAL64)
-
-
 # Vehicles and sets
 
 
@@ -400,7 +351,10 @@ class SetJson(OriginJson):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FetchJson(Json):
-    """A fetched table. `missing` are indices, `cached` names whose values are not confirmed."""
+    """A fetched table. `missing` are indices, `cached` names whose values are not confirmed.
+
+    `changed` are names whose cached values an ArduPilot did not confirm, and which were read.
+    """
 
     system: int
     component: int
@@ -412,6 +366,7 @@ class FetchJson(Json):
     hash: str | None
     missing: list[int]
     cached: list[str]
+    changed: tuple[str, ...]
     lost: int
     repeated: int
     round_trip_s: float | None
@@ -469,10 +424,10 @@ class WriteJson(Json):
     @classmethod
     def of(cls, outcome: SetOutcome, kind: ParamType | int, info: ParamInfo | None) -> WriteJson:
         """Return an outcome; `kind` is the vehicle's type of the parameter, `info` its metadata, or None."""
-        actual, error, result = outcome.reported, outcome.error, outcome.result
+        requested, actual, error, result = outcome.requested, outcome.reported, outcome.error, outcome.result
         return cls(
             name=outcome.name,
-            requested=value_json(outcome.requested, ParamType.REAL64),
+            requested=value_json(requested, kind if isinstance(requested, bytes) else ParamType.REAL64),
             actual=None if actual is None else value_json(actual, kind),
             status=outcome.status.value,
             reason=None if error is None else str(error),

@@ -9,8 +9,6 @@ from typing import Final
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
 from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import is_extended_source
-from paramclient.cli.extended_sources import show_extended
 from paramclient.cli.file_output import show_file
 from paramclient.cli.json_cache import SummaryJson, TableJson
 from paramclient.cli.json_output import ParamJson
@@ -40,9 +38,9 @@ from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.metadata import Metadata, MetadataStore
 from paramclient.model.defaults import add_default, default_of
 from paramclient.model.identity import autopilot_name
+from paramclient.model.names import NameChoice
 from paramclient.model.notation import hash_text
 from paramclient.model.paramset import ParamSet
-from paramclient.model.patterns import NameChoice
 from paramclient.model.values import Param, format_value, type_name
 from paramclient.model.wording import counted
 
@@ -82,10 +80,6 @@ def show(
             With a parameter file only for --changed.
         extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
-    if extended or (vehicle is not None and is_extended_source(vehicle)):
-        if changed or metadata is not None:
-            raise UsageError("--changed and --metadata are for plain parameters")
-        return show_extended(vehicle, names, options)
     if vehicle is not None and is_file(vehicle):
         if names or (metadata is not None and not changed):
             raise UsageError(
@@ -103,10 +97,10 @@ def show(
     described = from_file(metadata, offline=True)
     is_log = vehicle is not None and vehicle.lower().startswith("replay:")
     with _open(options) if not is_log or vehicle is None else cache_of_log(vehicle) as cache:
-        summaries = _tables_to_show(cache, None if is_log else vehicle)
+        summaries = _tables_to_show(cache, None if is_log else vehicle, extended=extended)
         extended_sizes = cache.ext_sizes()
         is_list = vehicle is None and len(summaries) > 1 and not options.json
-        tables = [] if is_list else _load(cache, summaries)
+        tables = [] if is_list else _load(cache, summaries, extended=extended)
         _check_known(cache, name_patterns, [name for table in tables for name in table.params])
     views = [_View.of(table, name_patterns, described, cache, changed=changed) for table in tables]
     if options.json:
@@ -169,18 +163,21 @@ def cache_remove(vehicle: str, /, *, options: CacheOptions = _DEFAULTS) -> ExitC
     return ExitCode.DONE
 
 
-def tables_of(cache: str | None, vehicle: str, component: int | None) -> list[CachedComponent]:
+def tables_of(
+    cache: str | None, vehicle: str, component: int | None, *, extended: bool
+) -> list[CachedComponent]:
     """Return the cached tables of a vehicle, or that of one of its components.
 
     Raises:
-        UnknownVehicle, AmbiguousVehicle: as `tables_in`.
+        NotInCache, UnknownVehicle, AmbiguousVehicle: as `tables_in`.
         CacheError: the cache cannot be read.
     """
     with ParamCache(cache) as opened:
-        return _load(opened, tables_in(opened, vehicle, component))
+        summaries = tables_in(opened, vehicle, component, extended=extended)
+        return _load(opened, summaries, extended=extended)
 
 
-def _tables_to_show(cache: ParamCache, vehicle: str | None) -> list[CachedSummary]:
+def _tables_to_show(cache: ParamCache, vehicle: str | None, *, extended: bool) -> list[CachedSummary]:
     """Return the tables that the arguments of show name, as `tables_in` does.
 
     Raises:
@@ -188,7 +185,7 @@ def _tables_to_show(cache: ParamCache, vehicle: str | None) -> list[CachedSummar
         UnknownVehicle, AmbiguousVehicle: as `tables_in`.
     """
     try:
-        return tables_in(cache, vehicle)
+        return tables_in(cache, vehicle, extended=extended)
     except UnknownVehicle:
         if vehicle is None or vehicle.upper() not in map(str.upper, cached_names(cache)):
             raise
@@ -214,8 +211,8 @@ def _open(options: CacheOptions) -> ParamCache:
     return ParamCache(options.cache)
 
 
-def _load(cache: ParamCache, summaries: Sequence[CachedSummary]) -> list[CachedComponent]:
-    loaded = (cache.load(each.key, each.component) for each in summaries)
+def _load(cache: ParamCache, summaries: Sequence[CachedSummary], *, extended: bool) -> list[CachedComponent]:
+    loaded = (cache.load(each.key, each.component, extended=extended) for each in summaries)
     return [table for table in loaded if table is not None]  # another process may have removed one
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,16 +13,15 @@ from paramclient.cache import ParamCache
 from paramclient.cli.session import CommandSession
 from paramclient.client.component import Component
 from paramclient.errors import CacheError, ParamClientError, UnknownParameter, UsageError
-from paramclient.model.group_switches import is_group_switch
 from paramclient.model.identity import autopilot_name
-from paramclient.model.patterns import NameChoice, is_pattern
-from paramclient.model.similar_names import did_you_mean, nearest_names
+from paramclient.model.names import NameChoice, did_you_mean, is_group_switch, is_pattern, nearest_names
 from paramclient.model.values import check_name
 
 __all__ = [
     "ChosenNames",
     "cached_names",
     "check_given",
+    "learn_spelling",
     "may_appear",
     "spelling",
     "suggest",
@@ -62,6 +62,20 @@ class ChosenNames:
             if not chosen:
                 errors[text] = _no_match(text, component)
         return cls(list(names), errors)
+
+
+async def learn_spelling(component: Component, given: Iterable[str]) -> None:
+    """Read names in lower case of which it is not known how the vehicle spells them."""
+    known = {each.upper() for each in component.params}
+    for name in given:
+        upper = name.upper()
+        if name == upper or upper in known or is_pattern(name) or component.autopilot not in _CAPITALS:
+            continue
+        with suppress(ParamClientError):
+            try:
+                await component.get(upper)
+            except UnknownParameter:
+                await component.get(name)
 
 
 def check_given(given: Iterable[str]) -> list[str]:

@@ -13,7 +13,6 @@ from cyclopts import Parameter
 
 from paramclient.cli.default_sources import find_defaults, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode, code_of
-from paramclient.cli.extended import fetch_extended, get_extended
 from paramclient.cli.json_output import FetchJson, ParamJson
 from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
@@ -33,24 +32,23 @@ from paramclient.cli.output import (
     progress_bar,
     report,
     say,
+    while_waiting,
 )
-from paramclient.cli.param_names import ChosenNames, check_given, suggest
+from paramclient.cli.param_names import ChosenNames, check_given, learn_spelling, suggest
 from paramclient.cli.session import (
     CommandSession,
     Done,
-    connect,
     failed_json,
     report_failures,
     report_others,
     run_on_all,
     sessions,
 )
-from paramclient.cli.waiting import while_waiting
 from paramclient.errors import ParamClientError, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import Default, add_default, default_of
+from paramclient.model.names import NameChoice, is_pattern
 from paramclient.model.notation import hash_text
-from paramclient.model.patterns import NameChoice, is_pattern
 from paramclient.model.values import Param, Trust, format_value, type_name
 from paramclient.model.wording import first_of
 from paramclient.protocol.fetch import FetchResult, Policy
@@ -77,7 +75,7 @@ async def fetch(
     extended: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
-    """Fetch all parameters. Uses the cache if the vehicle's hash matches, otherwise downloads.
+    """Fetch all parameters. Uses the cache if the vehicle confirms it, otherwise downloads.
 
     Args:
         url: The link: udpin:0.0.0.0:14550, tcp:HOST:PORT, serial:PATH, sim:px4.
@@ -95,11 +93,8 @@ async def fetch(
             f"fetch takes no names, as it fetches all: `paramclient get {url} {given}` reads only some, "
             f"`paramclient fetch {url} --only {given}` fetches all and prints some"
         )
-    if extended:
-        async with connect(url, options) as session:
-            return await fetch_extended(session, only)
     from_option = from_file(metadata)
-    async with sessions(url, options, policy=policy) as found:
+    async with sessions(url, options, policy=policy, extended=extended) as found:
 
         async def work(session: CommandSession) -> _Fetched:
             fetched = _Fetched.of(session, await fetch_table(session, refresh=refresh), policy)
@@ -127,17 +122,14 @@ async def get(
     Args:
         url: The link.
         name: The parameter, in upper or lower case, or a pattern such as "MC_*": then the whole table is
-            fetched, from the cache if the vehicle's hash matches.
+            fetched, from the cache if the vehicle confirms it.
         names: Further parameters and patterns.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
         extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
     given = check_given((name, *names))
-    if extended:
-        async with connect(url, options) as session:
-            return await get_extended(session, given)
     from_option = from_file(metadata)
-    async with sessions(url, options) as found:
+    async with sessions(url, options, extended=extended) as found:
 
         async def work(session: CommandSession) -> _Read:
             params, errors = await get_chosen(session, given)
@@ -236,7 +228,7 @@ class _Fetched:
         if len(self.session.client.components) > 1:  # the counters are those of the link
             transferred = f"{transferred} on the whole link"
         return (
-            f"{result.count - len(self.missing)}{of} parameters of {self.session.label} from "
+            f"{result.count - len(self.missing)}{of} {self.session.noun}s of {self.session.label} from "
             f"{result.source} in {result.elapsed:.2f} s, {lost}{trip}{transferred}{crc}"
         )
 
@@ -365,6 +357,8 @@ def _show_read(done: Sequence[Done[_Read]], options: LinkOptions) -> int:
         _print_params(rows, DESCRIBED_COLUMNS if is_described else (), is_all=is_all)
     code = report_failures(done)
     for each in found:
+        if doubt := each.session.component.session.encoding_doubt:
+            report(f"{each.session.prefix}{doubt}")
         code = max(code, report_all(each.errors.values(), each.session.prefix))
     return code
 
@@ -380,6 +374,7 @@ async def get_chosen(
     has_pattern = any(map(is_pattern, name_patterns))
     if has_pattern:
         await fetch_table(session)
+    await learn_spelling(component, name_patterns)
     chosen = ChosenNames.of(component, name_patterns)
     known = {
         name: component.params[name] for name in chosen.names if has_pattern and name in component.params

@@ -6,7 +6,6 @@ import shlex
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 import anyio.to_thread
@@ -14,14 +13,12 @@ import anyio.to_thread
 from paramclient.cache import ParamCache
 from paramclient.cli.apply import backups_of, metadata_of_all, set_up, within
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import is_extended_source, write_extended
 from paramclient.cli.file_output import described
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import local_time, printable, say
-from paramclient.cli.session import ChosenVehicle, CommandSession, connect, sessions
+from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
 from paramclient.cli.setup_results import Address, SetupOutput
 from paramclient.cli.sources import (
-    check_new,
     check_pattern,
     choose,
     fill_pattern,
@@ -40,17 +37,9 @@ from paramclient.errors import (
     UsageError,
 )
 from paramclient.files import ParamFile
-from paramclient.files.disk import read_extended_file
 from paramclient.model.paramset import ParamSet, RestorePoint
 from paramclient.model.wording import age_in_words, first_of
-from paramclient.provision import (
-    ApplyProgress,
-    FleetApplied,
-    FleetVerified,
-    load_extended_state,
-    restore_all,
-    restore_extended,
-)
+from paramclient.provision import ApplyProgress, FleetApplied, FleetVerified, restore_all
 from paramclient.provision.fleet import compare_states
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.restore_point import load_restore_point
@@ -103,17 +92,10 @@ async def restore(
         extended: Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them.
         yes: Do not ask for confirmation.
     """
-    if extended or (when is not None and is_extended_source(when)):
-        if include or reboot or allow_armed or force:
-            raise UsageError("--include, --reboot, --allow-armed and --force are for plain parameters")
-        path = None if backup is None else check_new(backup)
-        async with connect(url, options, writes=True) as session:
-            content = await _extended_state(session, url, when)
-            write_content = partial(restore_extended, session.component, content, backup=path)
-            return await write_extended(session, content, write_content, dry_run=dry_run, yes=yes)
     check_pattern("the file of --backup", backup, options)
     loader = _Loader.of(url, when, options)
-    async with sessions(url, options, writes=True) as found:
+    extended = extended or (loader.file is not None and loader.file.is_extended)
+    async with sessions(url, options, writes=True, extended=extended) as found:
         states: dict[Address, _State] = {}
         failed: dict[Address, ParamClientError] = {}
         for each in found:
@@ -272,13 +254,17 @@ class _Loader:
         vehicle = session.component
         await wait_for_identity(vehicle)
         await vehicle.core.cache_writer.write_all()
-        key, component = vehicle.identity.key, vehicle.component
+        key, component, extended = vehicle.identity.key, vehicle.component, vehicle.is_extended
         moment = self.moment
         if moment is not None:
-            state = await anyio.to_thread.run_sync(lambda: _state_at(cache, key, component, moment))
+            state = await anyio.to_thread.run_sync(
+                lambda: _state_at(cache, key, component, moment, extended=extended)
+            )
             return _State(state, name="" if isinstance(moment, int) else local_time(moment))
         try:
-            point = await anyio.to_thread.run_sync(lambda: load_restore_point(cache, key, component))
+            point = await anyio.to_thread.run_sync(
+                lambda: load_restore_point(cache, key, component, extended=extended)
+            )
         except NotInCache as error:
             raise NotInCache(f"{error}, such as '2h ago', or a backup file") from None
         except AlreadyRestored as error:
@@ -286,46 +272,22 @@ class _Loader:
         return _State.before_apply(point)
 
 
-async def _extended_state(session: CommandSession, url: str, when: str | None) -> ParamSet:
-    """Return the earlier state of the extended parameters of a component, and print what it is."""
-    if when is not None and is_file(when):
-        state = read_extended_file(when)
-    else:
-        moment = None if when is None else parse_when(when, time.time())
-        try:
-            state = await load_extended_state(session.component, moment)
-        except AlreadyRestored as error:
-            raise _choices_error(error, url, session, extended=True) from None
-    at = "" if state.at is None else f", {local_time(state.at)}"
-    say(printable(f"the state: {len(state.params)} extended parameters from {state.source}{at}"))
-    return state
-
-
-def _state_at(cache: ParamCache, key: str, component: int, moment: float) -> ParamSet:
+def _state_at(cache: ParamCache, key: str, component: int, moment: float, *, extended: bool) -> ParamSet:
     try:
-        return cache.state_at(key, component, moment)
+        return cache.state_at(key, component, moment, extended=extended)
     except UnknownVehicle:  # the vehicle was heard on the link; the user named none of the cache
         message = f"the cache {cache.place} has no earlier state of {key}, component {component}"
         raise NotInCache(message) from None
 
 
-def _choices_error(
-    error: AlreadyRestored, url: str, session: CommandSession, *, extended: bool = False
-) -> UsageError:
-    """Return the error with the commands that choose a state.
-
-    Args:
-        error: the error.
-        url: the link.
-        session: the vehicle.
-        extended: whether the states are those of extended parameters.
-    """
+def _choices_error(error: AlreadyRestored, url: str, session: CommandSession) -> UsageError:
+    """Return the error with the commands that choose a state."""
 
     def command(when: object) -> str:
         return f"`{_command(url, when, session)}`"
 
-    more = "--extended " if extended else ""
-    listing = f"`paramclient history {session.component.system} {more}--snapshots`"
+    more = " ".join([*_more(session), "--snapshots"])
+    listing = f"`paramclient history {session.component.system} {more}`"
     seconds = max(1, int(time.time() - error.restored_at) + 1)
     return UsageError(
         f"{error.summary}; choose the state: {command(error.before_apply)} for the state before that apply, "
@@ -340,4 +302,8 @@ def _command(url: str, when: object, session: CommandSession) -> str:
     if session.choice.is_all:
         vehicle = str(session.component.system)
     chosen: Sequence[str] = () if vehicle is None else ("--vehicle", vehicle)
-    return shlex.join(["paramclient", "restore", url, str(when), *chosen])
+    return shlex.join(["paramclient", "restore", url, str(when), *chosen, *_more(session)])
+
+
+def _more(session: CommandSession) -> Sequence[str]:
+    return ("--extended",) if session.component.is_extended else ()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,8 +19,7 @@ from paramclient.cli.default_sources import (
     say_sources,
 )
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import is_extended_source
-from paramclient.cli.extended_sources import save_extended
+from paramclient.cli.file_output import noun_of
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets
 from paramclient.cli.offline import tables_of
 from paramclient.cli.options import LinkOptions
@@ -35,14 +34,13 @@ from paramclient.cli.sources import (
     open_file,
     whole_table,
 )
-from paramclient.errors import UsageError
+from paramclient.errors import UsageError, VehicleError
 from paramclient.files import FileFormat, write_file
-from paramclient.files.formats import format_of_name
-from paramclient.files.param_file import AUTOPILOT, address
+from paramclient.files.formats import AUTOPILOT, address, format_of_name
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import default_of
+from paramclient.model.names import NameChoice
 from paramclient.model.paramset import ParamSet
-from paramclient.model.patterns import NameChoice
 from paramclient.model.wording import counted
 from paramclient.provision.vehicle_params import NO_DEFAULTS, cached_param_set, select_non_defaults
 
@@ -51,6 +49,8 @@ __all__ = ["save"]
 SaveFormat: TypeAlias = Literal["qgc", "parm", "mission-planner", "pck", "json"]
 """The file formats that can be written."""
 
+INCOMPLETE_HINT: Final = "--incomplete writes what was received"
+"""What to do with a table that is not complete."""
 _DEFAULTS: Final = LinkOptions()
 
 
@@ -63,16 +63,17 @@ async def save(
     changed: bool = False,
     only: tuple[str, ...] = (),
     refresh: bool = False,
+    incomplete: bool = False,
     metadata: MetadataChoice = None,
     extended: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Write the parameters of a vehicle to a file, in the file format of any ground station.
 
-    An existing file is replaced once the new one is completely on the disk. An incomplete table is not
-    written. Exit code 1: the table is incomplete, or with --changed, no parameter differs or the defaults are
-    not known. With --vehicle all, a file with {system} or {uid} in its name becomes a file for each vehicle;
-    otherwise the file format must be able to hold several components.
+    An existing file is replaced once the new one is completely on the disk. An incomplete table is written
+    with --incomplete only. Exit code 1: the table is incomplete, or with --changed, no parameter differs or
+    the defaults are not known. With --vehicle all, a file with {system} or {uid} in its name becomes a file
+    for each vehicle; otherwise the file format must be able to hold several components.
 
     Args:
         where: The link, such as udpin:0.0.0.0:14550 or sim:px4; an on-board log (.bin, .ulg), for the values
@@ -84,17 +85,12 @@ async def save(
             those of its metadata.
         only: Write only this name or pattern, such as "MC_*". May be given several times.
         refresh: Download all parameters even if the cache is up to date.
+        incomplete: Write the parameters that were received where others were not; the file names these.
         metadata: With --changed, a file with the firmware's defaults; or vehicle, to download the vehicle's
             own metadata. Default: the stored metadata of the firmware; else that of the vehicle if it can be
             downloaded in 2 s.
         extended: Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them.
     """
-    if extended or is_extended_source(where):
-        if changed or only:
-            raise UsageError("--changed and --only are for plain parameters")
-        return await save_extended(
-            where, file, None if file_format is None else FileFormat(file_format), options
-        )
     if metadata is not None and not changed:
         raise UsageError("--metadata gives the defaults for --changed")
     written = format_of_name(str(file)) if file_format is None else FileFormat(file_format)
@@ -104,10 +100,11 @@ async def save(
     selection = _Selection(changed, STORED_DEFAULTS_HINT if is_offline else DEFAULTS_HINT)
     given = from_file(metadata, offline=is_offline)
     if is_offline:
-        _add_offline(selection, where, given, options)
+        _add_offline(selection, where, given, options, incomplete=incomplete, extended=extended)
     else:
         check_link(where)
-        await _add_link(selection, where, metadata, given, options, refresh=refresh)
+        fetch = partial(_fetch, refresh=refresh, incomplete=incomplete)
+        await _add_link(selection, where, metadata, given, options, fetch, extended=extended)
     for fault in selection.faults:
         report(fault)
     sets = _chosen(selection.sets, only) if only else selection.sets
@@ -157,16 +154,12 @@ async def _add_link(
     choice: str | None,
     given: Metadata | None,
     options: LinkOptions,
+    fetch: Callable[[CommandSession], Awaitable[ParamSet]],
     *,
-    refresh: bool,
+    extended: bool,
 ) -> None:
     """Add the parameters of the vehicles on a link that were received or confirmed in this session."""
-    async with sessions(url, options) as found:
-        draws = not found[0].choice.is_all
-
-        async def fetch(session: CommandSession) -> ParamSet:
-            return await whole_table(session, draws=draws, refresh=refresh)
-
+    async with sessions(url, options, extended=extended) as found:
         for done in await run_on_all(found, fetch):
             if done.result is None:
                 selection.faults.append(f"{done.session.address}: {done.error}")
@@ -180,7 +173,26 @@ async def _add_link(
         await report_others(found)
 
 
-def _add_offline(selection: _Selection, where: str, given: Metadata | None, options: LinkOptions) -> None:
+async def _fetch(session: CommandSession, *, refresh: bool, incomplete: bool) -> ParamSet:
+    """Return the whole table of a vehicle, or with `incomplete` what was received of it."""
+    draws = not session.choice.is_all
+    try:
+        return await whole_table(session, draws=draws, refresh=refresh, partial=incomplete)
+    except VehicleError as error:
+        raise VehicleError(
+            f"{error}; {INCOMPLETE_HINT}", system=error.system, component=error.component
+        ) from None
+
+
+def _add_offline(
+    selection: _Selection,
+    where: str,
+    given: Metadata | None,
+    options: LinkOptions,
+    *,
+    incomplete: bool,
+    extended: bool,
+) -> None:
     """Add the parameters of a file, of an on-board log, or of a vehicle in the cache."""
     choice = ChosenVehicle.parse(options.vehicle)
     if is_file(where):
@@ -189,21 +201,23 @@ def _add_offline(selection: _Selection, where: str, given: Metadata | None, opti
     else:
         if options.place is False:
             raise UsageError(f"{where!r} is a vehicle in the cache, which --no-cache excludes")
-        tables = tables_of(options.cache, where, choice.component)
+        tables = tables_of(options.cache, where, choice.component, extended=extended)
         if not choice.is_all and len(tables) > 1:
             pilots = [table for table in tables if table.component == AUTOPILOT]
             if not pilots:
                 known = ", ".join(f"{table.system}/{table.component}" for table in tables)
                 raise UsageError(f"no autopilot is among {known}; name one of them, or use --vehicle all")
             tables = pilots
+        sets = []
         for table in tables:
-            if not table.complete:
-                of = "" if table.count is None else f" of {table.count}"
-                selection.faults.append(
-                    f"{table.system}/{table.component} is incomplete: {table.size}{of} parameters are in the "
-                    "cache"
-                )
-        sets = [cached_param_set(table) for table in tables if table.complete]
+            each = cached_param_set(table, extended=extended)
+            of = "" if table.count is None else f" of {table.count}"
+            are = f"{table.size}{of} parameters are in the cache"
+            if table.complete or incomplete:
+                sets.append(each if table.complete else replace(each, source=f"{each.source}: {are}"))
+            else:
+                fault = f"{table.system}/{table.component} is incomplete: {are}; {INCOMPLETE_HINT}"
+                selection.faults.append(fault)
     metadata = [given] * len(sets)
     if selection.is_changed and given is None:
         metadata = known_of_sets(sets, options)
@@ -257,5 +271,5 @@ def _show(files: Mapping[Path, Sequence[ParamSet]], file_format: FileFormat, *, 
         print_json(written[0] if len(written) == 1 else {"files": written})
         return
     for file, sets in files.items():
-        contents = ", ".join(f"{counted(len(each), 'parameter')} of {address(each)}" for each in sets)
+        contents = ", ".join(f"{counted(len(each), noun_of(each))} of {address(each)}" for each in sets)
         say(printable(f"{contents} written to {file} ({file_format})"))

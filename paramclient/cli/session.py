@@ -16,9 +16,13 @@ import anyio.to_thread
 from paramclient.cache import CachedSummary
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import LinkOptions, TrafficOptions
-from paramclient.cli.output import local_time, printable, report, say
-from paramclient.cli.waiting import while_waiting
-from paramclient.client.arguments import address_in_words
+from paramclient.cli.output import (
+    local_time,
+    printable,
+    report,
+    say,
+    while_waiting,
+)
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, ParamClientError, UsageError
@@ -26,8 +30,8 @@ from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.model.identity import version_text
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.fetch import Policy
-from paramclient.protocol.kinds import expects_extended, kind_in_words
-from paramclient.protocol.selection import LOOK_TIME, hint_of_link
+from paramclient.protocol.identity import expects_extended, kind_in_words
+from paramclient.protocol.selection import LOOK_TIME, address_in_words, hint_of_link, node_in_words
 from paramclient.wire.messages import MAV_AUTOPILOT_INVALID
 
 __all__ = [
@@ -133,8 +137,8 @@ class ChosenVehicle:
                 "at least 6 digits of its hardware id, or as all"
             )
         ids = [int(each) for each in found.groups() if each is not None]
-        if not all(1 <= each <= 255 for each in ids):
-            raise UsageError(f"--vehicle {text}: system and component ids are 1 to 255")
+        if not all(each <= 255 for each in ids) or ids[0] == 0:
+            raise UsageError(f"--vehicle {text}: system ids are 1 to 255, component ids 0 to 255")
         return cls(system=ids[0], component=ids[1] if len(ids) > 1 else None)
 
     @property
@@ -145,7 +149,7 @@ class ChosenVehicle:
 
 @dataclass(frozen=True, slots=True)
 class CommandSession:
-    """An open client, and a component that the command works on."""
+    """An open client, and a component that the command works on: with --extended, its extended parameters."""
 
     client: ParamClient
     component: Component
@@ -167,13 +171,20 @@ class CommandSession:
 
     @property
     def label(self) -> str:
-        """The component in words: `1/1 px4`."""
-        return f"{self.address} {self.component.autopilot}"
+        """The component in words: `1/1 px4`; one that names no autopilot by its kind: `1/100 camera`."""
+        autopilot = self.component.autopilot
+        is_named = autopilot not in ("unknown", "no autopilot", "generic")
+        return f"{self.address} {autopilot}" if is_named else node_in_words(self.component.node)
 
     @property
     def prefix(self) -> str:
         """The beginning of a line about the component: its label with --vehicle all, else ""."""
         return f"{self.label}: " if self.choice.is_all else ""
+
+    @property
+    def noun(self) -> str:
+        """The parameters of the component in words, in the singular."""
+        return "extended parameter" if self.component.is_extended else "parameter"
 
     @property
     def receiver(self) -> str:
@@ -198,7 +209,7 @@ class CommandSession:
             system, component = own.system, own.component
         timeout = self.deadline.left(RECHECK_TIMEOUT)
         found = await self.client.only_component(system, component, timeout=timeout)
-        if found is not own:
+        if found.node is not own.node:
             other = f"{found.system}/{found.component} {found.autopilot}"
             raise AmbiguousVehicle(
                 f"{self.label} was chosen and is no longer heard; {other} is heard instead. Nothing was "
@@ -216,7 +227,7 @@ async def sessions(
     writes: bool = False,
     policy: Policy = Policy.AUTO,
     is_live: bool = False,
-    is_plain: bool = True,
+    extended: bool = False,
 ) -> AsyncIterator[list[CommandSession]]:
     """Open a link, and yield a session for each vehicle that --vehicle names.
 
@@ -226,7 +237,7 @@ async def sessions(
         writes: whether several vehicles are an error, unless --vehicle names one or all.
         policy: as in `ParamClient`.
         is_live: read a log in real time; otherwise it is read at full speed, unless its name gives a speed.
-        is_plain: whether plain parameters are used, so that --extended is suggested for a camera.
+        extended: use the extended parameters. Otherwise --extended is suggested for a camera.
 
     Raises:
         UsageError: no such link, or options that exclude each other.
@@ -236,6 +247,8 @@ async def sessions(
     """
     check_link_argument(url)
     choice, deadline = ChosenVehicle.parse(options.vehicle), Deadline(options.timeout)
+    if extended and choice.is_all:
+        raise UsageError("--vehicle all is not possible with --extended; name one vehicle")
     async with ParamClient(
         url if is_live else _at_full_speed(url),
         cache=None if options.place is True else options.place,
@@ -251,16 +264,17 @@ async def sessions(
         found = await _find(client, choice, timeout=timeout, only=writes)
         if writes:
             await wait_for_firmware(found, deadline)
-        for each in found if is_plain else ():
+        for each in () if extended else found:
             if expects_extended(each.identity.vehicle_type, each.component):
                 label = f"{each.system}/{each.component}"
                 say(f"{label} usually has extended parameters: --extended uses them")
-        yield [CommandSession(client, each, deadline, options, choice) for each in found]
+        chosen = [each.ext for each in found] if extended else found
+        yield [CommandSession(client, each, deadline, options, choice) for each in chosen]
 
 
 @asynccontextmanager
 async def connect(
-    url: str, options: LinkOptions, *, writes: bool = False, is_live: bool = False
+    url: str, options: LinkOptions, *, writes: bool = False, is_live: bool = False, extended: bool = False
 ) -> AsyncIterator[CommandSession]:
     """Open a link, and yield the session of one vehicle; arguments and errors as in `sessions`.
 
@@ -269,7 +283,7 @@ async def connect(
     """
     if ChosenVehicle.parse(options.vehicle).is_all:
         raise UsageError("--vehicle all is not possible here; name one vehicle")
-    async with sessions(url, options, writes=writes, is_live=is_live, is_plain=False) as found:
+    async with sessions(url, options, writes=writes, is_live=is_live, extended=extended) as found:
         yield found[0]
 
 
@@ -439,8 +453,7 @@ def receiver_in_words(component: Component) -> str:
 
 def vehicle_in_words(component: Component) -> str:
     """Return address and kind of a component: `1/1 PX4 quadrotor`."""
-    kind = kind_in_words(component.identity.autopilot, component.identity.vehicle_type)
-    return f"{component.system}/{component.component} {kind}".rstrip()
+    return node_in_words(component.node)
 
 
 async def _find(

@@ -13,7 +13,6 @@ from cyclopts.validators import Number
 
 from paramclient.cli.confirmation import can_ask, confirm
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import set_extended
 from paramclient.cli.json_output import VehicleJson
 from paramclient.cli.metadata import (
     MetadataChoice,
@@ -21,18 +20,18 @@ from paramclient.cli.metadata import (
     info_of,
     known_of_session,
     parse_pairs,
+    parse_value,
     problems,
     resolved,
-    text_pairs,
 )
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_json, print_table, printable, report, say
-from paramclient.cli.param_names import spelling
+from paramclient.cli.param_names import learn_spelling, spelling
+from paramclient.cli.read_commands import get_chosen
 from paramclient.cli.session import (
     CommandSession,
     announce_write,
     check_link_argument,
-    connect,
     run_on_all,
     sessions,
     wait_for_firmware,
@@ -47,10 +46,10 @@ from paramclient.cli.write_outcomes import (
     write_all,
     writes_json,
 )
-from paramclient.client.arguments import SETTLE_MAX
-from paramclient.errors import ParamClientError, UsageError
+from paramclient.client.component import SETTLE_MAX
+from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
-from paramclient.model.values import ParamType, format_value
+from paramclient.model.values import ParamType, WireValue, format_value
 from paramclient.protocol.set_results import SetOutcome
 
 __all__ = ["set_"]
@@ -91,17 +90,11 @@ async def set_(
         extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
     check_link_argument(url)
-    if extended:
-        if settle or force or metadata is not None:
-            raise UsageError("--settle, --force and --metadata are for plain parameters")
-        texts = text_pairs(pairs)
-        async with connect(url, options, writes=True) as session:
-            return await set_extended(session, texts, durable=durable)
     described = from_file(metadata)
-    wanted = parse_pairs(pairs)
-    if described is not None:
+    wanted = parse_pairs(pairs, as_text=extended)
+    if described is not None and not extended:
         wanted = [*resolved(wanted, described)]
-    async with sessions(url, options, writes=True) as found:
+    async with sessions(url, options, writes=True, extended=extended) as found:
         jobs = {each.address: await _prepare(each, wanted, described, metadata) for each in found}
         await _check_values([*jobs.values()], force=force)
         for each in found:
@@ -146,22 +139,45 @@ class _Job:
     """The values for one vehicle, and its metadata."""
 
     session: CommandSession
-    writes: Sequence[tuple[str, int | float]]
+    writes: Sequence[tuple[str, WireValue]]
     described: Metadata | None
 
 
 async def _prepare(
     session: CommandSession,
-    wanted: Sequence[tuple[str, int | float | str]],
+    wanted: Sequence[tuple[str, WireValue]],
     described: Metadata | None,
     choice: MetadataChoice,
 ) -> _Job:
     """Return names and values as the vehicle and its metadata have them."""
+    if session.component.is_extended:
+        return _Job(session, await _extended_values(session, wanted), None)
+    await learn_spelling(session.component, [name for name, _ in wanted])
     wanted = [(spelling(name, session.component), value) for name, value in wanted]
     if described is None:
         named = [f"{name}: {value!r} is not a number" for name, value in wanted if isinstance(value, str)]
         described = await known_of_session(session, choice, needed_for=named[0] if named else "")
     return _Job(session, resolved(wanted, described), described)
+
+
+async def _extended_values(
+    session: CommandSession, wanted: Sequence[tuple[str, WireValue]]
+) -> list[tuple[str, WireValue]]:
+    """Return the values that texts give in the types of extended parameters, which are read first.
+
+    A name that the component does not have keeps its text; the write reports it.
+
+    Raises:
+        UsageError: a text is no value of the type.
+        ParamClientError: a type could not be read.
+    """
+    found, errors = await get_chosen(session, [name for name, _ in wanted])
+    for error in errors.values():
+        if not isinstance(error, UnknownParameter):
+            raise error
+    types = {param.name: param.type_number for param in found}
+    names = [(spelling(name, session.component), str(text)) for name, text in wanted]
+    return [(name, parse_value(name, text, types[name]) if name in types else text) for name, text in names]
 
 
 async def _check_values(jobs: Sequence[_Job], *, force: bool) -> None:

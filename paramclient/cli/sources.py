@@ -12,6 +12,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Final
 
@@ -22,16 +23,21 @@ from paramclient.cache.lookup import address_of, is_vehicle_name
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import progress_bar, report
 from paramclient.cli.session import ChosenVehicle, CommandSession, report_others, sessions
-from paramclient.errors import FileError, UnknownVehicle, UsageError
+from paramclient.errors import FileError, NotInCache, UnknownVehicle, UsageError
 from paramclient.files import ParamFile, read_file, read_renames
-from paramclient.files.formats import ENDINGS
-from paramclient.files.param_file import AUTOPILOT
+from paramclient.files.formats import AUTOPILOT, ENDINGS
 from paramclient.links import FORMS, parse_link
 from paramclient.logs.onboard import is_onboard_log, read_onboard_log
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
+from paramclient.model.wording import first_of
 from paramclient.provision.inspection import wait_for_identity
-from paramclient.provision.vehicle_params import collect_set, incomplete_error, load_cached_set
+from paramclient.provision.vehicle_params import (
+    NAMES_SHOWN_MAX,
+    collect_set,
+    incomplete_error,
+    load_cached_set,
+)
 
 __all__ = [
     "check_link",
@@ -67,15 +73,18 @@ _CACHED: Final = "cache:"
 """The prefix of a vehicle in the cache."""
 
 
-async def resolve(text: str, options: LinkOptions, *, writes: bool = False) -> ParamSet:
+async def resolve(
+    text: str, options: LinkOptions, *, writes: bool = False, extended: bool = False
+) -> ParamSet:
     """Return the parameters of the source that an argument names: a file, a vehicle in the cache, or a link.
 
-    Opens a link and fetches the whole table, from the cache if the vehicle's hash matches.
+    Opens a link and fetches the whole table, from the cache if the vehicle confirms it.
 
     Args:
         text: the argument; see the docstring of this module.
         options: --vehicle selects the vehicle of a link, and the component of a file or of the cache.
         writes: whether the values will be written; see `sessions`.
+        extended: the extended parameters of the vehicle.
 
     Raises:
         UsageError: the text names none of the three; a file cannot be read (FileError).
@@ -83,23 +92,31 @@ async def resolve(text: str, options: LinkOptions, *, writes: bool = False) -> P
         VehicleError: some parameters were not received; the message names them.
         NoReply, LinkError: as `sessions`.
     """
-    (params,) = await resolve_all([text], options, writes=writes)
+    (params,) = await resolve_all([text], options, writes=writes, extended=extended)
     return params
 
 
-async def resolve_all(texts: Sequence[str], options: LinkOptions, *, writes: bool = False) -> list[ParamSet]:
-    """Resolve several sources, as `resolve` does: files and cached vehicles first, then links concurrently.
+async def resolve_all(
+    texts: Sequence[str], options: LinkOptions, *, writes: bool = False, extended: bool = False
+) -> list[ParamSet]:
+    """Resolve several sources, as `resolve` does: files, then cached vehicles, then links concurrently.
 
-    A text that is given twice is resolved once. The first error ends all.
+    A text that is given twice is resolved once. The first error ends all. If one of the files has extended
+    parameters, those of the vehicles are meant too.
     """
     choice = ChosenVehicle.parse(options.vehicle)
-    found: dict[str, ParamSet] = {}
+    found = {
+        text: choose(open_file(text), choice.component, choice.system)
+        for text in dict.fromkeys(texts)
+        if is_file(text)
+    }
+    extended = extended or any(each.is_extended for each in found.values())
     links: list[str] = []
     for text in dict.fromkeys(texts):
-        if is_file(text):
-            found[text] = choose(open_file(text), choice.component, choice.system)
-        elif names_vehicle(text):
-            found[text] = _from_cache(text, options, choice.component)
+        if text in found:
+            continue
+        if names_vehicle(text):
+            found[text] = _from_cache(text, options, choice.component, extended=extended)
         else:
             check_link(text)
             links.append(text)
@@ -107,7 +124,7 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions, *, writes: boo
 
     async def fetch(url: str) -> None:
         try:
-            async with sessions(url, options, writes=writes) as opened:
+            async with sessions(url, options, writes=writes, extended=extended) as opened:
                 found[url] = await whole_table(opened[0], draws=len(links) == 1)
                 if not writes:
                     await report_others(opened)
@@ -123,13 +140,16 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions, *, writes: boo
     return [found[text] for text in texts]
 
 
-async def whole_table(session: CommandSession, *, draws: bool, refresh: bool = False) -> ParamSet:
+async def whole_table(
+    session: CommandSession, *, draws: bool, refresh: bool = False, partial: bool = False
+) -> ParamSet:
     """Fetch the table of a session's component; return the values received or confirmed in this session.
 
     Args:
         session: the session.
         draws: whether the progress is drawn; two bars at a time would mix.
         refresh: as in `Component.fetch_all`.
+        partial: whether a set of some parameters is returned; its source names the others.
 
     Raises:
         VehicleError: some parameters were not received; the message names them.
@@ -141,9 +161,13 @@ async def whole_table(session: CommandSession, *, draws: bool, refresh: bool = F
     for note in result.notes:
         report(f"{session.label} on {link}: {note}")
     found = await collect_set(component, result, source=f"link {link}")
-    if found.missing:
+    if found.missing and not partial:
         raise incomplete_error(component, found.missing)
-    return found.set
+    left_out = [*found.missing, *map(repr, sorted(component.session.table.left_out))]
+    if not left_out:
+        return found.set
+    missing = first_of(left_out, NAMES_SHOWN_MAX)
+    return replace(found.set, source=f"{found.set.source}, without {missing}")
 
 
 def is_file(text: str) -> bool:
@@ -226,15 +250,20 @@ def choose(file: ParamFile, component: int | None, system: int | None) -> ParamS
     return file.choose(component, system=system if is_of_several else None)
 
 
-def tables_in(cache: ParamCache, vehicle: str | None, component: int | None = None) -> list[CachedSummary]:
+def tables_in(
+    cache: ParamCache, vehicle: str | None, component: int | None = None, *, extended: bool = False
+) -> list[CachedSummary]:
     """Return the tables in the cache that an argument names. All subcommands use this function.
 
     Args:
         cache: the cache.
         vehicle: the name of the vehicle, also with the prefix `cache:`; None for all vehicles.
         component: return only the table of this component, unless the name has one.
+        extended: only components with extended parameters. A system id is then enough, also if a camera of
+            the system has a hardware id of its own.
 
     Raises:
+        NotInCache: no component of the vehicle has extended parameters in the cache.
         UsageError: the name is empty, such as an unset variable of a script.
         UnknownVehicle: no vehicle in the cache has this name, or none of its tables is of this component.
         AmbiguousVehicle: several vehicles have this name.
@@ -242,10 +271,17 @@ def tables_in(cache: ParamCache, vehicle: str | None, component: int | None = No
     name = None if vehicle is None else vehicle.removeprefix(_CACHED)
     if name == "":
         raise UsageError("a vehicle in the cache needs a name: its system id, its hardware id, or its key")
-    known = cache.components(name)
+    is_system = extended and name is not None and name.isdecimal()
+    known = cache.components(None if is_system else name)
+    if extended:
+        sizes = cache.ext_sizes()
+        known = [each for each in known if (each.key, each.component) in sizes]
+        known = [each for each in known if not is_system or str(each.system) == name]
     address = None if name is None else address_of(name)
     component = component if address is None else address[1]
     chosen = [each for each in known if component in (None, each.component)]
+    if not chosen and extended:
+        raise NotInCache("there are no extended parameters of that vehicle in the cache")
     if not chosen and (known or vehicle is not None):
         addresses = [f"{each.system}/{each.component} ({each.key})" for each in known]
         raise UnknownVehicle(
@@ -261,16 +297,16 @@ def component_of(vehicle: str) -> int | None:
     return None if address is None else address[1]
 
 
-def _from_cache(vehicle: str, options: LinkOptions, component: int | None) -> ParamSet:
+def _from_cache(vehicle: str, options: LinkOptions, component: int | None, *, extended: bool) -> ParamSet:
     if options.place is False:
         raise UsageError(f"{vehicle!r} is a vehicle in the cache, which --no-cache excludes")
     with ParamCache(options.cache) as cache:
-        tables = tables_in(cache, vehicle, component)
+        tables = tables_in(cache, vehicle, component, extended=extended)
         table = next((each for each in tables if each.component == AUTOPILOT), tables[0])
         if len(tables) > 1 and table.component != AUTOPILOT:
             known = ", ".join(f"{each.system}/{each.component}" for each in tables)
             raise UsageError(f"no autopilot is among {known}; name one of them instead of {vehicle}")
-        return load_cached_set(cache, table.key, table.component, note=report)
+        return load_cached_set(cache, table.key, table.component, extended=extended)
 
 
 # File names for several vehicles

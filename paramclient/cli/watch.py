@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Callable, Sequence
+from collections.abc import AsyncGenerator, Sequence
 from contextlib import aclosing, suppress
 from typing import Final, TypeAlias
 
 import anyio
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import ext_text, read_extended
-from paramclient.cli.json_output import ExtParamJson
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import local_time, print_json, print_line, printable, say
 from paramclient.cli.param_names import ChosenNames, check_given, may_appear
@@ -20,9 +18,9 @@ from paramclient.cli.session import CommandSession, connect, report_others
 from paramclient.client.events import Discovered, Event, Events, Found, Lost, Rebooted, Resynced
 from paramclient.client.streams import Changes
 from paramclient.errors import CacheError, ParamClientError
+from paramclient.model.names import NameChoice, is_pattern
 from paramclient.model.notation import hash_text, time_text, value_json
-from paramclient.model.patterns import NameChoice, is_pattern
-from paramclient.model.values import Param, format_value
+from paramclient.model.values import format_value
 from paramclient.model.wording import counted
 from paramclient.protocol.events import Change
 
@@ -46,27 +44,25 @@ async def watch(url: str, /, *names: str, extended: bool = False, options: LinkO
         extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
     given = check_given(names)
-    async with connect(url, options, is_live=True) as session:
-        feed = session.component.ext.changes() if extended else session.component.changes()
-        events = session.client.events()
+    async with connect(url, options, is_live=True, extended=extended) as session:
+        feed, events = session.component.changes(), session.client.events()
         known: set[str] | None = None
         if not session.client.listens_only:
-            code = await (_begin_extended if extended else _begin)(session, given)
+            code = await _begin(session, given)
             if code:
                 return code
-            known = set(session.component.ext.params if extended else session.component.params)
-        count = len(session.component.ext.params if extended else session.component.params)
-        everything = counted(count, "extended parameter" if extended else "parameter")
+            known = set(session.component.params)
+        everything = counted(len(session.component.params), session.noun)
         say(printable(f"watching {', '.join(given) or everything} of {session.label}"))
         await report_others([session])
         failure: Exception | None = None
         async with anyio.create_task_group() as tasks:
-            if given and not extended and not any(map(is_pattern, given)) and known is not None:
+            if given and not any(map(is_pattern, given)) and known is not None:
                 tasks.start_soon(_follow_groups, session)
             with anyio.move_on_after(session.deadline.left()):
                 try:
                     choice = NameChoice(given) if given else None
-                    await _print_changes_and_events(session, feed, events, known, choice, extended=extended)
+                    await _print_changes_and_events(session, feed, events, known, choice)
                 except Exception as error:  # raised here, the task group would wrap it in a group
                     failure = error
             tasks.cancel_scope.cancel()
@@ -94,15 +90,6 @@ async def _begin(session: CommandSession, given: Sequence[str]) -> int:
     return report_all(error for name, error in errors.items() if name not in hidden)
 
 
-async def _begin_extended(session: CommandSession, given: Sequence[str]) -> int:
-    """Update the extended parameters, and report unknown names; return the exit code."""
-    if not given or any(map(is_pattern, given)):
-        with suppress(CacheError):
-            await session.component.ext.fetch_all(timeout=session.deadline.left())
-    _, errors = await read_extended(session, [name for name in given if not is_pattern(name)])
-    return report_all(errors)
-
-
 async def _follow_groups(session: CommandSession) -> None:
     """Fetch the table, so that added and removed parameters are noticed. Values were read already."""
     with suppress(ParamClientError):  # the events and the end of the changes report it
@@ -115,19 +102,16 @@ async def _print_changes_and_events(
     events: Events,
     known: set[str] | None,
     choice: NameChoice | None,
-    *,
-    extended: bool,
 ) -> None:
     """Print changes and events of the component until cancelled.
 
     Args:
         session: the session.
-        changes: the changes of the component, or of its extended parameters.
+        changes: the changes of the component.
         events: the events of the client.
         known: names of the table at the start. The first value of any other parameter is not a change. None:
             the first value of every parameter is not a change.
         choice: the names to watch; None for all.
-        extended: whether the changes are those of extended parameters.
     """
     async with aclosing(_merged(changes, events)) as merged:
         async for each in merged:
@@ -137,14 +121,14 @@ async def _print_changes_and_events(
                     continue
                 if choice is not None and not choice.has(each.name):
                     continue
-                text = _change_text(each, ext_text if extended else _plain_text)
-            elif isinstance(each, Discovered) or each.component is not session.component:
+                text = _change_text(each)
+            elif isinstance(each, Discovered) or each.component.node is not session.component.node:
                 continue
             else:
                 text = _event_text(each)
             at = session.now
             if session.options.json:
-                print_json(_line(each, at, ExtParamJson.of if extended else _plain_json))
+                print_json(_line(each, at))
             else:
                 print_line(f"{local_time(at)}  {text}")
 
@@ -172,10 +156,13 @@ async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | E
                 each.exception()  # both end with the link; one error is reported
 
 
-def _line(item: Change | _ComponentEvent, at: float, shown: Callable[[Param], object]) -> dict[str, object]:
+def _line(item: Change | _ComponentEvent, at: float) -> dict[str, object]:
     """Return the JSON of a change or an event."""
     if isinstance(item, Change):
-        old, new = (None if param is None else shown(param) for param in (item.old, item.new))
+        old, new = (
+            None if param is None else value_json(param.settable, param.type_number)
+            for param in (item.old, item.new)
+        )
         return {
             "time": time_text(at),
             "name": item.name,
@@ -197,17 +184,10 @@ def _line(item: Change | _ComponentEvent, at: float, shown: Callable[[Param], ob
     return event
 
 
-def _plain_json(param: Param) -> object:
-    return value_json(param.settable, param.type_number)
-
-
-def _plain_text(param: Param) -> str:
-    return format_value(param.settable, param.type_number)
-
-
-def _change_text(change: Change, shown: Callable[[Param], str | None]) -> str:
+def _change_text(change: Change) -> str:
     old, new = (
-        "none" if param is None else printable(shown(param) or "") for param in (change.old, change.new)
+        "none" if param is None else printable(format_value(param.settable, param.type_number))
+        for param in (change.old, change.new)
     )
     if change.kind == "added":
         return f"{change.name}  added: {new}  ({change.by})"

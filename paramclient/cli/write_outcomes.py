@@ -13,10 +13,16 @@ import anyio
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.json_output import WriteJson
 from paramclient.cli.metadata import info_of, meaning_of, needs_reboot
-from paramclient.cli.output import Coloured, printable, progress_bar, report, say
+from paramclient.cli.output import (
+    Coloured,
+    printable,
+    progress_bar,
+    report,
+    say,
+    while_waiting,
+)
 from paramclient.cli.param_names import suggest
 from paramclient.cli.session import CommandSession
-from paramclient.cli.waiting import while_waiting
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.values import ParamType, WireValue, format_value
@@ -151,12 +157,13 @@ def outcome_cells(
     session: CommandSession, outcome: SetOutcome, described: Metadata | None = None
 ) -> tuple[object, ...]:
     """Return the cells of `OUTCOME_COLUMNS` for an outcome; the reported value with its meaning, if known."""
-    actual = _text(outcome.reported, type_of(session, outcome))
+    kind = type_of(session, outcome)
+    actual = _text(outcome.reported, kind)
     if outcome.reported is not None and (meaning := meaning_of(described, outcome.name, outcome.reported)):
         actual = f"{actual} ({meaning})"
     return (
         outcome.name,
-        _text(outcome.requested, ParamType.REAL64),
+        _text(outcome.requested, kind if isinstance(outcome.requested, bytes) else ParamType.REAL64),
         actual,
         Coloured(status_in_words(outcome.status, outcome.error), _STYLES[outcome.status]),
     )

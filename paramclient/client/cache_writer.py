@@ -6,7 +6,8 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Final, TypeVar
@@ -14,13 +15,12 @@ from typing import Final, TypeVar
 import anyio
 import anyio.to_thread
 
-from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
+from paramclient.cache import BY_VEHICLE, ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.errors import CacheError, UsageError
-from paramclient.links.clock_offset import seconds_ahead
 from paramclient.model.identity import Identity
 from paramclient.protocol.events import Change
-from paramclient.protocol.fetch import FetchResult
 from paramclient.protocol.node import Node
+from paramclient.protocol.selection import vehicle_of
 from paramclient.protocol.session import Session
 
 __all__ = ["CacheWriter", "choose_cache"]
@@ -45,16 +45,15 @@ class _Pending:
     """What is to be written of one table.
 
     Attributes:
-        observations: changed values, in order.
-        removed: names that the vehicle no longer has, and when that was found.
+        generation: of the component, when the first of it was received.
+        changes: changed parameters in order, each with the time by the clock of the event loop, as the
+            computer's clock may be wrong.
         is_whole: whether the whole table is to be written, as it is.
-        state: of the table, as written last.
     """
 
-    observations: list[StoredParam] = field(default_factory=list)
-    removed: dict[str, float] = field(default_factory=dict)
+    generation: int
+    changes: list[tuple[Change, float]] = field(default_factory=list)
     is_whole: bool = False
-    state: TableState | None = None
 
 
 class CacheWriter:
@@ -77,24 +76,27 @@ class CacheWriter:
         self.cache = cache
         self._owned = owned
         self._thread = anyio.CapacityLimiter(1)
-        self._identities: dict[Node, Identity] = {}  # under which the tables of a component are written
-        self._synced_at: dict[Session, float] = {}  # when each table was last proven
+        self._identities: dict[Node, Identity] = {}  # of the vehicle, under which tables are written
+        self._vehicles: dict[Node, Node] = {}  # the autopilot with this identity
+        self._synced_at: dict[Session, float] = {}  # when each table was last proven, as the cache knows
+        self._fetched_at: dict[Session, float] = {}  # and in this session, by the event loop's clock
         self._pending: dict[Session, _Pending] = {}
-        self._flushing = anyio.Lock()
+        self._writing = anyio.Lock()
         self._is_closing = False
-        self._durable_calls = 0
-        self._durable_until = 0  # the last of these whose values are safe from power loss
+        self._is_synced = True  # what was written is safe from power loss
         self._something_to_write = anyio.Event()
-        self._known: set[tuple[int, int]] = set()
+        self._known: set[tuple[int | str, int]] = set()  # systems and keys of vehicles, with components
         self._ahead = -math.inf  # of unix time to the time of the event loop, in seconds
+        self._replacements = 0 if cache is None else cache.replacements
 
     async def open(self) -> None:
         """Load the list of cached components."""
         if self.cache is not None:
-            summaries = await self._try(self.cache.components) or ()
-            self._known = {(each.system, each.component) for each in summaries}
+            with suppress(CacheError):
+                found = await self._call(self.cache.components)
+                self._known = {(which, each.component) for each in found for which in (each.system, each.key)}
 
-    async def close(self, nodes: Iterable[Node]) -> None:
+    async def close(self, nodes: Collection[Node]) -> None:
         """Write all new values, warn of lost ones, and close the cache if it is owned.
 
         Args:
@@ -109,8 +111,11 @@ class CacheWriter:
             for node in nodes:
                 is_known = node.identification.is_settled
                 if is_known or any(each.table.is_complete for each in node.sessions):
-                    await self.load(node)
-            is_written = await self.flush()
+                    await self.load(node, vehicle_of(nodes, node))
+            with suppress(CacheError):
+                await self.write_all()
+                await self.write_all()  # after a replaced file
+                is_written = True
         if not is_written and not was_warned:
             self._warn_of_lost()
         if self._owned:
@@ -119,7 +124,7 @@ class CacheWriter:
 
     def _warn_of_lost(self) -> None:
         for node, identity in self._identities.items():
-            if any(session in self._pending for session in node.sessions):
+            if any(self._waits(session) for session in node.sessions):
                 logger.warning(
                     "the last values of %d/%d (%s) are not in the cache, and lost: %s",
                     *(node.system, node.component, identity.key, self.failure or "timeout"),
@@ -129,10 +134,22 @@ class CacheWriter:
         """Return whether the cache had a table for these ids when the client was opened."""
         return (node.system, node.component) in self._known
 
-    async def load(self, node: Node) -> None:
-        """Load the cached tables of an identified component, and write its values from now on."""
-        identity = node.identification.identity
+    def may_load(self, node: Node, vehicle: Node) -> bool:
+        """Return whether it is known which vehicle a component belongs to, as far as the cache knows: the
+        vehicle is identified, or has never been before."""
+        key = vehicle.identification.identity.key
+        return vehicle.identification.is_settled or (key, node.component) in self._known
+
+    async def load(self, node: Node, vehicle: Node) -> None:
+        """Load the cached tables of a component, and write its values from now on.
+
+        Args:
+            node: the component.
+            vehicle: the autopilot of its vehicle, which is identified.
+        """
+        identity = vehicle.identification.identity
         kept = self._identities.get(node)
+        self._vehicles[node] = vehicle
         if self.cache is None or (kept is not None and kept.key == identity.key):
             self._identities[node] = identity
             self._wake()
@@ -140,22 +157,33 @@ class CacheWriter:
         cache = self.cache
         for session in node.sessions:
             is_extended = session is node.extended
-            cached = await self._try(partial(cache.load, identity.key, node.component, extended=is_extended))
+            cached = None
+            with suppress(CacheError):
+                cached = await self._call(
+                    partial(cache.load, identity.key, node.component, extended=is_extended)
+                )
+            if vehicle.identification.identity.key != identity.key:
+                return  # another vehicle has taken the address meanwhile, and its table is loaded
+            if identity.uid is not None:
+                session.table.forget_doubtful()
+            if kept is not None and session.table.params:  # received before it was known which vehicle it is
+                self._pending_of(node, session).is_whole = True
             if cached is None:
                 continue
-            if node.identification.autopilot is None:  # no heartbeat yet
+            if vehicle.identification.autopilot is None:  # no heartbeat yet
                 known = cached.identity
                 identity = replace(identity, autopilot=known.autopilot, vehicle_type=known.vehicle_type)
             if cached.synced_at is not None:
-                self._synced_at.setdefault(session, cached.synced_at)
+                self._synced_at[session] = cached.synced_at
             is_same_firmware = _firmware(cached.identity) == _firmware(identity)
-            params = cached.params.values()
+            params, ahead = cached.params.values(), self._seconds_ahead()
             session.table.load(
                 params if is_same_firmware else [replace(each, default=None) for each in params],
-                count=cached.count if cached.complete else None,
+                count=cached.count if cached.complete and is_same_firmware else None,
                 hash=cached.hash,
                 volatile=cached.volatile,
                 volatile_is_known=cached.volatile_known,
+                moments={name: at - ahead for name, at in cached.heard_at.items()},
             )
             if is_same_firmware and session.serves_file is None:
                 session.serves_file = cached.file_works
@@ -166,31 +194,38 @@ class CacheWriter:
         """Drop what waits: another vehicle uses the ids of the component."""
         self._identities.pop(node, None)
         for session in node.sessions:
-            self._pending.pop(session, None)
-            self._synced_at.pop(session, None)
+            for each in (self._pending, self._synced_at, self._fetched_at):
+                each.pop(session, None)
 
-    def changed(self, session: Session, change: Change) -> None:
+    def changed(self, node: Node, session: Session, change: Change) -> None:
         """Take a change of a parameter."""
         if self.cache is None:
             return
-        pending = self._pending.setdefault(session, _Pending())
-        at = self._unix(session.table.moments.get(change.name, math.inf))
-        if change.new is None:
-            pending.removed[change.name] = at
-        elif len(pending.observations) < PENDING_MAX:
-            table = session.table
-            is_volatile = change.name in table.volatile if table.volatile_is_known else None
-            pending.observations.append(StoredParam.of(change.new, at, is_volatile, change.by))
+        pending = self._pending_of(node, session)
+        if len(pending.changes) < PENDING_MAX:
+            at = min(session.table.moments.get(change.name, math.inf), anyio.current_time())
+            pending.changes.append((change, at))
         else:
             pending.is_whole = True
         self._wake()
 
-    def fetched(self, session: Session, result: FetchResult) -> None:
-        """Take note of a complete fetch."""
-        pending = self._pending.setdefault(session, _Pending())
-        self._synced_at[session] = time.time()
-        pending.is_whole = pending.is_whole or result.source != "cache"
+    def fetched(self, node: Node, session: Session, *, is_whole: bool) -> None:
+        """Take note of a complete fetch; `is_whole`: indices may have changed without values."""
+        pending = self._pending_of(node, session)
+        self._fetched_at[session] = anyio.current_time()
+        pending.is_whole = pending.is_whole or is_whole
         self._wake()
+
+    def _pending_of(self, node: Node, session: Session) -> _Pending:
+        """Return what is to be written of a table.
+
+        What was received of an unidentified component before it was lost may be of another vehicle.
+        """
+        pending = self._pending.get(session)
+        is_doubtful = pending is not None and pending.generation != node.generation
+        if pending is None or (is_doubtful and node not in self._identities):
+            pending = self._pending[session] = _Pending(node.generation)
+        return pending
 
     async def run(self) -> None:
         """Write new values in batches, until cancelled."""
@@ -198,66 +233,65 @@ class CacheWriter:
             await self._something_to_write.wait()
             await anyio.sleep(FLUSH_INTERVAL / 2)
             self._something_to_write = anyio.Event()
-            if not await self.flush():
+            try:
+                await self.write_all()
+            except CacheError:
                 await anyio.sleep(RETRY_INTERVAL)
                 self._wake()
 
-    async def flush(self, *, durable: bool = False) -> bool:
-        """Write all received values now; return False if the write failed. Cancellation loses no value.
+    async def write_all(self, *, durable: bool = False) -> None:
+        """Write all received values now. Cancellation loses no value.
 
         Args:
             durable: whether to wait until they are safe from power loss.
-        """
-        cache = self.cache
-        if cache is None:
-            return not durable
-        self._durable_calls += durable
-        call = self._durable_calls
-        async with self._flushing:
-            if durable and self._durable_until >= call:
-                return True
-            last_call = self._durable_calls
-            certain = [node for node in self._identities if node.identification.is_confirmed]
-            taken = [(node, session) for node in certain for session in node.sessions]
-            taken = [(node, session) for node, session in taken if session in self._pending]
-            before = {session: self._pending.pop(session) for _, session in taken}
-            updates = [self._update(node, session, before[session]) for node, session in taken]
-            is_saved = False
-
-            def save() -> bool:
-                cache.save(updates, durable=durable)
-                return True
-
-            try:
-                is_saved = await self._try(save) is True
-            finally:
-                if not is_saved:
-                    for session, pending in before.items():
-                        self._put_back(session, pending)
-        if is_saved:
-            self.failure = None
-            if durable:
-                self._durable_until = last_call
-        return is_saved
-
-    async def write_all(self) -> None:
-        """Write all received values, before a query of the cache.
 
         Raises:
             CacheError: the write failed. The values stay in memory and are written later.
         """
-        if not await self.flush():
-            raise CacheError(f"the last received values could not be written: {self.failure}")
+        cache = self.cache
+        if cache is None:
+            return
+        async with self._writing:
+            certain = [node for node in self._identities if self._is_certain(node)]
+            taken = [
+                (node, session, self._pending[session])
+                for node in certain
+                for session in node.sessions
+                if self._waits(session)
+            ]
+            if durable and self._is_synced and not taken:
+                return
+            updates = [self._update(*each) for each in taken]
+            before = [(pending, len(pending.changes), pending.is_whole) for _, _, pending in taken]
+            for _, _, pending in taken:
+                pending.is_whole = False
+            is_saved = self._is_synced = False
+            try:
+                await self._call(partial(cache.save, updates, durable=durable))
+                is_saved = True
+            finally:
+                for pending, count, was_whole in before:
+                    if is_saved:
+                        del pending.changes[:count]
+                    else:
+                        pending.is_whole |= was_whole
+            self._is_synced = durable
+            self.failure = None
+            if cache.replacements != self._replacements:  # a new file, without the earlier values
+                self._replacements = cache.replacements
+                for node in certain:
+                    for session in node.sessions:
+                        self._pending_of(node, session).is_whole = True
+                self._wake()
 
     async def write_durably(self, node: Node) -> None:
         """Write all received values, safe from power loss.
 
         Raises:
-            CacheError: the write failed. The values stay in memory and are written later.
+            UsageError, CacheError: as from `check_kept` and `write_all`.
         """
         self.check_kept(node)
-        if not await self.flush(durable=True):
-            raise CacheError(f"it could not be written: {self.failure}")
+        await self.write_all(durable=True)
 
     def check_kept(self, node: Node) -> None:
         """Check that the values of a component are written.
@@ -268,65 +302,66 @@ class CacheWriter:
         """
         if self.cache is None:
             raise UsageError("durable needs a cache, and the client has none; open it with a cache")
-        if node not in self._identities or not node.identification.is_confirmed:
+        if node not in self._identities or not self._is_certain(node):
             raise CacheError(f"it is not known which vehicle {node.system}/{node.component} is")
 
+    def _is_certain(self, node: Node) -> bool:
+        """Return whether the vehicle and the component are still those that were identified."""
+        return node.identification.is_confirmed and self._vehicles[node].identification.is_confirmed
+
     def _update(self, node: Node, session: Session, pending: _Pending) -> TableUpdate:
-        table = session.table
-        identity, heard = self._identities[node], node.identification
+        table, vehicle = session.table, self._vehicles[node]
+        identity, heard = self._identities[node], vehicle.identification
         if heard.autopilot is not None:
             identity = replace(identity, autopilot=heard.autopilot, vehicle_type=heard.vehicle_type or 0)
-        observations = list(pending.observations)
+        observations = [(each.new, at, each.by) for each, at in pending.changes if each.new is not None]
         if pending.is_whole:
-            volatile = table.volatile if table.volatile_is_known else None
-            observations += [
-                StoredParam.of(
-                    param,
-                    self._unix(table.moments.get(name, -math.inf)),
-                    None if volatile is None else name in volatile,
-                )
-                for name, param in table.params.items()
-                if name in table.moments
-            ]
+            observations += [(param, table.moments[name], BY_VEHICLE) for name, param in table.params.items()]
+        ahead = self._seconds_ahead()
+        fetched_at = self._fetched_at.get(session)
         is_extended = session is node.extended
         state = TableState(
             hash=table.hash if table.is_complete else None,
             count=table.count,
             complete=table.is_complete,
             volatile_known=table.volatile_is_known,
-            synced_at=self._synced_at.get(session),
+            synced_at=self._synced_at.get(session) if fetched_at is None else fetched_at + ahead,
             file_works=session.serves_file,
         )
         return TableUpdate(
             identity=identity,
             component=node.component,
-            autopilot=identity.autopilot,
+            autopilot=identity.autopilot if node is vehicle else node.identification.autopilot or 0,
             at=time.time(),
             table=state,
-            params=observations,
-            removed=dict(pending.removed),
+            params=[
+                StoredParam.of(
+                    table.with_default(param),
+                    at + ahead,
+                    param.name in table.volatile if table.volatile or table.volatile_is_known else None,
+                    by,
+                )
+                for param, at, by in observations
+            ],
+            removed={each.name: at + ahead for each, at in pending.changes if each.new is None},
             replace=pending.is_whole and table.is_complete,
             extended=is_extended,
         )
 
-    def _put_back(self, session: Session, pending: _Pending) -> None:
-        """Keep what could not be written, before what has come since."""
-        since = self._pending.get(session, _Pending())
-        pending.observations += since.observations
-        pending.removed |= since.removed
-        pending.is_whole = pending.is_whole or since.is_whole or len(pending.observations) > PENDING_MAX
-        self._pending[session] = pending
+    def _waits(self, session: Session) -> bool:
+        """Return whether something of a table is to be written."""
+        pending = self._pending.get(session)
+        return pending is not None and (pending.is_whole or bool(pending.changes))
 
-    def _unix(self, moment: float) -> float:
-        """Return the unix time of a time of the event loop, always the same for one; of a later one, now.
+    def _seconds_ahead(self) -> float:
+        """Return the seconds from the event loop's clock to unix time, always the same.
 
         The two clocks are compared once, and again where the computer's clock was set or was suspended.
         """
-        now = anyio.current_time()
-        ahead = seconds_ahead(time.time, anyio.current_time)
-        if abs(ahead - self._ahead) > CLOCK_STEP:
+        ahead = time.time() - anyio.current_time()
+        if not abs(ahead - self._ahead) <= CLOCK_STEP:  # also where the clock is NaN
             self._ahead = ahead
-        return min(moment, now) + self._ahead
+        return self._ahead
 
     def _wake(self) -> None:
         self._something_to_write.set()
@@ -335,15 +370,19 @@ class CacheWriter:
         """Run a blocking call in the cache's thread after earlier calls. Cancellation does not stop it."""
         return await anyio.to_thread.run_sync(work, abandon_on_cancel=True, limiter=self._thread)
 
-    async def _try(self, work: Callable[[], T]) -> T | None:
-        """Run a cache call in the thread; return None if it failed, with one warning for several failures."""
+    async def _call(self, work: Callable[[], T]) -> T:
+        """Run a cache call in the thread, with one warning in the log for several failures.
+
+        Raises:
+            CacheError: it failed.
+        """
         try:
             return await self.run_in_thread(work)
-        except CacheError as error:
+        except (CacheError, UsageError) as error:  # UsageError: the clock has an impossible time
             if self.failure is None and not self._is_closing:
                 logger.warning("continuing without the cache: %s", error)
             self.failure = error
-            return None
+            raise CacheError(f"the last received values could not be written: {error}") from error
 
 
 def choose_cache(

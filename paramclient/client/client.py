@@ -2,58 +2,64 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping
 from functools import partial
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Self
 
 import anyio
 
 from paramclient.cache import ParamCache
 from paramclient.client import events
-from paramclient.client.arguments import COMPONENT_TIMEOUT, address_in_words
 from paramclient.client.cache_writer import CacheWriter, choose_cache
-from paramclient.client.client_task import ClientTask
 from paramclient.client.component import Component
 from paramclient.client.core import ClientCore
 from paramclient.client.events import Events
 from paramclient.client.files import Ftp
 from paramclient.client.fleet_fetch import FetchedAll, fetch_components
+from paramclient.client.forwarding import Forwarder
+from paramclient.client.recording import Capture
 from paramclient.client.signing import Signing, refused_in_words
-from paramclient.client.signing_timestamps import TimestampKeeper
 from paramclient.client.streams import Subscribers
-from paramclient.client.taps import LinkTaps
-from paramclient.client.traffic import TrafficReport
+from paramclient.client.traffic import Traffic, TrafficReport
 from paramclient.errors import AnotherVehicle, NoReply, ParamClientError, UsageError
 from paramclient.links import Link, ReplayLink, SimLink, create_link
 from paramclient.model.values import Encoding
 from paramclient.model.wording import counted
 from paramclient.protocol import events as protocol
 from paramclient.protocol.addresses import Address
-from paramclient.protocol.fetch import Policy, Progress
+from paramclient.protocol.fetch import Policy
 from paramclient.protocol.node import Node
 from paramclient.protocol.selection import (
     LOOK_TIME,
+    address_in_words,
     autopilots_of,
     find,
     hint_of_link,
     node_in_words,
     only_vehicle,
+    vehicle_of,
 )
 from paramclient.protocol.session import Session
 from paramclient.protocol.station import Station
-from paramclient.protocol.watch import INTERVAL_MIN, Watch
+from paramclient.protocol.watch import INTERVAL_MIN
 from paramclient.wire.signing import SigningKey, SigningReport
 
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint
 
-__all__ = ["ParamClient"]
+__all__ = ["COMPONENT_TIMEOUT", "ParamClient"]
 
+COMPONENT_TIMEOUT: Final = 10.0
+"""Default timeout in seconds for the first component on a link."""
 VEHICLES_LISTENING_TIME: Final = 3.0
 """Seconds after the first autopilot in which further ones are looked for: three heartbeats, two of which may
 be lost."""
+PROBE_INTERVAL: Final = 0.5
+"""Seconds between two requests to a component that is named in full and was not heard; the first one after
+`LOOK_TIME`, in which a component with heartbeats is heard."""
 LISTENING_TIME: Final = 1.2
 """Seconds after the client was opened in which components are waited for, by a fetch of all."""
 
@@ -79,7 +85,7 @@ class ParamClient:
         system, component: MAVLink ids of this client, 1 to 255.
         encoding: parameter encoding of all components; None detects it for each component.
         watch_interval: seconds between two checks of each fetched table against the vehicle, at least 1.
-            None: every 30 s for a vehicle with a hash, and for others if a download takes no more than 1.5 s.
+            None: every 30 s for a vehicle with a hash or checksum (PX4, ArduPilot), never for others.
             0 disables the checks. See `Component.sync_state`.
         policy: which requests may update tables, see `Policy`: "auto", "hash-only" or "cache-only". Any value
             but "auto" also disables the checks of `watch_interval`.
@@ -97,7 +103,8 @@ class ParamClient:
         cache: cache of the tables, or None.
 
     Raises:
-        UsageError: the link name, an id, the interval or the policy is not valid. On entering: the client was
+        UsageError: the link name, an id, the interval or the policy is not valid, or one of the latter two is
+            given with `listen_only`. On entering: the client was
             entered before, or the telemetry log exists or cannot be created.
         LinkError: on entering: the link, or the link to the other program, cannot be opened.
     """
@@ -125,24 +132,26 @@ class ParamClient:
         if watch_interval is not None and watch_interval != 0 and not watch_interval >= INTERVAL_MIN:
             raise UsageError(f"watch_interval must be 0 or at least {INTERVAL_MIN:g} s, not {watch_interval}")
         try:
-            self._policy = Policy(policy)
+            self.policy = Policy(policy)
         except ValueError:
             raise UsageError(f"policy must be one of {', '.join(Policy)}, not {policy!r}") from None
+        if listen_only and (watch_interval or self.policy is not Policy.AUTO):
+            raise UsageError("the client only listens: it takes no policy, and no watch_interval but 0")
         opened = create_link(link)
         is_log = isinstance(opened, ReplayLink)
         self.cache = choose_cache(cache, is_log=is_log)
-        self._interval = watch_interval
+        self.watch_interval = watch_interval
         self._components: dict[Address, Component] = {}
         self._by_session: dict[Session, Component] = {}
         self._events: Subscribers[events.Event] = Subscribers()
-        self._task: ClientTask | None = None
-        self._is_entered = False
-        signing = Signing(signing) if isinstance(signing, SigningKey) else signing
+        forwarder = None if forward is None else Forwarder(create_link(forward))
+        capture = None if tlog is None else Capture(tlog)
+        self._traffic = Traffic() if traffic else None
         self.core = ClientCore(
             opened,
             CacheWriter(self.cache, owned=self.cache is not cache),
-            LinkTaps(tlog, forward, is_stream=opened.is_stream, counts_traffic=traffic),
-            None if signing is None else TimestampKeeper(signing),
+            [tap for tap in (forwarder, capture, self._traffic) if tap is not None],
+            Signing(signing) if isinstance(signing, SigningKey) else signing,
             partial(
                 Station,
                 link=opened.name,
@@ -153,7 +162,7 @@ class ParamClient:
                 listens_only=listen_only or is_log,
                 split_peers=split_peers,
                 discovered=self._meet,
-                emit=self._emit,
+                emit=self.emit,
                 changed=self._changed,
             ),
             self._end_streams,
@@ -164,17 +173,10 @@ class ParamClient:
         return f"<ParamClient {self.link.name} {self.core.state}, {count}>"
 
     async def __aenter__(self) -> Self:
-        await self.core.open()
-        self._is_entered = True
-        return self
+        return await self.open()
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
-            await self.core.close()
-        finally:
-            self._is_entered = False
+    async def __aexit__(self, *error: object) -> None:
+        await self.aclose()
 
     async def open(self) -> Self:
         """Open the client without an `async with`, until `aclose`. Return the client.
@@ -188,24 +190,12 @@ class ParamClient:
             LinkError: the link, or the link to the other program, cannot be opened.
             ClientClosed: `aclose` was called meanwhile.
         """
-        task = ClientTask(self.core)
-        if self._task is None and not self._is_entered:
-            self._task = task
-        await task.open()
+        await self.core.open()
         return self
 
     async def aclose(self) -> None:
-        """Close a client that `open` has opened, as on exit from an `async with`. Any task may call it.
-
-        Raises:
-            UsageError: the client was entered with `async with`, which closes it on exit.
-        """
-        if self._is_entered:
-            raise UsageError(
-                "the client was opened by `async with`, which closes it at its end; do not call aclose"
-            )
-        if self._task is not None:
-            await self._task.close()
+        """Close the client, as on exit from an `async with`. Any task may call it."""
+        await self.core.close()
 
     @property
     def components(self) -> Mapping[Address, Component]:
@@ -275,6 +265,9 @@ class ParamClient:
         several vehicles, the result may be a different vehicle at the next start. Use it in programs that
         only read, or if the link has only one vehicle. Programs that write use `only_component`.
 
+        A component that is named in full and was not heard is asked for a value: DroneCAN nodes and WiFi
+        bridges send no heartbeat, and some routers pass none on.
+
         On return, a cached table is in `params`, unless the vehicle does not report its identity.
 
         Args:
@@ -287,10 +280,12 @@ class ParamClient:
             NoReply: no message of the component arrived in time.
             LinkError: the link failed, or the client was closed.
         """
+        nodes = self.core.station.nodes
         return await self._wait_for(
-            lambda: find(self.core.station.nodes.values(), system, component, peer),
+            lambda: (find(nodes.values(), system, component, peer), None),
             address_in_words(system, component, peer),
             timeout,
+            asked=(system, component),
         )
 
     async def find_autopilots(
@@ -316,16 +311,16 @@ class ParamClient:
             raise UsageError(f"expect must be a number of vehicles from 1 up, not {expect}")
         began = anyio.current_time()
         await self.component(timeout=timeout)
-        if expect is None:
-            await anyio.sleep(VEHICLES_LISTENING_TIME)
-        else:
-            with anyio.move_on_after(None if timeout is None else began + timeout - anyio.current_time()):
-                while len(self.autopilots) < expect:
-                    await self._activity()
-            if len(self.autopilots) < expect:
-                heard = ", ".join(node_in_words(each.node) for each in self.autopilots)
-                waited = anyio.current_time() - began
-                raise NoReply(f"{expect} vehicles; heard only {heard}", attempts=0, waited=waited)
+        wait = VEHICLES_LISTENING_TIME
+        if expect is not None:
+            wait = math.inf if timeout is None else began + timeout - anyio.current_time()
+        with anyio.move_on_after(wait):
+            while expect is None or len(self.autopilots) < expect:
+                await self._activity()
+        if expect is not None and len(self.autopilots) < expect:
+            heard = ", ".join(node_in_words(each.node) for each in self.autopilots)
+            waited = anyio.current_time() - began
+            raise NoReply(f"{expect} vehicles; heard only {heard}", attempts=0, waited=waited)
         for each in self.autopilots:
             await each.wait_for_cache()
         return self.autopilots
@@ -361,18 +356,18 @@ class ParamClient:
         if self.listens_only or (isinstance(link, SimLink) and link.has_one_vehicle) or peer is not None:
             return await self.component(system, component, peer=peer, timeout=timeout)
         station = self.core.station
-        due: float | None = None
-
-        def choose() -> Node | None:
-            nonlocal due
-            since = station.listening_since
-            node, due = only_vehicle(
-                station.nodes.values(), system, component, anyio.current_time(), listening_since=since
-            )
-            return node
-
-        awaited = address_in_words(system, component)
-        return await self._wait_for(choose, awaited, timeout, until=lambda: due)
+        return await self._wait_for(
+            lambda: only_vehicle(
+                station.nodes.values(),
+                system,
+                component,
+                anyio.current_time(),
+                listening_since=station.listening_since,
+            ),
+            address_in_words(system, component),
+            timeout,
+            asked=(system, component),
+        )
 
     async def successor(
         self, component: Component, system: int, *, timeout: float | None = COMPONENT_TIMEOUT
@@ -395,12 +390,11 @@ class ParamClient:
         """
         before, began = component.identity, anyio.current_time()
 
-        def choose() -> Node | None:
+        def choose() -> tuple[Node | None, None]:
             node = find(self.core.station.nodes.values(), system, component.component, None)
-            return node if node is not None and node.presence.received_at > began else None
+            return node if node is not None and node.presence.received_at > began else None, None
 
-        awaited = address_in_words(system, component.component)
-        found = await self._wait_for(choose, awaited, timeout)
+        found = await self._wait_for(choose, address_in_words(system, component.component), timeout)
         with anyio.move_on_after(timeout), self.core.station.gate.until_closed():
             await found.node.identification.settled()
         if not before.is_same_vehicle(found.identity):
@@ -413,18 +407,17 @@ class ParamClient:
         *,
         refresh: bool = False,
         timeout: float | None = None,
-        progress: Callable[[Mapping[Address, Progress]], None] | None = None,
     ) -> FetchedAll:
         """Update the tables of all components of one system, or of every system on the link.
 
         The fetches run in parallel. Components that appear within 1.2 s after the client was opened are
-        included. A component that does not respond is given up; it may have no parameters.
+        included. A component that does not respond is given up; it may have no parameters. Where another
+        component responds, that takes 1.75 s.
 
         Args:
             system: fetch only this system; None for all.
             refresh: as in `Component.fetch_all`.
             timeout: seconds after which partial results are returned; None: no limit.
-            progress: called with the progress by (system, component), as values arrive.
 
         Returns:
             The results by (system, component), and the errors of the components that did not respond.
@@ -433,8 +426,12 @@ class ParamClient:
             NoReply: no component was found, or none responded.
             LinkError: the link failed, or the client was closed.
         """
+        if refresh:
+            self.core.check_may_send()
+        nodes = self.core.station.nodes
+        deadline = math.inf if timeout is None else anyio.current_time() + timeout
         await self._wait_for(
-            lambda: next((n for n in self.core.station.nodes.values() if system in (None, n.system)), None),
+            lambda: (next((each for each in nodes.values() if system in (None, each.system)), None), None),
             "a component" if system is None else f"a component of system {system}",
             COMPONENT_TIMEOUT if timeout is None else timeout,
         )
@@ -444,7 +441,8 @@ class ParamClient:
             for address, each in self._components.items()
             if system in (None, each.system) and each.node.identification.has_parameters
         }
-        return await fetch_components(chosen, refresh=refresh, timeout=timeout, progress=progress)
+        left = None if timeout is None else deadline - anyio.current_time()
+        return await fetch_components(chosen, refresh=refresh, timeout=left)
 
     def traffic_report(self) -> TrafficReport:
         """Return the traffic statistics of the link: components, message rates, packet loss.
@@ -453,11 +451,10 @@ class ParamClient:
             UsageError: the client was made without `traffic=True`.
             LinkError: the link failed, or the client was closed.
         """
-        traffic = self.core.taps.traffic
-        if traffic is None:
+        if self._traffic is None:
             raise UsageError("this client does not count traffic; use ParamClient(..., traffic=True)")
         self.core.check_open()
-        return traffic.report(anyio.current_time())
+        return self._traffic.report(anyio.current_time(), self.core.link_task.cutter)
 
     def signing_report(self) -> SigningReport | None:
         """Return the signing statistics of the link: signed frames, and refused frames with the reasons.
@@ -471,31 +468,22 @@ class ParamClient:
 
     def _meet(self, node: Node) -> None:
         """Follow a new component."""
-        ways = [self._new_component(node, session) for session in node.sessions]
-        component, ext = ways
-        component.is_extended_by(ext)
+        ext = Component(self, node, node.extended, None)
+        component = Component(self, node, node.plain, ext)
+        self._by_session |= {node.extended: ext, node.plain: component}
         self._components[component.address] = component
         self._events.push(events.Discovered(component))
+        self.core.spawn(self._join_vehicle, node)
 
-    def _new_component(self, node: Node, session: Session) -> Component:
-        def emit(event: protocol.Resynced) -> None:
-            self._emit(node, event)
-
-        watch = Watch(session, node.presence, emit, interval=self._interval, policy=self._policy)
-        session.table.recounted = watch.doubt
-        component = self._by_session[session] = Component(
-            self.core, node, session, watch, self._components, self.successor
-        )
-        component.policy = self._policy
-        if not self.listens_only:
-            self.core.spawn(watch.run)
-        return component
-
-    def _emit(self, node: Node, event: protocol.ComponentEvent) -> None:
+    def emit(self, node: Node, event: protocol.ComponentEvent) -> None:
+        """Tell the subscribers and the cache what has happened to a component."""
         component = self._by_session[node.plain]
         match event:
             case protocol.Identified():
-                self.core.spawn(self._load, node)
+                nodes = self.core.station.nodes.values()
+                for each in nodes:
+                    if vehicle_of(nodes, each) is node:
+                        self.core.spawn(self._load, each)
                 return
             case protocol.Replaced():
                 self.core.cache_writer.forget(node)
@@ -515,11 +503,22 @@ class ParamClient:
 
     def _changed(self, node: Node, session: Session, change: protocol.Change) -> None:
         self._by_session[session].subscribers.push(change)
-        self.core.cache_writer.changed(session, change)
+        self.core.cache_writer.changed(node, session, change)
+
+    async def _join_vehicle(self, node: Node) -> None:
+        """Load the cached tables of a component whose vehicle is identified already, or never was."""
+        await anyio.sleep_until(node.since + LOOK_TIME)  # for the heartbeat of its autopilot
+        if self.core.cache_writer.may_load(node, vehicle_of(self.core.station.nodes.values(), node)):
+            await self._load(node)
 
     async def _load(self, node: Node) -> None:
-        """Load the cached tables of an identified component."""
-        await self.core.cache_writer.load(node)
+        """Load the cached tables of a component of an identified vehicle."""
+        nodes = self.core.station.nodes.values()
+        vehicle = vehicle_of(nodes, node)
+        is_young = anyio.current_time() < node.since + LOOK_TIME
+        if vehicle is node and is_young and not node.identification.is_autopilot:
+            return  # it may have an autopilot: `_join_vehicle` waits for its heartbeat
+        await self.core.cache_writer.load(node, vehicle)
         for session in node.sessions:
             self._by_session[session].cache_is_read.set()
 
@@ -536,35 +535,42 @@ class ParamClient:
 
     async def _wait_for(
         self,
-        choose: Callable[[], Node | None],
+        choose: Callable[[], tuple[Node | None, float | None]],
         awaited: str,
         timeout: float | None,
         *,
-        until: Callable[[], float | None] = lambda: None,
+        asked: tuple[int | None, int | None] = (None, None),
     ) -> Component:
         """Wait until a choice is made, and its cached table is loaded.
 
         Args:
-            choose: called after each message, and at the time of `until`.
+            choose: called after each message; returns the choice, or when it may change without a message.
             awaited: for the error.
             timeout: seconds; None waits without limit.
-            until: returns when the choice may change without a message, or None.
+            asked: system and component to which requests are sent; nothing is, without both.
         """
         self.core.check_open()
         began = anyio.current_time()
-        node: Node | None = None
+        station = self.core.station
+        system, component = asked
+        probe_at = 0.0 if system and component else math.inf
+        node, due = choose()
         with anyio.move_on_after(timeout):
-            while (node := choose()) is None and not self.core.is_over:
-                due = until()
-                with anyio.move_on_after(None if due is None else due - anyio.current_time()):
+            while node is None and not self.core.is_over:
+                now = anyio.current_time()
+                probe_at = max(probe_at, station.listening_since + LOOK_TIME)
+                if system and component and now >= probe_at:
+                    station.probe(system, component)
+                    probe_at = now + PROBE_INTERVAL
+                with anyio.move_on_after(min(probe_at, math.inf if due is None else due) - now):
                     await self._activity()
+                node, due = choose()
             if node is not None:
                 await self._by_session[node.plain].wait_for_cache()
         if node is not None:
             return self._by_session[node.plain]
         refused = refused_in_words(self.signing_report())
-        hint = "" if refused else hint_of_link(self.core.station, self.bytes_received)
-        if (due := until()) is not None:
+        hint = "" if refused else hint_of_link(station, self.bytes_received)
+        if due is not None:
             hint, awaited = "", f"{awaited}, then {LOOK_TIME} s without another vehicle"
-        waited = anyio.current_time() - began
-        raise NoReply(f"{awaited}{refused}", attempts=0, waited=waited, hint=hint)
+        raise NoReply(f"{awaited}{refused}", attempts=0, waited=anyio.current_time() - began, hint=hint)

@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
-from typing import Final
+from typing import Final, Protocol
 
 import anyio
 
-from paramclient.client.arguments import (
-    check_author,
-    check_portable_name,
-    check_requested_name,
-    check_settle,
-    check_writes,
-)
+from paramclient.cache import check_author
 from paramclient.client.core import ClientCore
-from paramclient.client.reset import ResetChoice, ResetResult, read_unconfirmed
 from paramclient.client.signing import timestamp_now
 from paramclient.client.streams import Changes, Subscribers
 from paramclient.errors import (
@@ -31,37 +24,46 @@ from paramclient.errors import (
     UsageError,
 )
 from paramclient.links.replay import ReplayLink
+from paramclient.model.ext_values import check_ext_value
 from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.params import ParamMap
-from paramclient.model.values import Encoding, Param, Settable, Trust, WireValue
+from paramclient.model.values import (
+    Encoding,
+    Param,
+    Settable,
+    Trust,
+    WireValue,
+    check_portable_name,
+    check_value,
+)
 from paramclient.protocol import commands
 from paramclient.protocol.addresses import Address, PeerAddress, peer_in_words
-from paramclient.protocol.events import Change
+from paramclient.protocol.events import Change, Resynced
 from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all, result_of
 from paramclient.protocol.node import Node
-from paramclient.protocol.reads import read
-from paramclient.protocol.selection import hint_of_node, node_in_words
+from paramclient.protocol.reads import read_param
+from paramclient.protocol.selection import hint_of_node, node_in_words, vehicle_of
 from paramclient.protocol.session import Session
-from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
+from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.watch import SyncState, Watch
 from paramclient.protocol.writes import write, write_many
-from paramclient.wire.messages import MAV_MODE_FLAG_SAFETY_ARMED
+from paramclient.wire.messages import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, PARAMETERS_MAX
 from paramclient.wire.signing import SigningKey
 
-__all__ = ["Component", "ComponentState"]
+__all__ = ["SETTLE_MAX", "Component", "ComponentState"]
 
 CACHE_TIMEOUT: Final = 1.5
 """Seconds to wait for the identity of a component, without which its cached table cannot be loaded."""
 REBOOT_TIMEOUT: Final = 60.0
 """Seconds for a vehicle to reboot and report its identity, by default: small autopilot boards take up to 30
 seconds, and boards that calibrate sensors first a little longer."""
+SETTLE_MAX: Final = 60.0
+"""Maximum `settle` in seconds: further writes to the same name wait for it."""
 PASSIVE_TIMEOUT: Final = 20.0
 """Seconds of a fetch where nothing is sent, by default: another station may never request a list."""
-SETUP_SIGNING_COUNT: Final = 3
-"""SETUP_SIGNING messages that are sent: they have no acknowledgement, and a frame may be lost."""
-SETUP_SIGNING_INTERVAL: Final = 0.1
-"""Seconds after each SETUP_SIGNING message."""
 TIMEOUT_NOTE: Final = "The fetch ended at its timeout."
+
+logger = logging.getLogger(__name__)
 
 
 class ComponentState(StrEnum):
@@ -81,6 +83,26 @@ class ComponentState(StrEnum):
     """The component is lost."""
 
 
+class Owner(Protocol):
+    """What a component and its callers use of its client; see `paramclient.client.client`."""
+
+    core: ClientCore
+    policy: Policy
+    watch_interval: float | None
+
+    @property
+    def listens_only(self) -> bool: ...
+
+    @property
+    def components(self) -> Mapping[Address, Component]: ...
+
+    def emit(self, node: Node, event: Resynced) -> None: ...
+
+    async def successor(
+        self, component: Component, system: int, *, timeout: float | None = ...
+    ) -> Component: ...
+
+
 class Component:
     """One component of a vehicle; see `ParamClient.component`.
 
@@ -95,29 +117,27 @@ class Component:
             and follows the received messages.
     """
 
-    def __init__(
-        self,
-        core: ClientCore,
-        node: Node,
-        session: Session,
-        watch: Watch,
-        siblings: Mapping[Address, Component],
-        successor: Callable[..., Awaitable[Component]],
-    ) -> None:
-        self.core = core
+    def __init__(self, client: Owner, node: Node, session: Session, ext: Component | None) -> None:
+        self.client = client
+        self.core = client.core
         self.node = node
         self.session = session
-        self.watch = watch
-        self.siblings = siblings  # all components of the client, this one included
         self.system = node.system
         self.component = node.component
         self.params = ParamMap(session.table.params)
         self.subscribers: Subscribers[Change] = Subscribers()
-        self.policy = Policy.AUTO
+        self.policy = Policy.CACHE_ONLY if client.listens_only else client.policy
+        self.watch = Watch(
+            session, node.presence, self._resynced, interval=client.watch_interval, policy=self.policy
+        )
         self.cache_is_read = anyio.Event()
-        self.successor = successor
-        self._ext: Component | None = None
+        self._ext = ext
         self._last: FetchResult | None = None
+        session.table.recounted = self.watch.doubt
+        if client.listens_only:
+            session.contradicted = self.watch.doubt
+        else:
+            self.core.spawn(self.watch.run)
 
     @property
     def ext(self) -> Component:
@@ -125,6 +145,11 @@ class Component:
         if self._ext is None:
             raise UsageError("extended parameters have no extended parameters")
         return self._ext
+
+    @property
+    def is_extended(self) -> bool:
+        """Whether these are the extended parameters: whether the component is the `ext` of another one."""
+        return self.session.dialect.has_ack
 
     @property
     def autopilot(self) -> str:
@@ -135,7 +160,11 @@ class Component:
     @property
     def identity(self) -> Identity:
         """Identity of the vehicle from AUTOPILOT_VERSION: hardware id, firmware, capabilities, if known."""
-        return self.node.identification.identity
+        return self._vehicle.identification.identity
+
+    @property
+    def _vehicle(self) -> Node:
+        return vehicle_of(self.core.station.nodes.values(), self.node)
 
     @property
     def encoding(self) -> Encoding:
@@ -154,7 +183,7 @@ class Component:
 
     @property
     def hash(self) -> int | None:
-        """The PX4 hash (`_HASH_CHECK`) of the complete table; None if it is not known."""
+        """PX4's hash or ArduPilot's checksum of the complete table; None if it is not known."""
         return self.session.table.hash if self.session.table.is_complete else None
 
     @property
@@ -235,16 +264,13 @@ class Component:
             NoReply: the vehicle did not respond in time.
             LinkError: the link failed, or the client was closed.
         """
-        check_requested_name(name)
-        self._check_may_send()
-        with self._limited(timeout, f"parameter {name} of {self.system}/{self.component}"):
-            message = await read(self.session, name)
-        known = self.session.table.params.get(message.param_id)
-        if known is not None and (isinstance(name, str) or known.index == name):
-            return known
-        index = message.param_index if message.param_index < message.param_count else None
-        fields = (message.param_id, message.raw, message.param_type, index)
-        return self.session.dialect.param(*fields, self.encoding)
+        if isinstance(name, str):
+            check_portable_name(name)
+        elif not isinstance(name, int) or not 0 <= name < PARAMETERS_MAX:
+            raise UsageError(f"parameter index {name}: indices are 0 to {PARAMETERS_MAX - 1}")
+        self.core.check_may_send()
+        with self.limited(timeout, f"parameter {name} of {self.system}/{self.component}"):
+            return await read_param(self.session, name)
 
     async def set(
         self,
@@ -293,10 +319,9 @@ class Component:
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link failed, or the client was closed.
         """
-        ((name, checked),) = check_writes([(name, value)], extended=self.session.dialect.has_ack)
-        settle, by = check_settle(settle), check_author(author)
-        await self._check_may_write(durable=durable)
-        with self._limited(timeout, f"the acknowledgement of {name} by {self.system}/{self.component}"):
+        by = check_author(author)
+        ((name, checked),) = await self._check_writes([(name, value)], settle, durable=durable)
+        with self.limited(timeout, f"the acknowledgement of {name} by {self.system}/{self.component}"):
             result = await write(self.session, name, checked, settle=settle, force=force, author=by)
         if durable:
             await self._write_durably(name)
@@ -336,80 +361,22 @@ class Component:
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link had failed already, or the client was closed.
         """
-        pairs = check_writes(values, extended=self.session.dialect.has_ack)
-        settle, by = check_settle(settle), check_author(author)
-        await self._check_may_write(durable=durable)
-        began = anyio.current_time()
-        outcomes: list[SetOutcome] = []
-        error: ParamClientError | None = None
-        with anyio.move_on_after(timeout) as scope:
-            report = (lambda outcome: None) if progress is None else progress
-            error = await write_many(
-                self.session, pairs, outcomes, report, settle=settle, force=force, author=by
-            )
-        elapsed = anyio.current_time() - began
-        if scope.cancelled_caught:
-            error = NoReply(
-                f"{len(pairs)} writes to {self.system}/{self.component}", attempts=0, waited=elapsed
-            )
-            outcomes = [_ended(outcome, error) for outcome in outcomes]
+        by = check_author(author)
+        pairs = await self._check_writes(values, settle, durable=durable)
+        result = await write_many(
+            self.session, pairs, progress=progress, timeout=timeout, settle=settle, force=force, author=by
+        )
         hint = hint_of_node(self.core.station, self.node, anyio.current_time())
-        outcomes = [replace(each, error=_hinted(each.error, hint)) for each in outcomes]
-        error = _hinted(error, hint)
-        if durable and any(outcome.is_set for outcome in outcomes):
+        outcomes = [replace(each, error=_hinted(each.error, hint)) for each in result.outcomes]
+        error = _hinted(result.error, hint)
+        names = [outcome.name for outcome in outcomes if outcome.is_set]
+        if durable and names:
             try:
-                await self._write_durably(f"{sum(each.is_set for each in outcomes)} values")
+                await self._write_durably(names[0] if len(names) == 1 else f"{len(names)} values")
             except NotDurable as failure:
                 error = error or failure
                 outcomes = [replace(each, error=failure) if each.is_set else each for each in outcomes]
-        return SetManyResult(self.system, self.component, tuple(outcomes), error, elapsed)
-
-    async def reset(
-        self,
-        *names: str,
-        defaults: Mapping[str, WireValue] | None = None,
-        progress: Callable[[SetOutcome], None] | None = None,
-        timeout: float | None = None,
-        settle: float = 0.0,
-        durable: bool = False,
-        author: str | None = None,
-    ) -> ResetResult:
-        """Set parameters to the firmware's defaults, and verify each as `set` does.
-
-        The parameters are fetched first: ArduPilot, and PX4 from 1.18 on, give the defaults in the file
-        `param.pck`. Parameters without a known default, and those that have it already, are not written.
-
-        Args:
-            names: param_ids, at least one.
-            defaults: defaults of parameters whose default the vehicle does not give, by name, such as
-                `Metadata.defaults_of`.
-            progress, settle, durable, author: as in `set_many`.
-            timeout: seconds for the whole call; None: no limit besides the number of attempts.
-
-        Returns:
-            The outcomes of the written values, and the names that were not written.
-
-        Raises:
-            UsageError: no name, or another argument is not valid, or the client only listens.
-            UnknownParameter: the vehicle has no parameter with one of the names. Nothing was written.
-            ParamClientError: as from `fetch_all` and `set_many`.
-        """
-        if not names:
-            raise UsageError("reset needs the name of at least one parameter")
-        deadline = math.inf if timeout is None else anyio.current_time() + timeout
-
-        def left() -> float | None:
-            return None if timeout is None else max(deadline - anyio.current_time(), 0.0)
-
-        await self.fetch_all(timeout=timeout)
-        present = await read_unconfirmed(
-            self.params, self.get, map(check_portable_name, names), timeout=left()
-        )
-        choice = ResetChoice.of(present, defaults or {})
-        written = await self.set_many(
-            choice.values, progress=progress, timeout=left(), settle=settle, durable=durable, author=author
-        )
-        return ResetResult(written, choice.unchanged, choice.without_default)
+        return replace(result, outcomes=tuple(outcomes), error=error)
 
     async def fetch_all(
         self,
@@ -420,10 +387,11 @@ class Component:
     ) -> FetchResult:
         """Fetch all parameters. Uses the cache if the vehicle confirms it, otherwise downloads.
 
-        If the cache has a table and the vehicle a hash, the client requests the hash first. If it matches,
-        nothing is downloaded but the values outside the hash. Otherwise the client downloads the packed file
-        `param.pck` over MAVFTP if the component serves it: it is faster than the list, exact, and has the
-        firmware's defaults. If not, it downloads the list. `source` and `notes` of the result tell which.
+        If the cache has a table, the client first requests PX4's hash or ArduPilot's checksum. If it matches,
+        nothing is downloaded but the values outside the hash. Values that ArduPilot has changed are found by
+        checksums of ranges, and named in `changed` of the result. Otherwise the client downloads the packed
+        file `param.pck` over MAVFTP if the component serves it: it is faster than the list, exact, and has
+        the firmware's defaults. If not, it downloads the list. `source` and `notes` of the result tell which.
 
         The fetch always ends: indices without a response after all attempts are in `missing`, and a vehicle
         that is lost ends it with the values that arrived. Concurrent calls share one fetch. Cancellation
@@ -431,7 +399,7 @@ class Component:
         station requests.
 
         Args:
-            refresh: download even if the hash would confirm the cached table.
+            refresh: download even if the vehicle would confirm the cached table.
             timeout: seconds after which the partial table is returned with `missing`; None: no limit, except
                 20 s if the client only listens.
             progress: called as values arrive.
@@ -446,43 +414,64 @@ class Component:
             LinkError: the link failed, or the client was closed.
         """
         self.core.check_open()
-        if refresh and (self.policy is not Policy.AUTO or self.core.station.listens_only):
-            is_auto = self.policy is Policy.AUTO
-            why = "this client only listens" if is_auto else f"the policy is {self.policy}"
-            raise UsageError(f"refresh needs a download, and {why}")
+        if refresh:
+            self.core.check_may_send()
+            if self.policy is not Policy.AUTO:
+                raise UsageError(f"refresh needs a download, and the policy is {self.policy}")
         began = anyio.current_time()
-        is_log = isinstance(self.core.link, ReplayLink)
-        if timeout is None and self.core.station.listens_only and not is_log:
+        if timeout is None and self._waits_for_others:
             timeout = PASSIVE_TIMEOUT
-        with anyio.move_on_after(timeout), self._explained(began):
-            if not refresh:
-                await self.wait_for_cache()
-            if self.core.station.listens_only:
-                result = await self._listen(began)
-            else:
-                result = await fetch_all(self.session, refresh=refresh, policy=self.policy, progress=progress)
-            return self._fetched(replace(result, elapsed=anyio.current_time() - began))
-        if self.session.table.count is None:
-            waited = anyio.current_time() - began
-            with self._explained(began):
-                raise NoReply(f"the parameters of {self.system}/{self.component}", attempts=0, waited=waited)
-        is_confirmed = any(each.trust is Trust.VERIFIED for each in self.session.table.params.values())
+        with self.limited(None, "all parameters"):
+            with anyio.move_on_after(timeout):
+                if not refresh:
+                    await self.wait_for_cache()
+                if self.core.station.listens_only:
+                    result = await self._listen(began)
+                else:
+                    result = await fetch_all(
+                        self.session, refresh=refresh, policy=self.policy, progress=progress
+                    )
+                return self._fetched(replace(result, elapsed=anyio.current_time() - began))
+            if self.session.table.count is None:
+                raise self._nothing(began)
+        is_confirmed = _has(self.params, Trust.VERIFIED)
         return result_of(self.session, "cache" if is_confirmed else "stream", began, [TIMEOUT_NOTE])
 
     async def _listen(self, began: float) -> FetchResult:
         """Wait until the table is complete by what other stations request, or until a log has ended."""
-        table, is_log = self.session.table, isinstance(self.core.link, ReplayLink)
-        while not self.core.is_over and (is_log or not table.is_complete):
+        table = self.session.table
+        while not self.core.is_over and not (self._waits_for_others and self._is_heard()):
             await self.core.link_task.activity.wait()
             self.core.check_open()
         if not table.params:
-            what = f"the parameters of {self.system}/{self.component}"
-            raise NoReply(what, attempts=0, waited=anyio.current_time() - began)
-        self.session.confirm_announced()
-        return result_of(self.session, "stream", began, [])
+            raise self._nothing(began)
+        is_cached = self._is_heard() and _has(table.params, Trust.CACHED)
+        if not is_cached:
+            self.session.confirm_announced()
+        return result_of(self.session, "cache" if is_cached else "stream", began, [])
+
+    def _is_heard(self) -> bool:
+        """Return whether all values were received, or the hash of the cached ones was."""
+        table = self.session.table
+        is_confirmed = table.agrees_with(self.session.announced)
+        if is_confirmed:
+            table.verify()
+        return is_confirmed or (table.is_complete and not _has(table.params, Trust.CACHED))
+
+    @property
+    def _waits_for_others(self) -> bool:
+        """Whether only other stations request values, on a link that is no log."""
+        return self.core.station.listens_only and not isinstance(self.core.link, ReplayLink)
+
+    def _nothing(self, began: float) -> NoReply:
+        what = f"the parameters of {self.system}/{self.component}"
+        if self._waits_for_others:
+            what += ", which no other station has requested"
+        return NoReply(what, attempts=0, waited=anyio.current_time() - began)
 
     def _fetched(self, result: FetchResult) -> FetchResult:
         self._last = result
+        logger.debug("%s: %r", self.core.link.name, result)
         if not result.params and self.policy is not Policy.AUTO:
             raise CacheError(
                 f"nothing is cached of {self.system}/{self.component}, and nothing may be downloaded"
@@ -490,9 +479,13 @@ class Component:
         if result.source == "cache" and result.hash is None:
             self.watch.unconfirmed()
         elif result.complete:
-            self.watch.fetched(None if result.source == "cache" else result.elapsed)
-            self.core.cache_writer.fetched(self.session, result)
+            self.watch.fetched()
+            self.core.cache_writer.fetched(self.node, self.session, is_whole=result.source != "cache")
         return result
+
+    def _resynced(self, event: Resynced) -> None:
+        self.core.cache_writer.fetched(self.node, self.session, is_whole=True)
+        self.client.emit(self.node, event)
 
     async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
         """Give the vehicle a signing key with SETUP_SIGNING, or with None, disable its signing.
@@ -504,7 +497,8 @@ class Component:
             link_is_safe: that no other party can read the link, such as USB.
 
         Raises:
-            UsageError: `link_is_safe` is not given, or the component uses MAVLink 1, which has no signing.
+            UsageError: `link_is_safe` is not given, the client only listens, or the component uses MAVLink 1,
+                which has no signing.
             LinkError: the link failed, or the client was closed.
         """
         if not link_is_safe:
@@ -514,10 +508,8 @@ class Component:
             )
         if self.node.version == 1:
             raise UsageError(f"{self.system}/{self.component} uses MAVLink 1, which has no signing")
-        for _ in range(SETUP_SIGNING_COUNT):
-            self.core.check_open()
-            self.core.station.send_setup_signing(self.node, key, 0 if key is None else timestamp_now())
-            await anyio.sleep(SETUP_SIGNING_INTERVAL)
+        self.core.check_may_send()
+        await self.core.station.set_up_signing(self.node, key, 0 if key is None else timestamp_now())
 
     async def reboot(self, *, system: int | None = None, timeout: float | None = REBOOT_TIMEOUT) -> Component:
         """Reboot the vehicle, and wait until it is back and identified. Written values are saved before.
@@ -535,14 +527,13 @@ class Component:
             NoReply: it did not answer, or did not come back in time.
             LinkError: the link failed, or the client was closed.
         """
-        self._check_may_send()
+        self.core.check_may_send()
         moves = system is not None and system != self.system
-        with self._limited(timeout, f"{self.system}/{self.component} to be back after its reboot"):
+        with self.limited(timeout, f"{self.system}/{self.component} to be back after its reboot"):
             await commands.reboot(self.node, returns=not moves)
             if system is None or not moves:
                 return self
-            return await self.successor(self, system, timeout=None)
-        raise AssertionError("the timeout has raised")
+            return await self.client.successor(self, system, timeout=None)
 
     def changes(self) -> Changes:
         """Return a stream of parameter changes from now on: `async for change in component.changes()`.
@@ -561,25 +552,39 @@ class Component:
     async def wait_until_identified(self, timeout: float) -> None:
         """Wait at most `timeout` seconds until the vehicle is identified, as its cache key requires."""
         with anyio.move_on_after(timeout):
-            await self.node.identification.settled()
+            await self._vehicle.identification.settled()
 
     async def wait_for_cache(self) -> None:
-        """Wait until the cached table, if there is one, is in the table; 1.5 s at most."""
+        """Wait until the cached table, if there is one, is in the table; 1.5 s at most.
+
+        Raises:
+            LinkError: the client was closed.
+        """
         if self.core.cache_writer.may_have(self.node):
-            with anyio.move_on_after(CACHE_TIMEOUT):
+            with anyio.CancelScope(deadline=self.node.since + CACHE_TIMEOUT):
                 await self.cache_is_read.wait()
+            self.core.check_open()
 
-    def is_extended_by(self, ext: Component) -> None:
-        """Take the component with the extended parameters."""
-        self._ext = ext
+    async def _check_writes(
+        self,
+        values: Mapping[str, Settable] | Iterable[tuple[str, Settable]],
+        settle: float,
+        *,
+        durable: bool,
+    ) -> list[tuple[str, WireValue]]:
+        """Check that values may be written, and return them with their names.
 
-    def _check_may_send(self) -> None:
-        self.core.check_open()
-        if self.core.station.listens_only:
-            raise UsageError("this client only listens, and sends no requests")
-
-    async def _check_may_write(self, *, durable: bool) -> None:
-        self._check_may_send()
+        Raises:
+            UsageError, AmbiguousVehicle, CacheError, LinkError: as from `set_many`.
+        """
+        check = check_ext_value if self.is_extended else check_value
+        pairs = values.items() if isinstance(values, Mapping) else values
+        checked = [(check_portable_name(name), check(value)) for name, value in pairs]
+        if any(name == HASH_CHECK for name, _ in checked):
+            raise UsageError(f"{HASH_CHECK} is read-only: it is the hash of the parameters, not a parameter")
+        if not 0.0 <= settle <= SETTLE_MAX:
+            raise UsageError(f"settle must be 0 to {SETTLE_MAX:g} seconds, not {settle}")
+        self.core.check_may_send()
         if self.node.has_rival(anyio.current_time()):
             words = node_in_words(self.node)
             raise AmbiguousVehicle(
@@ -590,6 +595,7 @@ class Component:
                 with anyio.move_on_after(CACHE_TIMEOUT):
                     await self.cache_is_read.wait()
             self.core.cache_writer.check_kept(self.node)
+        return checked
 
     async def _write_durably(self, what: str) -> None:
         try:
@@ -599,28 +605,21 @@ class Component:
             raise NotDurable(f"{address} has accepted {what}, but it is not on the disk: {error}") from error
 
     @contextmanager
-    def _limited(self, timeout: float | None, what: str) -> Iterator[None]:
-        """Raise NoReply at a timeout."""
+    def limited(self, timeout: float | None, what: str) -> Iterator[None]:
+        """Raise NoReply at a timeout, and add to each NoReply what was received meanwhile."""
         began = anyio.current_time()
-        with self._explained(began):
+        try:
             with anyio.move_on_after(timeout) as scope:
                 yield
             if scope.cancelled_caught:
                 raise NoReply(what, attempts=0, waited=anyio.current_time() - began)
-
-    @contextmanager
-    def _explained(self, began: float) -> Iterator[None]:
-        """Add to a NoReply what was received on the link meanwhile."""
-        try:
-            yield
         except NoReply as error:
             hint = hint_of_node(self.core.station, self.node, anyio.current_time())
             raise error.with_hint(hint) from None
 
 
-def _ended(outcome: SetOutcome, error: ParamClientError) -> SetOutcome:
-    is_open = outcome.status in (SetStatus.NOT_TRIED, SetStatus.UNKNOWN) and outcome.error is None
-    return replace(outcome, error=error) if is_open else outcome
+def _has(params: Mapping[str, Param], trust: Trust) -> bool:
+    return any(param.trust is trust for param in params.values())
 
 
 def _hinted(error: ParamClientError | None, hint: str) -> ParamClientError | None:

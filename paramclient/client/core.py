@@ -3,39 +3,51 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import sys
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 import anyio
 import anyio.abc
+import anyio.lowlevel
 
 from paramclient.client.cache_writer import CacheWriter
 from paramclient.client.link_task import LinkTask
-from paramclient.client.signing_timestamps import TimestampKeeper
-from paramclient.client.taps import LinkTaps
+from paramclient.client.signing import Signing
+from paramclient.client.taps import Tap
 from paramclient.errors import ClientClosed, ParamClientError, UsageError
 from paramclient.links import Link
 from paramclient.protocol.station import Station
 
 __all__ = ["ClientCore"]
 
+TASK_NAME: Final = "paramclient client"
+"""Name of the task, in the debuggers of asyncio and trio."""
+
 logger = logging.getLogger(__name__)
+
+running: set[ClientCore] = set()
+"""The clients whose task has not ended: asyncio itself holds only weak references to its tasks."""
 
 
 class ClientCore:
     """The link of a client, the station, the cache and their tasks.
 
+    All tasks run in one of their own, which `open` starts and `close` ends: the callers of the two may be
+    different tasks, and cancelling one of them takes the link away from no conversation that closes a file
+    on board. If the event loop ends first, it cancels the task, which then closes the client.
+
     Args:
         link: the link, not open.
         cache_writer: writes tables to the cache.
-        taps: the telemetry log and the forwarder.
-        keeper: stores the signature timestamps; None without a key.
+        taps: receivers of all frames of the link.
+        signing: the key and its options, or None.
         new_station: makes the station, of functions that queue bytes and start background work.
         ended: called when the streams end: with a log, with a link that has failed for good, or at closing.
 
     Attributes:
-        link_task, station, cache_writer, taps: the parts.
+        link_task, station, cache_writer: the parts.
         cache: the cache of the tables, or None.
         is_over: whether a log has ended.
     """
@@ -44,8 +56,8 @@ class ClientCore:
         self,
         link: Link,
         cache_writer: CacheWriter,
-        taps: LinkTaps,
-        keeper: TimestampKeeper | None,
+        taps: Sequence[Tap],
+        signing: Signing | None,
         new_station: Callable[..., Station],
         ended: Callable[[], None],
     ) -> None:
@@ -53,21 +65,22 @@ class ClientCore:
         self.cache_writer = cache_writer
         self.cache = cache_writer.cache
         self.is_over = False
-        self.link_task = LinkTask(link, taps=taps.taps, ended=self._link_ended)
+        self.link_task = LinkTask(link, taps=taps, ended=self._link_ended)
         self.station = self.link_task.station = new_station(send=self.link_task.queue, spawn=self.spawn)
-        self.taps = taps
-        self._keeper = keeper
+        self._taps = taps
+        self._signing = signing
         self._ended = ended
-        self._io: anyio.abc.TaskGroup | None = None
         self._work: anyio.abc.TaskGroup | None = None
-        self._was_opened = False
-        if not self.station.listens_only:
-            taps.share(self.link_task.forward)
+        self._scope: anyio.CancelScope | None = None  # from `open` on: it needs an event loop
+        self._is_opened = anyio.Event()
+        self._is_to_close = anyio.Event()
+        self._is_closed = anyio.Event()
+        self._error: Exception | None = None
 
     @property
     def state(self) -> str:
         """open, reconnecting or closed."""
-        if self._io is None or self.station.gate.is_closed:
+        if self._work is None or self.station.gate.is_closed:
             return "closed"
         return "reconnecting" if self.link_task.is_disconnected else "open"
 
@@ -78,10 +91,18 @@ class ClientCore:
             LinkError: the link failed, or the client is not open.
         """
         self.station.gate.check()
-        if self._io is None:
+        if self._work is None:
             raise ClientClosed("the client is not open; use `async with` or `open`", link=self.link.name)
-        if self._work is None or self._work.cancel_scope.cancel_called:
-            raise ClientClosed("the client was closed", link=self.link.name)
+
+    def check_may_send(self) -> None:
+        """Check that the client is open, and does not only listen.
+
+        Raises:
+            UsageError, LinkError.
+        """
+        self.check_open()
+        if self.station.listens_only:
+            raise UsageError("the client only listens, and sends no requests")
 
     def spawn(self, work: Callable[..., Any], *arguments: Any) -> None:
         """Run a function in the background. Its errors are logged, and never end the link."""
@@ -97,69 +118,113 @@ class ClientCore:
             logger.exception("%s: unexpected error", self.link.name)
 
     async def open(self) -> None:
-        """Open the link and the cache, and start the tasks.
+        """Open the link and the cache, and start the tasks. Cancellation closes the client again.
 
         Raises:
             UsageError, LinkError: as from entering a `ParamClient`.
+            ClientClosed: `close` was called meanwhile.
         """
-        if self._was_opened:
+        if self._scope is not None:
             raise UsageError("a ParamClient can be opened only once; create a new one")
-        self._was_opened = True
+        scope = self._scope = anyio.CancelScope()
+        running.add(self)
+        _spawn(partial(self._run, scope))
         try:
-            await self.link.open()
-            await self.cache_writer.open()
-            await self.taps.open()
-            if self._keeper is not None:
-                self.station.begin_signing(*await self._keeper.open())
+            await self._is_opened.wait()
         except BaseException:
-            await self._release()
+            scope.cancel()
+            with anyio.CancelScope(shield=True):
+                await self._is_closed.wait()
             raise
-        self.station.listening_since = anyio.current_time()
-        self._io, self._work = anyio.create_task_group(), anyio.create_task_group()
-        await self._io.__aenter__()
-        await self._work.__aenter__()
-        self._io.start_soon(self.link_task.read, name="paramclient reader")
-        self._io.start_soon(self.link_task.send, name="paramclient sender")
-        self._io.start_soon(self.cache_writer.run, name="paramclient cache writer")
-        self.taps.start(self._io)
-        if self._keeper is not None:
-            self._io.start_soon(self._keeper.run, name="paramclient timestamp keeper")
-        self.spawn(self.station.send_heartbeats)
+        if self._is_closed.is_set():
+            self._raise_error()
+            raise ClientClosed("the client was closed while it was being opened", link=self.link.name)
 
     async def close(self) -> None:
         """End waiting calls, write new values, and release the link and the cache.
 
-        Conversations are cancelled first, while the link still carries what they send to close files on
-        board. Cancellation does not skip these steps.
+        Without effect before `open`, and after the first call. Cancellation skips no step.
+
+        Raises:
+            Exception: an unexpected error that has ended the client, or occurred while it was closed; from
+                the first call only.
         """
-        io, work = self._io, self._work
-        assert io is not None
-        assert work is not None
-        work.cancel_scope.cancel()
+        if self._scope is not None:
+            if not self._is_opened.is_set():
+                self._scope.cancel()
+            self._is_to_close.set()
+            with anyio.CancelScope(shield=True):
+                await self._is_closed.wait()
+            self._raise_error()
+            await anyio.lowlevel.checkpoint()
+
+    async def _run(self, scope: anyio.CancelScope) -> None:
         try:
-            await work.__aexit__(None, None, None)
+            with scope:
+                await self._live()
+        except Exception as error:
+            self._error = error  # for the caller of `open` or `close`, and as the cause of ClientClosed
+            if self._is_opened.is_set() and not self._is_to_close.is_set():
+                logger.error("%s: an unexpected error has ended the client", self.link.name, exc_info=error)
+            if self.station.gate.error is not None:
+                self.station.gate.error.__cause__ = error
         finally:
-            self._work = None
-            self.station.fail(ClientClosed("the client was closed", link=self.link.name), for_good=True)
-            self.link_task.notify()
-            self._ended()
-            io.cancel_scope.cancel()
-            try:
-                await io.__aexit__(None, None, None)
-            finally:
-                self._io = None
-                await self._release()
+            self._is_opened.set()
+            self._is_closed.set()
+            running.discard(self)
+
+    async def _live(self) -> None:
+        """Open the client, and close it when it is to be closed, is cancelled or a task of it fails.
+
+        Conversations are cancelled first, while the link still carries what they send to close files on
+        board.
+        """
+        try:
+            await self.link.open()
+            await self.cache_writer.open()
+            for tap in self._taps:
+                await tap.open()
+            if self._signing is not None:
+                self.station.begin_signing(*self._signing.begin())
+            logger.debug("%s: open", self.link.name)
+            self.station.listening_since = anyio.current_time()
+            async with anyio.create_task_group() as io:
+                io.start_soon(self.link_task.read, name="paramclient reader")
+                io.start_soon(self.link_task.send, name="paramclient sender")
+                io.start_soon(self.cache_writer.run, name="paramclient cache writer")
+                for tap in self._taps:
+                    io.start_soon(tap.run, self.link_task.forward)
+                try:
+                    async with anyio.create_task_group() as self._work:
+                        self.spawn(self.station.send_heartbeats)
+                        self._is_opened.set()
+                        await self._is_to_close.wait()
+                        logger.debug("%s: closing", self.link.name)
+                        self._work.cancel_scope.cancel()
+                finally:
+                    self._work = None
+                    closed = ClientClosed("the client was closed", link=self.link.name)
+                    self.station.fail(closed, for_good=True)
+                    self.link_task.notify()
+                    self._ended()
+                    io.cancel_scope.cancel()
+        finally:
+            await self._release()
 
     async def _release(self) -> None:
         with anyio.CancelScope(shield=True):
-            cache_close = partial(self.cache_writer.close, self.station.nodes.values())
-            for close in (cache_close, self.taps.close, self.link.close):
+            self.link_task.end_streams()
+            closing: list[Callable[[], Awaitable[None]]] = [
+                partial(self.cache_writer.close, self.station.nodes.values()),
+                self.link_task.flush,  # the last messages of conversations that were ended
+                *(tap.close for tap in self._taps),
+                self.link.close,
+            ]
+            for close in closing:
                 try:
                     await close()
                 except ParamClientError as error:
                     logger.warning("%s: %s", self.link.name, error)
-            if self._keeper is not None:
-                await self._keeper.close()
 
     def _link_ended(self) -> None:
         self.is_over = not self.station.gate.is_closed
@@ -167,3 +232,21 @@ class ClientCore:
             for node in self.station.nodes.values():
                 node.presence.is_over = True
         self._ended()
+
+    def _raise_error(self) -> None:
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+
+def _spawn(function: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Run a function in a task that belongs to the event loop, not to the caller's task."""
+    if "trio" in sys.modules:
+        from trio import lowlevel
+
+        if lowlevel.in_trio_task():
+            lowlevel.spawn_system_task(function, name=TASK_NAME)
+            return
+    import asyncio
+
+    asyncio.get_running_loop().create_task(function(), name=TASK_NAME)

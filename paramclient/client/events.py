@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -14,7 +13,7 @@ if TYPE_CHECKING:
 __all__ = ["Discovered", "Event", "Events", "Found", "Lost", "Rebooted", "Resynced"]
 
 EVENTS_MAX: Final = 1_000
-"""Queued events for a consumer, at most. Above it, the oldest are dropped."""
+"""Queued events for a consumer, at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +72,7 @@ class Resynced:
     Attributes:
         component: the component of the table.
         changed: names of the parameters that had changed.
-        hash: the vehicle's hash that confirms the table; None for a vehicle without a hash.
+        hash: PX4's hash or ArduPilot's checksum that confirms the table; None without one.
     """
 
     component: Component
@@ -87,14 +86,4 @@ Event: TypeAlias = Discovered | Lost | Found | Rebooted | Resynced
 class Events(Stream[Event]):
     """Stream of the component events since its creation; see `ParamClient.events`."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._waiting: deque[Event] = deque(maxlen=EVENTS_MAX)
-
-    def push(self, item: Event) -> None:
-        """Add an event."""
-        self._waiting.append(item)
-        self._arrived.set()
-
-    def _take(self) -> Event | None:
-        return self._waiting.popleft() if self._waiting else None
+    most = EVENTS_MAX

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-import anyio
-
-from paramclient.errors import NoReply
 from paramclient.protocol import ftp
+from paramclient.protocol.channel import Channel
 
 if TYPE_CHECKING:
     from paramclient.client.component import Component
@@ -32,7 +31,6 @@ class Ftp:
         self,
         path: str,
         *,
-        read_size: int = ftp.DATA_SIZE_MAX,
         size_max: int = ftp.FILE_SIZE_MAX,
         progress: Callable[[int, int | None], None] | None = None,
         timeout: float | None = None,
@@ -41,23 +39,18 @@ class Ftp:
 
         Args:
             path: of the file, as the component names it.
-            read_size: bytes of each read, 1 to 239.
             size_max: bytes, at most.
             progress: called with the bytes received and the size, which is an estimate for generated files.
             timeout: seconds; None waits as long as the component answers.
 
         Raises:
-            UsageError: the path is not valid.
+            UsageError: the path is not valid, or the client only listens.
             FileTransferError: the component refused it, or the file is larger than `size_max`.
             NoReply: it does not answer.
             LinkError: the link failed, or the client was closed.
         """
-        self._component.core.check_open()
-        channel = self._component.node.channel
-        with self._limit(path, timeout):
-            return await ftp.read_file(
-                channel, path, read_size=read_size, size_max=size_max, progress=progress
-            )
+        with self._channel(path, timeout) as channel:
+            return await ftp.read_file(channel, path, size_max=size_max, progress=progress)
 
     async def list(self, path: str, *, timeout: float | None = None) -> list[ftp.DirectoryEntry]:
         """Return the entries of a directory.
@@ -65,9 +58,8 @@ class Ftp:
         Raises:
             UsageError, FileTransferError, NoReply, LinkError: as from `read`.
         """
-        self._component.core.check_open()
-        with self._limit(path, timeout):
-            return await ftp.list_directory(self._component.node.channel, path)
+        with self._channel(path, timeout) as channel:
+            return await ftp.list_directory(channel, path)
 
     async def checksum(self, path: str, *, timeout: float | None = None) -> int:
         """Return the CRC-32 of a file, computed by the component; see `crc32_px4`.
@@ -75,28 +67,13 @@ class Ftp:
         Raises:
             UsageError, FileTransferError, NoReply, LinkError: as from `read`.
         """
-        self._component.core.check_open()
-        with self._limit(path, timeout):
-            return await ftp.checksum(self._component.node.channel, path)
+        with self._channel(path, timeout) as channel:
+            return await ftp.checksum(channel, path)
 
-    def _limit(self, path: str, timeout: float | None) -> _Limit:
-        return _Limit(f"{path} of {self._component.system}/{self._component.component}", timeout)
-
-
-class _Limit:
-    """Raises NoReply at a timeout."""
-
-    def __init__(self, what: str, timeout: float | None) -> None:
-        self._what = what
-        self._scope = anyio.move_on_after(timeout)
-        self._began = 0.0
-
-    def __enter__(self) -> None:
-        self._began = anyio.current_time()
-        self._scope.__enter__()
-
-    def __exit__(self, *error: object) -> bool | None:
-        handled = self._scope.__exit__(*error)  # type: ignore[arg-type]  # the three parts of an exception
-        if self._scope.cancelled_caught:
-            raise NoReply(self._what, attempts=0, waited=anyio.current_time() - self._began)
-        return handled
+    @contextmanager
+    def _channel(self, path: str, timeout: float | None) -> Iterator[Channel]:
+        """Raise NoReply at the timeout."""
+        component = self._component
+        component.core.check_may_send()
+        with component.limited(timeout, f"{path} of {component.system}/{component.component}"):
+            yield component.node.channel

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
+from typing import Final
 
 import anyio
 
 from paramclient.client.component import Component
 from paramclient.errors import CacheError, NoReply, ParamClientError
 from paramclient.protocol.addresses import Address
-from paramclient.protocol.fetch import FetchResult, Progress
+from paramclient.protocol.fetch import FetchResult
+from paramclient.protocol.selection import hint_of_node
 
 __all__ = ["FetchedAll", "fetch_components"]
+
+
+SILENT_TIME: Final = 1.75
+"""Seconds for a component that has never answered a request, where another one on the link answers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +45,6 @@ async def fetch_components(
     *,
     refresh: bool,
     timeout: float | None,
-    progress: Callable[[Mapping[Address, Progress]], None] | None,
 ) -> FetchedAll:
     """Fetch the tables of components in parallel; see `ParamClient.fetch_all`.
 
@@ -52,27 +56,35 @@ async def fetch_components(
     results: dict[Address, FetchResult] = {}
     silent: dict[Address, NoReply | CacheError] = {}
     failures: list[ParamClientError] = []
-    states: dict[Address, Progress] = {}
-
-    def report(address: Address, state: Progress) -> None:
-        states[address] = state
-        if progress is not None:
-            progress(dict(states))
+    scopes = {address: anyio.CancelScope() for address in components}
 
     async def fetch(address: Address, component: Component) -> None:
         try:
-            results[address] = await component.fetch_all(
-                refresh=refresh, timeout=timeout, progress=partial(report, address)
-            )
+            with scopes[address]:
+                results[address] = await component.fetch_all(refresh=refresh, timeout=timeout)
+            if scopes[address].cancelled_caught:
+                what = f"the parameters of {component.system}/{component.component}"
+                hint = hint_of_node(component.core.station, component.node, anyio.current_time())
+                raise NoReply(what, attempts=0, waited=SILENT_TIME, hint=hint)
         except (NoReply, CacheError) as error:
             silent[address] = error
         except ParamClientError as error:
             failures.append(error)
-            tasks.cancel_scope.cancel()
+            fetches.cancel_scope.cancel()
+
+    async def give_up_silent() -> None:
+        await anyio.sleep(SILENT_TIME)
+        if any(each.round_trip is not None for each in components.values()):
+            for address, each in components.items():
+                if each.round_trip is None and each.count is None:
+                    scopes[address].cancel()
 
     async with anyio.create_task_group() as tasks:
-        for address, component in components.items():
-            tasks.start_soon(fetch, address, component)
+        tasks.start_soon(give_up_silent)
+        async with anyio.create_task_group() as fetches:
+            for address, component in components.items():
+                fetches.start_soon(fetch, address, component)
+        tasks.cancel_scope.cancel()
     if failures:
         raise failures[0]
     if silent and not results:

@@ -4,30 +4,29 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from typing import Final
 
 import anyio
 
-from paramclient.client.frame_cutter import FrameCutter
+from paramclient.client.taps import FrameCutter, SeenFrame, Tap
 from paramclient.errors import LinkError
-from paramclient.links import Link, Peer
+from paramclient.links import Link
+from paramclient.wire.frames import bears_key
 
 __all__ = ["Forwarder"]
 
 QUEUED_FRAMES_MAX: Final = 1_000
 """Maximum number of frames queued for a slow program; further frames are dropped. A parameter list, which PX4
 sends in bursts, fits."""
-PROGRAM_BACKOFF_MIN: Final = 0.5
-"""Seconds before the first attempt to reopen the link to the program; doubled after each attempt."""
-PROGRAM_BACKOFF_MAX: Final = 5.0
-"""Maximum seconds between two attempts to reopen the link to the program."""
+PROGRAM_RETRY_INTERVAL: Final = 1.0
+"""Seconds between two attempts to reopen the link to the program, which is usually on this machine."""
 
 logger = logging.getLogger(__name__)
 
 
-class Forwarder:
+class Forwarder(Tap):
     """Forwards received frames to another program, and frames of the program to the vehicle link.
 
     Frames are complete and unchanged. Frames that this client sends are not forwarded. A slow or absent
@@ -35,19 +34,11 @@ class Forwarder:
 
     Args:
         link: link to the program.
-        is_stream: whether the vehicle link delivers a byte stream.
-
-    Attributes:
-        to_vehicle: called with each frame of the program; None if nothing may be sent to vehicles.
-        lost: number of dropped frames.
     """
 
-    def __init__(self, link: Link, *, is_stream: bool) -> None:
-        self.lost = 0
+    def __init__(self, link: Link) -> None:
         self._link = link
-        self.to_vehicle: Callable[[bytes], None] | None = None
-        self._from_vehicle = FrameCutter(stream=is_stream)
-        self._from_program = FrameCutter(stream=link.is_stream)
+        self._cutter = FrameCutter(stream=link.is_stream)
         self._waiting: deque[bytes] = deque()
         self._something_waits = anyio.Event()
         self._is_there = False
@@ -70,59 +61,51 @@ class Forwarder:
         """Close the link to the program."""
         await self._link.close()
 
-    def received(self, data: bytes, peer: Peer) -> None:
-        """Queue received data for the program."""
-        self._pass_on(self._from_vehicle.cut(data, peer))
+    def received(self, frames: Sequence[SeenFrame], size: int, peer: Hashable) -> None:
+        """Queue received frames for the program."""
+        for each in frames:
+            if self._is_there and len(self._waiting) < QUEUED_FRAMES_MAX and not bears_key(each.data):
+                self._waiting.append(each.data)
+                self._something_waits.set()
 
-    def sent(self, data: bytes) -> None:
-        """Ignore a sent frame: it is not forwarded."""
+    async def run(self, to_vehicles: Callable[[bytes], None]) -> None:
+        """Pass frames in both directions, until cancelled."""
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(self._send)
+            await self._read(to_vehicles)
 
-    def pause(self) -> None:
-        """Discard an incomplete frame: the vehicle link is disconnected."""
-        self._pass_on(self._from_vehicle.flush())
-
-    async def read(self) -> None:
+    async def _read(self, to_vehicles: Callable[[bytes], None]) -> None:
         """Receive frames of the program and reconnect to it, until its link fails permanently."""
         while True:
             try:
                 if not self._is_there:
                     await self._reach()
                 for peer, data in await self._link.receive():
-                    for frame in self._from_program.cut(data, peer):
-                        if self.to_vehicle is not None:
-                            self.to_vehicle(frame)
+                    for each in self._cutter.cut(data, peer):
+                        if not bears_key(each.data):
+                            to_vehicles(each.data)
             except LinkError as error:
                 self._is_there = False
-                self._from_program.flush()
+                self._cutter = FrameCutter(stream=self._link.is_stream)
                 if not self._link.reconnects:
                     logger.warning("forwarding has stopped: %s", error)
                     return
                 logger.warning("%s; reconnecting", error)
 
-    async def send(self) -> None:
+    async def _send(self) -> None:
         """Send the queued frames to the program, until cancelled."""
         while True:
             self._something_waits = anyio.Event()
             while self._waiting:
-                frame = self._waiting.popleft()
                 with suppress(LinkError):  # the reader reconnects
-                    await self._link.send(frame, None)
+                    await self._link.send(self._waiting.popleft(), None)
             await self._something_waits.wait()
 
     async def _reach(self) -> None:
-        """Reopen the link with backoff, without a time limit."""
-        backoff = PROGRAM_BACKOFF_MIN
+        """Reopen the link, without a time limit."""
         while not self._is_there:
-            await anyio.sleep(backoff)
-            backoff = min(2 * backoff, PROGRAM_BACKOFF_MAX)
+            await anyio.sleep(PROGRAM_RETRY_INTERVAL)
             with suppress(LinkError):
                 await self._link.open()
                 self._is_there = True
         logger.info("%s: reconnected", self._link.name)
-
-    def _pass_on(self, frames: list[bytes]) -> None:
-        free_frames = QUEUED_FRAMES_MAX - len(self._waiting) if self._is_there else 0
-        self.lost += max(0, len(frames) - free_frames)
-        if frames[:free_frames]:
-            self._waiting.extend(frames[:free_frames])
-            self._something_waits.set()

@@ -6,16 +6,17 @@ import logging
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Final, Protocol
+from typing import Final
 
 import anyio
 import anyio.lowlevel
 
-from paramclient.errors import LinkError
+from paramclient.client.taps import FrameCutter, Tap
+from paramclient.errors import ClientClosed, LinkError
 from paramclient.links import Link
 from paramclient.protocol.station import Peer, Station
 
-__all__ = ["LinkTask", "Tap"]
+__all__ = ["LinkTask"]
 
 READ_PAUSE: Final = 0.02
 """Seconds for which the reader pauses while no conversation waits, so that telemetry accumulates: one read of
@@ -39,19 +40,6 @@ RECONNECT_BACKOFF_MAX: Final = 5.0
 logger = logging.getLogger(__name__)
 
 
-class Tap(Protocol):
-    """Receiver of all data on a link. Its calls must neither block nor raise."""
-
-    def received(self, data: bytes, peer: Peer) -> None:
-        """Take received data; empty data marks the end of the peer's stream."""
-
-    def sent(self, data: bytes) -> None:
-        """Take a frame that is passed to the link."""
-
-    def pause(self) -> None:
-        """Drop an incomplete frame: the link is disconnected."""
-
-
 class LinkTask:
     """Passes received data from a link to the station, and its frames to the link.
 
@@ -60,7 +48,7 @@ class LinkTask:
 
     Args:
         link: an open link.
-        taps: receivers of all data on the link.
+        taps: receivers of all frames on the link.
         ended: called when a log has ended, or the link has failed for good.
 
     Attributes:
@@ -68,14 +56,16 @@ class LinkTask:
         is_disconnected: whether the link is disconnected and being reopened.
         activity: set, and replaced, when data was received, and when the link drops or has failed.
         bytes_received, bytes_sent: on this link.
+        cutter: cuts the received data for the taps.
     """
 
     station: Station
 
-    def __init__(self, link: Link, *, taps: Sequence[Tap] = (), ended: Callable[[], None]) -> None:
+    def __init__(self, link: Link, *, taps: Sequence[Tap], ended: Callable[[], None]) -> None:
         self.is_disconnected = False
         self.activity = anyio.Event()
         self.bytes_received = self.bytes_sent = 0
+        self.cutter = FrameCutter(stream=link.is_stream)
         self._link = link
         self._taps = taps
         self._ended = ended
@@ -89,8 +79,9 @@ class LinkTask:
         self._something_to_send.set()
 
     def forward(self, frame: bytes) -> None:
-        """Queue a frame of another program for all peers, unless the queue is full or the link is down."""
-        if len(self._forwarded) < FORWARDED_QUEUE_MAX and not self.is_disconnected:
+        """Queue a frame of another program for all peers, if this client sends and the queue is not full."""
+        may_send = not (self.is_disconnected or self.station.listens_only)
+        if may_send and len(self._forwarded) < FORWARDED_QUEUE_MAX:
             self._forwarded.append(frame)
             self.station.overhear(frame, anyio.current_time())
             self._something_to_send.set()
@@ -107,13 +98,11 @@ class LinkTask:
             try:
                 chunks = await self._link.receive()
             except LinkError as error:
-                if not self._link.reconnects:
-                    self.station.fail(error, for_good=True)
-                    self._ended()
-                    self.notify()
-                    return
-                await self._reconnect(error)
-                continue
+                if self._link.reconnects:
+                    await self._reconnect(error)
+                    continue
+                self.station.fail(error, for_good=True)
+                chunks = []
             if not chunks:
                 self._ended()
                 self.notify()
@@ -121,8 +110,7 @@ class LinkTask:
             for place, (peer, data) in enumerate(chunks, start=1):
                 self.bytes_received += len(data)
                 self.station.receive(data, peer, anyio.current_time())
-                for tap in self._taps:
-                    tap.received(data, peer)
+                self._show(data, peer)
                 if not place % CHUNKS_PER_TURN:
                     await anyio.lowlevel.checkpoint()
             self.notify()
@@ -132,20 +120,39 @@ class LinkTask:
 
     async def send(self) -> None:
         """Send queued frames, those of another program after those of this one, until cancelled."""
-        while True:
-            self._something_to_send = anyio.Event()
-            sent = 0
-            while self._queue or self._forwarded:
-                data, peer = self._queue.popleft() if self._queue else (self._forwarded.popleft(), None)
-                self.bytes_sent += len(data)
-                for tap in self._taps:
-                    tap.sent(data)
-                with suppress(LinkError):  # the reader reconnects; unanswered requests are repeated
-                    await self._link.send(data, peer)
-                sent += 1
-                if not sent % FRAMES_PER_TURN:
-                    await anyio.lowlevel.checkpoint()
-            await self._something_to_send.wait()
+        try:
+            while True:
+                self._something_to_send = anyio.Event()
+                await self.flush()
+                await self._something_to_send.wait()
+        finally:  # the event loop may cancel all tasks at once: no conversation waits for an answer then
+            self.station.fail(ClientClosed("the client was closed", link=self._link.name), for_good=True)
+
+    async def flush(self) -> None:
+        """Send all queued frames."""
+        sent = 0
+        while self._queue or self._forwarded:
+            data, peer = self._queue.popleft() if self._queue else (self._forwarded.popleft(), None)
+            self.bytes_sent += len(data)
+            for tap in self._taps:
+                tap.sent(data)
+            with suppress(LinkError):  # the reader reconnects; unanswered requests are repeated
+                await self._link.send(data, peer)
+            sent += 1
+            if not sent % FRAMES_PER_TURN:
+                await anyio.lowlevel.checkpoint()
+
+    def end_streams(self) -> None:
+        """End the unfinished frames: the link is down, or closed."""
+        for peer in self.cutter.unfinished:
+            self._show(b"", peer)
+
+    def _show(self, data: bytes, peer: Peer) -> None:
+        """Pass received data to the taps."""
+        if self._taps:
+            frames = self.cutter.cut(data, peer)
+            for tap in self._taps:
+                tap.received(frames, len(data), peer)
 
     async def _rest(self, seconds: float) -> None:
         """Pause reading for this time, or until a frame is sent, which may cause a response."""
@@ -159,8 +166,7 @@ class LinkTask:
         self.station.interrupt()
         self._queue.clear()
         self._forwarded.clear()
-        for tap in self._taps:
-            tap.pause()
+        self.end_streams()
         self.notify()
         deadline = anyio.current_time() + LINK_TIMEOUT
         delay = RECONNECT_BACKOFF_MIN

@@ -1,25 +1,34 @@
-"""Signing: keys from files and the environment, and the signing options of a client."""
+"""Signing: keys from files and the environment, and the options of a client."""
 
 from __future__ import annotations
 
 import os
+import stat
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from paramclient.client.file_ownership import (
-    GROUP_READS,
-    OF_OTHERS,
-    has_trusted_owner,
-    mode_of,
-    open_regular,
-)
 from paramclient.errors import UsageError
-from paramclient.wire.signing import SigningKey, SigningPolicy, SigningReport, timestamp_of
+from paramclient.wire.signing import (
+    Signer,
+    SigningKey,
+    SigningPolicy,
+    SigningReport,
+    Verifier,
+    timestamp_of,
+)
 
-__all__ = ["Signing", "key_from_environment", "read_key", "read_private", "refused_in_words", "timestamp_now"]
+__all__ = [
+    "Signing",
+    "key_from_environment",
+    "read_key",
+    "read_private",
+    "refused_in_words",
+    "timestamp_now",
+]
 
 KEY_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY"
 """Environment variable with the key in 64 hexadecimal digits or base64."""
@@ -28,7 +37,7 @@ KEY_FILE_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY_FILE"
 PASSPHRASE_VARIABLE: Final = "PARAMCLIENT_SIGNING_PASSPHRASE"
 """Environment variable with a passphrase from which the key is derived."""
 KEY_FILE_BYTES_MAX: Final = 1_000
-"""Maximum size of a key file in bytes: a binary or text key with some blank lines."""
+"""Bytes that are read of a key file, at most: a binary or text key with some blank lines."""
 CREDENTIALS_VARIABLE: Final = "CREDENTIALS_DIRECTORY"
 """Environment variable with the credentials folder of a systemd unit, which only the unit can access
 (systemd.exec, "Credentials")."""
@@ -41,9 +50,7 @@ class Signing:
     Attributes:
         key: the secret key, the same as on the vehicle.
         policy: which frames are accepted, see `SigningPolicy`; or its value, such as `"signed-only"`.
-        link_id: link id in the signatures of this client, 0 to 255. None: the lowest that no other session on
-            this machine uses with this key, so that the timestamps of two sessions do not conflict.
-        state: folder for the signature timestamps; None for the user's state folder.
+        link_id: link id in the signatures of this client, 0 to 255.
 
     Raises:
         UsageError: the policy is unknown, or the link id is out of range.
@@ -51,15 +58,19 @@ class Signing:
 
     key: SigningKey
     policy: SigningPolicy | str = SigningPolicy.UNSIGNED_RADIOS
-    link_id: int | None = None
-    state: str | os.PathLike[str] | None = None
+    link_id: int = 0
 
     def __post_init__(self) -> None:
         if self.policy not in list(SigningPolicy):
             known = ", ".join(SigningPolicy)
             raise UsageError(f"unknown signing policy {self.policy!r}; choose one of {known}")
-        if self.link_id is not None and not 0 <= self.link_id <= 255:
+        if not 0 <= self.link_id <= 255:
             raise UsageError(f"a signing link id must be 0 to 255, not {self.link_id}")
+
+    def begin(self) -> tuple[Signer, Verifier]:
+        """Return the signer and the verifier of a session, whose timestamps start at the system clock."""
+        signer = Signer(self.key, link_id=self.link_id, timestamp=timestamp_now())
+        return signer, Verifier(signer, SigningPolicy(self.policy))
 
 
 def read_key(path: str | os.PathLike[str]) -> SigningKey:
@@ -69,12 +80,10 @@ def read_key(path: str | os.PathLike[str]) -> SigningKey:
         UsageError: the file cannot be read, has no valid key, belongs to another user, or is accessible to
             other users than its owner (on systems with file modes). The message never includes its content.
     """
-    data = read_private(path, "signing key", KEY_FILE_BYTES_MAX + 1)
+    data = read_private(path, "signing key", KEY_FILE_BYTES_MAX)
     try:
         if len(data) == 32:
             return SigningKey(data)
-        if len(data) > KEY_FILE_BYTES_MAX:
-            raise UsageError(f"a signing key file has at most {KEY_FILE_BYTES_MAX} bytes; this one is larger")
         return SigningKey.from_text(data.decode("ascii", "replace"))
     except UsageError as error:
         raise UsageError(f"{os.fspath(path)}: {error}") from None
@@ -89,26 +98,29 @@ def read_private(path: str | os.PathLike[str], what: str, most: int) -> bytes:
         most: maximum number of bytes to read.
 
     Raises:
-        UsageError: the file cannot be read or is not a regular file, its owner is neither the user of this
+        UsageError: the file cannot be read, its owner is neither the user of this
             process nor root, or it is accessible to other users than its owner (on systems with file modes).
             A process of root also rejects a file of another user, as the owner of a file can change it.
     """
     try:
-        with open_regular(path) as file:
+        with Path(path).open("rb") as file:
             status = os.fstat(file.fileno())
             data = file.read(most)
     except OSError as error:
         raise UsageError(f"{os.fspath(path)}: the {what} cannot be read: {error.strerror}") from error
-    if not has_trusted_owner(status):
+    if sys.platform == "win32":  # it has neither such ids nor such modes
+        return data
+    if status.st_uid not in (os.geteuid(), 0):
         raise UsageError(
             f"{os.fspath(path)}: this {what} belongs to another user (id {status.st_uid}), who can change it;"
             " `chown` it to the user of this program"
         )
-    mode = mode_of(status)
+    mode = stat.S_IMODE(status.st_mode)
     # since version 254, a systemd credential shows the group-read bit for the access-list entry of the unit's
     # user, although no group can read it (systemd issue 29435)
-    of_others = OF_OTHERS & ~GROUP_READS if _is_credential(path) else OF_OTHERS
-    if mode & of_others:
+    folder = os.environ.get(CREDENTIALS_VARIABLE)
+    is_credential = folder and Path(path).resolve().parent == Path(folder).resolve()
+    if mode & (0o037 if is_credential else 0o077):
         raise UsageError(
             f"{os.fspath(path)}: other users than its owner can access this {what} (mode {mode:o}); "
             "run `chmod 600` on it, and replace it if another user may have read it"
@@ -152,9 +164,3 @@ def refused_in_words(report: SigningReport | None) -> str:
     refused = {} if report is None else report.refused
     reasons = ", ".join(f"{count} for: {reason}" for reason, count in refused.items())
     return f" (frames were refused, {reasons})" if reasons else ""
-
-
-def _is_credential(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file is in the credentials folder of the systemd unit of this process."""
-    folder = os.environ.get(CREDENTIALS_VARIABLE, "")
-    return folder != "" and Path(path).resolve().parent == Path(folder).resolve()

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import weakref
-from abc import abstractmethod
 from collections.abc import AsyncIterator
 from dataclasses import replace
-from typing import Final, Generic, TypeVar
+from typing import ClassVar, Final, Generic, Self, TypeVar
 
 import anyio
 
@@ -16,43 +15,51 @@ from paramclient.protocol.events import Change
 __all__ = ["Changes", "Stream", "Subscribers"]
 
 CHANGES_MAX: Final = 100_000
-"""Queued changes for a consumer, one for each name, at most: more than a table holds. Above it, the oldest
-are dropped."""
+"""Queued changes for a consumer, one for each name, at most: more than a table holds."""
 
 Item = TypeVar("Item")
 
 
 class Stream(AsyncIterator[Item], Generic[Item]):
-    """Stream of the items since its creation, one for each `await`. Cancellation loses no item."""
+    """Stream of the items since its creation, one for each `await`. Cancellation loses no item.
+
+    Attributes:
+        most: queued items for a slow consumer. Above it, the oldest are dropped.
+    """
+
+    most: ClassVar[int]
 
     def __init__(self) -> None:
+        self._waiting: dict[object, Item] = {}
         self._error: ParamClientError | StopAsyncIteration | None = None
         self._arrived = anyio.Event()
 
-    @abstractmethod
     def push(self, item: Item) -> None:
         """Add an item."""
-
-    @abstractmethod
-    def _take(self) -> Item | None:
-        """Remove and return the next item; None while the queue is empty."""
+        self._queue(object(), item)
 
     def end(self, error: ParamClientError | None) -> None:
         """End the stream after the queued items: with this error, or with None as at the end of a log."""
         self._error = StopAsyncIteration() if error is None else error
         self._arrived.set()
 
-    def __aiter__(self) -> Stream[Item]:
+    def __aiter__(self) -> Self:
         return self
 
     async def __anext__(self) -> Item:
-        while (item := self._take()) is None:
+        while not self._waiting:
             if self._error is not None:
                 raise self._error.with_traceback(None)
             if self._arrived.is_set():
                 self._arrived = anyio.Event()
             await self._arrived.wait()
-        return item
+        return self._waiting.pop(next(iter(self._waiting)))
+
+    def _queue(self, key: object, item: Item) -> None:
+        self._waiting[key] = item
+        if len(self._waiting) > self.most:
+            del self._waiting[next(iter(self._waiting))]
+        self._arrived.set()
 
 
 class Changes(Stream[Change]):
@@ -61,9 +68,7 @@ class Changes(Stream[Change]):
     A slow consumer receives several changes of one parameter as one.
     """
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._waiting: dict[str, Change] = {}
+    most = CHANGES_MAX
 
     def push(self, item: Change) -> None:
         """Add a change, or merge it with the queued change of the same parameter."""
@@ -74,13 +79,7 @@ class Changes(Stream[Change]):
                 return
             if item.old is not None and item.new is not None and item.old.same_value(item.new):
                 return
-        self._waiting[item.name] = item
-        if len(self._waiting) > CHANGES_MAX:
-            del self._waiting[next(iter(self._waiting))]
-        self._arrived.set()
-
-    def _take(self) -> Change | None:
-        return self._waiting.pop(next(iter(self._waiting))) if self._waiting else None
+        self._queue(item.name, item)
 
 
 class Subscribers(Generic[Item]):

@@ -8,9 +8,8 @@ from typing import Final, TypeAlias
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files import json_format, line_formats, param_pck
-from paramclient.files.formats import ENDINGS, FileFormat, parse_format
+from paramclient.files.formats import AUTOPILOT, ENDINGS, FileFormat, ParamFile, address, parse_format
 from paramclient.files.includes import Includes
-from paramclient.files.param_file import AUTOPILOT, ParamFile, address
 from paramclient.files.text import decode_text, lines_of, time_of
 from paramclient.model.identity import autopilot_name, version_text
 from paramclient.model.paramset import ParamSet
@@ -107,6 +106,11 @@ def _bytes(sets: list[ParamSet], file_format: FileFormat, around: ParamFile) -> 
             f"the format {file_format} holds one component, and there are {components}; choose one"
         )
     _check(sets)
+    if any(each.is_extended for each in sets):
+        if file_format is not FileFormat.JSON:
+            raise UsageError(f"the format {file_format} cannot hold extended parameters; write .json")
+        if len(sets) > 1:
+            raise UsageError("a file of extended parameters holds one component, and no plain parameters")
     match file_format:
         case FileFormat.PCK:
             return param_pck.write_packed(sets[0])
@@ -171,12 +175,12 @@ def _check(sets: list[ParamSet]) -> None:
     distinguishes them."""
     seen = set()
     for each in sets:
-        for number in (each.system, each.component):
-            if number is not None and not 1 <= number <= 255:
-                raise UsageError(f"systems and components have ids from 1 to 255, not {number}")
+        for number, least in ((each.system, 1), (each.component, 0)):
+            if number is not None and not least <= number <= 255:
+                raise UsageError(f"a system or component has an id from {least} to 255, not {number}")
         for param in each.values():
             check_name(param.name)
-        ids = (each.system, each.component or AUTOPILOT)
+        ids = (each.system, AUTOPILOT if each.component is None else each.component)
         if ids in seen:
             raise UsageError(f"two sets have the same component, {address(each)}")
         seen.add(ids)

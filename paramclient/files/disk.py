@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import secrets
 import stat
 import sys
@@ -14,19 +13,13 @@ from typing import Final
 
 from paramclient.errors import FileError
 from paramclient.files.conversion import LARGEST_FILE, dumps, loads
-from paramclient.files.formats import FileFormat, format_of_name, parse_format
+from paramclient.files.formats import FileFormat, ParamFile, format_of_name, parse_format
 from paramclient.files.includes import Includes
-from paramclient.files.json_format import read_ext_json, write_ext_json
-from paramclient.files.param_file import ParamFile
-from paramclient.files.text import decode_text
 from paramclient.model.paramset import ParamSet
 
 __all__ = [
-    "is_extended_file",
     "read_bytes",
-    "read_extended_file",
     "read_file",
-    "write_extended_file",
     "write_file",
 ]
 
@@ -37,7 +30,6 @@ else:
 
 _NEW_FILE_MODE: Final = 0o666
 """Mode of a new file, before the user's umask."""
-_extended_start: Final = re.compile(rb'\A\s*\{\s*"paramclient_extended"\s*:').match
 
 
 def read_file(path: str | os.PathLike[str], *, file_format: FileFormat | str | None = None) -> ParamFile:
@@ -65,57 +57,6 @@ def read_file(path: str | os.PathLike[str], *, file_format: FileFormat | str | N
         file_format=file_format,
         includes=Includes.of(source, _read, size_max=LARGEST_FILE),
     )
-
-
-def is_extended_file(path: str | os.PathLike[str]) -> bool:
-    """Return whether an existing file begins as one of extended parameters.
-
-    Raises:
-        FileError: the file cannot be read.
-    """
-    return _extended_start(read_bytes(os.fspath(path))[:200]) is not None
-
-
-def read_extended_file(path: str | os.PathLike[str]) -> ParamSet:
-    """Read a file of extended parameters. Blocks until the disk has delivered it.
-
-    Raises:
-        FileError: the file cannot be read, or is not one of extended parameters.
-    """
-    source = os.fspath(path)
-    data = read_bytes(source)
-    if len(data) > LARGEST_FILE:
-        raise FileError(f"a parameter file has at most {LARGEST_FILE} bytes", source=source)
-    return read_ext_json(decode_text(data, source), source)
-
-
-def write_extended_file(
-    path: str | os.PathLike[str], content: ParamSet, *, file_format: FileFormat | None = None
-) -> FileFormat:
-    """Write a file of extended parameters, and replace an existing one atomically.
-
-    Args:
-        path: the file.
-        content: the parameters.
-        file_format: the format; None to choose it by the file extension.
-
-    Returns:
-        The format of the written file.
-
-    Raises:
-        FileError: the format is not JSON: no other one can hold such values; or the extension is unknown,
-            there are no parameters, or writing failed.
-    """
-    source = os.fspath(path)
-    file_format = format_of_name(source) if file_format is None else file_format
-    if file_format is not FileFormat.JSON:
-        raise FileError(
-            f"the format {file_format} cannot hold extended parameters; write .json", source=source
-        )
-    if not content.params:
-        raise FileError("there are no parameters to write", source=source)
-    _replace_file(source, "".join(f"{line}\n" for line in write_ext_json(content)).encode())
-    return file_format
 
 
 def read_bytes(source: str) -> bytes:

@@ -26,9 +26,8 @@ from datetime import datetime
 from typing import Final
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.formats import FileFormat
+from paramclient.files.formats import FileFormat, ParamFile, TooManyParams
 from paramclient.files.json_reader import Checks, Place, Reader, between, found, read_json_text, typed
-from paramclient.files.param_file import ParamFile, TooManyParams
 from paramclient.files.text import as_type, is_plain, time_of
 from paramclient.model.ext_values import (
     EXT_VALUE_SIZE,
@@ -51,10 +50,7 @@ from paramclient.model.values import (
 )
 
 __all__ = [
-    "ext_param_of_fields",
-    "read_ext_json",
     "read_json",
-    "write_ext_json",
     "write_json",
 ]
 
@@ -79,16 +75,16 @@ _bits: Final = re.compile(r"[0-9a-fA-F]{8}(?:[0-9a-fA-F]{8})?").fullmatch
 
 
 def read_json(text: str, source: str, params_max: int | None = None) -> ParamFile:
-    """Read a document of plain parameters.
+    """Read a document of plain or of extended parameters.
 
     Raises:
         TooManyParams: the document has more parameters than `params_max`.
         FileError: invalid JSON, a repeated key, or not a valid document. The error names up to 20 problems.
     """
     content = read_json_text(text, source)
-    if isinstance(content, dict) and _EXT_KEY in content:
-        raise FileError("it has extended parameters, and plain ones are expected", source=source)
     reader = Reader(text, source)
+    if isinstance(content, dict) and _EXT_KEY in content:
+        return ParamFile((_ext_set(reader, content, params_max),), FileFormat.JSON, source)
     document = reader.fields(content, (), _DOCUMENT, {_KEY, "sets"})
     raw_sets = document.get("sets", [])
     named = [each.get("params") for each in raw_sets if isinstance(each, dict)]
@@ -100,29 +96,23 @@ def read_json(text: str, source: str, params_max: int | None = None) -> ParamFil
     return ParamFile(sets, FileFormat.JSON, source, tuple(document.get("header", [])))
 
 
-def read_ext_json(text: str, source: str) -> ParamSet:
-    """Read a document of extended parameters.
-
-    Raises:
-        FileError: as `read_json`.
-    """
-    content = read_json_text(text, source)
-    if not isinstance(content, dict) or _EXT_KEY not in content:
-        raise FileError(f"no extended parameters: the key {_EXT_KEY} is missing", source=source)
-    reader = Reader(text, source)
+def _ext_set(reader: Reader, content: Mapping[str, object], params_max: int | None) -> ParamSet:
+    """Return the set of a document of extended parameters."""
+    source = reader.problems.source
     known = {key: each for key, each in content.items() if key in _EXT_DOCUMENT}
     head = reader.fields(known, (), _EXT_DOCUMENT, {"params"})
+    TooManyParams.check(len(head.get("params", {})), params_max, source)
     params = {}
     for name, fields in head.get("params", {}).items():
         try:
-            params[name] = ext_param_of_fields(name, fields)
+            params[name] = _ext_param(name, fields)
         except ValueError as error:
             reader.problem(("params", name), str(error))
     reader.problems.raise_if_any()
     if not params:
         raise FileError("the file contains no parameters", source=source)
     ids = head.get("component"), head.get("system")
-    return ParamSet(params, *ids, None, head.get("at"), source)
+    return ParamSet(params, *ids, None, head.get("at"), source, is_extended=True)
 
 
 def _set(reader: Reader, content: object, place: Place) -> ParamSet:
@@ -160,7 +150,7 @@ def _param(reader: Reader, name: str, content: object, place: Place) -> WrittenP
         return None
 
 
-def ext_param_of_fields(name: str, fields: object) -> WrittenParam:
+def _ext_param(name: str, fields: object) -> WrittenParam:
     """Return the parameter that a document has under a name: `value` or `hex`, and `type`.
 
     Raises:
@@ -192,6 +182,7 @@ _list: Final = typed(list, "a list")
 _object: Final = typed(dict, "an object")
 _count: Final = between(0, math.inf, "a whole number from 0")
 _id: Final = between(1, 255, "an id from 1 to 255")
+_component: Final = between(0, 255, "an id from 0 to 255")
 _version: Final = between(VERSION, VERSION, f"{VERSION}, the version of the format")
 
 
@@ -253,7 +244,7 @@ def _with_bits(value: WireValue, kind: ParamType | int | None, text: str) -> Wir
 _DOCUMENT: Final[Checks] = {_KEY: _version, "header": _texts, "sets": _list}
 _SET: Final[Checks] = {
     "system": _id,
-    "component": _id,
+    "component": _component,
     "identity": _object,
     "at": _time,
     "source": _text,
@@ -278,7 +269,7 @@ _PARAM: Final[Checks] = {
 _EXT_DOCUMENT: Final[Checks] = {
     _EXT_KEY: _version,
     "system": _id,
-    "component": _id,
+    "component": _component,
     "at": _time,
     "params": _object,
 }
@@ -288,11 +279,14 @@ _EXT_DOCUMENT: Final[Checks] = {
 
 
 def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
-    """Generate the lines of a document of plain parameters.
+    """Generate the lines of a document: of one set of extended parameters, or of sets of plain ones.
 
     Raises:
         UsageError: a NaN with payload bits has no type.
     """
+    if sets[0].is_extended:
+        yield from _ext_lines(sets[0])
+        return
     header = [_encodable(line) for line in (*around.header, *around.footer)]
     yield "{"
     yield f'  "{_KEY}": {VERSION},'
@@ -313,7 +307,7 @@ def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
     yield "}"
 
 
-def write_ext_json(content: ParamSet) -> Iterator[str]:
+def _ext_lines(content: ParamSet) -> Iterator[str]:
     """Generate the lines of a document of extended parameters."""
     yield "{"
     for key, each in {_EXT_KEY: VERSION, **_about(content)}.items():

@@ -15,9 +15,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.formats import FileFormat
+from paramclient.files.formats import AUTOPILOT, FileFormat, ParamFile, TooManyParams
 from paramclient.files.includes import Includes
-from paramclient.files.param_file import AUTOPILOT, ParamFile, TooManyParams
 from paramclient.files.text import (
     Builder,
     Problems,
@@ -157,7 +156,7 @@ def read_qgc(text: str, source: str, params_max: int | None = None) -> ParamFile
             problems.add_line(line, _QGC_ROW)
             return
         try:
-            system, component = (_address(each) for each in columns[:2])
+            system, component = _address(columns[0], 1), _address(columns[1], 0)
             kind = _type(columns[4])
             name, value = _checked_name(columns[2]), _qgc_value(columns[3])
             param = WrittenParam(name, _fitting(value, kind), kind, comment=comment, line=line.number)
@@ -270,10 +269,10 @@ def _qgc_line(params: ParamSet, param: WrittenParam) -> str:
     return f"{params.system}\t{component}\t{_pair_name(param)}\t{text}\t{int(param.type_number)}"
 
 
-def _address(text: str) -> int:
+def _address(text: str, least: int) -> int:
     number = parse_number(text)
-    if not isinstance(number, int) or not 1 <= number <= 255:
-        raise UsageError("a system and a component from 1 to 255 in the first two columns")
+    if not isinstance(number, int) or not least <= number <= 255:
+        raise UsageError("a system from 1 to 255 and a component from 0 to 255 in the first two columns")
     return number
 
 

@@ -15,10 +15,12 @@ import anyio.to_thread
 from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.links.replay import LOG_PEER
 from paramclient.links.tlog import Record, open_log, read_records
-from paramclient.logs.imported_table import ImportedTable
+from paramclient.logs.logged_params import ImportedTable
+from paramclient.model.identity import Identity
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.events import Change
 from paramclient.protocol.node import Node
+from paramclient.protocol.selection import vehicle_of
 from paramclient.protocol.session import Session
 from paramclient.protocol.station import Station
 from paramclient.wire.frames import Framer
@@ -106,7 +108,7 @@ class _Import:
         updates += [self._update(node, session) for node in nodes for session in node.sessions]
         updates = [update for update in updates if update.params or update.table is None]
         await anyio.to_thread.run_sync(partial(self._cache.merge, updates))
-        return tuple(_imported_table(node) for node in nodes)
+        return tuple(self._imported_table(node) for node in nodes)
 
     def _introduce(self, node: Node) -> None:
         """Take the first HEARTBEAT and AUTOPILOT_VERSION: frames before them are of the same vehicle."""
@@ -128,7 +130,7 @@ class _Import:
         """Return that the vehicle was there at the beginning."""
         who = node.identification
         return TableUpdate(
-            identity=who.identity,
+            identity=self._identity_of(node),
             component=node.component,
             autopilot=who.autopilot or 0,
             at=node.since,
@@ -144,7 +146,7 @@ class _Import:
             for name, param in table.params.items()
         ]
         return TableUpdate(
-            identity=node.identification.identity,
+            identity=self._identity_of(node),
             component=node.component,
             autopilot=node.identification.autopilot or 0,
             at=node.presence.received_at,
@@ -160,18 +162,21 @@ class _Import:
             extended=session is node.extended,
         )
 
+    def _identity_of(self, node: Node) -> Identity:
+        """Return the identity of a component's vehicle."""
+        return vehicle_of(self._station.nodes.values(), node).identification.identity
 
-def _imported_table(node: Node) -> ImportedTable:
-    plain, extended = node.plain.table, node.extended.table
-    return ImportedTable(
-        node.identification.identity.key,
-        node.system,
-        node.component,
-        node.identification.autopilot,
-        params=len(plain.params) + len(extended.params),
-        complete=plain.is_complete if plain.params else extended.is_complete,
-        hash=plain.hash if plain.is_complete else None,
-    )
+    def _imported_table(self, node: Node) -> ImportedTable:
+        plain, extended = node.plain.table, node.extended.table
+        return ImportedTable(
+            self._identity_of(node).key,
+            node.system,
+            node.component,
+            node.identification.autopilot,
+            params=len(plain.params) + len(extended.params),
+            complete=plain.is_complete if plain.params else extended.is_complete,
+            hash=plain.hash if plain.is_complete else None,
+        )
 
 
 def _ignore(*_: object) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 from typing import Final, SupportsFloat, SupportsIndex
 
@@ -13,6 +12,7 @@ from paramclient.model.values import (
     Settable,
     Trust,
     WireValue,
+    bits_of,
     byte_length,
     from_bits,
     type_name,
@@ -80,8 +80,7 @@ def encode_ext_value(value: WireValue, number: int) -> bytes:
         UsageError: the value does not fit the type: a number only fits a numeric type, text and bytes only
             CUSTOM, and bytes a type that MAVLink does not define.
     """
-    name = type_name(number)
-    layout = _LAYOUTS.get(number)
+    name, layout = type_name(number), _LAYOUTS.get(number)
     if layout is None:
         if isinstance(value, str) and number == ParamType.CUSTOM:
             return own_bytes(value.encode(), number)
@@ -91,19 +90,7 @@ def encode_ext_value(value: WireValue, number: int) -> bytes:
         raise UsageError(f"{value!r} is not {wanted}, and the parameter is {name}")
     if isinstance(value, str | bytes):
         raise UsageError(f"{value!r} is not a number, and the parameter is {name}")
-    if number >= ParamType.REAL32:
-        try:
-            return layout.pack(float(value))
-        except OverflowError:
-            raise UsageError(f"{value} is beyond the range of {name}") from None
-    if isinstance(value, float):
-        if not (math.isfinite(value) and value.is_integer()):
-            raise UsageError(f"{value!r} is not a whole number, and the parameter is {name}")
-        value = int(value)
-    low, high = ParamType(number).bounds
-    if not low <= value <= high:
-        raise UsageError(f"{value} does not fit {name}, which holds {low} to {high}")
-    return layout.pack(value)
+    return bits_of(value, number).to_bytes(layout.size, "little")
 
 
 def _is_encodable(text: str) -> bool:

@@ -8,8 +8,7 @@ from typing import TypeVar, overload
 
 from paramclient.errors import UsageError
 from paramclient.model.identity import Identity
-from paramclient.model.patterns import NameChoice
-from paramclient.model.similar_names import unknown_name
+from paramclient.model.names import NameChoice, unknown_name
 from paramclient.model.values import (
     WIRE_SIZE,
     Param,
@@ -138,6 +137,7 @@ class ParamSet(Mapping[str, WrittenParam]):
         identity: the vehicle's identity, or None if the source does not contain it.
         at: when the values were observed, as a Unix time in seconds, or None if unknown.
         source: the source, for messages: a file's name, `link udpin:…`, `cache uid:…`.
+        is_extended: whether these are extended parameters.
     """
 
     params: Mapping[str, WrittenParam]
@@ -146,6 +146,7 @@ class ParamSet(Mapping[str, WrittenParam]):
     identity: Identity | None = None
     at: float | None = None
     source: str = ""
+    is_extended: bool = False
 
     @classmethod
     def of(
@@ -157,10 +158,11 @@ class ParamSet(Mapping[str, WrittenParam]):
         identity: Identity | None = None,
         at: float | None = None,
         source: str = "",
+        is_extended: bool = False,
     ) -> ParamSet:
         """Return a copy of a table's parameters, such as `component.params.values()`."""
         written = {param.name: WrittenParam.of(param) for param in params}
-        return cls(written, component, system, identity, at, source)
+        return cls(written, component, system, identity, at, source, is_extended)
 
     def only(self, patterns: Iterable[str]) -> ParamSet:
         """Return the set with only the selected parameters.

@@ -18,7 +18,7 @@ from typing import Final
 
 from paramclient.model.values import Param
 
-__all__ = ["crc32_px4", "find_volatile", "hash_bits", "hash_params"]
+__all__ = ["crc32_px4", "crc32_px4_before", "find_volatile", "hash_bits", "hash_params"]
 
 HASHED_PARAMETERS_MAX: Final = 1_000_000
 """Parameters hashed while single names are tried, about 0.1 s: each attempt hashes the whole table."""
@@ -45,12 +45,26 @@ _GROUPS = tuple(
 )
 
 
+_POLYNOMIAL = 0xEDB88320
+
+
 def crc32_px4(data: bytes, crc: int = 0) -> int:
     """Return PX4's CRC-32: polynomial 0xEDB88320, reflected, start 0, no final xor (crc.c, `crc32part`).
 
     MAVFTP and component metadata use the same one for files.
     """
     return zlib.crc32(data, crc ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
+
+
+def crc32_px4_before(crc: int, size: int) -> int:
+    """Return the CRC-32 from which `size` zero bytes lead to this one: the inverse of `crc32_px4`.
+
+    Of the difference of two checksums, it is the difference of the last `size` bytes (at most 4) of two files
+    that are equal before them.
+    """
+    for _ in range(8 * size):
+        crc = (crc ^ _POLYNOMIAL) << 1 | 1 if crc >> 31 else crc << 1
+    return crc
 
 
 def hash_params(params: Iterable[Param], *, leave_out: Iterable[str] = ()) -> int:

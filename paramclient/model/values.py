@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 __all__ = [
+    "HEX",
     "WIRE_SIZE",
     "Encoding",
     "TYPES_BY_NAME",
@@ -34,9 +35,11 @@ __all__ = [
     "as_reported",
     "bits_of",
     "check_name",
+    "check_portable_name",
     "check_value",
     "decode_value",
     "encode_value",
+    "encoding_of",
     "format_value",
     "from_bits",
     "is_portable_name",
@@ -57,6 +60,8 @@ number of the type (see `Param.is_raw`)."""
 Settable: TypeAlias = SupportsIndex | SupportsFloat | str | bytes
 """A value that can be set: a number, also of another library, or the four wire bytes."""
 
+HEX: Final = "hex:"
+"""Begins the text of a value that is bytes, in hexadecimal."""
 WIRE_SIZE: Final = 4
 """Bytes of the value in PARAM_VALUE and PARAM_SET, of any type."""
 NAME_LENGTH = 16
@@ -293,6 +298,21 @@ def is_portable_name(name: str) -> bool:
     return _portable(name) is not None
 
 
+def check_portable_name(name: str) -> str:
+    """Check and return a parameter name.
+
+    Raises:
+        UsageError: the name is not a valid param_id, or no parameter file can hold it. The client ignores
+            such names when a vehicle sends them.
+    """
+    if not is_portable_name(check_name(name)):
+        raise UsageError(
+            f"parameter name {name!r}: no parameter file can hold it, so the client ignores it; a name has"
+            " a letter, no space and none of # , ; = ; it begins with neither @ nor / and does not end with :"
+        )
+    return name
+
+
 def check_value(value: Settable) -> WireValue:
     """Convert a caller's value to an int, a float or four raw bytes; else raise UsageError.
 
@@ -351,6 +371,21 @@ def bits_of_wire(raw: bytes, number: int, encoding: Encoding) -> tuple[int, bool
         if low <= whole <= high:
             return whole & (high - low), False  # high - low has as many ones as the type has bits
     return bits, True
+
+
+def encoding_of(raw: bytes, number: int) -> Encoding | None:
+    """Return the encoding that the four wire bytes of an integer show; None of 0, and of other types.
+
+    A whole float32 that fits the type is cast: as bytes, it would be a number beyond 1,000,000,000. All else
+    is byte by byte: as a float32, it would be a fraction, too large or no number.
+    """
+    bounds = _BOUNDS.get(number)
+    if bounds is None or number >= ParamType.UINT64 or raw == bytes(WIRE_SIZE):
+        return None
+    number32: float = _FLOAT32.unpack(raw)[0]
+    low, high = bounds
+    is_cast = low <= number32 <= high + 1 and number32.is_integer()  # float32 rounds the largest up
+    return Encoding.C_CAST if is_cast else Encoding.BYTEWISE
 
 
 def encode_value(value: WireValue, number: int, encoding: Encoding) -> bytes:
@@ -490,11 +525,11 @@ def same_bits(number: int, a: int, b: int) -> bool:
 
 
 def format_value(value: WireValue, number: int = ParamType.REAL32) -> str:
-    """Return the shortest text that parses to the same value: floats as float32, raw bytes as hexadecimal."""
+    """Return the shortest text that parses to the same value: floats as float32, raw bytes as hexadecimal,
+    bytes of a CUSTOM value as `hex:ff00fe`."""
     if isinstance(value, bytes):
-        return (
-            f"0x{value.hex()}" if number == ParamType.CUSTOM else f"0x{int.from_bytes(value, 'little'):08x}"
-        )
+        is_custom = number == ParamType.CUSTOM
+        return f"{HEX}{value.hex()}" if is_custom else f"0x{int.from_bytes(value, 'little'):08x}"
     if isinstance(value, int | str):
         return str(value)
     return repr(shortest_float(value) if number == ParamType.REAL32 else value)

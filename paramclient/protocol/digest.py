@@ -1,21 +1,70 @@
-"""Is the table current? The vehicle's digest of its parameters, compared with the table's.
+"""Is the table current? One question, and the answers of the vehicles.
 
-PX4 announces a hash, `_HASH_CHECK`. Other vehicles have no answer, and their tables are downloaded.
+PX4 announces a hash, `_HASH_CHECK`. ArduPilot computes the checksum of its parameter file. Others have no
+answer, and their tables are downloaded.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from paramclient.errors import NoReply, UnknownParameter
+from paramclient.protocol.checksum import ChecksumUnavailable, TableDiffers, prove
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK
 
-__all__ = ["is_current", "request_digest"]
+__all__ = ["Answer", "ask", "may_confirm", "request_digest"]
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What the vehicle says of a table.
+
+    Attributes:
+        is_current: whether it confirms the table, as it is now.
+        digest: the vehicle's hash now, or None for a vehicle without one.
+        changed: the names whose values were others, and were read.
+        reason: why an ArduPilot confirms nothing, as a sentence; or empty.
+        is_silent: whether that was because it does not answer to MAVFTP.
+        is_other: whether that was because its table is another one.
+    """
+
+    is_current: bool = False
+    digest: Digest | None = None
+    changed: tuple[str, ...] = ()
+    reason: str = ""
+    is_silent: bool = False
+    is_other: bool = False
+
+
+def may_confirm(session: Session) -> bool:
+    """Return whether the vehicle has confirmed the table, or computes a checksum as far as known."""
+    return session.table.hash is not None or _may_prove(session)
+
+
+async def ask(session: Session) -> Answer:
+    """Ask whether the table is current. Confirmed values are verified then.
+
+    Raises:
+        LinkError: the link is closed for good.
+    """
+    if _may_prove(session):
+        try:
+            return Answer(is_current=True, changed=await prove(session))
+        except ChecksumUnavailable as error:
+            is_other = isinstance(error, TableDiffers)
+            return Answer(reason=error.reason, is_silent=error.is_silent, is_other=is_other)
+    digest = await request_digest(session)
+    if not session.table.agrees_with(digest):
+        return Answer(digest=digest)
+    session.table.verify()
+    return Answer(is_current=True, digest=digest)
 
 
 async def request_digest(session: Session) -> Digest | None:
-    """Return the digest of the vehicle's table now; None for a vehicle without one.
+    """Return PX4's hash now; None for another vehicle.
 
     Raises:
         LinkError: the link is closed for good.
@@ -29,9 +78,9 @@ async def request_digest(session: Session) -> Digest | None:
     return Digest.of(answer)
 
 
-def is_current(session: Session, digest: Digest | None) -> bool:
-    """Return whether a digest confirms the table as it is."""
-    table = session.table
-    return (
-        digest is not None and table.is_complete and (table.hash, table.count) == (digest.hash, digest.count)
-    )
+def _may_prove(session: Session) -> bool:
+    identification, table = session.identification, session.table
+    has_table = bool(table.names) and table.is_complete
+    is_possible = identification.is_ardupilot and identification.may_serve_file and has_table
+    is_served = session.serves_file is not False and session.serves_checksum is not False
+    return is_possible and is_served and not session.dialect.has_ack

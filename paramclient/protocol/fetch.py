@@ -13,7 +13,7 @@ from paramclient.errors import NoReply
 from paramclient.model.params import ParamMap
 from paramclient.model.values import Param
 from paramclient.protocol.dialect import Digest
-from paramclient.protocol.digest import is_current, request_digest
+from paramclient.protocol.digest import Answer, ask, request_digest
 from paramclient.protocol.file_download import FileUnavailable, download_file
 from paramclient.protocol.list_download import ListResult, download_list
 from paramclient.protocol.reads import read_many
@@ -24,11 +24,14 @@ __all__ = ["FetchResult", "FetchSource", "Policy", "Progress", "fetch_all", "res
 FetchSource: TypeAlias = Literal["cache", "ftp", "stream"]
 """Where a fetch has the values from: the cache, the packed file (MAVFTP) or the list."""
 
+IDENTITY_TIME: Final = 1.5
+"""Seconds that a download waits to hear whether there is a file; PX4 and ArduPilot do not need it."""
 REPAIRS_MAX: Final = 2
 """Downloads after the first one, while the table changes during them."""
 CHANGED_MEANWHILE: Final = "The parameters changed during the download: the table may be a mixture."
 NOT_REFRESHED: Final = "The values outside the hash were not read again, because the policy is hash-only."
 LEFT_OUT: Final = "Skipped {}: no parameter file can contain this name."
+UNCONFIRMED: Final = "The cached table was not confirmed: {}."
 UNPROVEN: Final = "The vehicle's hash could not be computed from the table; it was equal before and after."
 
 
@@ -79,12 +82,14 @@ class FetchResult:
             "ftp" for the packed file, "stream" for the list.
         count: parameters that the component says it has.
         missing: indices that were not received, rising. Empty when the fetch is complete.
-        hash: the PX4 hash by which the vehicle confirmed the table, or None.
+        hash: the PX4 hash, or ArduPilot's checksum, by which the vehicle confirmed the table, or None.
         elapsed: seconds from the call to the end.
         notes: further sentences for the user.
         lost: values of the list that were lost, so that they had to be read one by one or by another list.
         repeated: values received more than once.
         round_trip: the measured round trip in seconds, smoothed, or None.
+        changed: names whose cached values were others, and were read, where an ArduPilot then confirmed the
+            table; without those that it changes itself at each start or all the time.
     """
 
     system: int
@@ -99,6 +104,7 @@ class FetchResult:
     lost: int = 0
     repeated: int = 0
     round_trip: float | None = None
+    changed: tuple[str, ...] = ()
 
     @property
     def received(self) -> int:
@@ -169,22 +175,34 @@ class _Fetch:
         self.notes: list[str] = []
         self.listed = ListResult()
         self._began = anyio.current_time()
+        self._changed: tuple[str, ...] = ()
+        self._is_silent = False  # MAVFTP
 
     async def run(self, *, refresh: bool) -> FetchResult:
         """Fetch, and return the result."""
         if self.policy is Policy.CACHE_ONLY:
             return self._unconfirmed()
         can_confirm = self.table.is_complete or self.policy is Policy.HASH_ONLY
-        digest = await request_digest(self.session) if can_confirm else None
-        if not refresh and is_current(self.session, digest):
-            self.table.verify()
+        answer = Answer()
+        if can_confirm and refresh:
+            answer = Answer(digest=await request_digest(self.session))
+        elif can_confirm:
+            answer = await ask(self.session)
+        if answer.is_current:
+            self._changed = answer.changed
+            if answer.changed:
+                self.notes.append(f"Changed since they were cached: {', '.join(answer.changed)}.")
             if self.policy is Policy.AUTO:
                 await self._read_unverified()
             elif self.table.unverified():
                 self.notes.append(NOT_REFRESHED)
             return self._result("cache")
+        if answer.reason:
+            self.notes.append(UNCONFIRMED.format(answer.reason))
         if self.policy is Policy.HASH_ONLY:
             return self._unconfirmed()
+        self._is_silent = answer.is_silent
+        digest = answer.digest
         source = await self._download()
         for _ in range(REPAIRS_MAX):
             if not self.table.is_complete or self.listed.missing or await self._settle(digest):
@@ -196,8 +214,8 @@ class _Fetch:
     async def _download(self) -> FetchSource:
         """Download the file, or the list where there is none."""
         session = self.session
-        if session.serves_file is not False and not session.dialect.has_ack:
-            with session.channel.gate.until_closed(or_failed=True):
+        if not self._is_silent and session.serves_file is not False and not session.dialect.has_ack:
+            with session.channel.gate.until_closed(or_failed=True), anyio.move_on_after(IDENTITY_TIME):
                 await session.identification.encoding_certain()
             if session.identification.may_serve_file:
                 try:
@@ -209,7 +227,12 @@ class _Fetch:
                         self.notes.append(f"The component was lost: {error.reason}.")
                         return "ftp"
                     self.notes.append(f"Downloaded as a list: {error.reason}.")
+                    self._is_silent = error.is_silent
         self.listed = await download_list(session)
+        if self._is_silent and not self.listed.missing and not self.listed.lost:  # loss does not explain it
+            session.serves_file = False
+        with session.channel.gate.until_closed(or_failed=True):
+            await session.identification.encoding_certain()
         self.table.complete()
         return "stream"
 
@@ -251,7 +274,10 @@ class _Fetch:
     def _result(self, source: FetchSource) -> FetchResult:
         lost, repeated = self.listed.lost, self.listed.repeated
         self.notes += [LEFT_OUT.format(repr(name)) for name in self.table.left_out]
-        return result_of(self.session, source, self._began, self.notes, lost=lost, repeated=repeated)
+        if doubt := self.session.encoding_doubt:
+            self.notes.append(doubt)
+        result = result_of(self.session, source, self._began, self.notes, lost=lost, repeated=repeated)
+        return replace(result, changed=self._changed)
 
 
 def result_of(

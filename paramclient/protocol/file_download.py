@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Final
 
 import anyio
 
-from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError
+from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError, VehicleError
 from paramclient.protocol.ftp import FileCutOff, read_file
-from paramclient.protocol.param_pck import PACK_SIZE_MAX, Pack, decode, decode_prefix
+from paramclient.protocol.param_pck import PACK_SIZE_MAX, PARAM_FILE, Pack, decode, decode_prefix
+from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
 
 __all__ = ["FileUnavailable", "download_file"]
 
-PARAM_FILE: Final = "@PARAM/param.pck"
-"""The path of the file in MAVFTP."""
 WITH_DEFAULTS: Final = "?withdefaults=1"
 """Requests the defaults too; a server that does not know it may report that there is no such file."""
 ARDUPILOT_WITH_DEFAULTS: Final = 0x04040000
@@ -31,11 +31,13 @@ class FileUnavailable(Exception):
 
     Attributes:
         reason: why, as a sentence for the notes of a fetch.
+        is_silent: whether no request was answered.
     """
 
-    def __init__(self, reason: str) -> None:
+    def __init__(self, reason: str, *, is_silent: bool = False) -> None:
         super().__init__(reason)
         self.reason = reason
+        self.is_silent = is_silent
 
 
 async def download_file(session: Session) -> int:
@@ -68,9 +70,10 @@ async def download_file(session: Session) -> int:
                 session.serves_file = False
             raise FileUnavailable(f"the parameter file was refused: {error.reason}") from None
         except NoReply as error:
+            is_cut_off = isinstance(error, FileCutOff)
             if isinstance(error, FileCutOff):
                 _store_beginning(session, error.prefix, requested_at)
-            raise FileUnavailable("MAVFTP did not answer") from None
+            raise FileUnavailable("MAVFTP did not answer", is_silent=not is_cut_off) from None
         except PackError as error:
             reason = f"the parameter file is not valid: {error}"
             attempts += 1
@@ -79,22 +82,41 @@ async def download_file(session: Session) -> int:
             reason = f"the parameter file has {len(pack.entries)} of {pack.total} parameters"
             attempts += 1
             continue
+        known = session.table.count
+        if known not in (None, pack.total) and await _count(session) == known:
+            reason = f"the parameter file has {pack.total} parameters, and the vehicle {known}"
+            attempts += 1
+            continue
         session.serves_file = True
         _store(session, pack, requested_at)
         return pack.total
     raise FileUnavailable(reason)
 
 
+async def _count(session: Session) -> int | None:
+    """Return the number of parameters by another message than the file; None if it is not answered."""
+    with suppress(NoReply, VehicleError):
+        return (await read(session, 0)).param_count
+    return None
+
+
 async def _read(session: Session, path: str) -> bytes:
     channel = session.channel
+    total = session.table.count
+
+    def begun(head: bytes) -> None:
+        nonlocal total
+        with suppress(PackError):
+            total = decode_prefix(head)[0].total
 
     def report(received: int, size: int | None) -> None:
-        total = session.table.count
         if size and total:
             session.report(min(received * total // size, total), total)
 
     attempts = max(channel.timing.attempts_for(OPEN_LOST), OPEN_ATTEMPTS_MIN)
-    return await read_file(channel, path, size_max=PACK_SIZE_MAX, open_attempts=attempts, progress=report)
+    return await read_file(
+        channel, path, size_max=PACK_SIZE_MAX, open_attempts=attempts, progress=report, begun=begun
+    )
 
 
 def _store_beginning(session: Session, prefix: bytes, requested_at: float) -> None:
@@ -103,7 +125,7 @@ def _store_beginning(session: Session, prefix: bytes, requested_at: float) -> No
         pack, number = decode_prefix(prefix)
     except PackError:
         return
-    if number == pack.total:
+    if pack.entries and number == pack.total:
         _store(session, pack, requested_at)
 
 

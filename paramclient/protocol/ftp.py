@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 import anyio
 
-from paramclient.errors import FileErrorCode, FileTransferError, NoReply, UsageError
+from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoReply, UsageError
 from paramclient.protocol.channel import Channel, Inbox
 from paramclient.wire.messages import FileTransfer, Message
 
@@ -35,6 +35,9 @@ BUSY_ATTEMPTS: Final = 2
 CLOSE_TIMEOUT: Final = 2.0
 """Seconds for the closing of a session, also when its reader is cancelled. ArduPilot has one session for all
 links: an open one blocks the file access of all stations for 3 s."""
+CLOSE_COPIES: Final = 4
+"""Copies of each request that closes a session: the time for it is short, and packets are lost in bursts.
+ArduPilot's queue of requests holds 5."""
 BURST_PAUSE_MIN: Final = 0.15
 """Seconds before the first block after which a burst counts as lost: at 57600 baud, ArduPilot begins one
 95 ms after the request."""
@@ -44,6 +47,8 @@ BLOCK_INTERVALS: Final = 8
 """Mean intervals between two blocks after which a burst counts as over."""
 READS_AT_ONCE: Final = 4
 """Reads sent at once: ArduPilot's queue of MAVFTP requests has 5 places, and drops the surplus silently."""
+COPIES_AT_ONCE: Final = 16
+"""Reads sent for the last blocks, in several copies: one round trip of 100 ms has room for as many."""
 BLOCK_INTERVAL: Final = 0.006
 """Seconds in which a vehicle serves one read: ArduPilot sends a block every 5.9 ms (measured)."""
 READS_MAX: Final = 64
@@ -141,6 +146,7 @@ async def read_file(
     size_max: int = FILE_SIZE_MAX,
     open_attempts: int | None = None,
     progress: Callable[[int, int | None], None] | None = None,
+    begun: Callable[[bytes], None] = lambda head: None,
 ) -> bytes:
     """Read a file from the component. Its session on board is closed, whatever happens.
 
@@ -152,6 +158,7 @@ async def read_file(
         open_attempts: to open the file, where there is another way without it; None for as many as loss
             explains.
         progress: called with the bytes received and the size, which is an estimate for generated files.
+        begun: called with the first bytes of the file.
 
     Raises:
         FileTransferError: the component refused it, or the file is larger than `size_max`.
@@ -161,14 +168,20 @@ async def read_file(
     async with channel.ftp, _opened(channel, path, open_attempts) as (session, size, inbox):
         reader = _FileReader(channel, inbox, session, path, read_size, size_max)
         reader.progress = None if progress is None else (lambda received: progress(received, size))
+        reader.begun = begun
         try:
             return await reader.read()
         except NoReply as error:
             raise FileCutOff(error, reader.prefix) from None
 
 
-async def checksum(channel: Channel, path: str) -> int:
+async def checksum(channel: Channel, path: str, *, attempts: int | None = None) -> int:
     """Return the CRC-32 of a file, computed by the component: PX4's, see `crc32_px4`. Opens no session.
+
+    Args:
+        channel: the component's.
+        path: of the file.
+        attempts: at most; None for as many as loss explains.
 
     Raises:
         FileTransferError: the component does not compute it, or refused the file.
@@ -176,7 +189,8 @@ async def checksum(channel: Channel, path: str) -> int:
         LinkError: the link is closed for good.
     """
     with channel.inbox(FileTransfer) as inbox:
-        answer = await _request(channel, inbox, Opcode.CALC_FILE_CRC32, path, path_bytes(path))
+        data = path_bytes(path)
+        answer = await _request(channel, inbox, Opcode.CALC_FILE_CRC32, path, data, attempts=attempts)
     if len(answer.data) < 4:
         raise _error(channel, path, FileErrorCode.INVALID_DATA_SIZE)
     return int.from_bytes(answer.data[:4], "little")
@@ -242,6 +256,7 @@ async def _request(
     offset: int = 0,
     size: int = 0,
     attempts: int | None = None,
+    copies: int = 1,
     sequence: int | None = None,
 ) -> Packet:
     """Send one request until its ACK arrives.
@@ -266,6 +281,7 @@ async def _request(
         accept,
         what=f"MAVFTP {opcode.name} {path} of {channel.system}/{channel.component}",
         attempts=attempts,
+        copies=copies,
     )
 
 
@@ -306,8 +322,13 @@ async def _opened(
             yield session, size, inbox
         finally:
             if session is not None or is_requested:
-                with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT):
+                is_closed = False
+                with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT), suppress(LinkError):
                     await _close(channel, inbox, path, session, sequence)
+                    is_closed = True
+                if not is_closed:  # the opening may just have been repeated, or nothing is received any more
+                    last = Packet(channel.next_ftp_sequence(), session or 0, Opcode.TERMINATE_SESSION)
+                    channel.send(FileTransfer(0, *channel.target, last.pack()))
 
 
 async def _close(channel: Channel, inbox: Inbox, path: str, session: int | None, opening: int) -> None:
@@ -320,9 +341,13 @@ async def _close(channel: Channel, inbox: Inbox, path: str, session: int | None,
         if session is None:
             with suppress(FileTransferError):
                 data = path_bytes(path)
-                answer = await _request(channel, inbox, Opcode.OPEN_FILE_RO, path, data, sequence=opening)
+                answer = await _request(
+                    channel, inbox, Opcode.OPEN_FILE_RO, path, data, copies=CLOSE_COPIES, sequence=opening
+                )
                 session = answer.session
-        await _request(channel, inbox, Opcode.TERMINATE_SESSION, path, session=session or 0)
+        await _request(
+            channel, inbox, Opcode.TERMINATE_SESSION, path, session=session or 0, copies=CLOSE_COPIES
+        )
 
 
 class FileCutOff(NoReply):
@@ -385,6 +410,7 @@ class _FileReader:
         self, channel: Channel, inbox: Inbox, session: int, path: str, read_size: int, size_max: int
     ) -> None:
         self.progress: Callable[[int], None] | None = None
+        self.begun: Callable[[bytes], None] = lambda head: None
         self._channel = channel
         self._inbox = inbox
         self._session = session
@@ -490,7 +516,7 @@ class _FileReader:
                 else:
                     continue
                 del in_flight[at]
-            copies = max(1, min(timing.copies, READS_AT_ONCE // max(len(waiting) + len(in_flight), 1)))
+            copies = max(1, min(timing.copies, COPIES_AT_ONCE // max(len(waiting) + len(in_flight), 1)))
             allowed = int(min((now - paced_at) / BLOCK_INTERVAL, READS_AT_ONCE))
             while waiting and allowed > 0 and len(in_flight) < READS_MAX:
                 at = waiting.popleft()
@@ -507,8 +533,8 @@ class _FileReader:
                     self._send_read(at)
                 attempts[at] = tried + 1
                 in_flight[at] = (now, now + timing.timeout(tried))
-            if in_flight:
-                due = min(due for _, due in in_flight.values())
+            if in_flight or waiting:
+                due = min((due for _, due in in_flight.values()), default=math.inf)
                 if waiting:
                     due = min(due, now + BLOCK_INTERVAL * READS_AT_ONCE)
                 with anyio.move_on_after(max(due - now, 0.001)):
@@ -546,6 +572,8 @@ class _FileReader:
                 path=self._path,
                 code=FileErrorCode.INVALID_DATA_SIZE,
             )
+        if packet.offset == 0:
+            self.begun(packet.data)
         self._pieces.take(packet.offset, packet.data)
         self._blocks += 1
         self._last = anyio.current_time()

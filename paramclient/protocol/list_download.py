@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Final, NamedTuple
 
 import anyio
 
-from paramclient.protocol.channel import Inbox
+from paramclient.protocol.channel import LATE_GRACE, LATE_WAKE_UP, UNANSWERED_MAX, Inbox
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK, Message
@@ -33,6 +35,8 @@ READS_PER_SECOND_ARDUPILOT: Final = 49.0
 """Reads that an ArduPilot serves in a second: five in every 100 ms."""
 PASS_OVERHEAD: Final = 0.15
 """Seconds that another pass of the list takes beside its values."""
+FRUITLESS_PASSES_MAX: Final = 5
+"""Passes in a row without a new value, after which the count may be false: a request can be lost."""
 GAPS_INTERVAL: Final = 0.02
 """Seconds after which gaps are looked at again without a new value."""
 
@@ -59,8 +63,8 @@ async def download_list(session: Session) -> ListResult:
 
     PX4 answers reads beside its list at once, so gaps are read while it runs. An ArduPilot's list almost
     stands still while it serves reads, so its gaps are read when it is over, or by another pass of the list
-    where that is quicker. A list that runs is not requested again. Ends with what was received when the
-    component is lost.
+    where that is quicker, or where reads are not answered. A list that runs is not requested again. Ends with
+    what was received when the component is lost.
 
     Raises:
         NoReply: the list does not begin.
@@ -103,6 +107,7 @@ class _Download:
         self._reached = -1  # the highest index
         self._skipped: set[int] = set()  # missing indices below the highest one
         self._reads: dict[int, _Read] = {}
+        self._has_answer = False  # to a read
 
     async def begin(self) -> None:
         """Request the list until its first value arrives."""
@@ -111,7 +116,7 @@ class _Download:
 
         def request(attempt: int) -> Message:
             self.session.report(0, self.table.count)
-            return self.session.dialect.request_list(channel.target)
+            return self.session.dialect.request_list(channel.reads_from)
 
         first: Message = await channel.exchange(
             request,
@@ -127,7 +132,7 @@ class _Download:
     def _first(self, message: Message) -> Message | None:
         """Return the first value of the list; PX4's hash comes before it, and says nothing of its end."""
         assert isinstance(message, self.session.dialect.value)
-        if message.param_index < message.param_count:
+        if message.param_index <= message.param_count:
             return message
         self._take(message)
         return None
@@ -139,51 +144,63 @@ class _Download:
         else:
             while not self._is_over():
                 await self._take_for(GAPS_INTERVAL)
+            fruitless = 0
             while (missing := self._missing()) and not self._is_silent():
                 seconds_left = len(self.table.names) / self._rate() + PASS_OVERHEAD
-                if len(missing) / READS_PER_SECOND_ARDUPILOT <= seconds_left:
+                is_slower = len(missing) / READS_PER_SECOND_ARDUPILOT > seconds_left
+                if not is_slower or fruitless >= FRUITLESS_PASSES_MAX:
                     await self._read_gaps()
+                    if not self._has_answer and self._missing() and not self._is_silent():
+                        await self._next_pass(seconds_left)  # some firmware serves no reads
                     break
                 self.result.lost += len(missing)
                 await self._next_pass(seconds_left)
+                fruitless = fruitless + 1 if self._missing() == missing else 0
         self.result.missing = self._missing()
 
     async def _next_pass(self, seconds: float) -> None:
         """Request the list once more, where that is quicker than reads, and receive it."""
         await self.channel.gate.wait()
-        self.channel.send(self.session.dialect.request_list(self.channel.target))
+        self.channel.send(self.session.dialect.request_list(self.channel.reads_from))
         self._reached = -1
         self._skipped.clear()
         self._last = anyio.current_time()
         with anyio.move_on_after(seconds + self.channel.timing.timeout(0)):
-            while self._missing() and not self._is_over():
+            while len(self._received) < (self._count or 0) and not self._is_over():
                 await self._take_for(GAPS_INTERVAL)
 
     async def _read_gaps(self) -> None:
-        """Read what is missing, each index again when its time is over; several copies of the last ones."""
+        """Read what is missing, each index again when its time is over; several copies of the last ones.
+
+        Where no value arrives for seconds, and a window of reads is given up, the count is false: the
+        component has none of the others.
+        """
         channel, timing = self.channel, self.channel.timing
         while True:
             now = anyio.current_time()
+            given_up = sum(self._is_given_up(index, now) for index in self._reads)
             for index in [index for index in self._reads if index in self._received]:
                 read = self._reads.pop(index)
+                self._has_answer = True
                 timing.answered(read.attempts)
                 if read.attempts == 1 and self._is_over():
                     timing.measure(now - read.sent)
-            gaps = self._gaps()
-            if (not gaps and self._is_over()) or self._is_silent():
+            missing = (self._count or 0) - len(self._received)
+            is_fruitless = now - self._last >= UNANSWERED_MAX and given_up >= channel.window_size
+            is_ended = given_up >= missing or is_fruitless
+            if (is_ended and self._is_over()) or self._is_silent():
                 return
-            self._request(gaps, now)
-            if self._is_over() and all(self._is_given_up(index, now) for index in gaps):
-                return
+            self._request(now)
             await channel.gate.wait()
             await self._take_for(GAPS_INTERVAL)
 
-    def _request(self, gaps: list[int], now: float) -> None:
+    def _request(self, now: float) -> None:
         """Send the reads that are due, as many as the window holds."""
         timing, window = self.channel.timing, self.channel.window_size
         in_flight = sum(read.due > now for read in self._reads.values())
-        copies = timing.copies if len(gaps) <= window and self._is_over() else 1
-        for index in gaps:
+        is_tail = (self._count or 0) - len(self._received) <= window and self._is_over()
+        copies = timing.copies if is_tail else 1
+        for index in self._gaps():
             attempts, _, due = self._reads.get(index, _NO_READ)
             if due > now or attempts >= timing.attempts_max:
                 continue
@@ -191,7 +208,7 @@ class _Download:
                 return
             self.result.lost += attempts == 0
             for _ in range(copies):
-                self.channel.send(self.session.dialect.request_read(self.channel.target, index))
+                self.channel.send(self.session.dialect.request_read(self.channel.reads_from, index))
             self._reads[index] = _Read(attempts + 1, now, now + timing.timeout(attempts))
             in_flight += 1
 
@@ -201,20 +218,28 @@ class _Download:
 
     def _missing(self) -> list[int]:
         """Return the indices that are missing."""
-        return [index for index in range(self._count or 0) if index not in self._received]
+        return [index for index in self._indices() if index not in self._received]
 
-    def _gaps(self) -> list[int]:
+    def _indices(self) -> range:
+        """Return the indices of the list: they begin at 1 if the count itself is one, and 0 is none."""
+        count = self._count or 0
+        first = int(count in self._received and 0 not in self._received)
+        return range(first, first + count)
+
+    def _gaps(self) -> Iterable[int]:
         """Return the indices that are missing, below the end of the list so far."""
         if self._is_over():
-            return sorted(self._skipped) + list(range(self._reached + 1, self._count or 0))
+            rest = range(self._reached + 1, self._count or 0)
+            return chain(sorted(self._skipped), (each for each in rest if each not in self._received))
         return sorted(index for index in self._skipped if index <= self._reached - TAIL)
 
     def _is_over(self) -> bool:
         """Return whether the list has ended: by its last index, or by a pause."""
-        if self._count is not None and self._reached >= self._count - 1:
+        count = None if self.table.is_growing else self._count
+        if count is not None and self._reached >= count - 1:
             return True
         pause = PAUSE_PX4 if self.reads_beside else PAUSE_OTHERS
-        if self._count is not None and self._reached >= self._count - TAIL:
+        if count is not None and self._reached >= count - TAIL:
             pause = PAUSE_TAIL
         if self._received:
             pause = max(pause, PAUSE_INTERVALS * (self._last - self._began) / len(self._received))
@@ -230,8 +255,10 @@ class _Download:
 
     async def _take_for(self, seconds: float) -> None:
         """Take the values that arrive, at most for some seconds without one."""
-        with anyio.move_on_after(seconds):
+        with anyio.move_on_after(seconds) as scope:
             self._take(await self._inbox.next())
+        if anyio.current_time() > scope.deadline + LATE_WAKE_UP:
+            await anyio.sleep(LATE_GRACE)
         while self._inbox:
             self._take(await self._inbox.next())
         self.session.report(len(self._received), self._count)
@@ -243,9 +270,11 @@ class _Download:
         self._last = anyio.current_time()
         if message.param_id == HASH_CHECK:
             self.result.digest = Digest.of(message)
-        if index >= count:
+        if index > count:
             return
-        if count != self._count:
+        if self.table.is_growing:
+            self._count = self.table.count
+        elif count != self._count:
             self._count = count
             self._received = {each for each in self._received if each in self.table.names}
             self._skipped.clear()

@@ -21,12 +21,14 @@ from paramclient.protocol.events import (
     Rebooted,
     Replaced,
 )
-from paramclient.protocol.identity import Identification
-from paramclient.protocol.presence import Presence
+from paramclient.protocol.identity import HEARTBEAT_WAIT, Identification
+from paramclient.protocol.presence import SYSTEM_TIME, Presence
 from paramclient.protocol.session import Session, Shared, Spawn
 from paramclient.wire.messages import (
     HASH_CHECK,
+    MAV_CMD_REQUEST_MESSAGE,
     AutopilotVersion,
+    CommandLong,
     Heartbeat,
     HighLatency2,
     Message,
@@ -34,18 +36,24 @@ from paramclient.wire.messages import (
     ParamExtValue,
     ParamValue,
     SystemTime,
-    message_id,
 )
 
 __all__ = ["Node"]
 
 RIVAL_TIME: Final = 5.0
 """Seconds after its last message for which another peer with the same ids counts as live."""
+REBOOT_SILENCE_MIN: Final = 1.25
+"""Seconds without a message after which an ArduPilot may have rebooted (measured)."""
+CLOCK_DELAY: Final = 2.0
+"""Seconds from the identification until the clock of an ArduPilot without telemetry is requested."""
+CLOCK_REQUESTS: Final = 2
+"""Requests for it: one may be lost, and nothing waits for the answer."""
+CLOCK_INTERVAL: Final = 1.0
+"""Seconds between them."""
 WINDOW_PX4: Final = 60
 """Requests in flight to a PX4, which answers each at once."""
 ACCEPTED: Final = 0
 """PARAM_ACK_ACCEPTED in PARAM_EXT_ACK."""
-_SYSTEM_TIME: Final = message_id(SystemTime)
 
 
 class Node:
@@ -70,6 +78,7 @@ class Node:
         plain, extended: the parameters.
         peer, since, is_split: as given; a vehicle may move to another peer.
         rival: another live peer that uses the same ids, and when it was heard; None without one.
+        told_rival: the one of which the user was warned.
         version: of MAVLink, 1 or 2, by its last message.
         generation: counts how often the component was lost, has rebooted or was replaced: a conversation that
             sees another number than at its begin knows that values are of different times.
@@ -98,6 +107,7 @@ class Node:
         self.since = since
         self.is_split = is_split
         self.rival: tuple[Peer, float] | None = None
+        self.told_rival: Peer | None = None
         self.presence = Presence()
         self.channel = Channel(system, component, transmit, gate, self.presence)
         self.identification = Identification(system, link, encoding, listens_only=listens_only)
@@ -123,11 +133,13 @@ class Node:
             presence.is_lost = False
             self._emit(Found(silence))
             self._spawn(self.identify)
+        elif silence > REBOOT_SILENCE_MIN and self.identification.is_settled:
+            self._spawn(self._request_clock)
         match message:
             case ParamValue():
                 self.plain.receive(message, now)
                 if message.param_id == HASH_CHECK:
-                    self.plain.announced = Digest.of(message)
+                    self.plain.announce(Digest.of(message))
             case ParamExtValue():
                 self.extended.table.store(message, now)
             case ParamExtAck(param_id=name, raw=raw, param_type=number, param_result=result):
@@ -147,7 +159,7 @@ class Node:
                 self.identification.heartbeat(message)
                 self._settle_encoding()
             case SystemTime(time_boot_ms=boot_ms):
-                self.boot_clock(_SYSTEM_TIME, boot_ms, now)
+                self.boot_clock(SYSTEM_TIME, boot_ms, now)
             case AutopilotVersion():
                 if self.identification.version(message):
                     self._replace()
@@ -214,10 +226,28 @@ class Node:
             self.identification.settle()  # so that nothing waits for what is never requested
             return
         was_settled = self.identification.is_settled
-        await self._identifying.join(lambda: self.identification.request(self.channel))
+        await self.identified()
         self._settle_encoding()
         if not was_settled and self.identification.capabilities is None:
             self._emit(Identified())
+        if not self.identification.is_encoding_certain:
+            await anyio.sleep(HEARTBEAT_WAIT)
+            self.identification.miss_heartbeat()
+            self._settle_encoding()
+        if not self.channel.answered.is_set():  # requests may not reach it yet
+            await self.channel.answered.wait()
+            await self.identified()
+            self._settle_encoding()
+        await anyio.sleep(CLOCK_DELAY)
+        await self._request_clock()
+
+    async def _request_clock(self) -> None:
+        """Request the time since boot: a reboot of an ArduCopter without telemetry shows in nothing else."""
+        request = CommandLong(*self.channel.target, MAV_CMD_REQUEST_MESSAGE, float(SYSTEM_TIME))
+        for _ in range(CLOCK_REQUESTS):
+            if self.identification.is_ardupilot and not self.presence.has_telemetry:
+                self.channel.send(request)
+            await anyio.sleep(CLOCK_INTERVAL)
 
     async def watch_presence(self) -> None:
         """Mark the component as lost when it is silent for its timeout."""

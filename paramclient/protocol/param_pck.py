@@ -20,6 +20,8 @@ from paramclient.model.values import NAME_LENGTH, ParamType, check_name
 
 __all__ = [
     "MAGICS",
+    "PACKABLE",
+    "PARAM_FILE",
     "Pack",
     "PackedParam",
     "decode",
@@ -27,6 +29,8 @@ __all__ = [
     "encode",
 ]
 
+PARAM_FILE: Final = "@PARAM/param.pck"
+"""The path of the file in MAVFTP."""
 READ_SIZE_DEFAULT: Final = 239
 """Bytes in one message of MAVFTP, at most, and the usual size of reads of the file."""
 PACK_SIZE_MAX: Final = 6 + 65535 * (2 + NAME_LENGTH + 2 * 4 + 7)

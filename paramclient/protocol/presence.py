@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from paramclient.wire.messages import MAV_STATE_BOOT, Heartbeat
+from paramclient.wire.messages import MAV_STATE_BOOT, Heartbeat, SystemTime, message_id
 
-__all__ = ["Presence"]
+__all__ = ["SYSTEM_TIME", "Presence"]
 
 LOST_AFTER: Final = 5.0
 """Seconds of silence after which a component with heartbeats counts as lost: five missed in a row."""
@@ -26,6 +26,7 @@ REORDERING_TIME: Final = 2.0
 """Seconds by which a message may be late because the link reordered two messages."""
 BOOT_CLOCK_WRAP: Final = 1 << 32
 """Where time_boot_ms wraps, after 49 days."""
+SYSTEM_TIME: Final = message_id(SystemTime)
 CLOCKS_MAX: Final = 64
 """Message ids whose time_boot_ms is remembered for one component: more than the dialect has."""
 
@@ -70,6 +71,11 @@ class Presence:
     def has_beaten(self) -> bool:
         """Whether a heartbeat ever arrived."""
         return self.beat_at > -math.inf
+
+    @property
+    def has_telemetry(self) -> bool:
+        """Whether messages with the time since boot arrive, other than SYSTEM_TIME."""
+        return not self._clocks.keys() <= {SYSTEM_TIME}
 
     def heartbeat(self, message: Heartbeat, now: float) -> bool:
         """Take a heartbeat, and return whether it shows a reboot: the first with MAV_STATE_BOOT does."""

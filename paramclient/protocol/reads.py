@@ -15,20 +15,25 @@ from paramclient.errors import (
     Refused,
     TypeMismatch,
     UnknownParameter,
+    VehicleError,
 )
-from paramclient.model.similar_names import did_you_mean, nearest_names
-from paramclient.model.values import Param
+from paramclient.model.names import did_you_mean, nearest_names
+from paramclient.model.values import Param, Trust
 from paramclient.protocol.channel import Inbox
 from paramclient.protocol.dialect import ReportedValue
+from paramclient.protocol.identity import HEARTBEAT_WAIT
+from paramclient.protocol.list_download import download_list
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK, Message, ParamError
 
-__all__ = ["read", "read_many", "refusal"]
+__all__ = ["read", "read_many", "read_param", "refusal"]
 
 CONTROL_LOST: Final = 1e-4
 """Probability that all attempts of the control read are lost, which decides whether a component answers
 reads at all."""
 CONTROL_ATTEMPTS_MIN: Final = 8
+FIRST_ATTEMPTS: Final = 5
+"""Attempts of a read before anything was answered: 3.3 s, and the list answers where reads do not."""
 SLOT_ARDUPILOT: Final = 0.1
 """Seconds between two times at which an ArduPilot answers reads."""
 READS_PER_SLOT_ARDUPILOT: Final = 5
@@ -38,8 +43,10 @@ READS_PER_SLOT_ARDUPILOT: Final = 5
 async def read(session: Session, which: str | int) -> ReportedValue:
     """Read one parameter, by name or index. Its value is in the table then.
 
-    A component that leaves this read unanswered and answers another one has no such parameter: PX4 before
-    1.18 and ArduPilot before 4.7 say nothing of an unknown name.
+    A component that leaves this read unanswered and answers another one of its kind has no such parameter:
+    PX4 before 1.18 and ArduPilot before 4.7 say nothing of an unknown name. One that answers no reads by name
+    is read by index, or by its list. A read of what another caller is reading awaits the answer to that
+    request first.
 
     Raises:
         UnknownParameter: the component has no such parameter.
@@ -47,35 +54,106 @@ async def read(session: Session, which: str | int) -> ReportedValue:
         NoReply: it answered nothing.
         LinkError: the link is closed for good.
     """
+    spelled = session.spelled(which) if isinstance(which, str) else which
+    if spelled != which:
+        with suppress(UnknownParameter):
+            return await _read(session, spelled)
+    return await _read(session, which)
+
+
+async def _read(session: Session, which: str | int) -> ReportedValue:
+    channel = session.channel
+    began, must_wait = anyio.current_time(), channel.window.value == 0
+    async with channel.window:
+        now = anyio.current_time()
+        if must_wait and channel.is_lost(now):  # while others were read
+            raise NoReply(_what(session, which), attempts=0, waited=now - began)
+        is_first = which not in session.reading
+        session.reading.add(which)
+        try:
+            with channel.inbox((session.dialect.value, which)) as inbox:
+                try:
+                    return await _ask(session, inbox, which, is_asked=not is_first)
+                except NoReply:
+                    if which == HASH_CHECK or channel.is_lost(anyio.current_time()):
+                        raise
+                    control = await _control_read(session, which)
+                    if control is None:
+                        is_lost = channel.is_lost(anyio.current_time())
+                        answer = None if is_lost else await _read_list(session, inbox, which)
+                        if answer is None:
+                            raise
+                        _miss(session, which)
+                        return answer
+                if control.param_id == which:
+                    return control
+                with suppress(NoReply):  # it answers by now, and may only have been busy
+                    return await _ask(session, inbox, which, channel.timing.attempts_for(CONTROL_LOST))
+        finally:
+            if is_first:
+                session.reading.discard(which)
+    raise _unknown(session, which, ": it does not respond to reads of this name, but to others")
+
+
+async def _ask(
+    session: Session, inbox: Inbox, which: str | int, attempts: int = 0, *, is_asked: bool = False
+) -> ReportedValue:
+    """Request a parameter until it is received, and learn whether such reads are answered.
+
+    Few attempts suffice where another way is left: before anything was ever answered, where such reads were
+    not answered before, and for a hash beside other answers. One that is asked for already is awaited first.
+    """
     channel, dialect = session.channel, session.dialect
-    what = f"parameter {which} of {channel.system}/{channel.component}"
+    is_served = session.reads_names if isinstance(which, str) else session.reads_indices
 
     def accept(message: Message) -> ReportedValue | None:
         if isinstance(message, ParamError):
             raise refusal(session, which, message.error)
         return message if isinstance(message, dialect.value) else None
 
-    request = dialect.request_read(channel.target, which)
+    def attempts_max() -> int:
+        return channel.timing.attempts_max  # of this moment: the loss is better known with each answer
 
-    async def ask(inbox: Inbox) -> ReportedValue:
-        attempts, wait = channel.timing.attempts_max, _queue_time(session)
-        return await channel.exchange(request, inbox, accept, what=what, attempts=attempts, timeout_min=wait)
+    wait = _queue_time(session)
+    if is_served is False:
+        attempts = 1
+    elif is_served is None and (channel.timing.round_trip is None) != (which == HASH_CHECK):
+        attempts = min(attempts or FIRST_ATTEMPTS, FIRST_ATTEMPTS)
+    if is_asked:
+        answer: ReportedValue | None = await channel.wait_for(inbox, accept, anyio.current_time(), 0, wait)
+        if answer is not None:
+            return answer
+    request, what = dialect.request_read(channel.reads_from, which), _what(session, which)
+    received: ReportedValue = await channel.exchange(
+        request, inbox, accept, what=what, attempts=attempts or attempts_max, timeout_min=wait
+    )
+    if isinstance(which, str):
+        session.reads_names = True
+    else:
+        session.reads_indices = True
+    return received
 
-    async with channel.window:
-        with channel.inbox((dialect.value, which)) as inbox:
-            try:
-                return await ask(inbox)
-            except NoReply:
-                if which == HASH_CHECK or channel.is_lost(anyio.current_time()):
-                    raise
-                control = await _control_read(session, which)
-                if control is None:
-                    raise
-            if control.param_id == which:
-                return control
-            with suppress(NoReply):  # it answers by now, and may only have been busy
-                return await ask(inbox)
-    raise _unknown(session, which, ": it does not respond to reads of this name, but to others")
+
+def _what(session: Session, which: str | int) -> str:
+    return f"parameter {which} of {session.channel.system}/{session.channel.component}"
+
+
+async def read_param(session: Session, which: str | int) -> Param:
+    """Read one parameter, and return it as the component has reported it.
+
+    Raises:
+        UnknownParameter, Refused, NoReply, LinkError: as from `read`.
+    """
+    message = await read(session, which)
+    if session.identification.autopilot is None and not session.dialect.has_ack:
+        with anyio.move_on_after(HEARTBEAT_WAIT):  # it tells the encoding
+            await session.identification.encoding_certain()
+    known = session.table.params.get(message.param_id)
+    if known is not None and (isinstance(which, str) or known.index == which):
+        return known
+    index = message.param_index if message.param_index < message.param_count else None
+    fields = (message.param_id, message.raw, message.param_type, index)
+    return session.dialect.param(*fields, session.table.encoding)
 
 
 async def read_many(
@@ -137,25 +215,61 @@ def _queue_time(session: Session) -> float:
 
 
 async def _control_read(session: Session, which: str | int) -> ReportedValue | None:
-    """Read something that the component certainly has; return None if that is not answered either.
+    """Read something that the component certainly has; return None if reads of this kind are not answered.
 
     That is the same parameter by its index, where that is known: some components answer no read by name.
     """
-    channel, dialect, table = session.channel, session.dialect, session.table
-    same = table.params[which].index if isinstance(which, str) and which in table.moments else None
-    known = next((name for name in table.moments if name != which), 0) if same is None else same
-    control: str | int = HASH_CHECK if session.identification.is_px4 else known
+    px4 = session.identification.is_px4
+    live = {name: param.index for name, param in session.table.params.items() if param.trust is Trust.LIVE}
+    same = live.pop(which, None) if isinstance(which, str) else None
+    control = await _try(session, HASH_CHECK if px4 else next(iter(live), 0) if same is None else same)
+    if control is None and px4 and same is not None:
+        control = await _try(session, same)
+    if control is None or not isinstance(which, str) or session.reads_names or control.param_id == which:
+        return control
+    return await _try(session, control.param_id)
 
-    def accept(message: Message) -> ReportedValue | None:
-        return message if isinstance(message, dialect.value) else None
 
-    with channel.inbox((dialect.value, control)) as inbox:
-        request = dialect.request_read(channel.target, control)
-        attempts = max(channel.timing.attempts_for(CONTROL_LOST), CONTROL_ATTEMPTS_MIN)
+async def _try(session: Session, which: str | int) -> ReportedValue | None:
+    """Read a parameter that the component has; return None, and remember it, if that is not answered."""
+    channel = session.channel
+    attempts = max(channel.timing.attempts_for(CONTROL_LOST), CONTROL_ATTEMPTS_MIN)
+    with channel.inbox((session.dialect.value, which)) as inbox:
         try:
-            return await channel.exchange(request, inbox, accept, what="a control read", attempts=attempts)
+            return await _ask(session, inbox, which, attempts)
+        except (NoReply, VehicleError):
+            if which != HASH_CHECK:
+                _miss(session, which)
+            return None
+
+
+def _miss(session: Session, which: str | int) -> None:
+    """Remember that such a read was not answered."""
+    if isinstance(which, str):
+        session.reads_names = session.reads_names or False
+    else:
+        session.reads_indices = session.reads_indices or False
+
+
+async def _read_list(session: Session, inbox: Inbox, which: str | int) -> ReportedValue | None:
+    """Take a parameter from the list of a component that answers no reads; None if that is not complete.
+
+    Raises:
+        UnknownParameter: it is not in the list.
+        LinkError: the link is closed for good.
+    """
+    for _ in range(1 + session.listing.is_running):  # one that runs may have passed the parameter
+        try:
+            await session.listing.join(lambda: download_list(session))
         except NoReply:
             return None
+        while inbox:
+            message = await inbox.next()
+            if isinstance(message, session.dialect.value):
+                return message
+    if session.table.is_complete:
+        raise _unknown(session, which)
+    return None
 
 
 def _unknown(session: Session, which: str | int, reason: str = "") -> UnknownParameter:

@@ -12,19 +12,21 @@ from typing import Final
 from paramclient.errors import AmbiguousVehicle
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.addresses import peer_in_words
-from paramclient.protocol.kinds import kind_in_words
+from paramclient.protocol.identity import kind_in_words
 from paramclient.protocol.node import Node
 from paramclient.protocol.station import Station
-from paramclient.wire.messages import AUTOPILOT_COMPONENT, MAV_AUTOPILOT_GENERIC, MAV_TYPE_GCS
+from paramclient.wire.messages import AUTOPILOT_COMPONENT, MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS
 
 __all__ = [
     "LOOK_TIME",
+    "address_in_words",
     "autopilots_of",
     "find",
     "hint_of_link",
     "hint_of_node",
     "node_in_words",
     "only_vehicle",
+    "vehicle_of",
 ]
 
 LOOK_TIME: Final = 1.2
@@ -34,7 +36,9 @@ LISTED_MAX: Final = 8
 """Components that a hint names, so that it stays readable; it gives the number of further ones."""
 _PERIPHERALS: Final = frozenset({18, 26, 27, *range(30, 35), *range(36, 43), 44, 48})
 """MAV_TYPE of the parts of a vehicle: onboard computers, gimbals, cameras, batteries, GPS receivers. Some of
-them name the generic autopilot in their heartbeat, where they should name none."""
+them name an autopilot in their heartbeat, where they should name none."""
+PERIPHERAL_IDS_MIN: Final = 100
+"""The first component id that MAVLink gives to parts of a vehicle: MAV_COMP_ID_CAMERA."""
 _CAUSES: Final = {
     "udpin": " Is the vehicle sending to this port?",
     "udpout": " Is the address right, and does the vehicle listen there?",
@@ -57,7 +61,8 @@ def find(nodes: Iterable[Node], system: int | None, component: int | None, peer:
 def autopilots_of(nodes: Iterable[Node]) -> list[Node]:
     """Return the autopilot of each vehicle, component 1 before others, in the order of their first messages.
 
-    Lost ones are left out while another autopilot is heard, and so are peripherals that claim to be one.
+    Lost ones are left out while another autopilot is heard. Peripherals that claim to be one are none. A
+    component 1 that claims to be none is one in a system without another.
     """
     first: dict[object, Node] = {}
     for each in _autopilots(nodes):
@@ -65,6 +70,13 @@ def autopilots_of(nodes: Iterable[Node]) -> list[Node]:
         if key not in first or each.component == AUTOPILOT_COMPONENT != first[key].component:
             first[key] = each
     return list(first.values())
+
+
+def vehicle_of(nodes: Iterable[Node], node: Node) -> Node:
+    """Return the autopilot of a component's vehicle, whose identity is the vehicle's; without one, itself."""
+    same = [each for each in nodes if each.system == node.system]
+    near = [each for each in same if each.peer == node.peer] if node.is_split else same
+    return next(iter(autopilots_of(near)), node)
 
 
 def only_vehicle(
@@ -121,11 +133,18 @@ def hint_of_link(station: Station, bytes_received: int) -> str:
     if not station.gate.is_open:
         return f"{link} is down at present."
     nodes = sorted(station.nodes.values(), key=lambda each: (each.system, each.component))
+    if station.broadcaster is not None:
+        words = kind_in_words(station.broadcaster.autopilot, station.broadcaster.type)
+        return (
+            f"A vehicle with system id 0 is heard on {link} ({words or 'of no kind'}): 0 addresses all. "
+            "Give it an id from 1 to 255 (MAV_SYS_ID of PX4, SYSID_THISMAV of ArduPilot)."
+        )
     if nodes:
         listed = first_of([node_in_words(each) for each in nodes], LISTED_MAX)
         if all(each.identification.vehicle_type == MAV_TYPE_GCS for each in nodes):
             return f"Heard on {link} so far: only {listed}, and no vehicle.{cause}"
-        return f"Heard on {link} so far: {listed}."
+        unnamed = "" if _autopilots(nodes) else " None is an autopilot; one that is named in full is asked."
+        return f"Heard on {link} so far: {listed}.{unnamed}"
     frames = station.framing[0]
     if frames:
         return f"{counted(frames, 'MAVLink frame')} arrived on {link}, but no heartbeat."
@@ -144,8 +163,18 @@ def hint_of_node(station: Station, node: Node, now: float) -> str:
     if node.presence.is_lost or silence > LOOK_TIME:
         return f"Nothing was received of {label} for {silence:.1f} s."
     does = f"{label} sends messages (the last one {silence:.1f} s ago)"
+    others = [
+        f"{each.system}/{each.component}"
+        for each in station.nodes.values()
+        if each.system == node.system and each.plain.table.moments and not each.presence.has_beaten
+    ]
+    if others and not node.plain.table.moments:
+        return f"{does}, but no values; values came from {first_of(others, LISTED_MAX)}, which may be meant."
     if node.channel.timing.round_trip is not None:
-        return f"{does} and answered other requests: the link may lose packets, or the vehicle is busy."
+        return (
+            f"{does} and answered other requests: it may not support this one or be busy, or "
+            "the link may lose packets."
+        )
     return (
         f"{does} and answers no request: requests do not reach it, or it ignores them. Check the link "
         "towards the vehicle, and whether the vehicle requires signed messages."
@@ -153,10 +182,18 @@ def hint_of_node(station: Station, node: Node, now: float) -> str:
 
 
 def _autopilots(nodes: Iterable[Node]) -> list[Node]:
-    """Return all autopilots; lost ones, and peripherals that claim to be one, only if there is no other."""
-    found = [each for each in nodes if each.identification.is_autopilot]
-    found = [each for each in found if not each.presence.is_lost] or found
-    return [each for each in found if not _is_peripheral(each)] or found
+    """Return all autopilots; lost ones only if there is no other."""
+    vehicles = [each for each in nodes if not _is_peripheral(each)]
+    found = [each for each in vehicles if each.identification.is_autopilot]
+    systems = {each.system for each in found}
+    found += [
+        each
+        for each in vehicles
+        if each.system not in systems
+        and (each.component, each.identification.autopilot) == (AUTOPILOT_COMPONENT, MAV_AUTOPILOT_INVALID)
+        and each.identification.has_parameters
+    ]
+    return [each for each in found if not each.presence.is_lost] or found
 
 
 def _ambiguous(nodes: Sequence[Node]) -> AmbiguousVehicle:
@@ -177,6 +214,12 @@ def _is_at(node: Node, peer: str | None) -> bool:
 
 
 def _is_peripheral(node: Node) -> bool:
-    identification = node.identification
-    is_generic = identification.autopilot == MAV_AUTOPILOT_GENERIC
-    return is_generic and identification.vehicle_type in _PERIPHERALS
+    return node.component >= PERIPHERAL_IDS_MIN or node.identification.vehicle_type in _PERIPHERALS
+
+
+def address_in_words(system: int | None, component: int | None, peer: str | None = None) -> str:
+    """Return the component that a call waits for, for messages."""
+    at = "" if peer is None else f" at {peer}"
+    if component is None:
+        return f"an autopilot{at}" if system is None else f"an autopilot with system id {system}{at}"
+    return f"component {'*' if system is None else system}/{component}{at}"

@@ -10,12 +10,13 @@ from typing import Any, Final, Generic, TypeVar
 
 import anyio
 
-from paramclient.model.values import Param
+from paramclient.model.values import Encoding, Param
 from paramclient.protocol.channel import Channel, Gate
 from paramclient.protocol.dialect import Dialect, Digest, ReportedValue
 from paramclient.protocol.events import Change
 from paramclient.protocol.identity import Identification
 from paramclient.protocol.table import Table
+from paramclient.wire.messages import NO_INDEX
 
 __all__ = ["ReplacedValue", "Session", "Shared", "Spawn"]
 
@@ -137,11 +138,17 @@ class Session:
     Attributes:
         table: the current values.
         fetching: the fetch that is in progress, shared by all callers.
+        reading: names and indices whose reads are in progress.
         writing: the authors of the writes in progress, by name.
         serves_file: whether the parameter file was served on this link; None while unknown.
+        serves_checksum: likewise, whether its checksum is computed.
         announced: the last PX4 hash that was received, also in another station's list, or None.
         written_at: when the last write ended; minus infinity before the first.
         replaced: by name, the values before writes that have just ended.
+        contradicted: called when a hash is received that is not the table's.
+        reads_names, reads_indices: whether reads by name, and by index, are answered; None while unknown.
+        listing: the list that is downloaded in place of reads that are not answered.
+        acknowledging: names whose next value may acknowledge a set, in another type than the parameter's.
         observers: called with the parameters received and their number, while a fetch runs.
     """
 
@@ -160,24 +167,50 @@ class Session:
         self.table = Table(dialect, changed)
         self.table.author_of = self._author_of
         self.fetching: Shared[Any] = Shared(spawn, channel.gate)
+        self.reading: set[str | int] = set()
         self.writing: dict[str, str] = {}
         self.serves_file: bool | None = None
+        self.serves_checksum: bool | None = None
         self.announced: Digest | None = None
         self.written_at = -math.inf
         self.replaced: defaultdict[str, list[ReplacedValue]] = defaultdict(list)
+        self.contradicted: Callable[[], None] = lambda: None
+        self.reads_names: bool | None = None
+        self.reads_indices: bool | None = None
+        self.listing: Shared[Any] = Shared(spawn, channel.gate)
+        self.acknowledging: set[str] = set()
         self.observers: set[Callable[[int, int | None], None]] = set()
         self._locks: dict[str, anyio.Lock] = {}
         self._foreign_sets: dict[str, tuple[str, float]] = {}
 
     def receive(self, message: ReportedValue, now: float) -> None:
         """Store a value, unless it may be the answer to a read from before a write."""
-        name, raw, number, _, _ = message
+        name, spelled = message.param_id, self.spelled(message.param_id)
+        if name != spelled and (message.param_index == NO_INDEX or spelled in self.table.params):
+            name, message = spelled, message._replace(param_id=spelled)
+        _, raw, number, _, _ = message
         for each in self.replaced.get(name, ()):
             param = self.dialect.param(name, raw, number, None, self.table.encoding)
             if now <= each.until and param.same_value(each.param):
                 each.was_received = True
                 return
+        known = self.table.params.get(name)
+        if known is not None and known.type_number != number:
+            if name in self.acknowledging and self.table.encoding is Encoding.BYTEWISE:
+                return
+            if self.identification.is_ardupilot and message.param_index == NO_INDEX and not known.is_raw:
+                # it acknowledges the set of a default as REAL32; the bytes are a float for every type
+                message = message._replace(param_type=known.type_number)
         self.table.store(message, now)
+
+    def spelled(self, name: str) -> str:
+        """Return a name as the vehicle spells it.
+
+        An ArduPilot takes any case, and answers a read in the requested one, but a set in capitals. A name
+        that is listed in lower case stays.
+        """
+        is_open = self.identification.is_ardupilot and name.isascii() and name not in self.table.params
+        return name.upper() if is_open else name
 
     def lock(self, name: str) -> anyio.Lock:
         """Return the lock of the writes to one name: they run one after the other."""
@@ -185,11 +218,24 @@ class Session:
             self._locks = {each: lock for each, lock in self._locks.items() if lock.locked()}
         return self._locks.setdefault(name, anyio.Lock())
 
+    def announce(self, digest: Digest) -> None:
+        """Take a hash that was received."""
+        self.announced = digest
+        if self.table.is_complete and self.table.hash not in (None, digest.hash):
+            self.contradicted()
+
     def confirm_announced(self) -> None:
         """Confirm a complete table by the hash that was received last, if it is of as many parameters."""
         table, announced = self.table, self.announced
         if announced is not None and announced.count == table.count and table.is_complete:
             table.confirm(announced.hash)
+
+    @property
+    def encoding_doubt(self) -> str:
+        """Why the encoding is probably wrong, as a sentence; "" without evidence, or by the user's choice."""
+        why = self.table.contradicts if self.identification.chosen is None else ""
+        address = f"{self.channel.system}/{self.channel.component}"
+        return why and f"The encoding of {address} is probably wrong: {why}."
 
     def report(self, received: int, total: int | None) -> None:
         """Report the progress of a fetch."""

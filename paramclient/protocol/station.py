@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
@@ -13,6 +14,7 @@ from paramclient.errors import LinkError
 from paramclient.model.values import Encoding
 from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_words
 from paramclient.protocol.channel import Gate
+from paramclient.protocol.dialect import EXTENDED, PLAIN
 from paramclient.protocol.events import Change, ComponentEvent
 from paramclient.protocol.node import Node
 from paramclient.protocol.session import Session, Spawn
@@ -45,7 +47,9 @@ from paramclient.wire.signing import Signer, SigningKey, Verifier
 __all__ = ["Peer", "Station"]
 
 SEEK_INTERVAL: Final = 0.25
-"""Seconds between two requests for a heartbeat, while no component is known."""
+"""Seconds between two requests for the heartbeat of an unknown component."""
+SEEK_MAX: Final = 20
+"""Requests for the heartbeat of one system: it may be no vehicle, or serve no such request."""
 HEARTBEAT_INTERVAL: Final = 1.0
 """Seconds between two heartbeats of ours, by the standard."""
 COMPONENTS_MAX: Final = 1_000
@@ -54,6 +58,10 @@ STREAM_PEERS_MAX: Final = 256
 """Peers of a stream with an unfinished frame."""
 RIVAL_TIME: Final = 5.0
 """Seconds of silence after which another peer may take the ids of a component: its heartbeat timeout."""
+SETUP_SIGNING_COUNT: Final = 3
+"""SETUP_SIGNING messages that are sent: they have no acknowledgement, and a frame may be lost."""
+SETUP_SIGNING_INTERVAL: Final = 0.1
+"""Seconds after each SETUP_SIGNING message."""
 _MAVLINK2_REQUESTS: Final = (ParamExtRequestRead, ParamExtRequestList, ParamExtSet)
 """Requests that exist in MAVLink 2 only: a component that has sent MAVLink 1 so far may understand them."""
 
@@ -85,6 +93,7 @@ class Station:
         gate: whether the link carries messages.
         listening_since: since when everything on the link is received.
         verifier: verifies signatures; None without a key.
+        broadcaster: the last heartbeat with the system id 0, which no vehicle may have; None without one.
     """
 
     def __init__(
@@ -110,6 +119,7 @@ class Station:
         self.listens_only = listens_only
         self.listening_since = -math.inf
         self.verifier: Verifier | None = None
+        self.broadcaster: Heartbeat | None = None
         self._is_stream = is_stream
         self._send = send
         self._spawn = spawn
@@ -123,7 +133,9 @@ class Station:
         self._ended_peers: set[Peer] = set()  # of components: another connection may take their ids
         self._sequence = 0
         self._seek_at = -math.inf  # when the next heartbeat may be requested
+        self._sought: Counter[int] = Counter()  # requests by system
         self._signer: Signer | None = None
+        self._asked: dict[Address, int] = {}  # probes to components that were not heard
 
     @property
     def is_waiting(self) -> bool:
@@ -153,21 +165,36 @@ class Station:
             self._take(frame, peer, now)
         if not data:
             self._ended_peers.update(node.peer for node in self.nodes.values() if node.peer == peer)
-        if not self.nodes and now >= self._seek_at:
-            self._request_heartbeat(data, peer, now)
 
-    def _request_heartbeat(self, data: bytes, peer: Peer, now: float) -> None:
-        """Request the heartbeat of an autopilot that sends other messages, before any component is known.
+    def _seek(self, frame: Frame, peer: Peer, now: float) -> None:
+        """Request the heartbeat of an autopilot of which only other messages were received.
 
         A heartbeat is due once a second only; the command brings it in one round trip (measured on PX4).
         """
-        for frame in Framer(stream=False).receive(data):
-            address = (frame.system, frame.component)
-            if frame.component == AUTOPILOT_COMPONENT and frame.system != 0 and address != self.own_address:
-                self._seek_at = now + SEEK_INTERVAL
-                request = CommandLong(*address, MAV_CMD_REQUEST_MESSAGE, float(message_id(Heartbeat)))
-                self.transmit(request, peer, frame.version)
-                return
+        requests = self._sought[frame.system]
+        if frame.component == AUTOPILOT_COMPONENT and now >= self._seek_at and requests < SEEK_MAX:
+            self._seek_at = now + SEEK_INTERVAL
+            self._sought[frame.system] += 1
+            target = (frame.system, frame.component)
+            request = CommandLong(*target, MAV_CMD_REQUEST_MESSAGE, float(message_id(Heartbeat)))
+            self.transmit(request, peer, frame.version)
+
+    def probe(self, system: int, component: int) -> None:
+        """Request a value of a component that was not heard: it may send no heartbeat.
+
+        By turns a plain and an extended parameter, and the list for firmware without reads; then a parameter
+        of all components of the system, as some answer under another id than they are asked under.
+        """
+        number = self._asked[system, component] = self._asked.get((system, component), -1) + 1
+        target = (system, component)
+        ways = (
+            PLAIN.request_read(target, 0),
+            EXTENDED.request_read(target, 0),
+            PLAIN.request_list(target),
+            PLAIN.request_read((system, COMP_ID_ALL), 0),
+        )
+        version = next((node.version for node in self.nodes.values()), 2)
+        self.transmit(ways[number % len(ways)], None, version)
 
     def overhear(self, data: bytes, now: float) -> None:
         """Take a frame that another program sends to the vehicles over this link: it may be a PARAM_SET."""
@@ -181,6 +208,8 @@ class Station:
         if self.listens_only:
             return
         system, component = self.own_address
+        if logger.isEnabledFor(logging.DEBUG) and not isinstance(message, Heartbeat):
+            logger.debug("%s: to %s: %r", self.link, "all" if peer is None else peer_in_words(peer), message)
         if isinstance(message, _MAVLINK2_REQUESTS):
             version = 2
         data = encode(message, system=system, component=component, sequence=self._sequence, version=version)
@@ -189,10 +218,17 @@ class Station:
             data = sign_frame(data, self._signer)
         self._send(data, peer)
 
-    def send_setup_signing(self, node: Node, key: SigningKey | None, timestamp: int) -> None:
+    async def set_up_signing(self, node: Node, key: SigningKey | None, timestamp: int) -> None:
         """Give a vehicle its signing key, in clear, or with None disable signing. There is no
-        acknowledgement."""
-        self.transmit(SetupSigning(node.system, node.component, key, timestamp), node.peer, 2)
+        acknowledgement.
+
+        Raises:
+            LinkError: the link failed.
+        """
+        for _ in range(SETUP_SIGNING_COUNT):
+            self.gate.check()
+            self.transmit(SetupSigning(node.system, node.component, key, timestamp), node.peer, 2)
+            await anyio.sleep(SETUP_SIGNING_INTERVAL)
 
     async def send_heartbeats(self) -> None:
         """Send our heartbeat once a second."""
@@ -243,14 +279,18 @@ class Station:
         address = PeerAddress(system, component, peer) if self._splits_peers else (system, component)
         node = self.nodes.get(address)
         message = decode(frame)
+        is_own = (system, component) == self.own_address and not self.listens_only
+        if system == 0 and isinstance(message, Heartbeat):
+            self.broadcaster = message
+        if is_own or system == 0:
+            return
         if message is None:
-            if node is not None and peer == node.peer:
+            if node is None:
+                self._seek(frame, peer, now)
+            elif peer == node.peer:
                 at = BOOT_CLOCK_OFFSETS[frame.message_id]
                 boot_ms = int.from_bytes(frame.payload[at : at + 4], "little")
                 node.boot_clock(frame.message_id, boot_ms, now)
-            return
-        is_own = (system, component) == self.own_address and not self.listens_only
-        if is_own or system == 0:
             return
         if isinstance(message, ParamSet | ParamExtSet):
             self._take_foreign_set(message, frame, now)
@@ -260,8 +300,15 @@ class Station:
             if not is_sign or len(self.nodes) >= COMPONENTS_MAX:
                 return
             node = self._add(address, peer, now)
-        if peer != node.peer and not self._moves(node, peer, message, now):
-            return
+        if peer != node.peer:
+            if not self._moves(node, peer, message, now):
+                return
+        elif node.rival is not None and node.told_rival != node.rival[0]:  # both are there
+            node.told_rival = node.rival[0]
+            logger.warning(
+                "%s: messages of %d/%d arrive from %s too, and are ignored: two vehicles have the same ids",
+                *(self.link, node.system, node.component, peer_in_words(node.told_rival)),
+            )
         self._ended_peers.discard(peer)
         node.receive(message, now, frame.version)
 
@@ -273,11 +320,6 @@ class Station:
             node.peer = peer
             node.rival = None
             return True
-        if node.rival is None or node.rival[0] != peer:
-            logger.warning(
-                "%s: messages of %d/%d arrive from %s too, and are ignored: two vehicles have the same ids",
-                *(self.link, node.system, node.component, peer_in_words(peer)),
-            )
         node.rival = (peer, now)
         return False
 
@@ -295,7 +337,8 @@ class Station:
         node: Node
 
         def transmit(message: Message) -> None:
-            self.transmit(message, node.peer, node.version)
+            is_reopened = node.presence.received_at < self.listening_since  # its peer may have another name
+            self.transmit(message, None if is_reopened else node.peer, node.version)
 
         node = Node(
             address[0],
@@ -312,6 +355,8 @@ class Station:
             emit=lambda event: self._emit(node, event),
             changed=lambda session, change: self._changed(node, session, change),
         )
+        if self._asked.get((node.system, node.component), 0) > 2:
+            node.channel.reads_from = (node.system, COMP_ID_ALL)
         self.nodes[address] = node
         self._discovered(node)
         self._spawn(node.watch_presence)

@@ -10,13 +10,14 @@ from paramclient.model.px4_hash import find_volatile, hash_bits
 from paramclient.model.values import (
     Encoding,
     Param,
-    ParamType,
     Trust,
     as_reported,
+    encoding_of,
+    format_value,
     from_bits,
     is_portable_name,
 )
-from paramclient.protocol.dialect import PLAIN, Dialect, ReportedValue
+from paramclient.protocol.dialect import PLAIN, Dialect, Digest, ReportedValue
 from paramclient.protocol.events import Change
 from paramclient.protocol.param_pck import PackedParam
 from paramclient.wire.messages import HASH_CHECK, NO_INDEX, PARAMETERS_MAX
@@ -47,6 +48,9 @@ class Table:
         volatile: names outside the vehicle's hash, as far as known.
         author_of: returns the author of a change of a name.
         left_out: received names that no parameter file can contain, and that are not stored.
+        evidence: for each encoding, a value that shows it: name, bytes and type.
+        is_growing: whether each value so far was the last one by its own param_count: a component that counts
+            what it has sent, and whose list ends by a pause.
         recounted: called when the count of a complete table changes, or may have changed.
     """
 
@@ -61,12 +65,14 @@ class Table:
         self.volatile: frozenset[str] = frozenset()
         self.volatile_is_known = False
         self.left_out: set[str] = set()
+        self.is_growing = True
         self.author_of: Callable[[str], str] = lambda name: "vehicle"
         self.recounted: Callable[[], None] = lambda: None
         self._changed = changed
         self._held: dict[str, Change] | None = {} if dialect is PLAIN else None
         self._encoding = Encoding.BYTEWISE
-        self._wire: dict[str, tuple[bytes, int]] = {}  # as received, to decode again in another encoding
+        self._wire: dict[str, tuple[bytes, int]] = {}  # as received, until the encoding is certain
+        self.evidence: dict[Encoding, tuple[str, bytes, int]] = {}
         self._was_complete = False
         self._outdated: set[str] = set()  # names whose index belongs to an earlier count
         self._hash: int | None = None
@@ -77,17 +83,24 @@ class Table:
     @property
     def is_complete(self) -> bool:
         """Whether every index below the count has a parameter."""
-        return self.count is not None and len(self.names) >= self.count
+        if self.count is None:
+            return False
+        has_both_ends = self.count in self.names and 0 in self.names
+        return len(self.names) - has_both_ends >= self.count
 
-    def missing(self, below: int | None = None) -> list[int]:
-        """Return the indices without a parameter, below the count or a smaller number."""
-        end = self.count or 0 if below is None else below
-        names = self.names
-        return [index for index in range(end) if index not in names]
+    def missing(self) -> list[int]:
+        """Return the indices without a parameter. They begin at 1 if the count itself is one, and 0 is
+        none."""
+        count, names = self.count or 0, self.names
+        first = int(count in names and 0 not in names)
+        return [index for index in range(first, first + count) if index not in names]
 
     @property
     def encoding(self) -> Encoding:
-        """How the component encodes values; a change decodes all received values again."""
+        """How the component encodes values; a change decodes all received values again.
+
+        Later than `report_held`, a change is against all evidence: the values are forgotten.
+        """
         return self._encoding
 
     @encoding.setter
@@ -95,6 +108,8 @@ class Table:
         if encoding is self._encoding:
             return
         self._encoding = encoding
+        if self._held is None:
+            self.clear()
         for name, (raw, number) in self._wire.items():
             old = self.params[name]
             new = self.dialect.param(name, raw, number, old.index, encoding)
@@ -124,32 +139,60 @@ class Table:
                 of a known integer.
         """
         name, raw, number, count, index = message
-        if name == HASH_CHECK or not self._may_store(name):
+        if name == HASH_CHECK:
             return None
+        is_last = index == count - 1
         if count != self.count and 0 < count <= PARAMETERS_MAX:
-            self.recount(count)
-        place = index if index < count <= PARAMETERS_MAX else None
+            if self.is_growing and is_last:
+                self.count = max(count, self.count or 0)
+            else:
+                self.recount(count)
+        self.is_growing = is_last and (self.is_growing or not self.names)
+        place = index if index <= count <= PARAMETERS_MAX else None
+        if not self._may_store(name):
+            if place is not None:
+                self.names[place] = name
+            return None
         old = self.params.get(name)
         if place is None and old is not None and index == NO_INDEX:
             place = old.index
         elif place is not None:
-            self.names[place] = name
-            self._outdated.discard(name)
+            self._take_place(name, place)
         self.moments[name] = now
         if old is None:
             if len(self.params) >= NAMES_MAX:
                 return None
             new = self.dialect.param(name, raw, number, place, self._encoding)
-        elif (self._wire.get(name) == (raw, number) and not is_exact) or (
-            not is_exact and self._is_rounded(old, raw, number)
-        ):
+            self._take_evidence(name, raw, number)
+        elif not is_exact and self._is_reported(old, raw, number):
             new = self._placed(old, place)
         else:
             new = self.dialect.param(name, raw, number, place, self._encoding)
+            self._take_evidence(name, raw, number)
             if new.type_number == old.type_number:
                 new = replace(new, default=old.default)
-        self._wire[name] = (raw, number)
+        if self._held is not None:
+            self._wire[name] = (raw, number)
         return self._put(name, old, new)
+
+    def _take_evidence(self, name: str, raw: bytes, number: int) -> None:
+        if self.dialect is PLAIN and len(self.evidence) < len(Encoding):
+            encoding = encoding_of(raw, number)
+            if encoding is not None:
+                self.evidence.setdefault(encoding, (name, raw, number))
+
+    @property
+    def contradicts(self) -> str:
+        """The evidence of the values against their encoding, in words; "" without any, or with any for it."""
+        if not self.evidence or self._encoding in self.evidence:
+            return ""
+        ((against, (name, raw, number)),) = self.evidence.items()
+        looks = "bytes (a denormal float32)" if against is Encoding.BYTEWISE else "a float32"
+        read, meant = (
+            format_value(self.dialect.param(name, raw, number, None, each).settable, number)
+            for each in (self._encoding, against)
+        )
+        return f"each integer looks like {looks}; {name} = {read} is {meant} with --encoding {against}"
 
     def store_entry(
         self, entry: PackedParam, index: int, now: float, *, with_defaults: bool
@@ -166,24 +209,31 @@ class Table:
         """
         name = entry.name
         if not self._may_store(name):
+            self.names[index] = name
             return None
         old = self.params.get(name)
-        self.names[index] = name
-        self._outdated.discard(name)
+        self._take_place(name, index)
         default_bits = entry.default if entry.default is not None else entry.bits if with_defaults else None
         default = None if default_bits is None else from_bits(default_bits, entry.type)
         new = Param(
             name, from_bits(entry.bits, entry.type), entry.type, index, entry.bits, Trust.LIVE, default
         )
         raw = as_reported(entry.bits, entry.type, self._encoding)
-        if old is not None and self.moments.get(name, -1.0) > now and old.trust is Trust.LIVE:
-            wire = self._wire.get(name)
-            if wire is not None and wire != (raw, entry.type):
-                self.params[name] = replace(old, index=index, default=default)
-                return None
+        is_newer = old is not None and self.moments[name] > now and old.trust is Trust.LIVE
+        if old is not None and is_newer and not self._is_reported(old, raw, entry.type):
+            self.params[name] = replace(old, index=index, default=default)
+            return None
         self.moments[name] = now
-        self._wire[name] = (raw, entry.type)
+        if self._held is not None:
+            self._wire[name] = (raw, entry.type)
         return self._put(name, old, new)
+
+    def _take_place(self, name: str, index: int) -> None:
+        before = self.names.get(index, name)
+        if before != name and before in self.params and self.params[before].index == index:
+            self._outdated.add(before)
+        self.names[index] = name
+        self._outdated.discard(name)
 
     def _may_store(self, name: str) -> bool:
         if is_portable_name(name):
@@ -197,7 +247,12 @@ class Table:
         if not self.is_complete:
             return []
         self._was_complete = True
-        gone = [name for name in self.params if name in self._outdated]
+        names, outdated = self.names, self._outdated
+        gone = [
+            name
+            for name, param in self.params.items()
+            if name in outdated or (param.index is not None and names.get(param.index) != name)
+        ]
         self._outdated.clear()
         changes = [Change(name, self.params[name], None, "vehicle", "removed") for name in gone]
         for change in changes:
@@ -226,15 +281,13 @@ class Table:
             return param
         return replace(param, index=place, trust=Trust.LIVE)
 
-    def _is_rounded(self, old: Param, raw: bytes, number: int) -> bool:
-        """Return whether these bytes are a C-casting vehicle's form of a known exact integer."""
-        return (
-            self._encoding is Encoding.C_CAST
-            and old.type_number == number
-            and isinstance(old.type, ParamType)
-            and old.type.is_integer
-            and as_reported(old.bits, number, self._encoding) == raw
-        )
+    def _is_reported(self, known: Param, raw: bytes, number: int) -> bool:
+        """Return whether these bytes are the component's form of a known value, which may be rounded."""
+        if known.type_number != number or self.dialect is not PLAIN:
+            return False
+        if known.is_raw:
+            return int.from_bytes(raw, "little") == known.bits
+        return as_reported(known.bits, number, self._encoding) == raw
 
     def _put(self, name: str, old: Param | None, new: Param) -> Change | None:
         self.params[name] = new
@@ -259,9 +312,16 @@ class Table:
     def report_held(self) -> None:
         """Report the changes that waited until the encoding was certain, with the values in that encoding."""
         held, self._held = self._held or {}, None
+        self._wire.clear()
         for name, change in held.items():
             if change.new is not None and name in self.params:
                 self._changed(replace(change, new=self.params[name]))
+
+    def with_default(self, param: Param) -> Param:
+        """Return a parameter that was received earlier with the default that is known by now."""
+        now = self.params.get(param.name, param)
+        is_new = param.default is None and now.default is not None and now.type_number == param.type_number
+        return replace(param, default=now.default) if is_new else param
 
     # trust
 
@@ -278,6 +338,13 @@ class Table:
             if param.trust is Trust.CACHED and param.index is not None and name not in self.volatile:
                 self.params[name] = param.with_trust(Trust.VERIFIED)
 
+    def prove(self, checksum: int) -> None:
+        """Take a checksum that covers the whole table, and mark the cached values as verified."""
+        self._hash, self._hash_is_stale = checksum, False
+        for name, param in self.params.items():
+            if param.trust is Trust.CACHED and param.index is not None:
+                self.params[name] = param.with_trust(Trust.VERIFIED)
+
     def unverified(self) -> list[str]:
         """Return the names whose values are neither received on this link nor covered by the hash."""
         return [name for name, param in self.params.items() if param.trust is Trust.CACHED]
@@ -286,10 +353,25 @@ class Table:
         """Forget everything: another vehicle uses the address."""
         for each in (self.params, self.names, self.moments, self._wire, self._outdated, self.left_out):
             each.clear()
+        self.evidence.clear()
         self.count = None
         self.volatile, self.volatile_is_known = frozenset(), False
         self._was_complete = False
         self.unconfirm()
+
+    def forget_doubtful(self) -> None:
+        """Forget the values that may be of another vehicle: the component was lost since, and is identified
+        only now. A table that the vehicle has confirmed stays."""
+        if any(param.trust is Trust.VERIFIED for param in self.params.values()):
+            return
+        for name in [name for name, param in self.params.items() if param.trust is Trust.CACHED]:
+            index = self.params.pop(name).index
+            self.moments.pop(name, None)
+            self._wire.pop(name, None)
+            if index is not None and self.names.get(index) == name:
+                del self.names[index]
+        if not self.params:
+            self.clear()
 
     def load(
         self,
@@ -299,25 +381,39 @@ class Table:
         hash: int | None,  # noqa: A002 - the name of the attribute
         volatile: Iterable[str],
         volatile_is_known: bool,
+        moments: Mapping[str, float],
     ) -> None:
-        """Take the cached table of the component; values that were received on this link stay."""
+        """Take the cached table of the component; values that were received on this link stay.
+
+        `moments`: when the values arrived in earlier sessions, by the event loop's clock.
+        """
+        has_indices = count is not None and self.count in (None, count)
         for param in params:
             old = self.params.get(param.name)
             if old is None:
                 self.params[param.name] = param.with_trust(Trust.CACHED)
-                if param.index is not None and self.count in (None, count):
-                    self.names.setdefault(param.index, param.name)
-            elif old.default is None and old.type_number == param.type_number and param.default is not None:
-                self.params[param.name] = replace(old, default=param.default)
+                self.moments[param.name] = moments[param.name]
+            elif old.type_number == param.type_number:
+                index = old.index if old.index is not None or not has_indices else param.index
+                default = old.default if old.default is not None else param.default
+                self.params[param.name] = replace(old, index=index, default=default)
+            if param.index is not None and has_indices:
+                self.names.setdefault(param.index, param.name)
         if self.count is None:
             self.count = count
         if self.count == count:
+            self.is_growing = False
             self._hash, self._hash_is_stale = hash, False
             self.volatile = frozenset(volatile)
             self.volatile_is_known = volatile_is_known
             self._was_complete = self.is_complete
 
     # PX4's hash
+
+    def agrees_with(self, digest: Digest | None) -> bool:
+        """Return whether a hash that the vehicle announced is that of the complete table."""
+        is_same = digest is not None and (self.hash, self.count) == (digest.hash, digest.count)
+        return is_same and self.is_complete
 
     def confirm(self, announced: int) -> bool:
         """Take a hash that the vehicle announced for exactly this table, and return whether it is proven.

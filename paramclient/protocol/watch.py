@@ -12,7 +12,7 @@ import anyio
 
 from paramclient.errors import NoReply
 from paramclient.model.values import Param, Trust
-from paramclient.protocol.digest import is_current, request_digest
+from paramclient.protocol.digest import ask, may_confirm
 from paramclient.protocol.events import Resynced
 from paramclient.protocol.fetch import Policy, fetch_all
 from paramclient.protocol.presence import Presence
@@ -24,12 +24,10 @@ __all__ = ["SyncState", "Watch"]
 INTERVAL_MIN: Final = 1.0
 """Shortest interval in seconds that a user may choose."""
 INTERVAL_DEFAULT: Final = 30.0
-"""Seconds between two checks of a vehicle with a digest: two small messages each."""
+"""Seconds between two checks of a vehicle that confirms tables: two small messages each."""
 SETTLING_TIME: Final = 0.5
 """Seconds from a sign of change to the check: PX4 pushes what a change has caused within 25 ms, and while an
 ArduPilot sends a list, the numbers of parameters before and after a change alternate."""
-CHECK_TIME_MAX: Final = 1.5
-"""Seconds that a check without a digest, by download, may take to be repeated at intervals."""
 RETRY_INTERVAL: Final = 5.0
 """Seconds until the next check after one without an answer."""
 
@@ -53,8 +51,8 @@ class Watch:
     Args:
         session, presence: the component's.
         emit: called with a `Resynced` after a check that a sign of change has caused, or that found one.
-        interval: seconds between two checks of an idle table; None: 30 for a vehicle with a digest, and for
-            others if a download is quick; 0 for none.
+        interval: seconds between two checks of an idle table; None: 30 for a vehicle that confirms tables, no
+            checks of others; 0 for none.
         policy: any but AUTO disables the checks.
     """
 
@@ -76,7 +74,6 @@ class Watch:
         self._is_doubted = False
         self._before: Mapping[str, Param] = {}  # the table at the first sign of change
         self._is_due = False  # a sign of change was seen since the last check began
-        self._download_time = math.inf
         self._signal = anyio.Event()
         self._holds = 0
 
@@ -89,12 +86,10 @@ class Watch:
             return SyncState.UNSYNCED
         return SyncState.CHECKING if self._is_doubted else SyncState.SYNCED
 
-    def fetched(self, elapsed: float | None) -> None:
-        """Take note of a complete fetch; `elapsed` is the time of a download in seconds, or None."""
+    def fetched(self) -> None:
+        """Take note of a complete fetch."""
         self._is_fetched = True
         self._is_doubted = self._is_due = False
-        if elapsed is not None:
-            self._download_time = elapsed
         self._signal.set()
 
     def unconfirmed(self) -> None:
@@ -111,8 +106,11 @@ class Watch:
             self._holds -= 1
 
     def doubt(self) -> None:
-        """Check the table soon: there is a sign of change."""
-        if self._is_fetched:
+        """Check the table soon, where the policy allows it: there is a sign of change."""
+        if self._is_fetched and self._policy is not Policy.AUTO:
+            self._session.table.doubt()
+            self._is_fetched = False
+        elif self._is_fetched:
             if not self._is_doubted:
                 self._before = self._session.table.view()
             self._is_doubted = self._is_due = True
@@ -144,25 +142,26 @@ class Watch:
         """Seconds until the next check without a sign of change."""
         if self._interval is not None:
             return self._interval or math.inf
-        has_digest = self._session.table.hash is not None
-        return INTERVAL_DEFAULT if has_digest or self._download_time <= CHECK_TIME_MAX else math.inf
+        return INTERVAL_DEFAULT if may_confirm(self._session) else math.inf
 
     @property
     def _may_check(self) -> bool:
         is_allowed = self._policy is Policy.AUTO and self._is_fetched and not self._presence.is_lost
         is_armed = bool((self._presence.base_mode or 0) & MAV_MODE_FLAG_SAFETY_ARMED)
-        is_busy = self._session.fetching.is_running or bool(self._session.writing)
+        session = self._session
+        is_busy = session.fetching.is_running or session.channel.ftp.locked() or bool(session.writing)
         return is_allowed and not is_busy and not self._holds and (self._is_doubted or not is_armed)
 
     async def _check(self) -> None:
-        """Ask for the digest, and fetch what it does not confirm."""
+        """Ask whether the table is current, and fetch it where the vehicle does not say so."""
         session, table = self._session, self._session.table
         was_doubted = self._is_doubted
         before = self._before if was_doubted else table.view()
-        digest = await request_digest(session)
-        has_cached = any(param.trust is Trust.CACHED for param in table.params.values())
-        if has_cached or not is_current(session, digest):
-            result = await fetch_all(session, refresh=not is_current(session, digest))
+        answer = await ask(session)
+        if answer.reason and not answer.is_other and not was_doubted:
+            return  # another station's file is open, for example
+        if not answer.is_current or any(param.trust is Trust.CACHED for param in table.params.values()):
+            result = await fetch_all(session, refresh=not answer.is_current)
             if not result.complete:
                 return
         self._is_doubted = False

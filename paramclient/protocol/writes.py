@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext, suppress
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import anyio
 
@@ -22,8 +22,8 @@ from paramclient.errors import (
     ValueNotApplied,
     ValueUnsupported,
 )
-from paramclient.model.group_switches import is_group_switch
 from paramclient.model.identity import autopilot_name, reason_against_non_finite
+from paramclient.model.names import is_group_switch
 from paramclient.model.values import (
     Encoding,
     Param,
@@ -36,13 +36,20 @@ from paramclient.model.values import (
 from paramclient.protocol.channel import Inbox
 from paramclient.protocol.reads import read, refusal
 from paramclient.protocol.session import ReplacedValue, Session
-from paramclient.protocol.set_results import SetOutcome, SetResult, SetStatus
+from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
 from paramclient.wire.messages import Message, ParamError, ParamExtAck, StatusText
 
 __all__ = ["write", "write_many"]
 
 UNCHANGED_MAX: Final = 5
 """Sets that leave the old value, after which the vehicle has not applied it: a PARAM_SET can be lost."""
+SILENT_SETS_MAX: Final = 3
+"""Sets without an acknowledgement, after which a read shows the value: some firmware acknowledges none."""
+SETS_MAX: Final = 12
+SETS_LOST: Final = 1e-4
+"""Probability that sets without an acknowledgement, which leave the old value, are lost."""
+EVIDENCE_READS: Final = 8
+"""Indices that are read for evidence of the encoding: few components begin with more zeros and floats."""
 EXT_PROGRESS_TIMEOUT: Final = 60.0
 """Seconds for a component that reports progress to finish: a camera formats a card meanwhile."""
 BATCH_SIZE: Final = 20
@@ -62,14 +69,16 @@ async def write(
     settle: float = 0.0,
     force: bool = False,
     author: str = "us",
+    turn: AbstractAsyncContextManager[object] | None = None,
     sending: Callable[[], None] = lambda: None,
 ) -> SetResult:
     """Set one parameter, and prove its value by what the component reports.
 
-    Nothing is sent before the encoding is certain and the type is known: an integer in the wrong encoding
+    No set is sent before the encoding is certain and the type is known: an integer in the wrong encoding
     would be taken as another number. Only the wanted value proves success. Another value may be the answer to
     an old read, a part of a list, or an adjustment by the vehicle: it is read once more, and counts when a
-    second set leads to it again. A set whose caller is cancelled may still take effect.
+    second set leads to it again. A set that is not acknowledged is proven by a read too. A set whose caller
+    is cancelled may still take effect.
 
     Args:
         session: the component's.
@@ -78,6 +87,7 @@ async def write(
         settle: seconds after which the value is read once more; a different one is an adjustment.
         force: also send NaN and infinity to a vehicle that cannot store them.
         author: of the change, for the history.
+        turn: entered while requests are sent, but not while the value is watched.
         sending: called before the first set is sent.
 
     Raises:
@@ -90,21 +100,23 @@ async def write(
         LinkError: the link is closed for good.
     """
     gate = session.channel.gate
-    with gate.until_closed(or_failed=True):
-        await session.identification.encoding_certain()
+    _check_finite(session, name, value, force=force)
+    if session.spelled(name) != name:
+        name = (await read(session, name)).param_id
     async with session.lock(name):
         session.writing[name] = author
         try:
-            _check_finite(session, name, value, force=force)
-            await _learn_type(session, name)
-            before = session.table.params[name]
-            await gate.wait()
-            sending()
-            try:
-                result = await _Write(session, name, value).run()
-            except (NoReply, LinkError, anyio.get_cancelled_exc_class()):
-                session.foreign_set(name, author, anyio.current_time())  # it may be acknowledged yet
-                raise
+            async with turn or nullcontext():
+                await _learn_type(session, name)
+                await _check_encoding(session, name)
+                before = session.table.params[name]
+                await gate.wait()
+                sending()
+                try:
+                    result = await _Write(session, name, value).run()
+                except (NoReply, LinkError, anyio.get_cancelled_exc_class()):
+                    session.foreign_set(name, author, anyio.current_time())  # it may be acknowledged yet
+                    raise
             if session.identification.is_ardupilot and not result.param.same_value(before):
                 late = ReplacedValue(before, anyio.current_time() + LATE_ANSWER_TIME)
                 session.replaced[name].append(late)
@@ -118,6 +130,7 @@ async def write(
                     result = replace(result, status="adjusted", param=now)
             return result
         finally:
+            session.acknowledging.discard(name)
             del session.writing[name]
             session.written_at = anyio.current_time()
 
@@ -125,66 +138,82 @@ async def write(
 async def write_many(
     session: Session,
     pairs: Sequence[tuple[str, WireValue]],
-    outcomes: list[SetOutcome],
-    done: Callable[[SetOutcome], None],
     *,
+    progress: Callable[[SetOutcome], None] | None = None,
+    timeout: float | None = None,
     settle: float = 0.0,
     force: bool = False,
     author: str = "us",
-) -> ParamClientError | None:
+) -> SetManyResult:
     """Set several parameters, as many at once as the component serves.
 
     A parameter that shows or hides others (`*_ENABLE`) is set alone, after those before it. When the link
-    fails, or the component does not answer any more, the other parameters are not tried, and the error is
-    returned.
+    fails, the component does not answer any more, or the timeout expires, the other parameters are not tried,
+    and the result has the error.
 
     Args:
         session, settle, force, author: as for `write`.
         pairs: names and values, in order.
-        outcomes: gets one outcome for each pair, in order; complete also if the call is cancelled.
-        done: called with each outcome, as it is known.
+        progress: called with each outcome, as it is known.
+        timeout: seconds; None for no limit.
     """
-    outcomes[:] = [SetOutcome(name, value, SetStatus.NOT_TRIED) for name, value in pairs]
+    began, system, component = anyio.current_time(), *session.channel.target
+    done = progress or (lambda outcome: None)
+    outcomes = [SetOutcome(name, value, SetStatus.NOT_TRIED) for name, value in pairs]
     limiter = anyio.CapacityLimiter(BATCH_SIZE)
     failures: list[ParamClientError] = []
 
-    async def write_one(place: int) -> None:
-        name, value = pairs[place]
+    @asynccontextmanager
+    async def turn() -> AsyncIterator[None]:
         async with limiter:
             if failures:
-                return
+                raise failures[0]
+            yield
 
-            def sending() -> None:
-                outcomes[place] = replace(outcomes[place], status=SetStatus.UNKNOWN)
+    async def write_one(place: int) -> None:
+        name, value = pairs[place]
 
-            try:
-                result = await write(
-                    session, name, value, settle=settle, force=force, author=author, sending=sending
-                )
-            except (NoReply, LinkError) as error:
-                failures.append(error)
-                outcomes[place] = replace(outcomes[place], error=error)
-            except ParamClientError as error:
-                outcomes[place] = replace(outcomes[place], status=SetStatus.REFUSED, error=error)
-            else:
-                outcomes[place] = SetOutcome(name, value, SetStatus(result.status), result)
+        def sending() -> None:
+            outcomes[place] = replace(outcomes[place], status=SetStatus.UNKNOWN)
+
+        options: dict[str, Any] = {"settle": settle, "force": force, "author": author}
+        try:
+            result = await write(session, name, value, turn=turn(), sending=sending, **options)
+        except (NoReply, LinkError) as error:
+            failures.append(error)
+            outcomes[place] = replace(outcomes[place], error=error)
+        except ParamClientError as error:
+            outcomes[place] = replace(outcomes[place], status=SetStatus.REFUSED, error=error)
+        else:
+            outcomes[place] = SetOutcome(name, value, SetStatus(result.status), result)
         done(outcomes[place])
 
     autopilot = autopilot_name(session.identification.autopilot or 0)
     places = list(range(len(pairs)))
-    while places and not failures:
-        switches = (at for at, place in enumerate(places) if is_group_switch(pairs[place][0], autopilot))
-        together = max(next(switches, len(places)), 1)
-        async with anyio.create_task_group() as tasks:
-            for place in places[:together]:
-                tasks.start_soon(write_one, place)
-        del places[:together]
-    if not failures:
-        return None
-    for place, outcome in enumerate(outcomes):
-        if outcome.status is SetStatus.NOT_TRIED:
-            outcomes[place] = replace(outcome, error=failures[0])
-    return failures[0]
+    with anyio.move_on_after(timeout) as scope:
+        while places and not failures:
+            switches = (at for at, place in enumerate(places) if is_group_switch(pairs[place][0], autopilot))
+            together = max(next(switches, len(places)), 1)
+            try:
+                async with anyio.create_task_group() as tasks:
+                    for place in places[:together]:
+                        tasks.start_soon(write_one, place)
+            except ExceptionGroup as group:  # of `done`
+                raise group.exceptions[0] from None
+            del places[:together]
+        for place in places:  # behind a failure
+            outcomes[place] = replace(outcomes[place], error=failures[0])
+            done(outcomes[place])
+    elapsed = anyio.current_time() - began
+    if scope.cancelled_caught:
+        error = NoReply(f"{len(pairs)} writes to {system}/{component}", attempts=0, waited=elapsed)
+        failures.insert(0, error)
+        open_states = (SetStatus.NOT_TRIED, SetStatus.UNKNOWN)
+        outcomes = [
+            replace(each, error=error) if each.status in open_states and each.error is None else each
+            for each in outcomes
+        ]
+    return SetManyResult(system, component, tuple(outcomes), failures[0] if failures else None, elapsed)
 
 
 class _Write:
@@ -204,6 +233,7 @@ class _Write:
         self.wanted = self.before
         self.attempts = 0
         self._raw = b""
+        self._has_new_type = False
 
     async def run(self) -> SetResult:
         """Send the set until its outcome is proven."""
@@ -224,28 +254,34 @@ class _Write:
                 await channel.gate.wait()
                 sent = anyio.current_time()
                 number = self.before.type_number
+                self.session.acknowledging.add(self.name)
                 channel.send(self.session.dialect.request_set(channel.target, self.name, self._raw, number))
                 self.attempts += 1
                 answer = await self._answer(inbox, sent)
-                now = anyio.current_time()
+                is_silent = answer is None
                 if answer is None:
                     unanswered += 1
-                    if channel.is_hopeless(unanswered, began, now):
+                    if unanswered < SILENT_SETS_MAX:
+                        continue
+                    try:
+                        answer = await self._read()
+                    except NoReply:
                         what = f"the acknowledgement of {self.name} by {channel.system}/{channel.component}"
-                        raise NoReply(what, attempts=self.attempts, waited=now - began)
-                    continue
+                        waited = anyio.current_time() - began
+                        raise NoReply(what, attempts=self.attempts, waited=waited) from None
                 if answer.type_number != number:
                     self._retype(answer)
                     continue
                 if self._is_wanted(answer) or self._is_converted(answer):
                     return self._result(answer)
-                if adjusted is not None and adjusted.same_value(answer):
+                if adjusted is not None and (adjusted.same_value(answer) or self.attempts >= SETS_MAX):
                     return self._result(answer)
                 if not answer.same_value(self.before):
                     adjusted = answer
                     continue
-                unchanged += 1
-                if unchanged >= UNCHANGED_MAX:
+                unchanged += not is_silent
+                sets_max = min(max(channel.timing.attempts_for(SETS_LOST), UNCHANGED_MAX), SETS_MAX)
+                if unchanged >= UNCHANGED_MAX or self.attempts >= sets_max:
                     raise self._not_applied(answer)
 
     def _encode(self) -> None:
@@ -263,22 +299,23 @@ class _Write:
 
         def accept(message: Message) -> Param | None:
             param = self._take(message)
-            if param is not None and not self._is_wanted(param):
-                other.append(param)
-                return None
-            return param
+            if param is None or self._is_wanted(param) or param.type_number != self.before.type_number:
+                return param
+            other.append(param)
+            return None
 
         answer = await self.channel.wait_for(inbox, accept, sent, min(self.attempts - 1, 3))
         if answer is not None:
             if self.attempts == 1 and not self.channel.is_streaming:
                 self.channel.timing.measure(anyio.current_time() - sent)
-            return answer
+            is_typed = answer.type_number == self.before.type_number
+            return answer if is_typed else await self._read()  # only a read shows that the type has changed
         if not other:
             return None
-        await read(self.session, self.name)
+        param = await self._read()
         while inbox:
             self._take(await inbox.next())  # a refusal that came behind the value
-        return self.session.table.params[self.name]
+        return param
 
     async def _ext_answer(self, inbox: Inbox, sent: float) -> Param | None:
         """Wait for PARAM_EXT_ACK, as long as the component reports progress; then read the value."""
@@ -291,8 +328,7 @@ class _Write:
         if ack is None:
             return None
         if ack.param_result == ExtAckResult.ACCEPTED:
-            await read(self.session, self.name)
-            return self.session.table.params[self.name]
+            return await self._read()
         system, component = self.channel.target
         kind = ValueUnsupported if ack.param_result == ExtAckResult.VALUE_UNSUPPORTED else SetFailed
         reason = ExtAckResult.name_of(ack.param_result)
@@ -303,6 +339,14 @@ class _Write:
             code=ack.param_result,
             name=self.name,
         )
+
+    async def _read(
+        self,
+    ) -> Param:
+        """Return the parameter as the component reports it now."""
+        self.session.acknowledging.discard(self.name)
+        await read(self.session, self.name)
+        return self.session.table.params[self.name]
 
     def _take(self, message: Message) -> Param | None:
         """Return the parameter in a value, and raise the error in a refusal."""
@@ -317,6 +361,9 @@ class _Write:
         number = message.param_type
         if number == ParamType.REAL32 and self.before.type_number != number:
             number = self._known_type(message.raw)
+        elif (number, message.raw) == (self.before.type_number, self._raw):
+            # this value, and not the rounded form of the one before
+            self.session.table.store(message, anyio.current_time(), is_exact=True)
         return self.session.dialect.param(self.name, message.raw, number, None, encoding)
 
     def _known_type(self, raw: bytes) -> int:
@@ -356,10 +403,13 @@ class _Write:
         return SetResult(self.name, "accepted" if exact else "adjusted", self.value, actual, self.attempts)
 
     def _retype(self, answer: Param) -> None:
-        """Take another type than the known one: encode again, or raise TypeMismatch."""
+        """Take another type than the known one: encode again, or raise TypeMismatch; also the second time."""
         system, component = self.channel.target
         self.before = replace(answer, trust=Trust.LIVE)
         try:
+            if self._has_new_type:
+                raise UsageError("it acknowledges a set with another type than it was sent")
+            self._has_new_type = True
             self._encode()
         except UsageError as error:
             raise TypeMismatch(
@@ -388,6 +438,27 @@ async def _learn_type(session: Session, name: str) -> None:
     known = session.table.params.get(name)
     if known is None or known.trust is Trust.CACHED:
         await read(session, name)
+
+
+async def _check_encoding(session: Session, name: str) -> None:
+    """Wait until the encoding of an integer is certain, and raise UsageError if the values contradict it.
+
+    Where neither the component nor the user names the encoding, and 0 shows none, other values are read.
+    """
+    channel, identification, table = session.channel, session.identification, session.table
+    with channel.gate.until_closed(or_failed=True):
+        await identification.encoding_certain()
+    kind = table.params[name].type
+    if session.dialect.has_ack or not (isinstance(kind, ParamType) and kind.is_integer):
+        return
+    if not (identification.is_encoding_known or table.evidence):
+        with channel.inbox(session.dialect.value) as inbox, anyio.move_on_after(channel.timing.timeout(0)):
+            for index in range(EVIDENCE_READS):
+                channel.send(session.dialect.request_read(channel.reads_from, index))
+            while not table.evidence:
+                await inbox.next()
+    if doubt := session.encoding_doubt:
+        raise UsageError(f"{name} was not written. {doubt}")
 
 
 async def _ignore_late_answers(session: Session, late: ReplacedValue) -> None:

@@ -12,8 +12,7 @@ from importlib import resources
 from typing import Any, Final
 
 from paramclient.errors import UsageError
-from paramclient.model.group_switches import is_group_switch
-from paramclient.model.patterns import NameChoice
+from paramclient.model.names import NameChoice, is_group_switch
 
 __all__ = ["CATEGORIES", "OUT_OF_RANGE", "READ_ONLY", "ApplyRule", "ApplyRules", "Choice", "rules_for"]
 
@@ -156,12 +155,15 @@ class Choice:
 
 
 @cache
-def rules_for(autopilot: str) -> ApplyRules:
+def rules_for(autopilot: str, *, is_extended: bool = False) -> ApplyRules:
     """Return the entries for "px4" or "ardupilot"; for any other autopilot, the entries of both.
 
-    If several entries match a parameter, the first one applies.
+    If several entries match a parameter, the first one applies. The entries are of the plain parameters of
+    autopilots: there are none for extended ones.
     """
     found: dict[str, list[ApplyRule]] = {}
+    if is_extended:
+        return ApplyRules(dict.fromkeys(_read(), ()), autopilot)
     known = autopilot in ("px4", "ardupilot")
     for section, entries in _read().items():
         found[section] = [

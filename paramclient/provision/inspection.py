@@ -110,7 +110,9 @@ async def inspect(
     complete = fetched.complete and len(table) == len(listed)
     names = with_other_names(wanted, table, renames)
     hidden: frozenset[str] = frozenset()
-    if complete and component.autopilot == "ardupilot":
+    if complete and component.is_extended:  # the list has all of them
+        hidden = frozenset(names).difference(params)
+    elif complete and component.autopilot == "ardupilot":
         hidden = _in_no_hidden_group(table, names).difference(params)
     missing = frozenset(fetched.missing)
     given_up = {name for name, param in table.items() if param.index in missing}
@@ -197,7 +199,7 @@ async def prepare(
         NoReply: the vehicle did not answer.
         LinkError: the link failed, or the client was closed.
     """
-    check_component(wanted, component.component)
+    check_component(wanted, component.component, is_extended=component.is_extended)
     given = (include,) if isinstance(include, str) else tuple(include)
     plan({}, wanted, include=given, autopilot=component.autopilot)  # raises errors before the vehicle is read
     await wait_for_identity(component)

@@ -15,20 +15,20 @@ from typing import Final, Protocol
 
 from paramclient.errors import UsageError
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite, version_difference
+from paramclient.model.names import nearest_names
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Renames
-from paramclient.model.similar_names import nearest_names
 from paramclient.model.values import (
     Encoding,
     Param,
     ParamType,
     WireValue,
     bits_of,
-    encode_value,
     format_value,
     same_bits,
     type_name,
 )
+from paramclient.protocol.dialect import EXTENDED, PLAIN
 from paramclient.provision.apply_rules import OUT_OF_RANGE, READ_ONLY, ApplyRules, Choice, rules_for
 
 __all__ = [
@@ -304,19 +304,20 @@ def plan(
 
     Raises:
         UsageError: an element of `include` is neither a category nor a glob; `current` and `wanted` are of
-            different components or autopilots; or two wanted names are one parameter of `current`.
+            different components or autopilots, or one has plain and the other extended parameters; or two
+            wanted names are one parameter of `current`.
     """
     identity = None
     if isinstance(current, ParamSet):
         identity = current.identity
         if autopilot is None and identity is not None:
             autopilot = autopilot_name(identity.autopilot)
-        check_component(wanted, current.component)
+        check_component(wanted, current.component, is_extended=current.is_extended)
     _check_autopilot(wanted, autopilot)
     given = (include,) if isinstance(include, str) else tuple(include)
     if encoding is None:
         encoding = Encoding.C_CAST if autopilot == "ardupilot" else Encoding.BYTEWISE
-    rules = rules_for(autopilot or "")
+    rules = rules_for(autopilot or "", is_extended=wanted.is_extended)
     planner = _Planner(
         current,
         wanted,
@@ -347,7 +348,7 @@ def overlay(base: ParamSet, over: ParamSet) -> ParamSet:
     Raises:
         UsageError: the two are of different components.
     """
-    check_component(over, base.component)
+    check_component(over, base.component, is_extended=base.is_extended)
     return ParamSet(
         {**base.params, **over.params},
         component=base.component if over.component is None else over.component,
@@ -355,15 +356,20 @@ def overlay(base: ParamSet, over: ParamSet) -> ParamSet:
         identity=over.identity or base.identity,
         at=base.at if over.at is None else over.at,
         source=" + ".join(filter(None, (base.source, over.source))),
+        is_extended=base.is_extended,
     )
 
 
-def check_component(wanted: ParamSet, component: int | None) -> None:
-    """Check that parameters are meant for this component.
+def check_component(wanted: ParamSet, component: int | None, *, is_extended: bool) -> None:
+    """Check that parameters are meant for this component, and for its plain or its extended parameters.
 
     Raises:
-        UsageError: they name another component.
+        UsageError: they name another component, or are of the other kind.
     """
+    if wanted.is_extended != is_extended:
+        kinds = ("extended", "plain") if wanted.is_extended else ("plain", "extended")
+        of = f" of {wanted.source}" if wanted.source else ""
+        raise UsageError(f"the parameters{of} are {kinds[0]} ones, and {kinds[1]} ones are needed")
     if wanted.component is not None and component is not None and wanted.component != component:
         raise UsageError(
             f"the parameters{f' of {wanted.source}' if wanted.source else ''} are those of component "
@@ -414,6 +420,7 @@ class _Planner:
         self._choice = choice
         self._info = info
         self._encoding = encoding
+        self._dialect = EXTENDED if wanted.is_extended else PLAIN
         self._force = force
         # only ArduPilot sends integers as float32
         usual = "ardupilot" if encoding is Encoding.C_CAST else ""
@@ -556,7 +563,7 @@ class _Planner:
             return WRONG, "a system id is a number from 1 to 255"
         if kind is not None:
             try:
-                encode_value(value, kind, self._encoding)
+                self._dialect.encode(value, kind, self._encoding)
             except UsageError as error:
                 return WRONG, str(error)
             if isinstance(value, float) and kind < ParamType.REAL32 and not value.is_integer():
@@ -604,7 +611,7 @@ def _pop_matching(steps: list[Step], fits: Callable[[Step], bool]) -> list[Step]
 
 def _is_same(wanted: WireValue, current: WireValue, kind: ParamType | int | None) -> bool:
     """Return whether two values are equal in the vehicle's type; as float32 if the type is unknown."""
-    if isinstance(wanted, bytes) or isinstance(current, bytes):
+    if kind != ParamType.CUSTOM and (isinstance(wanted, bytes) or isinstance(current, bytes)):
         return wanted == current
     if kind is None:
         if isinstance(wanted, int) and isinstance(current, int):

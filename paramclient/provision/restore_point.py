@@ -38,16 +38,18 @@ def load_state_before_apply(
     return cache.state_at(key, component, number, extended=extended)
 
 
-def load_restore_point(cache: ParamCache, key: str, component: int) -> RestorePoint:
+def load_restore_point(
+    cache: ParamCache, key: str, component: int, *, extended: bool = False
+) -> RestorePoint:
     """Return the state before the latest `apply`, and what happened after it.
 
     Arguments and errors as of `load_state_before_apply`.
     """
-    snapshot = _find_snapshot(cache, key, component)
+    snapshot = _find_snapshot(cache, key, component, extended=extended)
     try:
-        state = cache.state_at(key, component, snapshot.id)
-        table = cache.load(key, component)
-        entries = cache.history(key, component)
+        state = cache.state_at(key, component, snapshot.id, extended=extended)
+        table = cache.load(key, component, extended=extended)
+        entries = cache.history(key, component, extended=extended)
     except UnknownVehicle:  # removed from the cache since the line above
         raise _none(_apply_to(key)) from None
     now = {} if table is None else table.params

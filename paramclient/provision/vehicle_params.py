@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BEFORE_APPLY",
+    "NAMES_SHOWN_MAX",
     "NO_DEFAULTS",
     "FetchedSet",
     "set_maker",
@@ -77,6 +78,7 @@ def set_maker(component: Component, source: str) -> Callable[[Iterable[Param]], 
         identity=component.identity,
         at=time.time(),
         source=source,
+        is_extended=component.is_extended,
     )
 
 
@@ -136,14 +138,15 @@ def incomplete_error(component: Component, missing: Sequence[str]) -> VehicleErr
     """Return the error for a component some of whose parameters were not received."""
     vehicle = f"{component.system}/{component.component} {component.autopilot}"
     names = first_of(missing, NAMES_SHOWN_MAX)
+    was = "was" if len(missing) == 1 else "were"
     return VehicleError(
-        f"{vehicle} on {component.identity.link} is incomplete: {names} were not received",
+        f"{vehicle} on {component.identity.link} is incomplete: {names} {was} not received",
         system=component.system,
         component=component.component,
     )
 
 
-def cached_param_set(table: CachedComponent) -> ParamSet:
+def cached_param_set(table: CachedComponent, *, extended: bool = False) -> ParamSet:
     """Return a component's cached parameters as a set."""
     return ParamSet.of(
         table.params.values(),
@@ -152,31 +155,30 @@ def cached_param_set(table: CachedComponent) -> ParamSet:
         identity=table.identity,
         at=table.updated_at if table.synced_at is None else table.synced_at,
         source=f"cache {table.key}",
+        is_extended=extended,
     )
 
 
-def load_cached_set(
-    cache: ParamCache, key: str, component: int, *, note: Callable[[str], None] | None = None
-) -> ParamSet:
+def load_cached_set(cache: ParamCache, key: str, component: int, *, extended: bool = False) -> ParamSet:
     """Return the complete cached table of a component as a set.
 
     Args:
         cache: the cache.
         key: `Identity.key` of the vehicle.
         component: component id.
-        note: called with a sentence that names the parameters that are left out.
+        extended: its extended parameters.
 
     Raises:
         CacheError: the cache has no table of this component, or an incomplete one.
     """
-    table = cache.load(key, component)
+    table = cache.load(key, component, extended=extended)
     if table is None:
         raise NotInCache(f"the cache has no table of component {component} of {key}")
     if not table.complete:
         vehicle = f"{table.system}/{component} ({key})"
         of = "" if table.count is None else f" of {table.count}"
         raise NotInCache(f"the cache has {table.size}{of} parameters of {vehicle}, not all; fetch them first")
-    return cached_param_set(table)
+    return cached_param_set(table, extended=extended)
 
 
 def select_non_defaults(whole: ParamSet, described: Mapping[str, int | float]) -> ParamSet:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson, SummaryJson
 from paramclient.cli.json_output import (
-    ExtParamJson,
     FetchJson,
     IdentityJson,
     InfoJson,
@@ -17,24 +16,22 @@ from paramclient.cli.json_output import (
     WriteJson,
     WrittenJson,
     as_json,
-    ext_value_json,
 )
 from paramclient.cli.json_setup import ApplyJson, PlanJson
-from paramclient.model.ext_values import ext_bytes
-from paramclient.model.notation import hash_text, rounded
+from paramclient.model.notation import bits_text, hash_text, rounded
 from paramclient.model.values import ParamType, Trust
-from paramclient.protocol.kinds import expects_extended
+from paramclient.protocol.identity import expects_extended
 
 if TYPE_CHECKING:
     from paramclient.cache import CachedSummary, CachedVehicle, HistoryEntry, SnapshotSummary
     from paramclient.files import ParamFile
     from paramclient.metadata import Metadata
-    from paramclient.model.paramset import ParamSet, WrittenParam
+    from paramclient.model.paramset import ParamSet
     from paramclient.model.values import Param
     from paramclient.protocol.events import Change
     from paramclient.protocol.fetch import FetchResult, Progress
     from paramclient.protocol.set_results import SetManyResult, SetOutcome
-    from paramclient.provision import ApplyResult, ExtApplyResult, ExtPlan, Plan
+    from paramclient.provision import ApplyResult, Plan
     from paramclient.service.targets import Target
 
 CHANGING_MEMBERS: Final = frozenset({"silence_s", "round_trip_s", "params", "fetch"})
@@ -112,35 +109,28 @@ def progress(now: Progress) -> dict[str, Any]:
 # Parameters
 
 
-def param(
-    known: Param, metadata: Metadata | None = None, *, whole: bool = True, ext: bool = False
-) -> dict[str, Any]:
+def param(known: Param, metadata: Metadata | None = None, *, whole: bool = True) -> dict[str, Any]:
     """Return a parameter of a table.
 
     Args:
         known: the parameter.
         metadata: the metadata of the vehicle, for the default and the meaning of the value; or None.
         whole: whether to include the whole metadata of the parameter.
-        ext: whether it is an extended parameter.
     """
-    if ext:
-        return dict(as_json(ExtParamJson.of_table(known)))
     info = None if metadata is None else metadata.find(known.name)
     found: dict[str, Any] = as_json(ParamJson.of_table(known, info))
     return found | {"metadata": as_json(InfoJson.of(info))} if whole and info is not None else found
 
 
 def params(
-    known: Iterable[Param], metadata: Metadata | None = None, *, whole: bool = True, ext: bool = False
+    known: Iterable[Param], metadata: Metadata | None = None, *, whole: bool = True
 ) -> dict[str, dict[str, Any]]:
     """Return parameters by name."""
-    return {each.name: param(each, metadata, whole=whole, ext=ext) for each in known}
+    return {each.name: param(each, metadata, whole=whole) for each in known}
 
 
-def param_set(found: ParamSet, *, ext: bool = False) -> dict[str, dict[str, Any]]:
+def param_set(found: ParamSet) -> dict[str, dict[str, Any]]:
     """Return the parameters of a set by name."""
-    if ext:
-        return {name: {"name": name} | _ext_written(each) for name, each in found.items()}
     return {name: as_json(WrittenJson.of(each)) for name, each in found.items()}
 
 
@@ -150,22 +140,23 @@ def param_file(file: ParamFile) -> dict[str, Any]:
     return {"file": file.source, "format": file.file_format, "notes": list(file.notes), "components": sets}
 
 
-def change(found: Change, target: Target, *, ext: bool = False) -> dict[str, Any]:
+def change(found: Change, target: Target) -> dict[str, Any]:
     """Return the members of an event about a changed, added or removed parameter."""
 
     def shown(each: Param | None) -> dict[str, Any] | None:
-        return None if each is None else param(each, target.metadata, whole=False, ext=ext)
+        return None if each is None else param(each, target.metadata, whole=False)
 
     old, new = shown(found.old), shown(found.new)
-    return {"name": found.name, "old": old, "new": new, "by": found.by, "kind": found.kind}
+    about = {"name": found.name, "old": old, "new": new, "by": found.by, "kind": found.kind}
+    return {**about, "extended": target.component.is_extended}
 
 
 # Fetches, writes and set-ups
 
 
-def fetch_result(result: FetchResult, target: Target, *, ext: bool = False) -> dict[str, Any]:
+def fetch_result(result: FetchResult, target: Target) -> dict[str, Any]:
     """Return the result of a fetch, without the parameters."""
-    client, component = target.link.client, target.parameters(ext=ext)
+    client, component = target.link.client, target.component
     found: dict[str, Any] = as_json(
         FetchJson.of(
             component,
@@ -182,27 +173,19 @@ def fetch_result(result: FetchResult, target: Target, *, ext: bool = False) -> d
     return found | {"notes": list(result.notes)}
 
 
-def write(outcome: SetOutcome, target: Target, *, ext: bool = False) -> dict[str, Any]:
-    """Return the outcome of a write, of an extended parameter with `actual_hex`, the bytes of its value."""
-    known = target.parameters(ext=ext).params.get(outcome.name)
+def write(outcome: SetOutcome, target: Target) -> dict[str, Any]:
+    """Return the outcome of a write, with the `bits` of a value that was set."""
+    known = target.component.params.get(outcome.name)
     kind = ParamType.REAL64 if known is None else known.type_number
-    found = dict(as_json(WriteJson.of(outcome, kind, target.info(outcome.name, ext=ext))))
-    if not ext:
-        return found
-    now = None if outcome.result is None else outcome.result.param
-    return found | {
-        "requested": ext_value_json(outcome.requested, ParamType.REAL64),
-        "actual": None if now is None else ext_value_json(now.value, now.type_number),
-        "actual_hex": None if now is None else ext_bytes(now).hex(),
-        "reason": found.get("reason"),
-    }
+    found = dict(as_json(WriteJson.of(outcome, kind, target.info(outcome.name))))
+    return found if outcome.result is None else found | {"bits": bits_text(outcome.result.param)}
 
 
-def writes(result: SetManyResult, target: Target, *, ext: bool = False) -> dict[str, Any]:
+def writes(result: SetManyResult, target: Target) -> dict[str, Any]:
     """Return the outcomes of several writes in order; `error` says why not all were tried."""
     return {
         "vehicle": as_json(VehicleJson.of(target.component)),
-        "results": [write(outcome, target, ext=ext) for outcome in result.outcomes],
+        "results": [write(outcome, target) for outcome in result.outcomes],
         "error": None if result.error is None else str(result.error),
     }
 
@@ -228,48 +211,12 @@ def apply_result(result: ApplyResult, target: Target) -> dict[str, Any]:
     )
 
 
-def ext_plan(found: ExtPlan) -> dict[str, Any]:
-    """Return what a set-up of extended parameters would write."""
-    return {
-        "system": found.system,
-        "component": found.component,
-        "is_met": found.is_met,
-        "changes": {name: _ext_written(each) for name, each in found.changes.items()},
-        "missing": list(found.missing),
-        "mistyped": list(found.mistyped),
-    }
-
-
-def ext_apply_result(result: ExtApplyResult, target: Target) -> dict[str, Any]:
-    """Return the result of a set-up of extended parameters."""
-    return {
-        "complete": result.complete,
-        "plan": ext_plan(result.plan),
-        "different": list(result.different),
-        "snapshot": result.snapshot,
-        "elapsed_s": round(result.elapsed, 3),
-        "results": [write(outcome, target, ext=True) for outcome in result.outcomes],
-        "error": None if result.error is None else str(result.error),
-    }
-
-
-def _ext_written(known: WrittenParam) -> dict[str, Any]:
-    return dict(as_json(ExtParamJson.written(known)))
-
-
 # The past
 
 
-def history(entries: Iterable[HistoryEntry], *, ext: bool = False) -> dict[str, Any]:
-    """Return changes of values; those of extended parameters are whole parameters."""
-    lines = []
-    for entry in entries:
-        line = as_json(HistoryLineJson.of(entry))
-        if ext:
-            values = {"old": entry.old, "new": entry.new}
-            line |= {which: each and as_json(ExtParamJson.of(each)) for which, each in values.items()}
-        lines.append(line)
-    return {"history": lines}
+def history(entries: Iterable[HistoryEntry]) -> dict[str, Any]:
+    """Return changes of values."""
+    return {"history": [as_json(HistoryLineJson.of(entry)) for entry in entries]}
 
 
 def snapshots(kept: Iterable[SnapshotSummary]) -> dict[str, Any]:

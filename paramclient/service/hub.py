@@ -218,9 +218,9 @@ class Hub:
         component = event.component
         target = link.targets.get((component.system, component.component))
         if target is None or target.component is not component:
-            target = link.targets[component.system, component.component] = Target(link, component)
-            for ext in (False, True):
-                tasks.start_soon(self._publish_changes, target, ext)
+            target = link.targets[component.system, component.component] = Target.of(link, component)
+            for each in filter(None, (target, target.extended)):
+                tasks.start_soon(self._publish_changes, each)
         if isinstance(event, Resynced):
             target.fetches += 1
         self._check(target)
@@ -244,16 +244,15 @@ class Hub:
         target.metadata = await anyio.to_thread.run_sync(store.known, identity, component)
         target.described = identity
 
-    async def _publish_changes(self, target: Target, ext: bool) -> None:
-        """Publish the changes of the plain or the extended parameters, until the client is closed.
+    async def _publish_changes(self, target: Target) -> None:
+        """Publish the changes of parameters until the client is closed.
 
         First values are not published: a fetch has thousands, and its end is published.
         """
         with suppress(ParamClientError):
-            async for change in target.parameters(ext=ext).changes():
+            async for change in target.component.changes():
                 if change.kind != "first":
-                    members = documents.change(change, target, ext=ext)
-                    self.feed.publish("extended_change" if ext else "change", **target.address, **members)
+                    self.feed.publish("change", **target.address, **documents.change(change, target))
 
     async def _check_regularly(self, link: ServiceLink) -> None:
         while True:

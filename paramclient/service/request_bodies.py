@@ -17,6 +17,7 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Param, ParamType, WireValue, check_name, from_bits, type_name
 
 if TYPE_CHECKING:
+    from paramclient.client.component import Component
     from paramclient.service.targets import Target
 
 __all__ = [
@@ -55,11 +56,11 @@ class Body(BaseModel):
 class Bits(Body):
     """A value by its bits, as in the member `bits` of a parameter."""
 
-    bits: Annotated[str, Field(pattern="^[0-9a-fA-F]{1,16}$")]
+    bits: Annotated[str, Field(pattern="^[0-9a-fA-F]{1,256}$")]
 
 
 class Hex(Body):
-    """The bytes of an extended parameter, as in its member `hex`."""
+    """The bytes of a value: of an extended parameter, or the four of the message of a plain one."""
 
     hex: Annotated[str, Field(pattern="^([0-9a-fA-F]{2}){0,128}$")]
 
@@ -235,25 +236,25 @@ class SnapshotRequest(Body):
     reason: Annotated[str, Field(min_length=1, max_length=200)]
 
 
-async def values_set(values: dict[str, GivenValue], target: Target, *, ext: bool) -> ParamSet:
+async def values_set(values: dict[str, GivenValue], target: Target) -> ParamSet:
     """Return values as a set. Values of extended parameters take the types that the component reports.
 
     Raises:
         UsageError: a name or value is invalid.
         ParamClientError: the component did not send the type of an extended parameter.
     """
-    found = {}
+    found, is_extended = {}, target.component.is_extended
     for name, given in values.items():
-        value = await resolve_value(target, name, given, ext=ext)
-        if ext:
-            number = (await _known_extended(target, name)).type_number
+        value = await resolve_value(target, name, given)
+        if is_extended:
+            number = (await _known(target.component, name)).type_number
             found[name] = WrittenParam.of(ext_param(name, encode_ext_value(value, number), number))
         else:
             found[name] = WrittenParam(check_name(name), value)
-    return ParamSet(found)
+    return ParamSet(found, is_extended=is_extended)
 
 
-async def resolve_value(target: Target, name: str, given: GivenValue, *, ext: bool) -> WireValue:
+async def resolve_value(target: Target, name: str, given: GivenValue) -> WireValue:
     """Return the value of a request. Text for a number is the number: JavaScript rounds 64-bit integers.
 
     Raises:
@@ -261,44 +262,41 @@ async def resolve_value(target: Target, name: str, given: GivenValue, *, ext: bo
         ParamClientError: the component did not send the type of an extended parameter.
     """
     if isinstance(given, Hex):
-        if not ext:
-            raise UsageError(f'{name}: {{"hex": …}} is for extended parameters')
         return bytes.fromhex(given.hex)
     if isinstance(given, Bits):
-        if ext:
-            raise UsageError(f'{name}: {{"bits": …}} is for plain parameters; give {{"hex": …}}')
-        return _value_of_bits(target, name, int(given.bits, 16))
+        return _value_of_bits(target.component, name, int(given.bits, 16))
+    is_extended = target.component.is_extended
     if not isinstance(given, str):
-        return check_ext_value(given) if ext else given
-    if ext and (await _known_extended(target, name)).type == ParamType.CUSTOM:
+        return check_ext_value(given) if is_extended else given
+    if is_extended and (await _known(target.component, name)).type == ParamType.CUSTOM:
         return check_ext_value(given)
     number = number_of(given)
     if number is not None:
         return number
-    info = target.info(name, ext=ext)
+    info = target.info(name)
     if info is None:
         raise UsageError(f"{name}: {given!r} is not a number, and there is no metadata with names of values")
     return info.parse(given)
 
 
-def _value_of_bits(target: Target, name: str, bits: int) -> WireValue:
-    known = target.component.params.get(name)
+def _value_of_bits(component: Component, name: str, bits: int) -> WireValue:
+    known = component.params.get(name)
     if known is None:
         raise UsageError(f"{name}: the type is not known; read the parameter first")
-    if bits >> (32 if known.is_raw else 8 * known.type.size):
+    if known.type != ParamType.CUSTOM and bits >> (32 if known.is_raw else 8 * known.type.size):
         raise UsageError(f"{name}: {bits:x} has more bits than {type_name(known.type_number)}")
     return from_bits(bits, known.type_number, is_raw=known.is_raw)
 
 
-async def _known_extended(target: Target, name: str) -> Param:
-    return target.component.ext.params.get(name) or await target.component.ext.get(name)
+async def _known(component: Component, name: str) -> Param:
+    return component.params.get(name) or await component.get(name)
 
 
-def range_faults(target: Target, values: dict[str, WireValue], *, ext: bool) -> dict[str, str]:
+def range_faults(target: Target, values: dict[str, WireValue]) -> dict[str, str]:
     """Return, by name, why values are outside the range in the metadata."""
     found = {}
     for name, value in values.items():
-        info = target.info(name, ext=ext)
+        info = target.info(name)
         fault = None if info is None else info.problem(value)
         if fault is not None:
             found[name] = fault

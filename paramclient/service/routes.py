@@ -20,8 +20,7 @@ from starlette.types import Receive, Scope, Send
 
 from paramclient.errors import NotInCache, UnknownParameter
 from paramclient.metadata import Metadata
-from paramclient.model.patterns import NameChoice
-from paramclient.model.similar_names import did_you_mean, nearest_names
+from paramclient.model.names import NameChoice, did_you_mean, nearest_names
 from paramclient.model.values import Param, WireValue
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetStatus
 from paramclient.service import documents
@@ -45,7 +44,6 @@ from paramclient.version import __version__
 
 __all__ = [
     "ROUTERS",
-    "Ext",
     "HubArgument",
     "Snapshot",
     "SourceArgument",
@@ -82,37 +80,53 @@ Key = Annotated[str | None, Query(max_length=400, description="Key of a vehicle 
 Ext = Annotated[bool, Query(description="The extended parameters (PARAM_EXT_*).")]
 
 
-async def _target_of(
+async def _vehicle_of(
     hub: HubArgument, system: System, component: ComponentId, link: LinkName = None
 ) -> Target:
     return hub.target(system, component, link)
 
 
+VehicleArgument = Annotated[Target, Depends(_vehicle_of)]
+"""A component on a link."""
+
+
+async def _target_of(vehicle: VehicleArgument, ext: Ext = False) -> Target:
+    return vehicle.extended or vehicle if ext else vehicle
+
+
 TargetArgument = Annotated[Target, Depends(_target_of)]
+"""The plain parameters of a component on a link; with `ext`, the extended ones."""
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A connected vehicle, or one in the cache.
+    """The plain or the extended parameters of a connected vehicle, or of one in the cache.
 
     Attributes:
         key: the key of its table in the cache.
         component: its component id.
+        extended: whether the parameters are the extended ones.
         target: the connected component, or None.
     """
 
     key: str
     component: int
+    extended: bool
     target: Target | None
 
 
 async def _source_of(
-    hub: HubArgument, system: System, component: ComponentId, link: LinkName = None, key: Key = None
+    hub: HubArgument,
+    system: System,
+    component: ComponentId,
+    link: LinkName = None,
+    key: Key = None,
+    ext: Ext = False,
 ) -> Source:
     if key is not None:
-        return Source(key, component, None)
-    target = hub.target(system, component, link)
-    return Source(target.component.identity.key, component, target)
+        return Source(key, component, ext, None)
+    target = await _target_of(hub.target(system, component, link), ext)
+    return Source(target.component.identity.key, component, ext, target)
 
 
 SourceArgument = Annotated[Source, Depends(_source_of)]
@@ -158,24 +172,23 @@ async def vehicles(hub: HubArgument) -> Any:
 
 
 @reading.get(VEHICLE)
-async def vehicle(target: TargetArgument) -> dict[str, Any]:
+async def vehicle(target: VehicleArgument) -> dict[str, Any]:
     """Return one component."""
     return documents.vehicle(target)
 
 
 @reading.post(f"{VEHICLE}/fetch")
-async def fetch(
-    request: Request, hub: HubArgument, target: TargetArgument, body: FetchRequest, ext: Ext = False
-) -> Any:
+async def fetch(request: Request, hub: HubArgument, target: TargetArgument, body: FetchRequest) -> Any:
     """Fetch the whole table. Simultaneous requests share one download; the progress is in the events."""
-    work = target.component.ext.fetch_all if ext else partial(hub.fetch, target)
+    component = target.component
+    work = component.fetch_all if component.is_extended else partial(hub.fetch, target)
     result = await run_until_disconnect(request, lambda: work(refresh=body.refresh, timeout=body.timeout_s))
-    return documents.fetch_result(result, target, ext=ext)
+    return documents.fetch_result(result, target)
 
 
 @reading.post(f"{VEHICLE}/metadata")
 async def load_metadata(
-    request: Request, hub: HubArgument, target: TargetArgument, body: MetadataRequest
+    request: Request, hub: HubArgument, target: VehicleArgument, body: MetadataRequest
 ) -> dict[str, Any]:
     """Load units, ranges, names of values and descriptions from the vehicle; they are stored."""
     found = await run_until_disconnect(request, lambda: hub.load_metadata(target, timeout=body.timeout_s))
@@ -193,35 +206,34 @@ async def params(
     metadata: Annotated[bool, Query(description="Include the whole metadata of the parameters.")] = False,
     snapshot: Snapshot = None,
     at: Annotated[Timestamp | None, Query(description="The parameters at this time.")] = None,
-    ext: Ext = False,
 ) -> Response:
     """Return the known parameters by name, without traffic."""
     position = hub.feed.position
     when = at if snapshot is None else snapshot
     if when is not None:
         place = source.key, source.component, when
-        state = await hub.read_cache(lambda cache: cache.state_at(*place, extended=ext))
-        return JSONResponse({**position, "params": _chosen(documents.param_set(state, ext=ext), names)})
-    described, known = await _known_params(hub, source, ext=ext)
+        state = await hub.read_cache(lambda cache: cache.state_at(*place, extended=source.extended))
+        return JSONResponse({**position, "params": _chosen(documents.param_set(state), names)})
+    described, known = await _known_params(hub, source)
     chosen = _chosen(known, names).values()
 
     def encode() -> Response:
-        found = documents.params(chosen, described, whole=metadata, ext=ext)
+        found = documents.params(chosen, described, whole=metadata)
         return JSONResponse({**position, "params": found})
 
     return await anyio.to_thread.run_sync(encode)
 
 
-async def _known_params(hub: Hub, source: Source, *, ext: bool) -> tuple[Metadata | None, dict[str, Param]]:
+async def _known_params(hub: Hub, source: Source) -> tuple[Metadata | None, dict[str, Param]]:
     """Return the metadata and the parameters of a vehicle.
 
     Raises:
         NotInCache: the cache has no such table.
     """
     if source.target is not None:
-        return source.target.metadata, dict(source.target.parameters(ext=ext).params)
+        return source.target.metadata, dict(source.target.component.params)
     key, component, store = source.key, source.component, hub.metadata_store
-    table = await hub.read_cache(lambda cache: cache.load(key, component, extended=ext))
+    table = await hub.read_cache(lambda cache: cache.load(key, component, extended=source.extended))
     if table is None:
         raise NotInCache(f"The cache has no table of component {component} of vehicle {key!r}.")
     described = None
@@ -236,10 +248,9 @@ async def param(
     target: TargetArgument,
     name: str,
     live: Annotated[bool, Query(description="Read it from the vehicle.")] = False,
-    ext: Ext = False,
 ) -> dict[str, Any]:
     """Return one parameter: the known value, or with `live` that of the vehicle."""
-    component = target.parameters(ext=ext)
+    component = target.component
     known = component.params.get(name)
     if live:
         known = await run_until_disconnect(request, lambda: component.get(name))
@@ -248,44 +259,40 @@ async def param(
         why = f"no value of {name} has been received yet.{did_you_mean(nearest)}"
         ids = {"system": component.system, "component": component.component}
         raise UnknownParameter(why, **ids, name=name, index=None, nearest=nearest)
-    return documents.param(known, target.metadata, ext=ext)
+    return documents.param(known, target.metadata)
 
 
 @writing.put(f"{VEHICLE}/params/{{name:path}}")
 async def set_param(
-    request: Request, target: TargetArgument, name: str, body: WriteRequest, ext: Ext = False
+    request: Request, target: TargetArgument, name: str, body: WriteRequest
 ) -> dict[str, Any]:
     """Write one parameter, and verify the value that the vehicle reports."""
-    author, component = author_of(request), target.parameters(ext=ext)
+    author, component = author_of(request), target.component
 
     async def work() -> SetOutcome:
-        value = await resolve_value(target, name, body.value, ext=ext)
-        _check_ranges(target, {name: value}, body, ext=ext)
+        value = await resolve_value(target, name, body.value)
+        _check_ranges(target, {name: value}, body)
         result = await component.set(name, value, **_write_options(body, author))
         return SetOutcome(name, value, SetStatus(result.status), result)
 
-    return documents.write(await run_until_disconnect(request, work), target, ext=ext)
+    return documents.write(await run_until_disconnect(request, work), target)
 
 
 @writing.patch(f"{VEHICLE}/params")
-async def set_params(
-    request: Request, target: TargetArgument, body: WriteManyRequest, ext: Ext = False
-) -> dict[str, Any]:
+async def set_params(request: Request, target: TargetArgument, body: WriteManyRequest) -> dict[str, Any]:
     """Write several parameters in order, many at a time, and verify each.
 
     If a value is invalid or out of range, nothing is written. A value that the vehicle refuses does not stop
     the others. `error` is present if not all could be tried.
     """
-    author, component = author_of(request), target.parameters(ext=ext)
+    author, component = author_of(request), target.component
 
     async def work() -> SetManyResult:
-        values = {
-            name: await resolve_value(target, name, given, ext=ext) for name, given in body.values.items()
-        }
-        _check_ranges(target, values, body, ext=ext)
+        values = {name: await resolve_value(target, name, given) for name, given in body.values.items()}
+        _check_ranges(target, values, body)
         return await component.set_many(values, **_write_options(body, author))
 
-    return documents.writes(await run_until_disconnect(request, work), target, ext=ext)
+    return documents.writes(await run_until_disconnect(request, work), target)
 
 
 async def run_until_disconnect(request: Request, work: Callable[[], Awaitable[Result]]) -> Result:
@@ -317,13 +324,13 @@ def _chosen(known: dict[str, Result], names: list[str] | None) -> dict[str, Resu
     return {name: each for name, each in known.items() if choice.has(name)}
 
 
-def _check_ranges(target: Target, values: dict[str, WireValue], body: WriteOptions, *, ext: bool) -> None:
+def _check_ranges(target: Target, values: dict[str, WireValue], body: WriteOptions) -> None:
     """Check that values are in the ranges of the metadata, unless they are forced.
 
     Raises:
         ServiceError: 422, values are out of range.
     """
-    faults = {} if body.force else range_faults(target, values, ext=ext)
+    faults = {} if body.force else range_faults(target, values)
     if faults:
         detail = f"{'; '.join(list(faults.values())[:5])}. Nothing was written; `force` writes it anyway."
         raise ServiceError(422, "out-of-range", detail, names=list(faults))

@@ -19,16 +19,7 @@ from paramclient.files import FileFormat, dumps
 from paramclient.files.formats import ENDINGS
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
-from paramclient.provision import (
-    ApplyProgress,
-    apply,
-    apply_extended,
-    load_extended_state,
-    prepare,
-    restore,
-    restore_extended,
-    verify_extended,
-)
+from paramclient.provision import ApplyProgress, apply, prepare, restore
 from paramclient.provision.apply_restore import restore_categories
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.restore_point import load_state_before_apply
@@ -48,7 +39,6 @@ from paramclient.service.request_bodies import (
 )
 from paramclient.service.routes import (
     VEHICLE,
-    Ext,
     HubArgument,
     Snapshot,
     SourceArgument,
@@ -88,12 +78,12 @@ async def file(
     snapshot: Snapshot = None,
 ) -> Response:
     """Return the parameters as a file. Those of a connected vehicle are fetched first, unless in sync."""
-    key, component, target = source.key, source.component, source.target
+    place, extended, target = (source.key, source.component), source.extended, source.target
     described: dict[str, int | float] = {}
     if snapshot is not None:
-        found = await hub.read_cache(lambda cache: cache.state_at(key, component, snapshot))
+        found = await hub.read_cache(lambda cache: cache.state_at(*place, snapshot, extended=extended))
     elif target is None:
-        found = await hub.read_cache(lambda cache: load_cached_set(cache, key, component))
+        found = await hub.read_cache(lambda cache: load_cached_set(cache, *place, extended=extended))
     else:
         fetch = partial(fetch_set, target.component, source=f"link {target.link.name}")
         found = (await run_until_disconnect(request, fetch)).set
@@ -112,20 +102,20 @@ async def file(
 
 @reading.post(f"{VEHICLE}/plan")
 async def plan(
-    request: Request, hub: HubArgument, target: TargetArgument, body: PlanRequest, ext: Ext = False
+    request: Request, hub: HubArgument, target: TargetArgument, body: PlanRequest
 ) -> dict[str, Any]:
     """Return which values an apply would write, in which order, and which it would skip, and why."""
 
     async def work() -> dict[str, Any]:
-        wanted = await _wanted(hub, target, body, ext=ext)
-        return await _plan(target, wanted, body.include, force=body.force, ext=ext)
+        wanted = await _wanted(hub, target, body)
+        return await _plan(target, wanted, body.include, force=body.force)
 
     return await run_until_disconnect(request, work)
 
 
 @writing.post(f"{VEHICLE}/apply")
 async def apply_(
-    request: Request, hub: HubArgument, target: TargetArgument, body: ApplyRequest, ext: Ext = False
+    request: Request, hub: HubArgument, target: TargetArgument, body: ApplyRequest
 ) -> dict[str, Any]:
     """Write the wanted values in a working order, and verify each of them.
 
@@ -134,15 +124,10 @@ async def apply_(
     author = author_of(request)
 
     async def work() -> dict[str, Any]:
-        wanted = await _wanted(hub, target, body, ext=ext)
-        if ext:
-            ended = await apply_extended(
-                target.component, wanted, durable=body.durable, timeout=body.timeout_s, author=author
-            )
-            return documents.ext_apply_result(ended, target)
-        options = _options(hub, target, body, author)
+        wanted = await _wanted(hub, target, body)
+        component, options = target.component, _options(hub, target, body, author)
         result = await apply(
-            target.component, wanted, skip_invalid=body.skip_invalid, durable=body.durable, **options
+            component, wanted, skip_invalid=body.skip_invalid, durable=body.durable, **options
         )
         return documents.apply_result(result, target)
 
@@ -152,20 +137,17 @@ async def apply_(
 
 @writing.post(f"{VEHICLE}/restore")
 async def restore_(
-    request: Request, hub: HubArgument, target: TargetArgument, body: RestoreRequest, ext: Ext = False
+    request: Request, hub: HubArgument, target: TargetArgument, body: RestoreRequest
 ) -> dict[str, Any]:
     """Restore an earlier state, with the vehicle's own identity and calibration; `dry_run` writes nothing."""
     author = author_of(request)
 
     async def work() -> dict[str, Any]:
         component = target.component
-        state = await _earlier_state(hub, target, body.when, ext=ext)
+        state = await _earlier_state(hub, target, body.when)
         if body.dry_run:
-            categories = () if ext else await restore_categories(component, state)
-            return await _plan(target, state, (*categories, *body.include), force=body.force, ext=ext)
-        if ext:
-            ended = await restore_extended(component, state, timeout=body.timeout_s, author=author)
-            return documents.ext_apply_result(ended, target)
+            categories = await restore_categories(component, state)
+            return await _plan(target, state, (*categories, *body.include), force=body.force)
         result = await restore(component, state, **_options(hub, target, body, author))
         return documents.apply_result(result, target)
 
@@ -173,12 +155,9 @@ async def restore_(
         return await run_until_disconnect(request, work)
 
 
-async def _plan(
-    target: Target, wanted: ParamSet, include: Iterable[str], *, force: bool, ext: bool
-) -> dict[str, Any]:
-    if ext:
-        return documents.ext_plan(await verify_extended(target.component, wanted))
-    found = await prepare(target.component, wanted, include=include, info=target.metadata, force=force)
+async def _plan(target: Target, wanted: ParamSet, include: Iterable[str], *, force: bool) -> dict[str, Any]:
+    component, info = target.component, target.metadata
+    found = await prepare(component, wanted, include=include, info=info, force=force)
     return documents.plan(found, target)
 
 
@@ -200,32 +179,32 @@ def _options(hub: Hub, target: Target, body: ApplyRequest | RestoreRequest, auth
 
 
 @reading.get(f"{VEHICLE}/snapshots")
-async def snapshots(hub: HubArgument, source: SourceArgument, ext: Ext = False) -> dict[str, Any]:
+async def snapshots(hub: HubArgument, source: SourceArgument) -> dict[str, Any]:
     """Return the snapshots, the newest last."""
     place = source.key, source.component
-    return documents.snapshots(await hub.read_cache(lambda cache: cache.snapshots(*place, extended=ext)))
+    return documents.snapshots(
+        await hub.read_cache(lambda cache: cache.snapshots(*place, extended=source.extended))
+    )
 
 
 @writing.post(f"{VEHICLE}/snapshots", status_code=201)
-async def create_snapshot(
-    hub: HubArgument, target: TargetArgument, body: SnapshotRequest, ext: Ext = False
-) -> dict[str, Any]:
+async def create_snapshot(hub: HubArgument, target: TargetArgument, body: SnapshotRequest) -> dict[str, Any]:
     """Store a snapshot of the known table."""
-    component, shown = target.component, target.parameters(ext=ext)
+    component = target.component
     await wait_for_identity(component)
-    if not shown.params:
+    if not component.params:
         raise UsageError("no parameter of the vehicle is known")
-    table = set_maker(component, f"link {target.link.name}")(list(shown.params.values()))
-    complete = shown.count is not None and len(shown.params) >= shown.count
+    table = set_maker(component, f"link {target.link.name}")(list(component.params.values()))
+    complete = component.count is not None and len(component.params) >= component.count
     kept = await hub.read_cache(
         lambda cache: cache.store_snapshot(
             component.identity,
             component.component,
             table,
             reason=body.reason,
-            hash=shown.hash,
+            hash=component.hash,
             complete=complete,
-            extended=ext,
+            extended=component.is_extended,
         )
     )
     return {"id": kept.id}
@@ -238,37 +217,33 @@ async def history(
     name: Annotated[str | None, Query(max_length=16)] = None,
     limit: Annotated[int, Query(ge=1, le=1_000)] = HISTORY_ENTRIES,
     since: Annotated[Timestamp | None, Query(description="Only from this time on.")] = None,
-    ext: Ext = False,
 ) -> Response:
     """Return the newest changes of values, the newest last."""
     which = source.key, source.component, name, limit, since
-    entries = await hub.read_cache(lambda cache: cache.history(*which, extended=ext))
-    return JSONResponse(documents.history(entries, ext=ext))
+    entries = await hub.read_cache(lambda cache: cache.history(*which, extended=source.extended))
+    return JSONResponse(documents.history(entries))
 
 
-async def _wanted(hub: Hub, target: Target, body: PlanRequest, *, ext: bool) -> ParamSet:
+async def _wanted(hub: Hub, target: Target, body: PlanRequest) -> ParamSet:
     """Return the wanted parameters of a request."""
     upload, snapshot = body.file, body.snapshot
     if upload is not None:
-        if ext:
-            raise UsageError("extended parameters are given in `values` or `snapshot`, not in a file")
         found = await anyio.to_thread.run_sync(lambda: upload.read_set(target))
     elif snapshot is not None:
-        found = await _earlier_state(hub, target, snapshot, ext=ext)
+        found = await _earlier_state(hub, target, snapshot)
     else:
-        found = await values_set(body.values or {}, target, ext=ext)
+        found = await values_set(body.values or {}, target)
     return found if body.only is None else found.only(body.only)
 
 
-async def _earlier_state(hub: Hub, target: Target, when: float | None, *, ext: bool) -> ParamSet:
+async def _earlier_state(hub: Hub, target: Target, when: float | None) -> ParamSet:
     """Return a state of a component from the cache; None for that before the last apply."""
-    await wait_for_identity(target.component)
-    key, component = target.component.identity.key, target.component.component
-    if when is None and ext:
-        return await load_extended_state(target.component)
+    component = target.component
+    await wait_for_identity(component)
+    place, extended = (component.identity.key, component.component), component.is_extended
     if when is None:
-        return await hub.read_cache(lambda cache: load_state_before_apply(cache, key, component))
-    return await hub.read_cache(lambda cache: cache.state_at(key, component, when, extended=ext))
+        return await hub.read_cache(lambda cache: load_state_before_apply(cache, *place, extended=extended))
+    return await hub.read_cache(lambda cache: cache.state_at(*place, when, extended=extended))
 
 
 @contextmanager
@@ -278,14 +253,14 @@ def _only_setup(target: Target, author: str) -> Iterator[None]:
     Raises:
         ServiceError: another one is running.
     """
-    if target.running_setup is not None:
-        detail = f"{target.running_setup} is setting up this vehicle already."
-        raise ServiceError(409, "busy", detail)
-    target.running_setup = author
+    setup = target.setup
+    if setup.author is not None:
+        raise ServiceError(409, "busy", f"{setup.author} is setting up this vehicle already.")
+    setup.author = author
     try:
         yield
     finally:
-        target.running_setup = None
+        setup.author = None
 
 
 class _Publisher:

@@ -15,29 +15,48 @@ from paramclient.protocol.fetch import Progress
 __all__ = ["ServiceLink", "Target"]
 
 
+@dataclass
+class Setup:
+    """The running apply or restore of a component.
+
+    Attributes:
+        author: its author; None if none runs.
+    """
+
+    author: str | None = None
+
+
 @dataclass(eq=False)
 class Target:
-    """One component on a link.
+    """The plain or the extended parameters of one component on a link.
 
     Attributes:
         link: its link.
         component: the component.
-        metadata: the metadata of its parameters, or None.
+        setup: the running apply or restore of plain or extended parameters.
+        extended: the target with the extended parameters; None if it is this one.
+        metadata: the metadata of its parameters, or None: extended ones have none.
         progress: the progress of a running fetch, or None.
         fetches: number of ended fetches: a page loads the table again when it has changed.
-        running_setup: the author of a running apply or restore, or None.
         published: the last published state.
         described: the identity to which `metadata` belongs.
     """
 
     link: ServiceLink
     component: Component
+    setup: Setup
+    extended: Target | None = None
     metadata: Metadata | None = None
     progress: Progress | None = None
     fetches: int = 0
-    running_setup: str | None = None
     published: object = None
     described: Identity | None = None
+
+    @classmethod
+    def of(cls, link: ServiceLink, component: Component) -> Target:
+        """Return the target with the plain parameters of a component; it has that with the extended ones."""
+        setup = Setup()
+        return cls(link, component, setup, cls(link, component.ext, setup))
 
     @property
     def address(self) -> dict[str, Any]:
@@ -48,13 +67,9 @@ class Target:
             "component": self.component.component,
         }
 
-    def parameters(self, *, ext: bool) -> Component:
-        """Return the component with its extended or its plain parameters."""
-        return self.component.ext if ext else self.component
-
-    def info(self, name: str, *, ext: bool = False) -> ParamInfo | None:
-        """Return the metadata of a parameter, or None; extended parameters have none."""
-        return None if ext or self.metadata is None else self.metadata.find(name)
+    def info(self, name: str) -> ParamInfo | None:
+        """Return the metadata of a parameter, or None."""
+        return None if self.metadata is None else self.metadata.find(name)
 
 
 @dataclass(eq=False)

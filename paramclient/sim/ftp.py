@@ -12,12 +12,10 @@ from paramclient.errors import FileErrorCode, UsageError
 from paramclient.model.px4_hash import crc32_px4
 from paramclient.protocol import param_pck
 from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
-from paramclient.protocol.param_pck import PackedParam
+from paramclient.protocol.param_pck import PARAM_FILE, PackedParam
 
-__all__ = ["PARAM_FILE", "Address", "FileServer"]
+__all__ = ["Address", "FileServer"]
 
-PARAM_FILE: Final = "@PARAM/param.pck"
-"""Path of the packed parameter file in MAVFTP."""
 IDLE_LIMIT: Final = 3.0
 """Seconds without a response after which ArduPilot reassigns the session; each response restarts the time."""
 PX4_IDLE_LIMIT: Final = 11.0
@@ -77,7 +75,8 @@ class FileServer:
     - A repeated request with the same sequence number gets the same response, if it was the last request.
     - ArduPilot has one session for all stations and links. While its file is open, requests of another
       session are refused with InvalidSession; closing another session is acknowledged and closes nothing. The
-      session ends after 3 s without any response; refusals count as responses.
+      session ends after 3 s without any response, with the next file that is opened; refusals count as
+      responses.
     - param.pck is generated for every read. With ArduPilot, all reads of a session request the same size, and
       the file size in the response to the open is an estimate, 12 bytes per parameter.
     - Unlike on real vehicles, a param.pck that is written sets no parameters.
@@ -106,6 +105,7 @@ class FileServer:
     _waiting: deque[tuple[float, Packet, Address]] = field(default_factory=deque)
     _burst: _Burst | None = None
     _free_at: float = -math.inf
+    _now: float = 0.0
     _answered_at: float = -math.inf
     _last: tuple[Address, Packet] | None = None
     _packed: tuple[object, bytes] | None = None
@@ -118,7 +118,9 @@ class FileServer:
 
     @property
     def open_files(self) -> list[str]:
-        """The paths of the open files."""
+        """The paths of the open files that are in the way of other stations."""
+        if not self.is_px4 and self._now - self._answered_at > IDLE_LIMIT:
+            return []
         return [session.path for session in self._open.values()]
 
     def reset(self) -> None:
@@ -147,6 +149,7 @@ class FileServer:
         """Do the due work, limited to `packets_max` responses; return the responses with their receivers."""
         out: list[tuple[Packet, Address]] = []
         answer: Packet | None
+        self._now = now
         while (due := self.next_deadline()) <= now:
             if packets_max is not None and len(out) >= packets_max:
                 self._free_at = now
@@ -262,7 +265,9 @@ class FileServer:
                 return request.session, _no(FileErrorCode.NO_SESSIONS_AVAILABLE)
             number = 0
         elif number in self._open:
-            return number, _no(FileErrorCode.FAIL)
+            if now - self._answered_at <= IDLE_LIMIT:
+                return number, _no(FileErrorCode.FAIL)
+            self._terminate(number, now)
         session = _Session(sender, path, None, now)
         if request.opcode == Opcode.CREATE_FILE:
             session.written = bytearray()

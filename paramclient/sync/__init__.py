@@ -44,16 +44,12 @@ __all__ = [
     "Wanted",
     "apply",
     "apply_all",
-    "apply_extended",
-    "load_extended_state",
     "metadata_of",
     "prepare",
     "restore",
     "restore_all",
-    "restore_extended",
     "verify",
     "verify_all",
-    "verify_extended",
 ]
 
 prepare = blocking(provision.prepare)
@@ -63,8 +59,4 @@ restore = blocking(provision.restore)
 apply_all = blocking(provision.apply_all)
 verify_all = blocking(provision.verify_all)
 restore_all = blocking(provision.restore_all)
-apply_extended = blocking(provision.apply_extended)
-verify_extended = blocking(provision.verify_extended)
-restore_extended = blocking(provision.restore_extended)
-load_extended_state = blocking(provision.load_extended_state)
 metadata_of = blocking(metadata.metadata_of)

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import Self, TypeAlias
 
 from paramclient.cache import ParamCache
-from paramclient.client.arguments import COMPONENT_TIMEOUT
+from paramclient.client.client import COMPONENT_TIMEOUT
 from paramclient.client.component import REBOOT_TIMEOUT, ComponentState
 from paramclient.client.fleet_fetch import FetchedAll
-from paramclient.client.reset import ResetResult
 from paramclient.client.signing import Signing
 from paramclient.client.traffic import TrafficReport
 from paramclient.links import Link
@@ -19,14 +18,13 @@ from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
-from paramclient.model.values import Encoding, Param, Settable, WireValue
+from paramclient.model.values import Encoding, Param, Settable
 from paramclient.protocol import ftp
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.watch import SyncState
-from paramclient.provision.extended import ExtApplyResult, ExtPlan
 from paramclient.provision.planning import ParamInfo, Plan
 from paramclient.provision.results import ApplyProgress, ApplyResult, FleetApplied, FleetVerified
 from paramclient.sim import Endpoint
@@ -47,22 +45,13 @@ __all__ = [
     "Wanted",
     "apply",
     "apply_all",
-    "apply_extended",
-    "load_extended_state",
     "metadata_of",
     "prepare",
     "restore",
     "restore_all",
-    "restore_extended",
     "verify",
     "verify_all",
-    "verify_extended",
 ]
-
-class Changes(Iterator[Change]):
-    "Stream of the changes since its creation; see `Component.changes`."
-    def __next__(self) -> Change: ...
-    def next(self, timeout: float | None = None) -> Change: ...
 
 class Ftp:
     "The files of a component over MAVFTP; see `ParamClient.ftp`."
@@ -70,7 +59,6 @@ class Ftp:
         self,
         path: str,
         *,
-        read_size: int = ftp.DATA_SIZE_MAX,
         size_max: int = ftp.FILE_SIZE_MAX,
         progress: Callable[[int, int | None], None] | None = None,
         timeout: float | None = None,
@@ -91,6 +79,9 @@ class Component:
     def ext(self) -> Component:
         """The extended parameters of the component (PARAM_EXT_*), whose values are also text and bytes."""
     @property
+    def is_extended(self) -> bool:
+        """Whether these are the extended parameters: whether the component is the `ext` of another one."""
+    @property
     def autopilot(self) -> str:
         """Autopilot of its heartbeat: px4, ardupilot, generic, …; "unknown" before the first heartbeat."""
     @property
@@ -107,7 +98,7 @@ class Component:
         """The `param_count` of the component; None before its first value."""
     @property
     def hash(self) -> int | None:
-        """The PX4 hash (`_HASH_CHECK`) of the complete table; None if it is not known."""
+        """PX4's hash or ArduPilot's checksum of the complete table; None if it is not known."""
     @property
     def state(self) -> ComponentState:
         """State of the table."""
@@ -155,17 +146,6 @@ class Component:
         author: str | None = None,
     ) -> SetManyResult:
         """Write many parameters in one call, and verify each as `set` does."""
-    def reset(
-        self,
-        *names: str,
-        defaults: Mapping[str, WireValue] | None = None,
-        progress: Callable[[SetOutcome], None] | None = None,
-        timeout: float | None = None,
-        settle: float = 0.0,
-        durable: bool = False,
-        author: str | None = None,
-    ) -> ResetResult:
-        """Set parameters to the firmware's defaults, and verify each as `set` does."""
     def fetch_all(
         self,
         *,
@@ -182,6 +162,11 @@ class Component:
         """Return a stream of parameter changes from now on: `async for change in component.changes()`."""
 
 Wanted: TypeAlias = ParamSet | Mapping[tuple[int, int], ParamSet] | Callable[[Component], ParamSet]
+
+class Changes(Iterator[Change]):
+    "Stream of the changes since its creation; see `Component.changes`."
+    def __next__(self) -> Change: ...
+    def next(self, timeout: float | None = None) -> Change: ...
 
 @dataclass(frozen=True, slots=True)
 class Discovered:
@@ -298,12 +283,7 @@ class ParamClient:
     ) -> Component:
         """Return the component of the same vehicle under its new system id, after its first message there."""
     def fetch_all(
-        self,
-        system: int | None = None,
-        *,
-        refresh: bool = False,
-        timeout: float | None = None,
-        progress: Callable[[Mapping[Address, Progress]], None] | None = None,
+        self, system: int | None = None, *, refresh: bool = False, timeout: float | None = None
     ) -> FetchedAll:
         """Update the tables of all components of one system, or of every system on the link."""
     def traffic_report(self) -> TrafficReport:
@@ -417,38 +397,6 @@ def restore_all(
     before_writing: Callable[[Component], object] | None = None,
 ) -> FleetApplied:
     """`restore` several vehicles concurrently. A failure of one vehicle does not stop the others."""
-
-def apply_extended(
-    component: Component,
-    wanted: ParamSet,
-    *,
-    durable: bool = False,
-    backup: str | os.PathLike[str] | None = None,
-    timeout: float | None = None,
-    author: str | None = None,
-    progress: Callable[[SetOutcome], None] | None = None,
-    before_writing: Callable[[], object] | None = None,
-) -> ExtApplyResult:
-    """Write the wanted values that differ to a component, and verify them by another download."""
-
-def verify_extended(component: Component, wanted: ParamSet, *, timeout: float | None = None) -> ExtPlan:
-    """Compare wanted extended parameters with those of a component, after a download. Writes nothing."""
-
-def restore_extended(
-    component: Component,
-    state: ParamSet,
-    *,
-    durable: bool = False,
-    backup: str | os.PathLike[str] | None = None,
-    timeout: float | None = None,
-    author: str | None = None,
-    progress: Callable[[SetOutcome], None] | None = None,
-    before_writing: Callable[[], object] | None = None,
-) -> ExtApplyResult:
-    """Restore an earlier state of a component: `apply_extended` with a snapshot *before restore*."""
-
-def load_extended_state(component: Component, when: float | None = None) -> ParamSet:
-    """Return an earlier state of the extended parameters of a component, from the cache."""
 
 def metadata_of(
     component: Component,

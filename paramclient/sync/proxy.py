@@ -8,23 +8,21 @@ import os
 import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from concurrent import futures
-from contextlib import suppress
-from contextvars import Context
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial, wraps
 from queue import Empty, SimpleQueue
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 from typing import Any, Final, Self
 
 import anyio
-from anyio.from_thread import BlockingPortal
+from anyio.from_thread import BlockingPortal, start_blocking_portal
 
 import paramclient.client.client as asynchronous
 from paramclient.client import component, events, files, streams
 from paramclient.errors import ClientClosed, UsageError
-from paramclient.model.params import ParamMap
 
 __all__ = ["Changes", "Component", "Events", "Ftp", "ParamClient", "blocking"]
 
@@ -32,12 +30,6 @@ THREAD_NAME: Final = "paramclient blocking client"
 """Name of the thread of a client, in debuggers."""
 WAIT_INTERVAL: Final = 0.1
 """Seconds after which a waiting thread wakes up: Windows delivers Ctrl-C only then."""
-CANCEL_TIMEOUT: Final = 0.5
-"""Seconds for which an interrupted call waits until the client has cancelled it. Most calls take 1 ms. A file
-transfer also closes its session on board, which continues in the background."""
-EXIT_TIMEOUT: Final = 3.0
-"""Seconds for which the end of the program waits until open clients are closed: longer than a file session
-takes to be closed on board."""
 
 
 class _Session:
@@ -51,17 +43,14 @@ class _Session:
     """
 
     def __init__(self, make: Callable[[], asynchronous.ParamClient]) -> None:
-        self._portal, self._thread = _start_event_loop()
-        try:
+        with ExitStack() as thread:
+            self._portal = thread.enter_context(start_blocking_portal(name=THREAD_NAME))
             self.client = self._portal.call(make)
-        except BaseException:
-            self._portal.call(self._portal.stop)
-            self._thread.join()
-            raise
+            self._thread = thread.pop_all()
         self.proxies: weakref.WeakValueDictionary[object, Proxy] = weakref.WeakValueDictionary()
         self._process = os.getpid()
-        self._end = weakref.finalize(self, _end_in_background, self._portal, self.client)
-        self._end.atexit = False  # `_close_all` waits for the end
+        self._end = weakref.finalize(self, _end_in_background, self._portal, self.client, self._thread)
+        self._end.atexit = False  # `_close_all` ends it
         _sessions.add(self)
 
     def close(self) -> None:
@@ -71,8 +60,7 @@ class _Session:
                 self.run(self.client.aclose)
         finally:
             if self._end.detach() is not None:
-                self._portal.call(self._portal.stop)
-                self._thread.join()
+                self._thread.close()
 
     def run(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """Call a function in the event loop, and await what it returns. Return the result as a proxy.
@@ -85,20 +73,17 @@ class _Session:
             UsageError: the caller is in the event loop itself, or in a forked process.
         """
         calls: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
-        ended = threading.Event()
-        convert = partial(self._argument, calls, _components_of(args))
-        values = [convert("", value) for value in args]
-        options = {name: convert(name, value) for name, value in kwargs.items()}
-
-        async def work() -> Any:
-            try:
-                result = function(*values, **options)
-                return await result if inspect.isawaitable(result) else result
-            finally:
-                ended.set()
-                calls.put(None)
-
-        future = self.start(work)
+        values = [self._argument(calls, "", value) for value in args]
+        options = {name: self._argument(calls, name, value) for name, value in kwargs.items()}
+        if os.getpid() != self._process:
+            raise UsageError("a client cannot be used in a forked process; create a new one there")
+        try:
+            future = self._portal.start_task_soon(partial(function, *values, **options))
+        except RuntimeError as error:
+            if "event loop thread" in str(error):
+                raise UsageError("a blocking call cannot be made in the event loop of its client") from None
+            raise ClientClosed("the client was closed", link=self.client.link.name) from None
+        future.add_done_callback(lambda _: calls.put(None))
         try:
             while (call := _next(calls)) is not None:
                 call()
@@ -106,34 +91,16 @@ class _Session:
         except futures.CancelledError:
             raise ClientClosed("the client was closed", link=self.client.link.name) from None
         except BaseException:
-            if not future.done():
-                future.cancel()
-                ended.wait(CANCEL_TIMEOUT)
+            future.cancel()
             raise
 
-    def start(self, work: Callable[[], Coroutine[Any, Any, Any]]) -> futures.Future[Any]:
-        """Start a task in the event loop.
-
-        Raises:
-            ClientClosed, UsageError: as from `run`.
-        """
-        if os.getpid() != self._process:
-            raise UsageError("a client cannot be used in a forked process; create a new one there")
-        try:
-            return self._portal.start_task_soon(work)
-        except RuntimeError as error:
-            if "event loop thread" in str(error):
-                raise UsageError("a blocking call cannot be made in the event loop of its client") from None
-            raise ClientClosed("the client was closed", link=self.client.link.name) from None
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the event loop runs."""
-        return self._end.alive
-
-    def read(self, function: Callable[[], Any]) -> Any:
-        """Call a function that does not wait: in the event loop, or after its end in this thread."""
-        return self.run(function) if self.is_open else self.shown(function())
+    def read(self, function: Callable[..., Any], *args: Any) -> Any:
+        """Call a function that also works with a closed client: in the event loop, or after its end, when
+        nothing waits, in another one."""
+        if self._end.alive:
+            return self.run(function, *args)
+        with start_blocking_portal() as portal:
+            return self.shown(portal.call(function, *map(_target_of, args)))
 
     def shown(self, value: Any) -> Any:
         """Return a value of the client as the caller is to see it."""
@@ -146,55 +113,30 @@ class _Session:
             return found
         if isinstance(value, list):
             return [self.shown(each) for each in value]
-        if isinstance(value, ParamMap):
-            return ParamMap(_LiveMapping(self, value))
         if isinstance(value, MappingProxyType):
-            return _LiveMapping(self, value)
+            return {key: self.shown(each) for key, each in value.items()}
         if isinstance(value, events.Event):
             return replace(value, component=self.shown(value.component))
         return value
 
-    def _argument(
-        self,
-        calls: SimpleQueue[Callable[[], object] | None],
-        vehicles: Sequence[Component],
-        name: str,
-        value: Any,
-    ) -> Any:
+    def _argument(self, calls: SimpleQueue[Callable[[], object] | None], name: str, value: Any) -> Any:
         """Return an argument of a call as the client is to see it."""
-        if isinstance(value, Proxy):
-            return value._target
+
+        async def ask() -> None:
+            answered = anyio.Event()
+            calls.put(lambda: (value(), self._portal.start_task_soon(answered.set)))
+            await answered.wait()
+
         if name == "progress" and value is not None:
             return lambda *items: calls.put(partial(value, *map(self.shown, items)))
         if name == "before_writing" and value is not None:
-            return partial(self._ask, calls, value)
-        if callable(value) and vehicles:  # one result for each vehicle
-            results = {each._target: value(each) for each in vehicles}
-            return results.__getitem__
+            return ask
         if isinstance(value, list | tuple):
-            return type(value)(each._target if isinstance(each, Proxy) else each for each in value)
-        return value if isinstance(value, Mapping | str) or not isinstance(value, Iterator) else list(value)
-
-    async def _ask(
-        self,
-        calls: SimpleQueue[Callable[[], object] | None],
-        question: Callable[..., object],
-        *items: object,
-    ) -> None:
-        """Call a function in the thread of the caller, and wait for its end."""
-        answered = anyio.Event()
-
-        def answer() -> None:
-            question(*map(self.shown, items))
-            self._portal.start_task_soon(answered.set)
-
-        calls.put(answer)
-        await answered.wait()
+            return type(value)(map(_target_of, value))
+        return list(value) if isinstance(value, Iterator) else _target_of(value)
 
 
 _sessions: weakref.WeakSet[_Session] = weakref.WeakSet()
-_ending: set[threading.Thread] = set()
-"""The threads that close clients whose last reference was dropped."""
 
 
 class Proxy:
@@ -208,19 +150,18 @@ class Proxy:
             raise AttributeError(name)
         target, session = self._target, self._session
         method = getattr(type(target), name, None)
-        if inspect.iscoroutinefunction(method):
-            return wraps(method)(partial(session.run, getattr(target, name)))
         if inspect.isfunction(method):
-            return wraps(method)(lambda *args: session.read(partial(method, target, *map(_target_of, args))))
+            call = session.run if inspect.iscoroutinefunction(method) else session.read
+            return wraps(method)(partial(call, getattr(target, name)))
         if name in vars(target):
             return session.shown(vars(target)[name])
-        return session.read(partial(getattr, target, name))
+        return session.read(getattr, target, name)
 
     def __dir__(self) -> list[str]:
         return sorted(name for name in dir(self._target) if not name.startswith("_"))
 
     def __repr__(self) -> str:
-        shown: str = self._session.read(partial(repr, self._target))
+        shown: str = self._session.read(repr, self._target)
         return shown
 
 
@@ -249,9 +190,7 @@ class ParamClient(Proxy):
     def __enter__(self) -> Self:
         return self.open()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
@@ -286,26 +225,15 @@ class Stream(Proxy):
         taken: deque[Any] = self.__dict__.setdefault("_taken", deque())  # an interrupted call leaves its item
         if not taken:
             try:
-                self._session.read(partial(self._take, taken, timeout))
+                self._session.read(self._take, taken, timeout)
             except StopAsyncIteration:
                 raise StopIteration from None
         return self._session.shown(taken.popleft())
 
-    def _take(self, taken: deque[Any], timeout: float | None) -> Any:
-        """Move one item into `taken`; a closed client has no event loop, and its streams do not wait."""
-
-        async def take() -> None:
+    async def _take(self, taken: deque[Any], timeout: float | None) -> None:
+        """Move one item into `taken`."""
+        with anyio.fail_after(timeout):
             taken.append(await anext(self._target))
-
-        async def take_in_time() -> None:
-            with anyio.fail_after(timeout):
-                await take()
-
-        if self._session.is_open:
-            return take_in_time()
-        with suppress(StopIteration):
-            take().send(None)
-        return None
 
 
 class Changes(Stream):
@@ -325,26 +253,6 @@ _PROXIES: dict[type, type[Proxy]] = {
 }
 
 
-class _LiveMapping(Mapping[Any, Any]):
-    """A view of a mapping that the event loop may change at any moment: an iteration is one over a copy."""
-
-    def __init__(self, session: _Session, mapping: Mapping[Any, Any]) -> None:
-        self._session = session
-        self._mapping = mapping
-
-    def __getitem__(self, key: Any) -> Any:
-        return self._session.shown(self._mapping[key])
-
-    def __iter__(self) -> Iterator[Any]:
-        return iter(self._session.read(partial(list, self._mapping)))
-
-    def __len__(self) -> int:
-        return len(self._mapping)
-
-    def __repr__(self) -> str:
-        return repr(dict(self))
-
-
 def blocking(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that takes a client or components with calls that block."""
 
@@ -360,6 +268,8 @@ def blocking(function: Callable[..., Any]) -> Callable[..., Any]:
             )
         if not sessions:
             return anyio.run(partial(function, vehicles, *rest, **kwargs))
+        if callable(rest[0]):  # one result for each vehicle
+            rest[0] = {each._target: rest[0](each) for each in vehicles}.__getitem__
         return sessions.pop().run(function, vehicles, *rest, **kwargs)
 
     return call
@@ -369,61 +279,28 @@ def _target_of(value: Any) -> Any:
     return value._target if isinstance(value, Proxy) else value
 
 
-def _components_of(args: Sequence[Any]) -> Sequence[Component]:
-    """Return the vehicles of a call for several: its first argument."""
-    is_fleet = bool(args) and isinstance(args[0], list) and all(isinstance(each, Proxy) for each in args[0])
-    return args[0] if is_fleet else ()
-
-
 def _next(calls: SimpleQueue[Callable[[], object] | None]) -> Callable[[], object] | None:
     while True:
         with suppress(Empty):
             return calls.get(timeout=WAIT_INTERVAL)
 
 
-def _start_event_loop() -> tuple[BlockingPortal, threading.Thread]:
-    """Start an event loop in a thread of its own."""
-    started: futures.Future[BlockingPortal] = futures.Future()
-
-    async def serve() -> None:
-        async with BlockingPortal() as portal:
-            started.set_result(portal)
-            await portal.sleep_until_stopped()
-
-    def run() -> None:
-        try:
-            anyio.run(serve)
-        except BaseException as error:
-            if not started.done():
-                started.set_exception(error)
-
-    # without the context of the caller, which may run in another event loop
-    thread = threading.Thread(target=Context().run, args=(run,), name=THREAD_NAME, daemon=True)
-    thread.start()
-    return started.result(), thread
-
-
-def _end_in_background(portal: BlockingPortal, client: asynchronous.ParamClient) -> None:
+def _end_in_background(
+    portal: BlockingPortal, client: asynchronous.ParamClient, portal_thread: ExitStack
+) -> None:
     """Close a client whose last reference was dropped. The garbage collector may call this in any thread."""
 
     def end() -> None:
         with suppress(Exception):
             portal.call(client.aclose)
-        portal.call(portal.stop)
-        _ending.discard(thread)
+        portal_thread.close()
 
-    thread = threading.Thread(target=end, name=THREAD_NAME, daemon=True)
-    _ending.add(thread)
-    thread.start()
+    threading.Thread(target=end, name=THREAD_NAME).start()
 
 
 @atexit.register
 def _close_all() -> None:
     """Close the clients that are open at the end of the program."""
-    closing = []
     for session in list(_sessions):
         with suppress(ClientClosed, UsageError):
-            closing.append(session.start(session.client.aclose))
-    futures.wait(closing, EXIT_TIMEOUT)
-    for thread in list(_ending):
-        thread.join(EXIT_TIMEOUT)
+            session.close()

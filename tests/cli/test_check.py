@@ -38,6 +38,16 @@ def test_a_vehicle_on_a_good_link_has_no_findings(command: Command, put: Put) ->
     assert 45 < done.json["reads"]["per_s"] < 55
 
 
+def test_the_cost_of_proving_a_cached_table_is_measured(command: Command, put: Put) -> None:
+    for vehicle, limit in ((PX4Vehicle(), 100), (ArduPilotVehicle(), 150)):
+        found = command("check", put(vehicle), "--json").json["hash"]
+        assert (len(found["before"]), found["error"]) == (8, None)
+        assert 0 <= found["elapsed_s"] < 0.1
+        assert 50 < found["bytes"] < limit
+    rows = dict(row for row in command("check", put(ArduPilotVehicle(ftp=False))).rows if len(row) == 2)
+    assert rows["checksum"].startswith("none: ")
+
+
 def test_nothing_is_changed(command: Command, put: Put) -> None:
     vehicle = Tap(PX4Vehicle())
     assert command("check", put(vehicle)).code == 0

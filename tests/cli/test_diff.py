@@ -310,7 +310,7 @@ def test_parameters_missing_from_a_link_are_named(command: Command, vehicles: di
     vehicles["tcp:two:1"] = GenericVehicle({"A": 1, "B": 2})
     outcome = command("diff", "tcp:one:1", "tcp:two:1", "--timeout", 1)
     assert (outcome.code, outcome.out) == (1, "")
-    assert "1/1 generic on tcp:one:1 is incomplete: index 1 were not received" in outcome.err
+    assert "1/1 generic on tcp:one:1 is incomplete: index 1 was not received" in outcome.err
 
 
 def test_a_failed_link_ends_the_comparison(command: Command) -> None:

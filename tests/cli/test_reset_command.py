@@ -228,6 +228,10 @@ def test_a_vehicle_that_falls_silent_has_an_outcome_for_each_value(command: Comm
             if not self.requests["PARAM_SET"]:
                 super()._on_read(request, sender)
 
+        def _on_list(self) -> None:
+            if not self.requests["PARAM_SET"]:
+                super()._on_list()
+
     table = [SimParam(f"P_{number}", ParamType.INT16, 3, default=1) for number in range(6)]
     done = command("reset", put(Ending(table=table, live=())), "P_*", "--json")
     assert done.code == 3

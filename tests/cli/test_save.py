@@ -11,6 +11,7 @@ import pytest
 from paramclient import ParamCache, ParamType, read_file
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam
 from tests.commands import Command, Put, behind, in_process, leaping
+from tests.conversations.partial import TABLE, Partial
 
 ODD = [
     SimParam("BIG", ParamType.INT32, 16777217),
@@ -112,6 +113,33 @@ def test_nothing_is_written_if_no_parameter_differs(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("ending", ["params", "parm", "param", "json"])
+def test_what_was_received_is_written_with_incomplete_and_the_file_names_the_others(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path, ending: str
+) -> None:
+    table = {**TABLE, "RC MAP": (1.0, ParamType.REAL32)}
+    vehicle, path = Partial(table, count=lambda index: len(table) + 1), tmp_path / f"quad.{ending}"
+    refused = command("save", put(vehicle), path, "--no-cache")
+    assert refused.code == 1
+    assert "index 9 was not received; --incomplete writes what was received" in refused.err
+    saved = command("save", put(vehicle), path, "--no-cache", "--incomplete")
+    assert (saved.code, saved.out) == (0, "")
+    assert set(read_file(path).choose()) == set(TABLE)
+    assert "without index 9, 'RC MAP'" in path.read_text()
+
+
+@pytest.mark.parametrize("ending", ["params", "json"])
+def test_a_vehicle_with_component_0_is_written_and_read(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path, ending: str
+) -> None:
+    path = tmp_path / f"quad.{ending}"
+    for words in ((), ("--vehicle", "1/0")):
+        saved = command("save", put(Partial(component=0, asked_as=0)), path, "--no-cache", *words)
+        assert saved.code == 0
+    [params] = read_file(path).sets
+    assert (params.system, params.component, set(params)) == (1, 0, set(TABLE))
+
+
 def test_an_incomplete_table_is_not_written(
     command: Command, put: Callable[[Endpoint], str], tmp_path: Path
 ) -> None:
@@ -126,6 +154,8 @@ def test_an_incomplete_table_is_not_written(
     assert (cached.code, cached.out) == (1, "")
     assert "1/1 is incomplete: 19 of 20 parameters are in the cache" in cached.err
     assert not path.exists()
+    assert command("save", "1", path, "--cache", cache, "--incomplete").code == 0
+    assert len(read_file(path).choose()) == 19
 
 
 def test_a_value_that_is_only_cached_is_not_written(

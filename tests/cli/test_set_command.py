@@ -44,8 +44,12 @@ class Ending(GenericVehicle):
         if self.requests["PARAM_SET"] <= 40:
             super()._on_read(request, sender)
 
+    def _on_list(self) -> None:
+        if self.requests["PARAM_SET"] <= 40:
+            super()._on_list()
+
     def end(self) -> None:
-        """Keep silent from now on, also about reads."""
+        """Keep silent from now on, also about reads and lists."""
 
 
 class Interrupting(Ending):

@@ -68,8 +68,8 @@ def test_a_component_of_a_vehicle(command: Command, put: Put) -> None:
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("4/300", "system and component ids are 1 to 255"),
-        ("0", "system and component ids are 1 to 255"),
+        ("4/300", "ids are 1 to 255, component ids 0 to 255"),
+        ("0", "ids are 1 to 255, component ids 0 to 255"),
         ("tractor", "a vehicle is written as 4, as 4/1"),
         ("px4", "a vehicle is written as 4, as 4/1"),
         ("uid:0a0a", "a vehicle is written as 4, as 4/1"),

@@ -249,8 +249,8 @@ async def test_a_vehicle_is_set_up_and_put_back() -> None:
         assert bits(vehicle.params) == before
 
 
-async def test_a_link_whose_bytes_are_signed(tmp_path: Path) -> None:
-    signing = Signing(SigningKey.from_passphrase("a key"), state=tmp_path)
+async def test_a_link_whose_bytes_are_signed() -> None:
+    signing = Signing(SigningKey.from_passphrase("a key"))
     vehicle = small_px4(signing_key=signing.key, **QUICK)
     async with beside(), a_client(vehicle, signing=signing) as client:
         await everything(await client.component(), vehicle)

@@ -7,10 +7,8 @@ import gc
 import logging
 import math
 import os
-import re
-import socket
 import threading
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -28,23 +26,17 @@ from paramclient import (
     ParamClient,
     ParamType,
     Progress,
-    Refused,
-    TypeMismatch,
-    UnknownParameter,
     UsageError,
     ValueNotApplied,
 )
-from paramclient.client import arguments, link_task
-from paramclient.client.component import CACHE_TIMEOUT
-from paramclient.errors import ParamErrorCode
+from paramclient.client import link_task
+from paramclient.client.client import COMPONENT_TIMEOUT
 from paramclient.links import create_link, serve_endpoint
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
 from paramclient.wire import frames, messages
 from tests.shell import (
-    TIMEOUT,
     VALUES,
     FlakyLink,
-    Radio,
     Tap,
     a_client,
     bits,
@@ -106,35 +98,6 @@ async def test_an_exception_of_the_body_is_raised_unchanged() -> None:
 
 
 @in_simulated_time
-async def test_an_error_of_a_call_is_raised_unchanged() -> None:
-    async def session() -> None:
-        async with a_client(generic(param_error=True)) as client:
-            await (await client.component()).get("NOT_THERE")
-
-    with pytest.raises(UnknownParameter):
-        await session()
-
-
-@in_simulated_time
-async def test_the_task_of_a_client_can_be_cancelled() -> None:
-    entered = asyncio.Event()
-
-    async def session() -> None:
-        async with a_client(generic()) as client:
-            await client.component()
-            entered.set()
-            await asyncio.sleep(math.inf)
-
-    task = asyncio.create_task(session())
-    await entered.wait()
-    task.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await task
-    assert task.cancelled()
-    assert not tasks_beside()
-
-
-@in_simulated_time
 async def test_a_time_limit_around_the_client_ends_it() -> None:
     task = asyncio.current_task()
     assert task is not None
@@ -149,19 +112,6 @@ async def test_a_time_limit_around_the_client_ends_it() -> None:
     assert task.cancelling() == 0
     await asyncio.sleep(1.0)
     assert not tasks_beside()
-
-
-@in_simulated_time
-async def test_a_time_limit_inside_the_client_leaves_it_open() -> None:
-    async with a_client(generic()) as client:
-        component = await client.component()
-        with pytest.raises(TimeoutError):
-            async with asyncio.timeout(0.5):
-                await client.component(system=99)
-        with anyio.move_on_after(0.5) as scope:
-            await client.component(system=99)
-        assert scope.cancelled_caught
-        assert (await component.get("PARAM_01")).value == 1
 
 
 @in_simulated_time
@@ -208,25 +158,6 @@ async def test_calls_on_a_client_that_is_not_open() -> None:
 
 
 @in_simulated_time
-async def test_closing_ends_everyone_who_waits() -> None:
-    tap = Tap(generic())
-    async with a_client(tap) as client:
-        component = await client.component()
-        tap.is_mute = True
-        waiting = {
-            name: asyncio.create_task(outcome(call(client, component))) for name, call in CALLS.items()
-        }
-        await settled()
-        assert not any(task.done() for task in waiting.values())
-    for name, task in waiting.items():
-        error = await task
-        assert isinstance(error, ClientClosed), name
-        assert error.link == client.link.name
-    assert not residue(component)
-    assert not tasks_beside()
-
-
-@in_simulated_time
 async def test_closing_while_the_link_is_disconnected() -> None:
     tap = Tap(generic())
     link = FlakyLink(tap)
@@ -251,7 +182,8 @@ def own_threads() -> list[threading.Thread]:
 @pytest.mark.parametrize("cached", [False, True])
 async def test_nothing_is_left_behind(tmp_path: Path, cached: bool) -> None:
     async with Served(small_px4(), "udpin") as served:
-        before = tasks_beside(), own_threads(), open_files()
+        before = tasks_beside(), open_files()
+        threads = own_threads()
         for _ in range(2):
             url = f"udpout:127.0.0.1:{served.port}"
             async with ParamClient(url, cache=tmp_path / "cache" if cached else False) as client:
@@ -259,7 +191,8 @@ async def test_nothing_is_left_behind(tmp_path: Path, cached: bool) -> None:
                 await component.fetch_all()
                 await component.set("PARAM_01", 5)
             del client, component
-            assert (tasks_beside(), own_threads(), open_files()) == before
+            assert (tasks_beside(), open_files()) == before
+            assert not set(own_threads()) - set(threads), "one of an earlier test may end meanwhile"
         gc.collect()
 
 
@@ -271,30 +204,6 @@ async def test_the_port_is_free_again_at_once() -> None:
         pass
     async with a_client(f"tcpin:127.0.0.1:{port}"):
         pass
-
-
-@pytest.mark.asyncio
-async def test_a_link_that_cannot_be_opened(tmp_path: Path) -> None:
-    before = tasks_beside(), own_threads(), open_files()
-    with socket.create_server(("127.0.0.1", 0)) as taken, socket.socket(type=socket.SOCK_DGRAM) as busy:
-        busy.bind(("127.0.0.1", 0))
-        names = [f"tcpin:127.0.0.1:{taken.getsockname()[1]}", f"udpin:127.0.0.1:{busy.getsockname()[1]}"]
-        for name in names:
-            with pytest.raises(LinkError, match="in use") as caught:
-                async with ParamClient(name, cache=tmp_path / "cache"):
-                    pass
-            assert caught.value.link == name
-            assert isinstance(caught.value.__cause__, OSError)
-    with pytest.raises(LinkError, match="refused") as caught:
-        async with ParamClient(f"tcp:127.0.0.1:{taken_port(names[0])}", cache=tmp_path / "cache"):
-            pass
-    assert isinstance(caught.value.__cause__, ConnectionRefusedError)
-    assert (tasks_beside(), own_threads(), open_files()) == before
-    assert not (tmp_path / "cache").exists()
-
-
-def taken_port(name: str) -> int:
-    return int(name.rsplit(":", 1)[1])
 
 
 def open_files() -> int:
@@ -310,12 +219,12 @@ class Served:
 
     def __init__(self, endpoint: Endpoint, kind: str) -> None:
         self.port = 0
-        self._endpoint = endpoint
+        self.endpoint = endpoint
         self._kind = kind
 
     async def __aenter__(self) -> Served:
         link: Any = create_link(f"{self._kind}:127.0.0.1:{self.port}")
-        self._task = asyncio.create_task(serve_endpoint(self._endpoint, link))
+        self._task = asyncio.create_task(serve_endpoint(self.endpoint, link))
         await until(lambda: link.address is not None)
         self.port = link.address[1]
         return self
@@ -326,34 +235,6 @@ class Served:
 
 
 # On the link
-
-
-@in_simulated_time
-async def test_the_heartbeat_of_a_ground_station_goes_out_every_second() -> None:
-    tap = Tap(generic())
-    async with a_client(tap, system=200, component=25):
-        await asyncio.sleep(5.5)
-    beats = [
-        (when, frame, message)
-        for when, frame, message in tap.received
-        if isinstance(message, messages.Heartbeat)
-    ]
-    assert [round(when - beats[0][0], 3) for when, _, _ in beats] == [0, 1, 2, 3, 4, 5]
-    for _, frame, message in beats:
-        assert (frame.system, frame.component) == (200, 25)
-        assert (message.type, message.autopilot) == (messages.MAV_TYPE_GCS, messages.MAV_AUTOPILOT_INVALID)
-
-
-@in_simulated_time
-async def test_a_component_is_requested_to_identify_itself() -> None:
-    async with a_client(ArduPilotVehicle()) as client:
-        component = await client.component()
-        await asyncio.sleep(0.5)
-        assert component.autopilot == "ardupilot"
-        assert component.identity.uid is not None
-        assert component.identity.git_hash == "5eed5eed"
-        assert component.encoding is Encoding.C_CAST
-        assert "ArduPilot" in component.encoding_reason
 
 
 @in_simulated_time
@@ -394,62 +275,6 @@ async def test_the_first_autopilot_is_the_component() -> None:
 
 
 @in_simulated_time
-async def test_a_component_is_waited_for() -> None:
-    vehicle = generic()
-    vehicle.reboot(1000.0, down=3.0)
-    async with a_client(vehicle) as client:
-        began = anyio.current_time()
-        await client.component()
-        assert 2.9 < anyio.current_time() - began < 3.1
-
-
-@in_simulated_time
-async def test_a_component_that_is_heard_before_its_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a firmware that does not send its heartbeat on request; others are known at once."""
-    vehicle = small_px4()
-    answer = vehicle._on_command
-
-    def without_heartbeat(request: messages.CommandLong, sender: frames.Frame) -> None:
-        if request.param1 != messages.message_id(messages.Heartbeat):
-            answer(request, sender)
-
-    monkeypatch.setattr(vehicle, "_on_command", without_heartbeat)
-    vehicle.tick(1000.0)
-    vehicle.data_to_send()
-    vehicle.set_param("PARAM_01", 5)
-    async with a_client(vehicle) as client:
-        waiting = [asyncio.create_task(client.component()) for _ in range(2)]
-        named = await client.component(1, 1, timeout=0.4)
-        assert named.encoding_reason == "the vehicle's capability PARAM_ENCODE_BYTEWISE"
-        await asyncio.sleep(0.5)
-        assert repr(client.components[1, 1]) == "<Component 1/1 unknown partial 1 of 25 params>"
-        assert not any(task.done() for task in waiting)
-        await asyncio.sleep(0.51)
-        assert [task.result().autopilot for task in waiting] == ["px4", "px4"]
-
-
-class Mute:
-    """Sends one PARAM_VALUE at the beginning, and nothing else ever."""
-
-    def __init__(self) -> None:
-        value = messages.ParamValue("A", bytes(4), 6, 1, 0)
-        self.out = [messages.encode(value, system=1, component=7, sequence=0)]
-
-    def receive(self, data: bytes, now: float) -> None:
-        """Take it and do nothing."""
-
-    def tick(self, now: float) -> None:
-        """Do nothing."""
-
-    def next_deadline(self) -> float | None:
-        return None
-
-    def data_to_send(self) -> list[bytes]:
-        out, self.out = self.out, []
-        return out
-
-
-@in_simulated_time
 @pytest.mark.parametrize(
     ("wanted", "words"),
     [
@@ -460,7 +285,7 @@ class Mute:
     ],
 )
 async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str) -> None:
-    async with a_client(generic(autopilot=messages.MAV_AUTOPILOT_INVALID)) as client:
+    async with a_client(generic(component=101, autopilot=messages.MAV_AUTOPILOT_INVALID)) as client:
         with pytest.raises(NoReply) as caught:
             await client.component(**wanted, timeout=2.5)
         error = caught.value
@@ -468,14 +293,7 @@ async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str)
         began = anyio.current_time()
         with pytest.raises(NoReply):
             await client.component(**wanted)
-        assert round(anyio.current_time() - began, 3) == arguments.COMPONENT_TIMEOUT
-
-
-@in_simulated_time
-async def test_a_component_that_is_not_there_and_what_was_received_instead() -> None:
-    async with a_client(generic(autopilot=messages.MAV_AUTOPILOT_INVALID)) as client:
-        with pytest.raises(NoReply, match=rf"Heard on {re.escape(client.link.name)} so far: 1/1 generic\.$"):
-            await client.component(timeout=2.5)
+        assert round(anyio.current_time() - began, 3) == COMPONENT_TIMEOUT
 
 
 # Reading and writing
@@ -504,29 +322,6 @@ async def test_the_hash_can_be_read_like_a_parameter_and_is_none() -> None:
         assert "_HASH_CHECK" not in component.params
         with pytest.raises(UsageError, match="_HASH_CHECK is read-only"):
             await component.set("_HASH_CHECK", 0)
-
-
-@in_simulated_time
-async def test_writes_to_one_name_are_done_in_order_and_others_beside() -> None:
-    vehicle = generic()
-    tap = Tap(vehicle)
-    async with a_client(Air.symmetric([tap], delay=0.1)) as client:
-        component = await client.component()
-        await component.fetch_all()
-        began = anyio.current_time()
-        results = await asyncio.gather(
-            *(component.set("PARAM_01", value) for value in (10, 11, 12)),
-            *(component.set(f"PARAM_{number:02}", -number) for number in (2, 4, 5)),
-        )
-        assert [result.actual for result in results] == [10, 11, 12, -2, -4, -5]
-        assert all(result.status == "accepted" and result.attempts == 1 for result in results)
-        assert anyio.current_time() - began < 0.65, "three round trips, and not six"
-    sent = [
-        (message.param_id, int.from_bytes(message.raw, "little"))
-        for message in tap.messages(messages.ParamSet)
-    ]
-    assert [value for name, value in sent if name == "PARAM_01"] == [10, 11, 12]
-    assert vehicle.param("PARAM_01").value == 12
 
 
 @in_simulated_time
@@ -563,39 +358,6 @@ async def test_a_write_that_the_vehicle_adjusts() -> None:
         assert (await component.set("rtl_alt", 1000)).param.name == "RTL_ALT"
 
 
-@in_simulated_time
-async def test_a_write_that_is_refused_says_why() -> None:
-    vehicle = ArduPilotVehicle(read_only=["RTL_ALT"], param_error=True)
-    async with a_client(vehicle) as client:
-        component = await client.component()
-        with pytest.raises(Refused) as caught:
-            await component.set("RTL_ALT", 2000)
-        assert caught.value.code == ParamErrorCode.READ_ONLY
-        assert (caught.value.system, caught.value.component, caught.value.name) == (1, 1, "RTL_ALT")
-        with pytest.raises(UnknownParameter):
-            await component.set("NOT_THERE", 2000)
-        with pytest.raises(UnknownParameter):
-            await component.get(5000)
-
-
-@in_simulated_time
-async def test_an_unknown_name_is_distinguished_from_silence() -> None:
-    async with a_client(small_px4()) as client:
-        component = await client.component()
-        with pytest.raises(UnknownParameter, match="NOT_THERE"):
-            await component.get("NOT_THERE")
-        with pytest.raises(UnknownParameter, match="NOT_THERE"):
-            await component.set("NOT_THERE", 1)
-        assert not residue(component)
-
-
-class Stubborn(GenericVehicle):
-    """It answers every PARAM_SET with the value that it has."""
-
-    def _write(self, entry: Any, bits: int) -> None:
-        return
-
-
 class Retyping(GenericVehicle):
     """It calls its parameters REAL32 when they are read, and INT32 when they are written."""
 
@@ -605,20 +367,10 @@ class Retyping(GenericVehicle):
 
 
 @in_simulated_time
-async def test_a_vehicle_that_keeps_its_value_without_a_reason() -> None:
-    async with a_client(Stubborn(VALUES)) as client:
-        component = await client.component()
-        with pytest.raises(ValueNotApplied) as caught:
-            await component.set("PARAM_01", 9)
-        assert (caught.value.requested, caught.value.actual, caught.value.name) == (9, 1, "PARAM_01")
-        assert not residue(component)
-
-
-@in_simulated_time
-async def test_a_vehicle_that_changes_the_type() -> None:
+async def test_a_vehicle_that_acknowledges_in_another_type_has_not_changed_the_type() -> None:
     async with a_client(Retyping(VALUES)) as client:
         component = await client.component()
-        with pytest.raises(TypeMismatch):
+        with pytest.raises(ValueNotApplied):
             await component.set("PARAM_01", 9)
         assert not residue(component)
 
@@ -647,25 +399,16 @@ async def test_invalid_values_and_names_are_not_sent() -> None:
             with pytest.raises(UsageError):
                 await component.get(bad_name)
         bad_value: Any
+        bad_index: Any
         for bad_value in ("1", None, b"123", [1]):
             with pytest.raises(UsageError):
                 await component.set("WHOLE", bad_value)
-        for bad_index in (-1, 65535):
+        for bad_index in (-1, 32_768, 1.5):
             with pytest.raises(UsageError):
                 await component.get(bad_index)
         await settled()
         assert not tap.received
         assert not residue(component)
-
-
-@in_simulated_time
-async def test_a_value_that_turns_out_not_to_fit_is_not_written() -> None:
-    tap = Tap(generic())
-    async with a_client(tap) as client:
-        component = await client.component()
-        with pytest.raises(UsageError):
-            await component.set("PARAM_01", 1.5)
-        assert not tap.messages(messages.ParamSet)
 
 
 # Time-outs
@@ -683,8 +426,6 @@ async def test_every_call_has_a_time_limit_of_its_own() -> None:
             "parameter 5 of 1/1": component.get(5, timeout=2.5),
             "the acknowledgement of PARAM_01 by 1/1": component.set("PARAM_01", 2, timeout=2.5),
             "the parameters of 1/1": component.fetch_all(timeout=2.5),
-            "the parameters of any component": client.fetch_all(timeout=2.5),
-            "the parameters of any component of system 1": client.fetch_all(1, timeout=2.5),
         }
         for awaited, call in limited.items():
             with pytest.raises(NoReply) as caught:
@@ -775,46 +516,14 @@ async def test_a_first_fetch_waits_to_hear_whether_there_is_a_file(refresh: bool
 
 
 @in_simulated_time
-async def test_a_first_fetch_does_not_wait_for_long_to_hear_that() -> None:
-    class Unknown(ArduPilotVehicle):
-        def _on_command(self, request: messages.CommandLong, sender: frames.Frame) -> None:
-            """It never says who it is."""
-
-    async with a_client(Unknown()) as client:
-        component = await client.component()
-        began = anyio.current_time()
-        result = await component.fetch_all()
-        # the heartbeat says ArduPilot, so the file is tried whatever it says of itself
-        assert (result.complete, result.source) == (True, "ftp")
-        assert anyio.current_time() - began < CACHE_TIMEOUT + 2.0  # simulated seconds
-
-
-@in_simulated_time
-async def test_fetches_at_the_same_time_are_one() -> None:
-    vehicle = generic(period=0.1)
-    async with a_client(vehicle) as client:
-        component = await client.component()
-        first, second, third = await asyncio.gather(
-            component.fetch_all(), component.fetch_all(refresh=True), component.fetch_all(timeout=9)
-        )
-        assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
-        assert first.params == second.params == third.params
-
-
-@in_simulated_time
 async def test_the_progress_of_a_fetch_is_reported() -> None:
     async with a_client(generic(burst=1, period=0.05)) as client:
         component = await client.component()
         seen: list[Progress] = []
         await component.fetch_all(progress=seen.append)
-        assert 10 <= len(seen) <= 14
         assert [each.received for each in seen] == sorted(each.received for each in seen)
         assert seen[-1].received == seen[-1].total == 24
         assert 15 < seen[-1].rate < 25
-
-        several: list[Mapping[tuple[int, int], Progress]] = []
-        await client.fetch_all(refresh=True, progress=several.append)
-        assert several[-1][1, 1].received == 24
 
         def stop(progress: Progress) -> None:
             raise ValueError(progress)
@@ -850,20 +559,6 @@ async def test_several_vehicles_are_fetched_side_by_side() -> None:
         assert one_system.results.keys() == {(1, 1), (1, 100)}
 
 
-@in_simulated_time
-async def test_a_fetch_under_way_is_not_begun_again_for_all_components() -> None:
-    vehicle = generic(burst=1, period=0.1)
-    camera = generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
-    async with a_client(Air([vehicle, camera])) as client:
-        component = await client.component()
-        one = asyncio.create_task(component.fetch_all())
-        await asyncio.sleep(1.0)
-        both = await client.fetch_all()
-        assert both.complete
-        assert both.results[1, 1].params == (await one).params
-        assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
-
-
 class Silent(GenericVehicle):
     """A component that sends heartbeats and nothing else."""
 
@@ -887,7 +582,7 @@ async def test_a_silent_component_delays_no_other_component(autopilot: int) -> N
         assert everything.silent.keys() == {(1, 100), (2, 1)}
         for error in everything.silent.values():
             assert isinstance(error, NoReply)
-            assert error.attempts >= 2
+            assert "sends messages" in str(error)
         assert everything.complete
         assert (await component.get("PARAM_01")).value == 1
         assert not any(residue(each) for each in client.components.values())
@@ -911,18 +606,14 @@ async def test_a_link_without_an_autopilot_can_be_fetched() -> None:
 
 
 @in_simulated_time
-async def test_no_parameters_are_requested_from_a_ground_station() -> None:
-    class Station(Silent):
-        def __init__(self) -> None:
-            super().__init__(VALUES, system=254, component=190)
-            self._heartbeat = messages.Heartbeat(messages.MAV_TYPE_GCS, messages.MAV_AUTOPILOT_INVALID)
-
-    tap = Tap(Air([Station(), generic()]))
-    async with a_client(tap) as client:
-        everything = await client.fetch_all()
-        assert everything.results.keys() == {(1, 1)}
-        assert not everything.silent
-    assert not [each for each in tap.messages(messages.ParamRequestList) if each.target_system == 254]
+async def test_a_vehicle_that_answers_nothing_ends_a_fetch_within_7_s() -> None:
+    for silent in (Silent(VALUES), Silent(VALUES, component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)):
+        async with a_client(silent) as client:
+            await asyncio.sleep(1.5)
+            began = anyio.current_time()
+            with pytest.raises(NoReply, match="answers no request"):
+                await client.fetch_all()
+            assert anyio.current_time() - began < 7.0
 
 
 @in_simulated_time
@@ -965,18 +656,6 @@ async def test_changes_have_the_old_and_the_new_value() -> None:
 
 
 @in_simulated_time
-async def test_a_change_that_is_taken_back_is_none() -> None:
-    async with a_client(small_px4()) as client:
-        component = await client.component()
-        await component.get("PARAM_01")
-        changes = component.changes()
-        for value in (5, 6, 1):
-            await component.set("PARAM_01", value)
-        await component.set("PARAM_02", 5)
-        assert (await anext(changes)).name == "PARAM_02"
-
-
-@in_simulated_time
 async def test_queued_changes_of_one_parameter_are_merged() -> None:
     vehicle = small_px4()
     async with a_client(vehicle) as client:
@@ -1005,23 +684,6 @@ async def test_changes_end_with_the_client_after_the_queued_ones() -> None:
     with pytest.raises(ClientClosed):
         async for _ in component.changes():
             pass
-
-
-@in_simulated_time
-async def test_changes_by_other_stations_are_distinguished_from_the_vehicles_own() -> None:
-    vehicle = small_px4()
-    radio = Radio(vehicle)
-    async with a_client(radio) as client:
-        component = await client.component()
-        await component.fetch_all()
-        changes = component.changes()
-        message = messages.ParamSet(1, 1, "PARAM_01", (55).to_bytes(4, "little"), ParamType.INT32)
-        radio.other.append(messages.encode(message, system=254, component=190, sequence=0))
-        change = await anext(changes)
-        assert (change.name, change.by) == ("PARAM_01", "station 254/190")
-        vehicle.set_param("PARAM_02", 66)
-        change = await anext(changes)
-        assert (change.name, change.by) == ("PARAM_02", "vehicle")
 
 
 # Links that drop
@@ -1132,75 +794,7 @@ async def test_a_link_that_cannot_reconnect_ends_every_call() -> None:
     assert isinstance(await outcome(component.get("PARAM_01")), ClientClosed)
 
 
-@pytest.mark.asyncio
-@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
-async def test_a_vehicle_over_real_sockets(kind: str) -> None:
-    with anyio.fail_after(TIMEOUT):
-        vehicle = PX4Vehicle(stream=kind == "tcpin")
-        far = "udpout" if kind == "udpin" else "tcp"
-        async with Served(vehicle, kind) as served, a_client(f"{far}:127.0.0.1:{served.port}") as client:
-            component = await client.component()
-            result = await component.fetch_all()
-            assert result.complete
-            assert result.hash == vehicle.announced_hash()
-            assert (await component.set("MC_ROLL_P", 7.25)).status == "accepted"
-            assert (await component.get("MC_ROLL_P")).value == 7.25
-        assert vehicle.param("MC_ROLL_P").value == 7.25
-
-
-@pytest.mark.asyncio
-@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
-async def test_a_client_that_listens(kind: str) -> None:
-    with anyio.fail_after(TIMEOUT):
-        async with a_client(f"{kind}:127.0.0.1:0") as client, anyio.create_task_group() as tasks:
-            port = client.link.address[1]  # type: ignore[attr-defined]  # only sockets have one
-            far = f"{'udpout' if kind == 'udpin' else 'tcp'}:127.0.0.1:{port}"
-            vehicles = [generic(system=system, stream=kind == "tcpin") for system in (1, 2)]
-            for vehicle in vehicles:
-                tasks.start_soon(serve_endpoint, vehicle, create_link(far))
-            for system in (1, 2):
-                component = await client.component(system=system)
-                assert (await component.fetch_all()).complete
-                await component.set("PARAM_01", system * 10)
-            assert [vehicle.param("PARAM_01").value for vehicle in vehicles] == [10, 20]
-            tasks.cancel_scope.cancel()
-
-
-@pytest.mark.asyncio
-async def test_a_tcp_connection_that_breaks_during_a_download() -> None:
-    vehicle = generic(burst=1, period=0.03, stream=True)
-    served = Served(vehicle, "tcpin")
-    async with asyncio.timeout(TIMEOUT), served, a_client(f"tcp:127.0.0.1:{served.port}") as client:
-        component = await client.component()
-        changes = component.changes()
-        fetch = asyncio.create_task(component.fetch_all())
-        await anext(changes)
-        await served.__aexit__()
-        assert not fetch.done()
-        await served.__aenter__()
-        result = await fetch
-        assert result.complete
-        assert bits(result.params) == bits(vehicle.params)
-
-
-@pytest.mark.asyncio
-async def test_a_tcp_server_that_stays_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_task, "LINK_TIMEOUT", 0.3)
-    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.05)
-    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MAX", 0.1)
-    served = Served(generic(stream=True), "tcpin")
-    async with asyncio.timeout(TIMEOUT), served, a_client(f"tcp:127.0.0.1:{served.port}") as client:
-        component = await client.component()
-        await served.__aexit__()
-        with pytest.raises(LinkError, match="refused") as caught:
-            await component.get("PARAM_01")
-        assert isinstance(caught.value.__cause__, ConnectionRefusedError)
-        await served.__aenter__()
-        await until(lambda: " open, " in repr(client))
-        assert (await component.get("PARAM_01")).value == 1
-
-
-# Rests
+# Pauses between reads of the link
 
 
 class Chatter(Tap):
@@ -1314,9 +908,6 @@ async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyP
     assert with_rests < without + 0.05
 
 
-# How they look
-
-
 @in_simulated_time
 async def test_a_blocked_program_processes_received_data_before_timeouts_count() -> None:
     """As by a call that blocks the event loop for half a second, in the middle of a list."""
@@ -1327,8 +918,7 @@ async def test_a_blocked_program_processes_received_data_before_timeouts_count()
         loop.call_later(0.41, lambda: setattr(loop, "now", loop.now + 0.5))
         result = await vehicle.fetch_all()
     assert result.complete
-    hash_reads = 1  # goes out with the list request
-    assert (result.lost, result.repeated, px4.requests["PARAM_REQUEST_READ"]) == (0, 0, hash_reads)
+    assert (result.lost, result.repeated, px4.requests["PARAM_REQUEST_READ"]) == (0, 0, 0)
 
 
 @in_simulated_time
@@ -1341,16 +931,6 @@ async def test_the_autopilots_are_the_vehicles_without_what_they_carry() -> None
         addresses = [(each.system, each.component) for each in client.autopilots]
         assert addresses == [(1, 1), (2, 7), (3, 1)]
         assert len(client.components) == 4
-
-
-@in_simulated_time
-@pytest.mark.parametrize("index", [-1, 32_768, 1.5])
-async def test_an_invalid_index_is_refused_and_later_reads_work(index: Any) -> None:
-    async with a_client(generic()) as client:
-        component = await client.component()
-        with pytest.raises(UsageError, match=f"parameter index {index}: indices are 0 to 32767"):
-            await component.get(index)
-        assert (await component.get(0)).index == 0
 
 
 @in_simulated_time

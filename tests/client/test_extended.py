@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
+import anyio
+import pytest
+
 from paramclient import Component, ParamCache, ParamClient, Trust
-from paramclient.sim import Camera
+from paramclient.sim import Air, Camera
 from tests.caches import extended
-from tests.shell import in_simulated_time
+from tests.shell import in_simulated_time, small_px4
 
 TABLE: dict[str, int | float | str | bytes] = {"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_ISO": 100}
 
@@ -72,3 +76,41 @@ async def test_plain_and_extended_tables_are_kept_apart(tmp_path: Path) -> None:
     assert kept(path)["CAM_MODE"] == 1
     with ParamCache(path) as cache:
         assert cache.component(component=100).params["CAM_MODE"].value == 0.5
+
+
+@in_simulated_time
+async def test_a_parameter_whose_index_another_one_has_leaves_the_cache(tmp_path: Path) -> None:
+    path = tmp_path / "cache"
+    for table in (TABLE, {"CAM_MODE": 1, "CAM_WB": 5, "CAM_ISO": 100}):
+        async with ParamClient(Camera(table), cache=path) as client:
+            await (await client.component(1, 100)).ext.fetch_all()
+        assert kept(path) == table
+
+
+@pytest.mark.parametrize("is_first", [True, False], ids=["before its autopilot", "after its autopilot"])
+@in_simulated_time
+async def test_a_camera_is_cached_with_its_vehicle(tmp_path: Path, is_first: bool) -> None:
+    """A vehicle is its autopilot's hardware id; the camera has another one of its own."""
+    path = tmp_path / "cache"
+    camera, autopilot = Camera(TABLE), small_px4()
+    late = autopilot if is_first else camera
+    for value in (200, 400):
+        late.reboot(anyio.current_time(), down=math.inf)
+        async with ParamClient(Air([camera, autopilot]), cache=path) as client:
+            late.reboot(anyio.current_time(), down=1.0 if is_first else 5.0)
+            found = await client.component(1, 100, timeout=10.0)
+            await client.component(1, 1)
+            await found.wait_for_cache()
+            assert ("CAM_ISO" in found.ext.params) == (value == 400)
+            await found.ext.fetch_all()
+            await found.ext.set("CAM_ISO", value)
+            assert found.identity == client.components[1, 1].identity
+    with ParamCache(path) as cache:
+        [vehicle] = cache.vehicles()
+        assert vehicle.key == client.components[1, 1].identity.key
+        assert 100 in vehicle.components
+        found_lines = cache.history("1", extended=True)
+    assert [(each.name, each.new and each.new.value) for each in found_lines] == [
+        ("CAM_ISO", 200),
+        ("CAM_ISO", 400),
+    ]

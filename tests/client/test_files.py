@@ -63,9 +63,9 @@ async def test_a_time_limit_ends_a_read_and_closes_the_file() -> None:
     async with a_client(vehicle) as client:
         files = await files_of(client)
         began = anyio.current_time()
-        with pytest.raises(NoReply, match=r"the file /APM/LOGS/1.BIN of 1/1"):
+        with pytest.raises(NoReply, match=r"/APM/LOGS/1.BIN of 1/1"):
             await files.read("/APM/LOGS/1.BIN", timeout=0.3)
-        assert anyio.current_time() - began < 0.41  # with a round trip for the closing
+        assert anyio.current_time() - began < 1.41  # the vehicle ends its burst of a second before it closes
         await anyio.sleep(1.0)
         assert not vehicle.open_files
 
@@ -110,8 +110,8 @@ async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str)
 @pytest.mark.parametrize(
     ("fault", "longest"),
     [
-        ("none", 1.1),
-        ("deaf", 3.0),
+        ("none", 0.1),
+        ("deaf", 2.0),
         ("dropped", 0),
         ("failed", 0),
         ("drops", 0.1),
@@ -146,13 +146,17 @@ async def test_a_scope_around_a_client_ends_it_whatever_the_link_does(fault: str
             await anyio.sleep_forever()
     assert scope.cancelled_caught
     took = anyio.current_time() - cancelled_at
-    assert took <= longest + 0.01, "a burst of a second, which the vehicle ends first, and a round trip"
+    assert took <= longest + 0.01
     if fault in ("drops", "fails"):
         await closing
     ending = await reading
     assert isinstance(ending, LinkError)
     assert isinstance(ending, ClientClosed) == (fault != "failed")
-    assert bool(vehicle.open_files) == (fault != "none")
+    for _ in range(120):  # a burst of a second, which the vehicle ends first
+        await anyio.sleep(0.01)
+        tap.tick(anyio.current_time())
+        tap.data_to_send()
+    assert bool(vehicle.open_files) == (fault in ("deaf", "dropped", "failed"))
     assert not tasks_beside()
 
 
@@ -161,8 +165,10 @@ async def test_tasks_that_are_cancelled_each_for_itself_leave_no_file_open() -> 
     """As `asyncio.run` does with all that remain when its main task has ended."""
     vehicle = with_files()
 
+    air = Air.symmetric([vehicle], delay=0.02)
+
     async def session() -> None:
-        async with a_client(Air.symmetric([vehicle], delay=0.02)) as client:
+        async with a_client(air) as client:
             await (await client.component()).fetch_all()
 
     fetching = asyncio.ensure_future(session())
@@ -174,6 +180,8 @@ async def test_tasks_that_are_cancelled_each_for_itself_leave_no_file_open() -> 
     await asyncio.wait([fetching])
     assert fetching.cancelled()
     assert anyio.current_time() - began < 0.5
+    await anyio.sleep(1.0)
+    air.tick(anyio.current_time())
     assert not vehicle.open_files
     assert not tasks_beside()
 
@@ -185,7 +193,7 @@ async def test_the_file_is_closed_when_its_content_is_given() -> None:
         component = await client.component()
         for _ in range(3):
             began = anyio.current_time()
-            assert (await component.fetch_all()).source == "ftp"
+            assert (await component.fetch_all(refresh=True)).source == "ftp"
             assert not vehicle.open_files
             assert anyio.current_time() - began < 0.55
         assert await client.ftp(component).read("/APM/a.txt") == b"hello"

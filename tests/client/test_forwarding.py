@@ -170,16 +170,11 @@ async def test_a_program_that_reads_nothing_holds_nothing_up(monkeypatch: pytest
         assert bits((await component.fetch_all()).params) == bits(vehicle.params)
         assert (await component.set("PARAM_01", 8)).status == "accepted"
         assert anyio.current_time() - began < 3.0
-        forwarder = client.core.taps.forwarder
-        assert forwarder is not None
-        assert len(forwarder._waiting) == 10
-        lost = forwarder.lost
-        assert lost > 10
         program.is_stuck = False
+        await anyio.sleep(0.0)
+        assert len(program.received) <= 11
         await anyio.sleep(3.0)
-        assert not forwarder._waiting
-        assert forwarder.lost < lost + 20
-    assert len(program.received) >= 11
+        assert len(program.received) > 11
 
 
 @in_simulated_time

@@ -22,11 +22,9 @@ from paramclient import (
 from paramclient.cli import run
 from paramclient.client.component import PASSIVE_TIMEOUT
 from paramclient.model.values import Encoding, encode_value
-from paramclient.protocol.station import Station
 from paramclient.sim import Endpoint
 from paramclient.wire import frames, messages
 from tests.shell import Radio, bits, generic, in_simulated_time, residue, small_px4
-from tests.simulation import param_value
 
 LIST = messages.ParamRequestList(1, 1)
 HASH = messages.ParamRequestRead(1, 1, messages.HASH_CHECK, -1)
@@ -202,7 +200,7 @@ async def test_a_cached_table_is_confirmed_by_a_hash_that_others_ask_for(tmp_pat
         assert trusts["PARAM_03"] is Trust.CACHED  # which no hash covers, and must not be requested
         # it changes without a message, and the next hash shows it
         channel.is_mute = True
-        channel._endpoint.set_param("PARAM_01", 77)  # type: ignore[attr-defined]  # of a simulated vehicle
+        channel.endpoint.set_param("PARAM_01", 77)  # type: ignore[attr-defined]  # of a simulated vehicle
         await anyio.sleep(2.0)
         channel.is_mute = False
         channel.ask(HASH)
@@ -226,15 +224,3 @@ def test_the_command_listens_too(capsys: pytest.CaptureFixture[str]) -> None:
     report = json.loads(capsys.readouterr().out)
     assert report["frames"] > 0
     assert report["bytes_sent"] == 0
-
-
-# the core
-
-
-def say(station: Station, message: messages.Message, now: float) -> None:
-    station.receive(messages.encode(message, system=1, component=1, sequence=0), "peer", now)
-
-
-def report(station: Station, count: int, *indices: int, now: float = 1.0, prefix: str = "P") -> None:
-    for index in indices:
-        say(station, param_value(f"{prefix}{index}", 1.0, index=index, count=count), now)

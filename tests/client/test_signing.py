@@ -1,4 +1,4 @@
-"""Signing as users have it: keys, timestamps over restarts, clients, commands, and what never shows."""
+"""Signing as users have it: keys, clients, commands, and what never shows."""
 
 from __future__ import annotations
 
@@ -20,25 +20,17 @@ from unittest import mock
 
 import anyio
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 import paramclient
 from paramclient import NoReply, ParamClient, Signing, SigningKey, SigningPolicy, UsageError, read_key
 from paramclient.cli import run
 from paramclient.cli import session as cli_session
 from paramclient.cli import signing as signing_commands
-from paramclient.client import signing, signing_timestamps
+from paramclient.client import signing
 from paramclient.client.signing import key_from_environment
-from paramclient.client.signing_timestamps import (
-    TIMESTAMP_CHECK_INTERVAL,
-    TIMESTAMP_RESERVE,
-    TimestampFile,
-    TimestampKeeper,
-)
 from paramclient.links import SimLink
 from paramclient.sim import ArduPilotVehicle, Vehicle
-from paramclient.wire.signing import Refusal
+from paramclient.wire.signing import UNITS_PER_SECOND, Refusal
 from tests.shell import VALUES, in_simulated_time, simulated_time_loop, small_px4
 
 SECRET = bytes(range(101, 133))
@@ -53,12 +45,10 @@ FORMS += [repr(SECRET)[2:-1].encode(), ", ".join(map(str, SECRET[:8])).encode()]
 
 
 @pytest.fixture(autouse=True)
-def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of the user's state, empty; and an environment without a key."""
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+def no_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An environment without a key."""
     for name in ("KEY", "KEY_FILE", "PASSPHRASE"):
         monkeypatch.delenv(f"PARAMCLIENT_SIGNING_{name}", raising=False)
-    return tmp_path / "state" / "paramclient" / "signing"
 
 
 @pytest.fixture
@@ -145,166 +135,28 @@ def test_invalid_signing_settings_are_refused_at_once() -> None:
 # Timestamps
 
 
-def test_each_session_has_the_lowest_link_id_that_is_free(state: Path) -> None:
-    files = [TimestampFile(state, KEY.fingerprint, None) for _ in range(3)]
-    assert [(file.claim(), file.link_id) for file in files] == [(0, 0), (0, 1), (0, 2)]
-    others = TimestampFile(state, OTHER_KEY.fingerprint, None)
-    others.claim()
-    assert others.link_id == 0
-    files[1].write(NOW)
-    files[1].release()
-    again = TimestampFile(state, KEY.fingerprint, None)
-    assert (again.claim(), again.link_id) == (NOW, 1)
-    wanted = TimestampFile(state, KEY.fingerprint, 2)
-    with pytest.raises(UsageError, match="link id 2 of this signing key is in use by other sessions"):
-        wanted.claim()
-    for file in (*files, again, others):
-        file.release()
-    assert wanted.claim() == 0
-    wanted.release()
-
-
-def test_a_key_without_a_free_link_id_is_an_error(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(signing_timestamps, "LINK_IDS", 2)
-    files = [TimestampFile(state, KEY.fingerprint, None) for _ in range(3)]
-    for file in files[:2]:
-        file.claim()
-    with pytest.raises(UsageError, match="every link id"):
-        files[2].claim()
-    for file in files:
-        file.release()
-
-
-def test_another_process_keeps_its_link_id_until_it_ends(state: Path) -> None:
-    program = (
-        "import sys; from pathlib import Path\n"
-        "from paramclient.client.signing_timestamps import TimestampFile\n"
-        f"file = TimestampFile(Path({str(state)!r}), {KEY.fingerprint!r}, None); file.claim()\n"
-        "print(file.link_id, flush=True); sys.stdin.read()"
-    )
-    file = TimestampFile(state, KEY.fingerprint, None)
-    with subprocess.Popen(
-        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as other:
-        assert other.stdout is not None
-        assert other.stdout.readline() == "0\n"
-        file.claim()
-        assert file.link_id == 1
-        file.release()
-        other.kill()
-    file = TimestampFile(state, KEY.fingerprint, None)
-    file.claim()
-    assert file.link_id == 0
-    file.release()
-
-
-def test_the_timestamp_file_is_private_and_contains_no_key(state: Path) -> None:
-    file = TimestampFile(state, KEY.fingerprint, 7)
-    file.claim()
-    file.write(NOW)
-    file.write(NOW + 1)
-    file.release()
-    names = {path.name for path in state.iterdir()}
-    assert names == {f"{KEY.fingerprint}-7.lock", f"{KEY.fingerprint}-7.timestamp"}
-    assert (state / f"{KEY.fingerprint}-7.timestamp").read_text() == f"{NOW + 1}\n"
-    assert {path.stat().st_mode & 0o777 for path in state.iterdir()} == {0o600}
-    assert state.stat().st_mode & 0o777 == 0o700
-
-
-@pytest.mark.parametrize("text", ["", "soon", "-5", "9" * 30, "\xff"])
-def test_a_damaged_file_is_reported_and_the_time_of_day_counts(
-    state: Path, text: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    file = TimestampFile(state, KEY.fingerprint, 0)
-    file.claim()
-    (state / f"{KEY.fingerprint}-0.timestamp").write_text(text, encoding="latin-1")
-    file.release()
-    assert file.claim() == 0
-    assert "no valid signature timestamp" in caplog.text
-    file.release()
-
-
-def in_session(use: Callable[[Any], None], *, crashes: bool = False, **options: Any) -> None:
-    """A session of the keeper alone."""
-
-    async def live() -> None:
-        keeper = TimestampKeeper(Signing(KEY, **options))
-        signer, _ = await keeper.open()
-        use(signer)
-        await keeper._keep()
-        if crashes:
-            keeper._signer = None  # nothing is written at the end; the lock goes with the process
-        await keeper.close()
-
-    anyio.run(live)
-
-
-class Clock:
-    """The system's clock, which can be set."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.now = NOW
-        for module in (signing, signing_timestamps):
-            monkeypatch.setattr(module, "timestamp_now", lambda: self.now)
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    return Clock(monkeypatch)
-
-
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    sessions=st.lists(
-        st.tuples(st.integers(-(10**9), 10**9), st.integers(0, 10**8), st.booleans()), min_size=2, max_size=5
-    ),
-    number=st.uuids(),
-)
-def test_no_timestamp_is_used_twice_whatever_clock_and_crashes_do(
-    tmp_path: Path, clock: Clock, sessions: list[tuple[int, int, bool]], number: object
-) -> None:
-    used = [0]
-    for offset, length, crashes in sessions:
-        clock.now = NOW + offset
-
-        def use(signer: Any, length: int = length) -> None:
-            signer.sign(b"")
-            assert signer.timestamp > used[-1]
-            assert signer.timestamp > clock.now
-            signer.catch_up(signer.timestamp + length)
-            signer.sign(b"")
-            used.append(signer.timestamp)
-
-        in_session(use, crashes=crashes, state=tmp_path / str(number))
-
-
-def test_after_a_crash_at_most_a_minute_is_skipped(clock: Clock) -> None:
-    in_session(lambda signer: signer.catch_up(NOW + 5), crashes=True)
-    last = []
-    in_session(lambda signer: last.append(signer.timestamp))
-    assert NOW + 5 < last[0] <= NOW + 5 + TIMESTAMP_RESERVE
-
-
 @in_simulated_time
-async def test_an_unusable_folder_is_reported_and_the_session_continues(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+async def test_a_client_whose_clock_was_set_back_adopts_the_timestamp_of_the_vehicle(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    file = a_file(tmp_path / "file", b"")
-    async with a_client(signed_vehicle(), signing=Signing(KEY, state=file)) as client:
-        vehicle = await client.component()
-        assert (await vehicle.fetch_all()).complete
-        await anyio.sleep(3 * TIMESTAMP_CHECK_INTERVAL)
-    assert len(caplog.records) == 1
-    assert "cannot store signature timestamps (Not a directory)" in caplog.text
+    vehicle = signed_vehicle(signing_timestamp=NOW)
+    for now in (NOW, NOW - 50 * UNITS_PER_SECOND):
+        monkeypatch.setattr(signing, "timestamp_now", lambda now=now: now)
+        async with a_client(vehicle) as client:
+            component = await client.component()
+            assert (await component.get("PARAM_04", timeout=2.0)).name == "PARAM_04"
 
 
 # Clients
 
 
 @in_simulated_time
-async def test_a_signed_client(state: Path) -> None:
+async def test_a_signed_client() -> None:
     vehicle = signed_vehicle()
-    async with a_client(vehicle) as client, a_client(signed_vehicle()) as other:
+    async with (
+        a_client(vehicle) as client,
+        a_client(signed_vehicle(), signing=Signing(KEY, link_id=1)) as other,
+    ):
         component = await client.component()
         assert dict((await component.fetch_all()).params).keys() == vehicle.params.keys()
         assert (await component.set("PARAM_04", 44)).actual == 44
@@ -374,7 +226,7 @@ async def test_accept_all_answers_a_mavlink_1_vehicle_unsigned() -> None:
 
 
 def test_the_key_shows_nowhere(
-    tmp_path: Path, state: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A life with everything in it; then all that was written is looked through."""
     caplog.set_level(logging.DEBUG)
@@ -399,7 +251,6 @@ def test_the_key_shows_nowhere(
                 component.setup_signing(OTHER_KEY),
                 component.get("NO_SUCH_NAME", timeout=1.0),
                 component.set("NO_SUCH_NAME", 1, timeout=1.0),
-                a_client(vehicle, signing=Signing(KEY, link_id=0)).__aenter__(),
             ):
                 with pytest.raises(paramclient.ParamClientError) as caught:
                     await call
@@ -413,7 +264,7 @@ def test_the_key_shows_nowhere(
     live()
     printed = capsys.readouterr()
     written = [path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()]
-    assert len(written) >= 3
+    assert written
     assert any(KEY.fingerprint in text for text in shown)
     everything = [*shown, caplog.text, printed.out, printed.err]
     for data in [*written, *(text.encode("utf-8", "surrogateescape") for text in everything)]:

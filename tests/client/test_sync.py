@@ -382,7 +382,7 @@ class Berth(Tap):
     """An address that one vehicle takes after the other."""
 
     def moor(self, vehicle: Endpoint) -> None:
-        self._endpoint = vehicle
+        self.endpoint = vehicle
 
 
 def kept(path: Path) -> dict[tuple[str, int], dict[str, object]]:

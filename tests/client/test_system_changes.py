@@ -55,7 +55,7 @@ def test_only_the_keeping_of_things_knows_the_time_of_day() -> None:
     asking = {module for module, path in MODULES.items() if CLOCKS.search(path.read_text(encoding="utf-8"))}
     library = {module for module in asking if module.split(".")[1:2] not in (["cli"], ["service"])}
     keeping = {
-        *("client.recording", "cache.store", "cache.sqlite"),
+        *("client.cache_writer", "client.recording", "cache.store", "cache.sqlite"),
         *("provision.inspection", "provision.restore_point", "provision.vehicle_params"),
     }
     signing = {"client.signing"}  # whose timestamps are times of day by definition
@@ -227,6 +227,32 @@ async def test_a_disk_that_is_full_for_a_while(path: Path, caplog: pytest.LogCap
         assert bits(cache.component(system=1).params) == bits(vehicle.params)
         assert cache.component(system=1).complete
     assert set_aside(path) == []
+
+
+@in_simulated_time
+async def test_the_cache_has_the_times_of_arrival_although_it_is_written_later(
+    path: Path, wall: Wall
+) -> None:
+    vehicle = small_px4()
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        await component.get("PARAM_02")
+        await anyio.sleep(2.0)
+        with full_disk(at=100):
+            await component.fetch_all()
+            fetched_at = wall.now
+            await anyio.sleep(3.0)
+            await component.set("PARAM_01", 55)
+            changed_at = wall.now
+            await anyio.sleep(3.0)
+        await anyio.sleep(cache_writer.RETRY_INTERVAL + 2.0)
+    with ParamCache(path) as cache:
+        table = cache.component(system=1)
+        heard_at = dict(table.heard_at)
+        assert heard_at.pop("PARAM_01") == pytest.approx(changed_at, abs=0.1)
+        assert fetched_at - 1.0 < min(heard_at.values()) <= max(heard_at.values()) <= fetched_at
+        [line] = cache.history(table.key, name="PARAM_01")
+        assert line.at == pytest.approx(changed_at, abs=0.1)
 
 
 def test_replacements_counts_how_often_the_cache_file_was_replaced(path: Path) -> None:

@@ -15,7 +15,7 @@ from paramclient.errors import (
 from paramclient.model.values import WireValue
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read
-from paramclient.protocol.set_results import SetOutcome, SetStatus
+from paramclient.protocol.set_results import SetStatus
 from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, Camera, PX4Vehicle
 from paramclient.wire.messages import (
@@ -144,15 +144,14 @@ async def test_many_are_set_and_a_lost_camera_ends_it() -> None:
     async with converse(endpoint) as conversation:
         session = (await conversation.node(*CAMERA)).extended
         await fetch_all(session)
-        outcomes: list[SetOutcome] = []
         pairs: list[tuple[str, WireValue]] = [(f"P{number:02}", number + 100) for number in range(60)]
-        await write_many(session, pairs, outcomes, lambda outcome: None)
-        assert {each.status for each in outcomes} == {SetStatus.ACCEPTED}
+        result = await write_many(session, pairs)
+        assert {each.status for each in result.outcomes} == {SetStatus.ACCEPTED}
         assert list(camera.ext_values.values()) == [value for _, value in pairs]
         endpoint.at = anyio.current_time() + 0.3
-        await write_many(session, [(name, 7) for name, _ in pairs], outcomes, lambda outcome: None)
+        result = await write_many(session, [(name, 7) for name, _ in pairs])
         assert anyio.current_time() - endpoint.at < 7.0
-        assert {each.status for each in outcomes} >= {SetStatus.UNKNOWN, SetStatus.NOT_TRIED}
+        assert {each.status for each in result.outcomes} >= {SetStatus.UNKNOWN, SetStatus.NOT_TRIED}
 
 
 @virtual

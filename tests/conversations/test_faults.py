@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Coroutine, Iterable
 from contextlib import suppress
 from random import Random
 
@@ -18,8 +18,9 @@ from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read
 from paramclient.protocol.station import Station
 from paramclient.protocol.writes import write
-from paramclient.sim import Air, ArduPilotVehicle, Faults, PX4Vehicle, Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, Faults, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire.messages import (
+    NO_INDEX,
     AutopilotVersion,
     CommandAck,
     CommandLong,
@@ -37,7 +38,7 @@ from paramclient.wire.messages import (
     SystemTime,
     encode,
 )
-from tests.conversations.virtual import Puppet, converse, run, virtual
+from tests.conversations.virtual import Puppet, converse, jump, run, virtual, virtual_on_both
 
 KINDS = {
     "loss in bursts": Faults(loss=0.2, loss_burst=5.0, delay=0.05),
@@ -155,6 +156,60 @@ def test_any_bytes_are_taken_by_a_station(chunks: list[bytes], is_stream: bool) 
     run(main)
 
 
+@virtual_on_both
+async def test_hostile_values_change_no_table() -> None:
+    vehicle = GenericVehicle({"A": 1, "B": 2.5})
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        await fetch_all(session)
+        before = dict(session.table.params)
+        raw = struct.pack("<i", 66)
+        for name in ("A\nB", "A B", "\x1b[2J", "A,B", "\xb5", "\x7f", ""):
+            for index in (0, 1, NO_INDEX):
+                conversation.hear(ParamValue(name, raw, 6, 2, index))
+        for system, number in ((1, 2), (2, 1), (255, 190)):
+            conversation.hear(ParamValue("A", raw, 6, 2, 0), system=system, component=number)
+        frame = encode(ParamValue("A", raw, 6, 2, 0), system=1, component=1, sequence=0)
+        for place in range(len(frame)):
+            now = anyio.current_time()
+            conversation.station.receive(frame[:place], "sim", now)
+            conversation.station.receive(
+                frame[:place] + bytes((frame[place] ^ 1,)) + frame[place + 1 :], "sim", now
+            )
+        assert (dict(session.table.params), session.table.count) == (before, 2)
+        for count, index in ((0xFFFF, 5), (0xFFFF, NO_INDEX), (2, 40), (0, 0)):
+            conversation.hear(ParamValue("A", struct.pack("<i", 1), 6, count, index))
+        result = await fetch_all(session, refresh=True)
+        assert (result.complete, result.elapsed < 3.0) == (True, True)
+        check_right(vehicle, dict(result.params))
+
+
+@virtual_on_both
+@pytest.mark.parametrize("kind", ["px4", "ardupilot", "ardupilot by list"])
+@pytest.mark.parametrize("at", [0.03, 0.1])
+async def test_calls_go_on_after_the_computer_was_suspended(kind: str, at: float) -> None:
+    vehicle = vehicle_on(kind, "")
+    async with converse(Air.symmetric([vehicle], delay=0.02)) as conversation:
+        node = await conversation.node()
+        await node.identification.settled()
+        calls: list[Callable[[], Coroutine[object, object, object]]] = [
+            lambda: fetch_all(node.plain, refresh=True),
+            lambda: read(node.plain, vehicle.listed[1].name),
+            lambda: write(node.plain, vehicle.listed[2].name, 1),
+        ]
+        for call in calls:
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(call)
+                await anyio.sleep(at)
+                jump(60.0)
+                resumed_at = anyio.current_time()
+            assert anyio.current_time() - resumed_at < 3.0
+            await anyio.sleep(3.0)
+        assert not node.presence.is_lost
+        assert not node.channel.is_waiting
+        check_right(vehicle, dict(node.plain.table.params))
+
+
 # components that bend the protocol
 
 
@@ -193,6 +248,16 @@ async def test_a_count_that_is_one_too_high_leaves_one_missing_and_an_end() -> N
         result = await fetch_all((await conversation.node()).plain)
         assert (len(result.params), result.missing) == (8, (8,))
         assert result.elapsed < 30.0
+
+
+@virtual
+async def test_a_false_large_count_ends_within_seconds_and_a_few_hundred_reads() -> None:
+    for count in (30_000, 65_535):
+        async with converse(component([f"P{number}" for number in range(8)], count=count)) as conversation:
+            result = await fetch_all((await conversation.node()).plain)
+            assert (len(result.params), result.complete) == (8, False)
+            assert result.elapsed < 20.0
+            assert len(conversation.sent) < 1000
 
 
 @virtual

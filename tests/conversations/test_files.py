@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine
+from contextlib import suppress
 from functools import partial
 from random import Random
 
@@ -11,6 +12,7 @@ import pytest
 
 from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoReply, UsageError
 from paramclient.model.px4_hash import crc32_px4
+from paramclient.model.values import ParamType
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.ftp import (
     DirectoryEntry,
@@ -204,6 +206,20 @@ async def test_cancelled_at_any_moment_a_session_is_closed_on_board(make: Maker)
 
 
 @virtual
+async def test_sessions_are_closed_where_packets_are_lost_in_bursts() -> None:
+    vehicle = ArduPilotVehicle()
+    vehicle.files["a.bin"] = CONTENT[:20_000]
+    air = Air.symmetric([vehicle], loss=0.05, loss_burst=4.0, delay=0.3, seed=5)
+    async with converse(air) as conversation:
+        channel = (await conversation.node()).channel
+        for number in range(30):
+            with suppress(NoReply), anyio.move_on_after(number * 0.06):
+                await read_file(channel, "a.bin")
+            await anyio.sleep(0.4)  # what was sent last arrives
+            assert vehicle.open_files == []
+
+
+@virtual
 async def test_a_cancelled_transfer_ends_within_2_s_although_its_closing_is_lost() -> None:
     vehicle = ArduPilotVehicle()
     vehicle.files["a.bin"] = CONTENT
@@ -298,6 +314,7 @@ def pack_of(vehicle: ArduPilotVehicle, number: int | None = None) -> bytes:
     "content",
     [
         pytest.param(encode([]), id="empty"),
+        pytest.param(encode([PackedParam("RTL_ALT", ParamType.INT16, 1500)]), id="short"),
         pytest.param(b"no parameter file", id="other"),
         pytest.param(b"", id="none"),
         pytest.param(None, id="cut off"),

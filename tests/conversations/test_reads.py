@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections import Counter
 from collections.abc import Iterable
 
@@ -9,9 +10,11 @@ import anyio
 import pytest
 
 from paramclient.errors import LinkError, NoReply, ParamErrorCode, Refused, UnknownParameter
-from paramclient.model.values import Trust
+from paramclient.model.values import ParamType, Trust
+from paramclient.protocol.dialect import ReportedValue
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read, read_many
+from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire.messages import Message, ParamError, ParamRequestRead, ParamValue
 from tests.conversations.virtual import Puppet, Silence, Tap, converse, virtual, virtual_on_both
@@ -165,9 +168,14 @@ async def test_a_parameter_that_answers_by_its_index_only_is_read_by_that() -> N
 
 
 @virtual
-async def test_ardupilots_names_are_answered_in_the_requested_spelling() -> None:
+async def test_an_ardupilot_takes_names_in_any_case_and_its_table_has_one_of_each() -> None:
     async with converse(ArduPilotVehicle()) as conversation:
-        assert (await read((await conversation.node()).plain, "rtl_alt")).param_id == "rtl_alt"
+        session = (await conversation.node()).plain
+        assert (await read(session, "rtl_alt")).param_id == "RTL_ALT"
+        result = await write(session, "rtl_alt", 1000)
+        assert (result.name, result.actual, result.attempts) == ("RTL_ALT", 1000, 1)
+        conversation.hear(ParamValue("Rtl_Alt", struct.pack("<f", 900.0), ParamType.INT32, 900, 3))
+        assert [session.table.params[name].value for name in session.table.params] == [900]
 
 
 @virtual_on_both
@@ -208,6 +216,32 @@ async def test_reads_wait_while_the_link_is_down_and_end_when_it_fails() -> None
         with pytest.raises(LinkError):
             await read(session, "MC_ROLL_P")
         assert len(raised) == 1
+
+
+@virtual_on_both
+@pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
+async def test_equal_reads_at_once_are_one_request_and_a_cancelled_one_ends_only_its_wait(
+    make: type[PX4Vehicle],
+) -> None:
+    vehicle = make()
+    name = vehicle.listed[5].name
+    async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
+        session = (await conversation.node()).plain
+        await read(session, vehicle.listed[0].name)
+        values: list[ReportedValue] = []
+
+        async def ask(seconds: float) -> None:
+            with anyio.move_on_after(seconds):
+                values.append(await read(session, name))
+
+        before = vehicle.requests["PARAM_REQUEST_READ"]
+        async with anyio.create_task_group() as tasks:
+            for number in range(8):
+                tasks.start_soon(ask, 9.0 if number else 0.01)
+        assert len(values) == 7
+        assert vehicle.requests["PARAM_REQUEST_READ"] - before == 1
+        await read(session, name)
+        assert vehicle.requests["PARAM_REQUEST_READ"] - before == 2
 
 
 @virtual_on_both

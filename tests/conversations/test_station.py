@@ -25,6 +25,7 @@ from paramclient.protocol.identity import judge_encoding
 from paramclient.protocol.presence import BOOT_CLOCK_WRAP, LOST_AFTER_HIGH_LATENCY, REORDERING_TIME, Presence
 from paramclient.protocol.reads import read
 from paramclient.protocol.selection import find, hint_of_link, hint_of_node, only_vehicle
+from paramclient.protocol.watch import Watch
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire.messages import (
@@ -43,6 +44,7 @@ from paramclient.wire.messages import (
     StatusText,
     SystemTime,
     encode,
+    message_id,
 )
 from paramclient.wire.signing import Refusal, Signer, SigningKey, Verifier
 from tests.conversations.virtual import (
@@ -112,7 +114,9 @@ async def test_vehicles_are_identified(loss: float) -> None:
             assert conversation.of(Identified)
             asked = len(conversation.sent_of(CommandLong))
             await anyio.sleep(20.0)
-            assert len(conversation.sent_of(CommandLong)) == asked
+            further = conversation.sent_of(CommandLong)[asked:]
+            assert {each.param1 for each in further} <= {message_id(SystemTime)}
+            assert loss or len(further) == 2 * (name == "ardupilot")
 
 
 @pytest.mark.parametrize("refuses", [True, False])
@@ -215,6 +219,24 @@ async def test_a_silent_vehicle_is_lost_after_5_s_and_found_again() -> None:
         await read(node.plain, "MC_ROLL_P")
 
 
+@virtual_on_both
+async def test_nothing_is_requested_from_a_lost_component() -> None:
+    endpoint = Silence(ArduPilotVehicle(), at=1e9)
+    async with converse(endpoint) as conversation:
+        node = await conversation.node()
+        await fetch_all(node.plain)
+        watch = Watch(node.plain, node.presence, lambda event: None, interval=5.0)
+        watch.fetched()
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(watch.run)
+            endpoint.at = anyio.current_time()
+            await anyio.sleep(12.0)  # a call that began before may take 5 s more
+            conversation.sent.clear()
+            await anyio.sleep(60.0)
+            tasks.cancel_scope.cancel()
+        assert len(conversation.sent) == len(conversation.sent_of(Heartbeat)) == 60
+
+
 def test_the_heartbeat_timeout_follows_slow_heartbeats_and_satellites() -> None:
     presence = Presence()
     assert presence.timeout == math.inf
@@ -284,6 +306,19 @@ async def test_clocks_of_different_messages_are_not_compared_and_two_signs_are_o
 
 
 @virtual
+async def test_a_reboot_of_an_ardupilot_that_sends_heartbeats_only_is_seen_by_its_clock() -> None:
+    vehicle = ArduPilotVehicle()
+    async with converse(vehicle) as conversation:
+        node = await conversation.node()
+        await read(node.plain, "RTL_ALT")
+        await anyio.sleep(10.0)
+        vehicle.reboot(down=1.5)
+        await anyio.sleep(8.0)
+        assert [type(event) for event in conversation.events].count(Rebooted) == 1
+        assert node.plain.table.params["RTL_ALT"].trust == "cached"
+
+
+@virtual
 async def test_a_reboot_by_others_is_seen_with_telemetry() -> None:
     vehicle = PX4Vehicle(telemetry=10.0)
     async with converse(vehicle) as conversation:
@@ -299,6 +334,24 @@ MAKES = pytest.mark.parametrize(
     [PX4Vehicle, ArduPilotVehicle, partial(ArduPilotVehicle, kind="plane")],
     ids=["px4", "copter", "plane"],
 )
+
+
+@virtual
+async def test_a_vehicle_with_a_new_system_id_is_another_component_with_the_same_identity() -> None:
+    vehicle = PX4Vehicle(uid=7)
+    async with converse(vehicle) as conversation:
+        old = await conversation.node()
+        await old.identification.settled()
+        await write(old.plain, "MAV_SYS_ID", 9)
+        assert list(conversation.station.nodes) == [(1, 1)]
+        await reboot(old, returns=False)
+        new = await conversation.node(9)
+        await new.identified()
+        assert new.identification.identity.uid == old.identification.identity.uid
+        await read(new.plain, "MAV_SYS_ID")
+        assert new.plain.table.params["MAV_SYS_ID"].value == 9
+        await anyio.sleep(7.0)
+        assert (old.presence.is_lost, new.presence.is_lost) == (True, False)
 
 
 @virtual_on_both
@@ -503,7 +556,7 @@ async def test_setup_signing_is_obeyed_and_another_key_is_not_understood() -> No
     vehicle = PX4Vehicle()
     async with converse(vehicle) as conversation:
         node = await conversation.node()
-        conversation.station.send_setup_signing(node, KEY, NOW)
+        await conversation.station.set_up_signing(node, KEY, NOW)
         await anyio.sleep(0.5)
         assert vehicle.signing_key == KEY
         with pytest.raises(NoReply):

@@ -36,8 +36,8 @@ class Watched:
 
     async def fetch(self) -> None:
         """Fetch all parameters, and begin to watch them."""
-        result = await fetch_all(self.session)
-        self.watch.fetched(None if result.source == "cache" else result.elapsed)
+        await fetch_all(self.session)
+        self.watch.fetched()
 
     @property
     def requests(self) -> int:
@@ -167,9 +167,9 @@ async def test_a_lost_vehicle_is_checked_when_it_is_back_and_its_values_are_cach
 
 
 @virtual
-async def test_a_generic_vehicle_is_watched_by_quick_downloads() -> None:
+async def test_a_vehicle_that_confirms_no_table_is_watched_by_downloads_if_the_user_wants_it() -> None:
     vehicle = GenericVehicle({f"P{number}": float(number) for number in range(30)})
-    async with watched(vehicle) as found:
+    async with watched(vehicle, interval=30.0) as found:
         vehicle.set_param("P7", 70.5)
         await anyio.sleep(35.0)
         assert found.session.table.params["P7"].value == 70.5

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import random
 import selectors
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from contextlib import asynccontextmanager
@@ -12,6 +13,8 @@ from typing import Any, TypeVar
 
 import anyio
 import pytest
+import sniffio
+import trio
 from trio.testing import MockClock
 
 from paramclient.links.sim import SimLink
@@ -45,11 +48,11 @@ class _JumpingSelector(selectors.SelectSelector):
 
 class _VirtualLoop(asyncio.SelectorEventLoop):
     def __init__(self) -> None:
-        self._jumps = _JumpingSelector()
-        super().__init__(self._jumps)
+        self.jumps = _JumpingSelector()
+        super().__init__(self.jumps)
 
     def time(self) -> float:
-        return self._jumps.passed
+        return self.jumps.passed
 
 
 def run(test: Callable[..., Awaitable[T]], *arguments: Any, backend: str = "trio") -> T:
@@ -60,10 +63,25 @@ def run(test: Callable[..., Awaitable[T]], *arguments: Any, backend: str = "trio
             return await test(*arguments)
 
     if backend == "trio":
+        # trio runs its tasks in a random order, which it lets only pytest-trio decide
+        scheduling: Any = trio._core._run
+        scheduling._ALLOW_DETERMINISTIC_SCHEDULING, scheduling._r = True, random.Random(0)
         options: dict[str, Any] = {"clock": MockClock(autojump_threshold=0)}
     else:
         options = {"loop_factory": _VirtualLoop}
     return anyio.run(limited, backend=backend, backend_options=options)
+
+
+def jump(seconds: float) -> None:
+    """Let the clock jump, as after a suspend of the computer."""
+    if sniffio.current_async_library() == "trio":
+        clock = trio.lowlevel.current_clock()
+        assert isinstance(clock, MockClock)
+        clock.jump(seconds)
+    else:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, _VirtualLoop)
+        loop.jumps.passed += seconds
 
 
 def virtual(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:

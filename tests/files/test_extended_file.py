@@ -12,12 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from paramclient.errors import FileError
-from paramclient.files import read_file
-from paramclient.files.disk import (
-    is_extended_file,
-    read_extended_file,
-    write_extended_file,
-)
+from paramclient.files import read_file, write_file
 from paramclient.model.ext_values import ext_param
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType
@@ -48,14 +43,20 @@ def every_kind() -> dict[str, WrittenParam]:
     return params | {param.name: param for param in more}
 
 
+def read(path: Path) -> ParamSet:
+    (found,) = read_file(path).sets
+    return found
+
+
 def test_a_written_file_reads_back_unchanged(tmp_path: Path) -> None:
     """The written file is the one that the first version of the format wrote."""
     path = tmp_path / "camera.json"
     params = every_kind()
-    write_extended_file(path, ParamSet(params, 100, 1, at=1_700_000_000.0, source="link sim:camera"))
+    content = ParamSet(params, 100, 1, at=1_700_000_000.0, source="link sim:camera", is_extended=True)
+    write_file(path, content)
     assert path.read_bytes() == (DATA / "camera.json").read_bytes()
-    assert is_extended_file(path)
-    found = read_extended_file(path)
+    found = read(path)
+    assert found.is_extended
     assert dict(found.params) == params
     assert list(found.params) == list(params)
     assert (found.system, found.component, found.at, found.source) == (1, 100, 1_700_000_000.0, str(path))
@@ -65,30 +66,23 @@ def test_a_written_file_reads_back_unchanged(tmp_path: Path) -> None:
 def test_any_custom_value_is_restored(tmp_path_factory: pytest.TempPathFactory, raw: bytes) -> None:
     path = tmp_path_factory.getbasetemp() / "any.json"
     param = written("A", raw[:128])
-    write_extended_file(path, ParamSet({"A": param}))
-    assert read_extended_file(path).params["A"] == param
+    write_file(path, ParamSet({"A": param}, is_extended=True))
+    assert read(path).params["A"] == param
 
 
 @pytest.mark.parametrize("ending", ["param", "parm", "params", "pck"])
 def test_formats_that_cannot_hold_them(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"camera.{ending}"
     with pytest.raises(FileError, match=r"cannot hold extended parameters; write \.json"):
-        write_extended_file(path, ParamSet(every_kind()))
+        write_file(path, ParamSet(every_kind(), is_extended=True))
     assert not path.exists()
 
 
-def test_nothing_is_written_without_parameters(tmp_path: Path) -> None:
-    with pytest.raises(FileError, match="no parameters"):
-        write_extended_file(tmp_path / "a.json", ParamSet({}))
-
-
-def test_the_two_kinds_of_files_are_distinguished() -> None:
-    plain, extended = DATA / "vehicle.json", DATA / "camera.json"
-    assert (is_extended_file(plain), is_extended_file(extended)) == (False, True)
-    with pytest.raises(FileError, match="paramclient_extended is missing"):
-        read_extended_file(plain)
-    with pytest.raises(FileError, match="it has extended parameters, and plain ones are expected"):
-        read_file(extended)
+def test_a_file_is_for_one_component(tmp_path: Path) -> None:
+    camera, (plain, *_) = read(DATA / "camera.json"), read_file(DATA / "vehicle.json").sets
+    assert (camera.is_extended, plain.is_extended) == (True, False)
+    with pytest.raises(FileError, match="holds one component, and no plain parameters"):
+        write_file(tmp_path / "both.json", [camera, plain])
 
 
 @pytest.mark.parametrize(
@@ -117,15 +111,13 @@ def test_an_invalid_file_is_an_error_with_its_path(tmp_path: Path, fields: objec
     path = tmp_path / "camera.json"
     path.write_text(json.dumps({"paramclient_extended": 1, "params": {"CAM": fields}}))
     with pytest.raises(FileError, match=words) as caught:
-        read_extended_file(path)
+        read_file(path)
     assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("{}", "the key paramclient_extended is missing"),
-        ("{", "expected JSON"),
         ('{"paramclient_extended": 2, "params": {}}', "should be 1, the version of the format, found 2"),
         ('{"paramclient_extended": 1}', "params: the field is missing"),
         ('{"paramclient_extended": 1, "params": []}', "params: it should be an object"),
@@ -142,4 +134,4 @@ def test_documents_that_are_none(tmp_path: Path, content: str, words: str) -> No
     path = tmp_path / "camera.json"
     path.write_text(content)
     with pytest.raises(FileError, match=words):
-        read_extended_file(path)
+        read_file(path)

@@ -497,8 +497,8 @@ def test_inexpressible_content_is_rejected(sets: list[ParamSet], form: str, prob
 @pytest.mark.parametrize(
     ("params", "problem"),
     [
-        (params_of(WrittenParam("A", 1), system=256), "ids from 1 to 255, not 256"),
-        (params_of(WrittenParam("A", 1), component=0), "ids from 1 to 255, not 0"),
+        (params_of(WrittenParam("A", 1), system=256), "id from 1 to 255, not 256"),
+        (params_of(WrittenParam("A", 1), system=0), "id from 1 to 255, not 0"),
         (params_of(WrittenParam("", 1)), "at least one character"),
         (params_of(WrittenParam("A_VERY_LONG_NAME_", 1)), "a param_id holds 16"),
         (replace(params_of(WrittenParam("A", 1)), at=math.inf), "inf is not a valid Unix time in seconds"),

@@ -27,7 +27,7 @@ import anyio
 import anyio.from_thread
 import anyio.lowlevel
 
-from paramclient.client.frame_cutter import FrameCutter
+from paramclient.client.taps import FrameCutter
 from paramclient.errors import FileErrorCode, LinkError
 from paramclient.links import create_link, parse_link
 from paramclient.links.link import Peer
@@ -155,7 +155,8 @@ class RealVehicle:
 
     def take_data(self, data: bytes, peer: Peer, now: float) -> None:
         """Take what the vehicle has sent over its link at the time `now`."""
-        for datagram in (data,) if self._cutter is None else self._cutter.cut(data, peer):
+        cut = [data] if self._cutter is None else [each.data for each in self._cutter.cut(data, peer)]
+        for datagram in cut:
             number = _message_id(datagram)
             is_telemetry = number not in PARAMETER_TRAFFIC
             if not (is_telemetry and self._conditions.drops_telemetry):

@@ -21,7 +21,7 @@ from paramclient import (
 from paramclient.cache import BY_US, StoredParam, TableUpdate
 from paramclient.links import LinkKind, ReplayLink, create_link, parse_link
 from paramclient.links.replay import PAUSE_MAX
-from paramclient.logs.imported_table import ImportedTable
+from paramclient.logs.logged_params import ImportedTable
 from paramclient.logs.telemetry import import_log
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param
@@ -152,7 +152,7 @@ async def test_requests_to_a_log_fail(tmp_path: Path) -> None:
             lambda: component.fetch_all(refresh=True),
         )
         for call in calls:
-            with pytest.raises(UsageError, match="only listens|may not request"):
+            with pytest.raises(UsageError, match=r"only listens|may not request"):
                 await call()
         began = anyio.current_time()
         with pytest.raises(NoReply, match="component 9/9"):

@@ -75,7 +75,7 @@ def test_every_custom_value_can_be_set_again(data: bytes) -> None:
         (2**63, KINDS.INT64, "does not fit INT64"),
         (1.5, KINDS.INT32, "not a whole number"),
         (math.inf, KINDS.INT32, "not a whole number"),
-        (1e39, KINDS.REAL32, "beyond the range of REAL32"),
+        (1e39, KINDS.REAL32, "beyond the range of a float32"),
         (10**400, KINDS.REAL64, "beyond the range of REAL64"),
         ("5", KINDS.INT32, "'5' is not a number, and the parameter is INT32"),
         (b"5", KINDS.REAL32, "is not a number"),

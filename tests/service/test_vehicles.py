@@ -118,7 +118,13 @@ async def test_a_value_is_written_read_back_and_read_from_the_vehicle() -> None:
     async with service(vehicle) as (_, browser):
         await synced(browser)
         written = (await browser.put(f"{V}/params/PARAM_04", json={"value": 44})).json()
-        assert written == {"name": "PARAM_04", "requested": 44, "actual": 44, "status": "accepted"}
+        assert written == {
+            "name": "PARAM_04",
+            "requested": 44,
+            "actual": 44,
+            "status": "accepted",
+            "bits": "0000002c",
+        }
         assert vehicle.param("PARAM_04").value == 44
         assert value(await browser.get(f"{V}/params/PARAM_04?live=true")) == 44
         problem(await browser.put(f"{V}/params/NO_SUCH", json={"value": 1}), 404, "unknown-parameter")
@@ -294,9 +300,9 @@ async def test_extended_parameters_are_fetched_written_and_followed() -> None:
         assert (done.json()["status"], done.json()["actual"]) == ("accepted", "Rear")
         body = {"values": {text: {"hex": "ff00fe"}}}
         (result,) = (await browser.patch(f"{CAMERA}/params", params=EXT, json=body)).json()["results"]
-        assert (result["actual"], result["actual_hex"]) == (None, "ff00fe")
+        assert (result["actual"], result["bits"]) == ("hex:ff00fe", "00fe00ff")
         live = await browser.get(f"{CAMERA}/params/{text}", params={**EXT, "live": "true"})
-        assert live.json()["hex"] == "ff00fe"
+        assert live.json()["value"] == "hex:ff00fe"
         problem(await browser.get(f"{CAMERA}/params/NOPE", params=EXT), 404, "unknown-parameter")
 
 
@@ -317,24 +323,27 @@ async def test_extended_parameters_are_set_up_and_restored(tmp_path: Path) -> No
         await browser.post(f"{CAMERA}/fetch", params=EXT, json={})
         known = (await browser.get(f"{CAMERA}/params", params=EXT)).json()["params"]
         text = next(name for name, each in known.items() if each["type"] == "CUSTOM")
-        before, body = known[text]["hex"], {"values": {text: "Rear"}}
+        before, body = known[text]["value"], {"values": {text: "Rear"}}
         planned = (await browser.post(f"{CAMERA}/plan", params=EXT, json=body)).json()
-        assert list(planned["changes"]) == [text]
+        assert list(planned["params"]) == [text]
         applied = (await browser.post(f"{CAMERA}/apply", params=EXT, json=body)).json()
         assert applied["complete"]
         (kept,) = (await browser.get(f"{CAMERA}/snapshots", params=EXT)).json()["snapshots"]
-        assert kept["id"] == applied["snapshot"]
+        assert kept["reason"] == "before apply"
         query = {**EXT, "snapshot": kept["id"]}
-        assert (await browser.get(f"{CAMERA}/params", params=query)).json()["params"][text]["hex"] == before
+        assert (await browser.get(f"{CAMERA}/params", params=query)).json()["params"][text]["value"] == before
         restored = (await browser.post(f"{CAMERA}/restore", params=EXT, json={})).json()
         assert restored["complete"]
         await asyncio.sleep(1)
         history = (await browser.get(f"{CAMERA}/history", params=EXT)).json()["history"]
-        assert [each["new"]["hex"] for each in history] == ["52656172", before]
+        assert [each["new"] for each in history] == ["Rear", before]
+        saved = await browser.get(f"{CAMERA}/file", params={**EXT, "format": "json"})
+        given = {"file": {"name": "camera.json", "text": saved.text}, "only": [text]}
+        assert (await browser.post(f"{CAMERA}/plan", params=EXT, json=given)).json()["params"] == {}
         made = await browser.post(f"{CAMERA}/snapshots", params=EXT, json={"reason": "by hand"})
         *_, kept = (await browser.get(f"{CAMERA}/snapshots", params=EXT)).json()["snapshots"]
         assert (made.json(), kept["reason"]) == ({"id": kept["id"]}, "by hand")
         key = (await browser.get(CAMERA)).json()["key"]
     async with service(small_px4(), cache=str(tmp_path / "cache.sqlite3")) as (_, browser):
         query = {**EXT, "key": key}
-        assert (await browser.get(f"{CAMERA}/params", params=query)).json()["params"][text]["hex"] == before
+        assert (await browser.get(f"{CAMERA}/params", params=query)).json()["params"][text]["value"] == before

@@ -21,12 +21,10 @@ export function offerExtended() {
 
 export const hasExtended = (component) => Boolean(component?.extended?.is_expected || component?.extended?.params);
 
-/** Formats a value: bytes as `hex:…`, 64-bit integers with all digits. */
-function textOf({ value, type, hex }) {
-  if (value === null) return HEX + hex;
+/** Formats a value, 64-bit integers with all digits. Bytes are `hex:…` already. */
+function textOf({ value, type, bits }) {
   if (type !== "INT64" && type !== "UINT64") return numberText(value, type);
-  const digits = (hex.match(/../g) ?? []).reverse().join("");
-  const number = BigInt(`0x${digits}`);
+  const number = BigInt(`0x${bits}`);
   return String(type === "INT64" ? BigInt.asIntN(64, number) : number);
 }
 
@@ -154,7 +152,7 @@ export async function showExtended() {
     else {
       take(event.new);
       const by = authorOf(event.by);
-      const isValue = event.old && (event.old.hex !== event.new.hex || event.old.type !== event.new.type);
+      const isValue = event.old && (event.old.bits !== event.new.bits || event.old.type !== event.new.type);
       if (isValue && by !== "you") lines.get(event.name).report(`now ${textOf(event.new)}, by ${by}`, "warn");
     }
     refresh();
@@ -200,9 +198,9 @@ export async function showExtended() {
     try {
       const body = { values: { [param.name]: value } };
       const answer = await request("PATCH", at(component, "/params", EXTENDED), body, { timeout: EXTENDED_TIMEOUT });
-      const { status, reason, actual, actual_hex: hex } = answer.results[0];
-      const now = { ...param, value: actual, hex };
-      if (hex !== null) {
+      const { status, reason, actual, bits } = answer.results[0];
+      const now = { ...param, value: actual, bits };
+      if (bits) {
         line.text = field.value; // what was typed is sent
         line.take(now);
       }

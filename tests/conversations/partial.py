@@ -1,0 +1,92 @@
+"""A vehicle that serves a part of the protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from paramclient import Encoding, ParamType
+from paramclient.model.values import encode_value
+from paramclient.wire.messages import (
+    COMP_ID_ALL,
+    CommandAck,
+    CommandLong,
+    Message,
+    ParamRequestList,
+    ParamRequestRead,
+    ParamSet,
+    ParamValue,
+)
+from tests.conversations.virtual import Puppet
+
+TABLE: dict[str, tuple[float, ParamType]] = {
+    **{f"GAIN_{number}": (number / 2, ParamType.REAL32) for number in range(5)},
+    "MODE": (5, ParamType.INT32),
+    "OFFSET": (-7, ParamType.INT16),
+    "NODE_ID": (3, ParamType.UINT8),
+}
+EVERYTHING = ("list", "names", "indices", "sets", "acks", "commands")
+
+
+class Partial(Puppet):
+    """A vehicle with the parts of the protocol that a test gives it.
+
+    Args:
+        table: values and types, by name.
+        serves: of `EVERYTHING`.
+        first: the first index.
+        count: returns the param_count of an index.
+        encoding: of the values.
+        ack_type: the type in acknowledgements; None for the parameter's.
+        asked_as: the component id under which it is asked, if that is not its own.
+        options: as of `Puppet`.
+    """
+
+    def __init__(
+        self,
+        table: Mapping[str, tuple[float, ParamType]] = TABLE,
+        *,
+        serves: Iterable[str] = EVERYTHING,
+        first: int = 0,
+        count: Callable[[int], int] | None = None,
+        encoding: Encoding = Encoding.BYTEWISE,
+        ack_type: ParamType | None = None,
+        asked_as: int | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(self._answers, **options)
+        self.values = {name: encode_value(value, kind, encoding) for name, (value, kind) in table.items()}
+        self._types = {name: kind for name, (_, kind) in table.items()}
+        self._serves = frozenset(serves)
+        self._first = first
+        self._count = count or (lambda index: len(table))
+        self._ack_type = ack_type
+        self._target = options.get("component", 1) if asked_as is None else asked_as
+
+    def number_of(self, kind: type[Message]) -> int:
+        """Return the number of received messages of a kind."""
+        return sum(isinstance(each, kind) for each in self.received)
+
+    def _value(self, name: str, kind: ParamType | None = None) -> ParamValue:
+        index = self._first + list(self.values).index(name)
+        kind = self._types[name] if kind is None else kind
+        return ParamValue(name, self.values[name], kind, self._count(index), index)
+
+    def _answers(self, message: Message) -> Iterable[Message]:
+        if getattr(message, "target_component", COMP_ID_ALL) not in (COMP_ID_ALL, self._target):
+            return
+        match message:
+            case ParamRequestList() if "list" in self._serves:
+                yield from map(self._value, self.values)
+            case ParamRequestRead(param_index=index, param_id=name):
+                by_index = dict(enumerate(self.values, self._first)) if "indices" in self._serves else {}
+                name = by_index.get(index, "") if index >= 0 else name if "names" in self._serves else ""
+                if name in self.values:
+                    yield self._value(name)
+            case ParamSet(param_id=name, raw=raw) if name in self.values:
+                if "sets" in self._serves:
+                    self.values[name] = raw
+                if "acks" in self._serves:
+                    yield self._value(name, self._ack_type)
+            case CommandLong(command=command) if "commands" in self._serves:
+                yield CommandAck(command, 3)

@@ -1,0 +1,363 @@
+"""ArduPilot's checksum: it proves a cached table, finds what has changed, and never proves a wrong one."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+
+import anyio
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from paramclient.errors import FileErrorCode
+from paramclient.model.values import Param, ParamType, Trust, from_bits
+from paramclient.protocol.fetch import FetchResult, fetch_all
+from paramclient.protocol.ftp import Opcode, Packet
+from paramclient.protocol.node import Node
+from paramclient.protocol.watch import Watch
+from paramclient.protocol.writes import write
+from paramclient.sim import Air, ArduPilotVehicle
+from paramclient.wire.messages import NO_INDEX, FileTransfer, Message, ParamRequestList, ParamValue, encode
+from tests.conversations.virtual import Conversation, Tap, converse, run, virtual, virtual_on_both
+
+MOVED = ("INS_GYROFFS_X", "INS_GYR2OFFS_Z", "BARO1_GND_PRESS", "STAT_RUNTIME", "STAT_BOOTCNT")
+
+
+async def with_cached_table(conversation: Conversation, cached: dict[str, Param], **options: object) -> Node:
+    """Return the identified autopilot with a table as the cache loads it."""
+    node = await conversation.node()
+    await node.identification.settled()
+    count_ = sum(param.index is not None for param in cached.values())
+    known = {"volatile": (), "volatile_is_known": False, "hash": None, "count": count_}
+    known |= {"moments": dict.fromkeys(cached, -1.0)} | options
+    node.plain.table.load(cached.values(), **known)  # type: ignore[arg-type]  # a mapping of options
+    return node
+
+
+def opcodes(conversation: Conversation) -> list[int]:
+    """Return the MAVFTP requests that were sent."""
+    return [Packet.unpack(each.payload).opcode for each in conversation.sent_of(FileTransfer)]
+
+
+def check(vehicle: ArduPilotVehicle, node: Node, result: FetchResult) -> None:
+    """Check that every value is the vehicle's, and that nothing is merely cached."""
+    for param in vehicle.listed:
+        assert result.params[param.name].same_value(param), param.name
+    assert not any(each.trust is Trust.CACHED for each in node.plain.table.params.values())
+
+
+@virtual_on_both
+async def test_an_unchanged_table_costs_one_request_and_opens_nothing() -> None:
+    vehicle = ArduPilotVehicle()
+    async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
+        node = await with_cached_table(conversation, vehicle.params)
+        began = anyio.current_time()
+        result = await fetch_all(node.plain)
+        assert anyio.current_time() - began < 0.15
+        assert (result.source, result.changed, result.notes) == ("cache", (), ())
+        assert result.hash is not None
+        assert opcodes(conversation) == [Opcode.CALC_FILE_CRC32]
+        assert {each.trust for each in result.params.values()} == {Trust.VERIFIED}
+        check(vehicle, node, result)
+
+
+@virtual
+async def test_values_that_move_are_read_by_their_checksum_and_learnt() -> None:
+    vehicle = ArduPilotVehicle()
+    async with converse(vehicle) as conversation:
+        cached = vehicle.params
+        vehicle.load({"STAT_RUNTIME": 4711, "BARO1_GND_PRESS": 94_000.5, "ATC_RAT_RLL_P": 0.25})
+        node = await with_cached_table(conversation, cached)
+        result = await fetch_all(node.plain)
+        assert (result.source, result.changed) == ("cache", ("ATC_RAT_RLL_P",))
+        check(vehicle, node, result)
+        assert node.plain.table.volatile >= {"STAT_RUNTIME"}
+
+
+@virtual
+async def test_an_announcement_before_the_cached_table_takes_no_index_away() -> None:
+    vehicle = ArduPilotVehicle(live_period=0.0)
+    async with converse(vehicle) as conversation:
+        node = await conversation.node()
+        value = struct.pack("<f", 31.0)
+        conversation.hear(ParamValue("STAT_RUNTIME", value, ParamType.INT32, 1382, NO_INDEX))
+        assert node.plain.table.params["STAT_RUNTIME"].index is None
+        await with_cached_table(conversation, vehicle.params)
+        result = await fetch_all(node.plain)
+        assert (result.source, result.missing) == ("cache", ())
+        check(vehicle, node, result)
+
+
+@virtual
+async def test_a_restart_is_recognized_by_the_boot_count() -> None:
+    vehicle = ArduPilotVehicle()
+    async with converse(vehicle) as conversation:
+        cached = vehicle.params
+        node = await with_cached_table(conversation, cached)
+        vehicle.load({name: cached[name].value * 2 + 1 for name in MOVED})  # type: ignore[operator]  # numbers
+        sent, began = len(conversation.sent), anyio.current_time()
+        result = await fetch_all(node.plain)
+        assert (result.source, result.changed) == ("cache", ())
+        check(vehicle, node, result)
+        assert sum(map(len, conversation.sent[sent:])) < 2_000
+        assert anyio.current_time() - began < 0.4
+
+
+@virtual
+async def test_two_values_changed_by_others_are_found_and_named() -> None:
+    vehicle = ArduPilotVehicle()
+    async with converse(vehicle) as conversation:
+        node = await with_cached_table(conversation, vehicle.params)
+        vehicle.load({"ATC_RAT_RLL_P": 0.25, "FORMAT_VERSION": 121})
+        sent, began = len(conversation.sent), anyio.current_time()
+        result = await fetch_all(node.plain)
+        assert (result.source, set(result.changed)) == ("cache", {"ATC_RAT_RLL_P", "FORMAT_VERSION"})
+        assert "ATC_RAT_RLL_P" in result.notes[0]
+        check(vehicle, node, result)
+        assert sum(map(len, conversation.sent[sent:])) < 2_000
+        assert anyio.current_time() - began < 0.3
+        changes = {each.name: each.by for each in conversation.changes}
+        assert changes["FORMAT_VERSION"] == "vehicle"
+
+
+@pytest.mark.parametrize("loss", [0.05, 0.2])
+@pytest.mark.parametrize(
+    "changed", [{}, {"STAT_RUNTIME": 99, "ATC_RAT_RLL_P": 0.25}], ids=["same", "changed"]
+)
+def test_loss_leaves_nothing_wrong(loss: float, changed: dict[str, float]) -> None:
+    async def main() -> None:
+        for seed in range(4):
+            vehicle = ArduPilotVehicle()
+            cached = vehicle.params
+            vehicle.load(changed)
+            async with converse(Air.symmetric([vehicle], loss=loss, delay=0.05, seed=seed)) as conversation:
+                node = await with_cached_table(conversation, cached)
+                check(vehicle, node, await fetch_all(node.plain))
+
+    run(main)
+
+
+CASES = {
+    "unknown command": ("ftp", "refused"),
+    "silent": ("stream", "MAVFTP did not answer"),
+    "count": ("ftp", "other parameters"),
+    "many": ("ftp", "quicker than a search"),
+    "renamed": ("ftp", "other parameters"),
+    "rounded": ("cache", ""),
+}
+
+
+@pytest.mark.parametrize("kind", CASES)
+@virtual
+async def test_where_it_does_not_work_the_table_is_downloaded(kind: str) -> None:
+    vehicle = ArduPilotVehicle()
+    cached = vehicle.params
+    if kind == "count":
+        vehicle.load({"EK2_ENABLE": 1})
+    elif kind == "many":
+        vehicle.load(dict.fromkeys(list(cached)[300:700:20], 3))
+    elif kind == "renamed":
+        cached["STAT_BOOTS"] = replace(cached.pop("STAT_BOOTCNT"), name="STAT_BOOTS")
+        vehicle.load({"STAT_RUNTIME": 5})
+    elif kind == "rounded":
+        vehicle.load({"BARO_PROBE_EXT": 0x7654321})
+        cached["BARO_PROBE_EXT"] = replace(cached["BARO_PROBE_EXT"], bits=0x7654320)
+
+    def passes(message: Message) -> bool:
+        if not isinstance(message, FileTransfer) or kind not in ("silent", "unknown command"):
+            return True
+        request = Packet.unpack(message.payload)
+        if kind == "silent" or request.opcode != Opcode.CALC_FILE_CRC32:
+            return kind != "silent"
+        code = bytes((FileErrorCode.UNKNOWN_COMMAND,))
+        refusal = Packet(request.sequence + 1, 0, Opcode.NAK, code, requested=request.opcode)
+        conversation.hear(FileTransfer(0, 255, 190, refusal.pack()))
+        return False
+
+    async with converse(Tap(vehicle, up=passes)) as conversation:
+        node = await with_cached_table(conversation, cached)
+        began = anyio.current_time()
+        result = await fetch_all(node.plain)
+        source, reason = CASES[kind]
+        assert result.source == source
+        assert reason in " ".join(result.notes)
+        assert anyio.current_time() - began < 3.0
+        check(vehicle, node, result)
+
+
+@virtual
+async def test_nothing_is_checked_or_changed_by_a_refresh_or_without_a_complete_table() -> None:
+    vehicle = ArduPilotVehicle()
+    cached = vehicle.params
+    del cached["STAT_RESET"]
+    for table, refresh in (({}, False), (cached, False), (vehicle.params, True)):
+        async with converse(vehicle) as conversation:
+            node = await with_cached_table(conversation, table, count=len(table) and len(vehicle.params))
+            result = await fetch_all(node.plain, refresh=refresh)
+            assert result.source == "ftp"
+            assert Opcode.CALC_FILE_CRC32 not in opcodes(conversation)
+
+
+@virtual
+async def test_another_stations_open_file_costs_one_request() -> None:
+    vehicle = ArduPilotVehicle()
+    async with converse(vehicle) as conversation:
+        node = await with_cached_table(conversation, vehicle.params)
+        opening = Packet(7, 3, Opcode.OPEN_FILE_RO, b"@PARAM/param.pck")
+        data = encode(FileTransfer(0, 1, 1, opening.pack()), system=252, component=190, sequence=0)
+        vehicle.receive(data, anyio.current_time())
+        await anyio.sleep(0.1)
+        result = await fetch_all(node.plain)
+        assert result.source != "cache"
+        assert "INVALID_SESSION" in " ".join(result.notes).upper().replace(" ", "_")
+        assert opcodes(conversation).count(Opcode.CALC_FILE_CRC32) == 1
+        check(vehicle, node, result)
+
+
+NAMES = [param.name for param in ArduPilotVehicle().listed]
+CHANGES = st.dictionaries(st.sampled_from(NAMES), st.integers(1, 2**32 - 1), min_size=1, max_size=20)
+
+
+@settings(deadline=None, max_examples=40, phases=[Phase.generate])
+@given(changes=CHANGES, kind=st.sampled_from(["values", "type", "name", "count"]), place=st.integers(0, 1381))
+def test_no_difference_is_ever_taken_for_equal(changes: dict[str, int], kind: str, place: int) -> None:
+    async def main() -> None:
+        vehicle = ArduPilotVehicle(live_period=0.0)
+        cached = vehicle.params
+        for name, difference in changes.items():
+            param = cached[name]
+            bits = param.bits ^ (difference & (1 << 8 * param.type.size) - 1)
+            cached[name] = replace(param, bits=bits, value=from_bits(bits, param.type))
+        name = NAMES[place]
+        param = cached[name]
+        if kind == "type":
+            other = ParamType.INT8 if param.type is not ParamType.INT8 else ParamType.INT16
+            cached[name] = Param(name, 1, other, param.index, 1)
+        elif kind == "name":
+            cached[name] = replace(param, name="NO_SUCH_NAME")
+        elif kind == "count":
+            del cached[NAMES[-1]]
+        async with converse(vehicle) as conversation:
+            node = await with_cached_table(conversation, {each.name: each for each in cached.values()})
+            result = await fetch_all(node.plain)
+            assert set(result.params) == set(vehicle.params)
+            check(vehicle, node, result)
+
+    run(main)
+
+
+def _of_another_type(cached: dict[str, Param], name: str) -> None:
+    param = cached[name]
+    kind = ParamType.REAL32 if param.type is ParamType.INT32 else ParamType.INT32
+    cached[name] = Param(name, from_bits(param.bits, kind), kind, param.index, param.bits)
+
+
+def _renamed(cached: dict[str, Param], old: str, new: str) -> None:
+    cached[new] = replace(cached.pop(old), name=new)
+
+
+def _swapped(cached: dict[str, Param], one: str, other: str) -> None:
+    first, second = cached[one], cached[other]
+    cached |= {one: replace(first, index=second.index), other: replace(second, index=first.index)}
+
+
+@pytest.mark.parametrize(
+    ("change", "names"),
+    [
+        (_of_another_type, ["RTL_ALT"]),
+        (_of_another_type, ["STAT_RUNTIME"]),
+        (_of_another_type, ["ATC_RAT_RLL_P"]),
+        (_renamed, ["EK3_HRT_FILT", "EK3_HRT_FILQ"]),
+        (_swapped, ["COMPASS_OFS_X", "COMPASS_OFS_Y"]),
+    ],
+)
+@virtual
+async def test_a_value_makes_up_for_no_other_name_or_type(
+    change: Callable[..., None], names: list[str]
+) -> None:
+    """The checksum is linear: some value of 4 bytes has it, whatever stands before."""
+    vehicle = ArduPilotVehicle(live_period=0.0)
+    cached = vehicle.params
+    change(cached, *names)
+    async with converse(vehicle) as conversation:
+        node = await with_cached_table(conversation, cached)
+        result = await fetch_all(node.plain)
+        assert set(result.params) == set(vehicle.params)
+        check(vehicle, node, result)
+
+
+@virtual
+async def test_a_change_in_the_middle_of_a_proof_is_not_proven() -> None:
+    vehicle = ArduPilotVehicle(live_period=0.0)
+    async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
+        node = await with_cached_table(conversation, vehicle.params)
+        async with anyio.create_task_group() as tasks:
+
+            async def change() -> None:
+                await anyio.sleep(0.06)
+                vehicle.load({"EK2_ENABLE": 1})
+                value = struct.pack("<f", 0.25)
+                conversation.hear(ParamValue("ATC_RAT_RLL_P", value, ParamType.REAL32, 1434, NO_INDEX))
+
+            tasks.start_soon(change)
+            result = await fetch_all(node.plain)
+        assert not result.missing
+        assert len(result.params) == 1434
+        check(vehicle, node, result)
+
+
+@virtual
+async def test_an_acknowledgement_as_real32_changes_no_type() -> None:
+    """ArduPilot acknowledges the set of a default as REAL32, whatever the type is."""
+    vehicle = ArduPilotVehicle(live_period=0.0)
+    async with converse(vehicle) as conversation:
+        node = await with_cached_table(conversation, vehicle.params)
+        await fetch_all(node.plain)
+        for name in ("BARO_PROBE_EXT", "LOG_BITMASK", "RTL_ALT", "ARMING_CHECK"):
+            before = vehicle.param(name)
+            await write(node.plain, name, before.value)
+            assert node.plain.table.params[name].same_value(before)
+        result = await fetch_all(node.plain)
+        assert (result.source, result.changed) == ("cache", ())
+        check(vehicle, node, result)
+
+
+@virtual
+async def test_a_list_with_a_gap_in_its_names_is_no_question_for_a_checksum() -> None:
+    vehicle = ArduPilotVehicle(live_period=0.0)
+    cached = vehicle.params
+    cached["WP_NAVALT_MIN_"] = replace(cached["WP_NAVALT_MIN"], name="WP_NAVALT_MIN_")
+    async with converse(vehicle) as conversation:
+        node = await with_cached_table(conversation, cached, count=1382)
+        node.plain.table.names[9] = node.plain.table.names[8]
+        result = await fetch_all(node.plain)
+        assert result.source == "ftp"
+        check(vehicle, node, result)
+
+
+@pytest.mark.parametrize("is_cached", [True, False], ids=["cached", "downloaded"])
+@virtual_on_both
+async def test_a_watch_finds_a_lost_announcement_for_one_request(is_cached: bool) -> None:
+    vehicle = ArduPilotVehicle(live_period=0.0)
+    async with converse(vehicle) as conversation:
+        table = vehicle.params if is_cached else {}
+        node = await with_cached_table(conversation, table, count=len(vehicle.params))
+        await fetch_all(node.plain)
+        watch = Watch(node.plain, node.presence, lambda event: None)
+        watch.fetched()
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(watch.run)
+            before = len(conversation.sent_of(FileTransfer))
+            await anyio.sleep(31.0)
+            assert len(conversation.sent_of(FileTransfer)) - before == 1
+            vehicle.load({"ATC_RAT_RLL_P": 0.25})
+            await anyio.sleep(31.0)
+            assert node.plain.table.params["ATC_RAT_RLL_P"].value == 0.25
+            assert Opcode.OPEN_FILE_RO not in opcodes(conversation)[before:]
+            vehicle.load(dict.fromkeys(NAMES[300:700:20], 3))  # as a written param.pck: not announced
+            await anyio.sleep(31.0)
+            assert all(node.plain.table.params[name].value == 3 for name in NAMES[300:700:20])
+            assert not conversation.sent_of(ParamRequestList)
+            tasks.cancel_scope.cancel()

@@ -1,0 +1,279 @@
+"""Vehicles that serve only part of the protocol, count wrongly, or are not what they seem."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import anyio
+import pytest
+
+from paramclient import (
+    AmbiguousVehicle,
+    Encoding,
+    NoReply,
+    ParamClient,
+    ParamType,
+    UnknownParameter,
+    UsageError,
+    ValueNotApplied,
+)
+from paramclient.protocol.fetch import fetch_all
+from paramclient.protocol.reads import read
+from paramclient.protocol.writes import write
+from paramclient.sim import Air, GenericVehicle
+from paramclient.wire.messages import (
+    Heartbeat,
+    ParamSet,
+)
+from tests.conversations.partial import EVERYTHING, TABLE, Partial
+from tests.conversations.virtual import QUIET, Puppet, Tap, converse, virtual
+
+ARDUPILOT = Heartbeat(2, 3, system_status=4)
+NO_AUTOPILOT = Heartbeat(2, 8, system_status=4)
+ONBOARD_COMPUTER = Heartbeat(18, 0, system_status=4)
+CAMERA = Heartbeat(30, 0, system_status=4)
+
+PARTS = [
+    ("list", "sets", "acks", "commands"),
+    ("list", "sets", "acks"),
+    ("list", "sets"),
+    ("list", "indices", "sets", "acks", "commands"),
+    ("list", "indices", "sets"),
+    ("indices", "sets", "acks"),
+    ("names", "sets"),
+    ("names", "indices", "sets", "acks"),
+]
+
+
+@pytest.mark.parametrize("parts", PARTS, ids="+".join)
+@virtual
+async def test_what_a_vehicle_serves_is_enough_to_read_and_to_prove_a_set(parts: tuple[str, ...]) -> None:
+    vehicle = Partial(serves=parts)
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        if "list" not in parts and "names" not in parts:
+            await read(session, 5)  # nothing else tells the name
+        began = anyio.current_time()
+        result = await write(session, "MODE", 4)
+        assert (result.status, result.actual) == ("accepted", 4)
+        assert vehicle.values["MODE"] == struct.pack("<i", 4)
+        assert anyio.current_time() - began < 15.0
+        assert vehicle.number_of(ParamSet) <= 12
+        if "list" in parts or "names" in parts:
+            await read(session, "OFFSET")
+            assert session.table.params["OFFSET"].value == -7
+        if "list" in parts:
+            with pytest.raises(UnknownParameter):
+                await read(session, "OFFSETS")
+
+
+@pytest.mark.parametrize("parts", [("list",), ("list", "names"), ("list", "acks")], ids="+".join)
+@virtual
+async def test_a_set_that_changes_nothing_is_told_as_that_within_a_dozen(parts: tuple[str, ...]) -> None:
+    vehicle = Partial(serves=parts)
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        began = anyio.current_time()
+        with pytest.raises(ValueNotApplied, match="1/1 keeps MODE at 5"):
+            await write(session, "MODE", 4)
+        assert anyio.current_time() - began < 15.0
+        assert vehicle.number_of(ParamSet) <= 12
+
+
+@virtual
+async def test_an_acknowledgement_in_another_type_changes_neither_the_type_nor_the_history() -> None:
+    for kind in (ParamType.REAL32, ParamType.UINT32, ParamType.INT8):
+        vehicle = Partial(ack_type=kind)
+        async with converse(vehicle) as conversation:
+            session = (await conversation.node()).plain
+            await fetch_all(session)
+            conversation.changes.clear()
+            result = await write(session, "MODE", 4)
+            assert (result.status, result.actual, result.param.type) == ("accepted", 4, ParamType.INT32)
+            assert [(each.name, each.new and each.new.value) for each in conversation.changes] == [
+                ("MODE", 4)
+            ]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"first": 1},
+        {"first": 1, "serves": ("list",)},
+        {"count": lambda index: index + 1},
+        {"count": lambda index: index + 1, "serves": ("list",)},
+    ],
+    ids=["from 1", "from 1, list only", "growing", "growing, list only"],
+)
+@pytest.mark.parametrize("loss", [0.0, 0.1])
+@virtual
+async def test_odd_indices_and_counts_make_a_complete_table(options: dict[str, Any], loss: float) -> None:
+    vehicle = Partial({f"P{number:02}": (number, ParamType.INT32) for number in range(40)}, **options)
+    async with converse(Air.symmetric([vehicle], loss=loss, seed=5)) as conversation:
+        session = (await conversation.node()).plain
+        for _ in range(4):
+            result = await fetch_all(session)
+            if len(result.params) == 40:
+                break
+        assert (result.complete, len(result.params), result.count) == (True, 40, 40)
+        assert {name: each.value for name, each in result.params.items()} == {
+            f"P{number:02}": number for number in range(40)
+        }
+
+
+@pytest.mark.parametrize("too_many", [1, 3_000])
+@virtual
+async def test_a_count_that_is_too_large_costs_seconds_and_no_value(too_many: int) -> None:
+    vehicle = Partial(count=lambda index: len(TABLE) + too_many)
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        result = await fetch_all(session)
+        assert set(result.params) == set(TABLE)
+        assert result.missing == tuple(range(len(TABLE), len(TABLE) + too_many))
+        assert anyio.current_time() < 20.0
+
+
+@virtual
+async def test_names_in_lower_case_are_found_whatever_the_autopilot() -> None:
+    vehicle = Partial({"gain": (0.5, ParamType.REAL32), "mode": (5, ParamType.REAL32)}, heartbeat=ARDUPILOT)
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        result = await write(session, "mode", 4)
+        assert (result.name, result.actual) == ("mode", 4)
+        await fetch_all(session)
+        assert set(session.table.params) == {"mode", "gain"}
+
+
+@pytest.mark.parametrize("name", ["RC MAP", "A,B", "42"])
+@virtual
+async def test_a_name_that_no_file_can_hold_is_noted_and_not_missed(name: str) -> None:
+    vehicle = Partial({**TABLE, name: (1.0, ParamType.REAL32)})
+    async with converse(vehicle) as conversation:
+        result = await fetch_all((await conversation.node()).plain)
+        assert (result.missing, set(result.params)) == ((), set(TABLE))
+        assert any(repr(name) in note for note in result.notes)
+
+
+# the encoding
+
+
+@pytest.mark.parametrize(
+    ("heartbeat", "encoding"),
+    [(ARDUPILOT, Encoding.BYTEWISE), (QUIET, Encoding.C_CAST)],
+    ids=["AP", "generic"],
+)
+@pytest.mark.parametrize("name", ["MODE", "OFFSET", "ZERO"])
+@virtual
+async def test_integers_in_another_encoding_are_told_and_not_written(
+    heartbeat: Heartbeat, encoding: Encoding, name: str
+) -> None:
+    table = {"ZERO": (0, ParamType.INT32), **TABLE}
+    vehicle = Partial(table, heartbeat=heartbeat, encoding=encoding)
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        with pytest.raises(UsageError, match=rf"was not written.*--encoding {encoding}"):
+            await write(session, name, 9)
+        assert (await write(session, "GAIN_1", 2.5)).status == "accepted"
+        assert vehicle.number_of(ParamSet) == 1
+        assert any(f"--encoding {encoding}" in note for note in (await fetch_all(session)).notes)
+    async with converse(vehicle, encoding=encoding) as conversation:
+        session = (await conversation.node()).plain
+        assert (await write(session, name, 9)).status == "accepted"
+        assert (await fetch_all(session)).params["NODE_ID"].value == 3
+        assert not session.encoding_doubt
+
+
+@virtual
+async def test_right_encodings_are_not_doubted() -> None:
+    for heartbeat, encoding in ((ARDUPILOT, Encoding.C_CAST), (QUIET, Encoding.BYTEWISE)):
+        table = {**TABLE, "LARGE": (2**31 - 1, ParamType.INT32), "ID": (1_310_988, ParamType.INT32)}
+        vehicle = (
+            Partial(heartbeat=heartbeat)
+            if encoding is Encoding.BYTEWISE
+            else GenericVehicle({name: value for name, (value, _) in table.items()})
+        )
+        async with converse(vehicle) as conversation:
+            session = (await conversation.node()).plain
+            await fetch_all(session)
+            assert not session.encoding_doubt
+
+
+# addresses
+
+
+@pytest.mark.parametrize("serves", [EVERYTHING, ("list",), ("names", "indices")], ids="+".join)
+@virtual
+async def test_a_component_without_heartbeat_is_asked_where_it_is_named_in_full(
+    serves: tuple[str, ...],
+) -> None:
+    bridge = Partial(serves=serves, heartbeat=None, component=240)
+    async with ParamClient(Air.symmetric([GenericVehicle({"A": 1}), bridge]), cache=False) as client:
+        component = await client.component(1, 240)
+        assert (await component.get("MODE")).value == 5
+        assert client.autopilots == [client.components[1, 1]]
+        with pytest.raises(NoReply):
+            await client.component(1, 241)
+        with pytest.raises(NoReply):
+            await client.component(component=242)
+        writable = await client.only_component(1, 240)
+        assert writable is component
+
+
+@virtual
+async def test_values_under_another_id_are_named_and_can_be_read() -> None:
+    vehicle = Partial(component=50, asked_as=1, heartbeat=None)
+    beacon = Puppet(lambda message: ())
+    async with ParamClient(Air.symmetric([beacon, vehicle]), cache=False) as client:
+        with pytest.raises(NoReply, match="values came from 1/50"):
+            await (await client.component(1, 1)).fetch_all()
+    async with ParamClient(Air.symmetric([beacon, vehicle]), cache=False) as client:
+        result = await (await client.component(1, 50)).fetch_all()
+        assert (result.complete, set(result.params)) == (True, set(TABLE))
+
+
+@virtual
+async def test_a_component_1_that_claims_no_autopilot_is_the_vehicle_where_no_other_is() -> None:
+    vehicle = Partial(heartbeat=NO_AUTOPILOT)
+    async with ParamClient(vehicle, cache=False) as client:
+        assert (await client.component()).address == (1, 1)
+        assert (await client.only_component(1)).address == (1, 1)
+    pilot = GenericVehicle({"A": 1}, component=2)
+    async with ParamClient(Air.symmetric([vehicle, pilot]), cache=False) as client:
+        await anyio.sleep(2.0)
+        assert (await client.only_component()).address == (1, 2)
+
+
+@virtual
+async def test_a_vehicle_with_system_id_0_is_named_as_that() -> None:
+    async with ParamClient(Partial(system=0), cache=False) as client:
+        with pytest.raises(NoReply, match="vehicle with system id 0"):
+            await client.component(timeout=3.0)
+
+
+@pytest.mark.parametrize(
+    ("heartbeat", "component"),
+    [(ONBOARD_COMPUTER, 191), (CAMERA, 100), (Heartbeat(26, 3, system_status=4), 1), (QUIET, 154)],
+    ids=["companion", "camera", "gimbal", "gimbal by its id"],
+)
+@virtual
+async def test_a_part_of_a_vehicle_is_never_the_vehicle(heartbeat: Heartbeat, component: int) -> None:
+    part = Partial(heartbeat=heartbeat, system=2, component=component)
+    async with ParamClient(part, cache=False) as client:
+        for choose in (client.component, client.only_component):
+            with pytest.raises(NoReply, match="None is an autopilot"):
+                await choose(timeout=3.0)
+        assert (await client.component(2, component)).address == (2, component)
+    late = Tap(GenericVehicle({"A": 1}), down=lambda message: anyio.current_time() > 4.0)
+    async with ParamClient(Air.symmetric([part, late]), cache=False) as client:
+        assert (await client.component()).address == (1, 1)
+        assert (await client.only_component()).address == (1, 1)
+
+
+@virtual
+async def test_a_component_with_the_id_0_is_a_component() -> None:
+    async with ParamClient(Partial(component=0, asked_as=0), cache=False) as client:
+        component = await client.component(1, 0)
+        assert (await component.fetch_all()).complete
+        with pytest.raises((NoReply, AmbiguousVehicle)):
+            await client.component(1, 7, timeout=3.0)
