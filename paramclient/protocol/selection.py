@@ -34,8 +34,8 @@ LOOK_TIME: Final = 1.2
 fifth of it for jitter."""
 LISTED_MAX: Final = 8
 """Components that a hint names, so that it stays readable; it gives the number of further ones."""
-_PERIPHERALS: Final = frozenset({18, 26, 27, *range(30, 35), *range(36, 43), 44, 48})
-"""MAV_TYPE of the parts of a vehicle: onboard computers, gimbals, cameras, batteries, GPS receivers. Some of
+_PERIPHERALS: Final = frozenset({18, 26, 27, *range(30, 35), *range(36, 43), 44, 48, 49})
+"""MAV_TYPE of the parts of a vehicle: computers, gimbals, cameras, batteries, GPS receivers, radios. Some of
 them name an autopilot in their heartbeat, where they should name none."""
 PERIPHERAL_IDS_MIN: Final = 100
 """The first component id that MAVLink gives to parts of a vehicle: MAV_COMP_ID_CAMERA."""
