@@ -20,7 +20,7 @@ import anyio
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, VehicleError
 from paramclient.model.px4_hash import crc32_px4, crc32_px4_before
 from paramclient.model.values import Encoding, ParamType, as_reported, bits_of, bits_of_wire, from_bits
-from paramclient.protocol.ftp import checksum
+from paramclient.protocol.ftp import SILENT_LOST, checksum
 from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
@@ -34,8 +34,6 @@ AT_ONCE: Final = 5
 """Requests sent at once: ArduPilot's queue has 5 places, and drops the surplus silently (measured)."""
 INTERVAL: Final = 0.005
 """Seconds between further requests: ArduPilot keeps up with one in 3 ms (measured)."""
-LOST: Final = 1e-3
-"""Probability that all first requests are lost, at which MAVFTP counts as silent."""
 FLOAT32_EXACT: Final = 2**24
 """The largest integer up to which float32 holds all."""
 BOOT_COUNT: Final = "STAT_BOOTCNT"
@@ -101,8 +99,9 @@ async def prove(session: Session) -> tuple[str, ...]:
                 proof = _Proof(session, _rows(session.table))
                 await proof.run()
                 await proof.confirm()
-                if proof.take_over():
-                    return proof.changed
+                changed = proof.take_over()
+                if changed is not None:
+                    return changed
         except FileTransferError as error:
             if error.code == FileErrorCode.UNKNOWN_COMMAND:
                 session.serves_checksum = False
@@ -118,7 +117,6 @@ class _Proof:
 
     def __init__(self, session: Session, rows: list[PackedParam]) -> None:
         self._session = session
-        self.changed: tuple[str, ...] = ()
         self._rows = rows
         self._changed: dict[int, float] = {}  # by index, when the checksum was requested
         self._checksum = 0
@@ -139,11 +137,9 @@ class _Proof:
             raise TableDiffers(f"{len(moving)} values of the cached table are not exact")
         whole = range(len(self._rows))
         places = await self._round([whole] if self._round_trip > QUICK_ROUND_TRIP else [], moving)
-        boot_count = next((at for at, row in enumerate(self._rows) if row.name == BOOT_COUNT), None)
-        if boot_count is None or boot_count in self._changed:
-            places = await self._round(
-                [], [at for at, row in enumerate(self._rows) if MEASURED.fullmatch(row.name)]
-            )
+        if all(at in self._changed for at, row in enumerate(self._rows) if row.name == BOOT_COUNT):
+            measured = [at for at, row in enumerate(self._rows) if MEASURED.fullmatch(row.name)]
+            places = await self._round([], measured)
         searches = 0
         while not self._is_equal() and self._last_time <= SEARCH_TIME_MAX and searches < SEARCHES_MAX:
             places = await self._round(places or [whole])
@@ -166,7 +162,7 @@ class _Proof:
         return self._is_equal()
 
     def _is_equal(self) -> bool:
-        return self._checksum == self.computed()
+        return self._checksum == _checksum_of(self._rows)
 
     async def _round(self, places: list[range], indices: Sequence[int] = ()) -> list[range]:
         """Take over the values at some indices, and ask for the parts of ranges that differ.
@@ -185,7 +181,9 @@ class _Proof:
             self._solve(part.start, found[part], began)
         remaining = []
         for parts in splits:
-            differing = [part for part in parts if part in found and found[part] != self._computed(part)]
+            differing = [
+                part for part in parts if part in found and found[part] != _checksum_of(self._rows, part)
+            ]
             for part in differing or parts[-1:]:  # if no other one does, the last one differs
                 if len(part) == 1 and part in found:
                     self._solve(part.start, found[part], began)
@@ -200,28 +198,24 @@ class _Proof:
 
     def _solve(self, at: int, found: int, requested_at: float) -> None:
         """Take over the one value with which the file of one parameter has this checksum."""
-        row = self._rows[at]
-        difference = crc32_px4_before(found ^ self._computed(range(at, at + 1)), row.type.size)
+        row, known = self._rows[at], _checksum_of(self._rows, range(at, at + 1))
+        difference = crc32_px4_before(found ^ known, row.type.size)
         if difference >> 8 * row.type.size:
             raise TableDiffers(OTHER)
         if difference:
             self._rows[at] = row._replace(bits=row.bits ^ difference)
             self._changed[at] = requested_at
 
-    def computed(self) -> int:
-        """Return the checksum of the whole file."""
-        return self._computed(range(len(self._rows)))
-
-    def _computed(self, place: range) -> int:
-        rows = self._rows[place.start : place.stop]
-        return crc32_px4(encode(rows, total=len(self._rows), read_size=CHECKED_READ_SIZE))
-
     async def _request(self, places: Sequence[range | None]) -> list[int]:
         """Return the vehicle's checksums of some ranges, or with None, of all."""
+        if not places:
+            return []
         session, began = self._session, anyio.current_time()
         answers: dict[int, int] = {}
         errors: list[FileTransferError | NoReply] = []
-        attempts = session.channel.timing.attempts_for(LOST) if session.serves_checksum is None else None
+        attempts = (
+            session.channel.timing.attempts_for(SILENT_LOST) if session.serves_checksum is None else None
+        )
 
         async def request(number: int, place: range | None) -> None:
             query = "" if place is None else f"?start={place.start}&count={len(place)}"
@@ -271,27 +265,31 @@ class _Proof:
         if other:
             raise TableDiffers(OTHER)
 
-    def take_over(self) -> bool:
+    def take_over(self) -> tuple[str, ...] | None:
         """Put the proven file into the table, and learn which values change.
 
         Returns:
-            False where the table has changed meanwhile.
+            The names of the changed values, without those that move by themselves; None where the table has
+            changed meanwhile.
         """
         table = self._session.table
         names = [self._rows[at].name for at in self._changed]
         if table.count != len(self._rows):
-            return False
+            return None
         for at, moment in self._changed.items():
             table.store_entry(self._rows[at], at, moment, with_defaults=False)
-        if _Proof(self._session, _rows(table)).computed() != self._checksum:
-            return False
+        if _checksum_of(_rows(table)) != self._checksum:
+            return None
         if names:
             table.volatile = frozenset(names)
         table.prove(self._checksum)
-        self.changed = tuple(
-            each for each in names if not (MOVING.fullmatch(each) or MEASURED.fullmatch(each))
-        )
-        return True
+        return tuple(each for each in names if not (MOVING.fullmatch(each) or MEASURED.fullmatch(each)))
+
+
+def _checksum_of(rows: Sequence[PackedParam], place: range | None = None) -> int:
+    """Return the checksum of the file with these rows, or of a range of it."""
+    part = rows if place is None else rows[place.start : place.stop]
+    return crc32_px4(encode(part, total=len(rows), read_size=CHECKED_READ_SIZE))
 
 
 def _rows(table: Table) -> list[PackedParam]:

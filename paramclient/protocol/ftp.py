@@ -20,7 +20,16 @@ from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoRe
 from paramclient.protocol.channel import Channel, Inbox
 from paramclient.wire.messages import FileTransfer, Message
 
-__all__ = ["DATA_SIZE_MAX", "DirectoryEntry", "Opcode", "Packet", "checksum", "list_directory", "read_file"]
+__all__ = [
+    "DATA_SIZE_MAX",
+    "SILENT_LOST",
+    "DirectoryEntry",
+    "Opcode",
+    "Packet",
+    "checksum",
+    "list_directory",
+    "read_file",
+]
 
 DATA_SIZE_MAX: Final = 239
 """Bytes of a file in one message, at most."""
@@ -28,6 +37,8 @@ FILE_SIZE_MAX: Final = 64 * 1024 * 1024
 """Bytes of a file, by default: more than any flight log, less than memory."""
 PATH_SIZE_MAX: Final = DATA_SIZE_MAX - 1
 """Bytes of a path, at most: it fills one message, with a NUL."""
+SILENT_LOST: Final = 1e-3
+"""Probability that all requests are lost, at which MAVFTP counts as silent where there is another way."""
 BUSY_TIME: Final = 3.3
 """Seconds after which ArduPilot ends the silent session of another station (measured)."""
 BUSY_ATTEMPTS: Final = 2
