@@ -46,6 +46,8 @@ LATE_GRACE: Final = 0.02
 """Seconds for which a stalled program looks once more for the answer."""
 WINDOW: Final = 12
 """Requests in flight: ArduPilot's queue of reads has 20 places, and its overflow is dropped silently."""
+WINDOW_PX4: Final = 60
+"""Requests in flight to a PX4, which answers each at once."""
 FTP_SEQUENCES_PER_SECOND: Final = 1000
 """Sequence numbers of MAVFTP that a second skips, more than a program uses in it."""
 

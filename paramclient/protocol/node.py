@@ -10,7 +10,7 @@ import anyio
 from paramclient.model.identity import hardware_id
 from paramclient.model.values import Encoding
 from paramclient.protocol.addresses import Peer
-from paramclient.protocol.channel import Channel, Gate
+from paramclient.protocol.channel import WINDOW_PX4, Channel, Gate
 from paramclient.protocol.dialect import EXTENDED, PLAIN, Digest
 from paramclient.protocol.events import (
     Change,
@@ -50,8 +50,6 @@ CLOCK_REQUESTS: Final = 2
 """Requests for it: one may be lost, and nothing waits for the answer."""
 CLOCK_INTERVAL: Final = 1.0
 """Seconds between them."""
-WINDOW_PX4: Final = 60
-"""Requests in flight to a PX4, which answers each at once."""
 ACCEPTED: Final = 0
 """PARAM_ACK_ACCEPTED in PARAM_EXT_ACK."""
 
