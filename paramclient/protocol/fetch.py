@@ -201,6 +201,12 @@ class _Fetch:
             self.notes.append(UNCONFIRMED.format(answer.reason))
         if self.policy is Policy.HASH_ONLY:
             return self._unconfirmed()
+        channel = self.session.channel
+        if channel.is_silent(self._began):
+            waited = anyio.current_time() - self._began
+            raise NoReply(
+                f"the parameters of {channel.system}/{channel.component}", attempts=0, waited=waited
+            )
         self._is_silent = answer.is_silent
         digest = answer.digest
         source = await self._download()
@@ -223,7 +229,7 @@ class _Fetch:
                     self.table.complete()
                     return "ftp"
                 except FileUnavailable as error:
-                    if self._is_lost():
+                    if session.channel.is_silent(self._began):
                         self.notes.append(f"The component was lost: {error.reason}.")
                         return "ftp"
                     self.notes.append(f"Downloaded as a list: {error.reason}.")
@@ -235,10 +241,6 @@ class _Fetch:
             await session.identification.encoding_certain()
         self.table.complete()
         return "stream"
-
-    def _is_lost(self) -> bool:
-        channel = self.session.channel
-        return channel.silence_since(self._began, anyio.current_time()) >= channel.silence_max
 
     async def _settle(self, before: Digest | None) -> bool:
         """Compare the table with the digest after the download; return whether the fetch is done."""

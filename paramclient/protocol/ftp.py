@@ -334,7 +334,8 @@ async def _opened(
         finally:
             if session is not None or is_requested:
                 is_closed = False
-                with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT), suppress(LinkError):
+                seconds = 0.0 if channel.is_lost(anyio.current_time()) else CLOSE_TIMEOUT
+                with anyio.CancelScope(shield=True), anyio.move_on_after(seconds), suppress(LinkError):
                     await _close(channel, inbox, path, session, sequence)
                     is_closed = True
                 if not is_closed:  # the opening may just have been repeated, or nothing is received any more
@@ -461,12 +462,12 @@ class _FileReader:
                 sequence, self._session, Opcode.BURST_READ_FILE, size=self._read_size, offset=offset
             )
             channel.send(FileTransfer(0, *channel.target, request.pack()))
-            sent = self._last = anyio.current_time()
+            self._last = anyio.current_time()
             pause = max(channel.timing.timeout(attempt), BURST_PAUSE_MIN)
             first = math.inf
             while True:
                 packet = None
-                with anyio.move_on_after(max(self._last + pause - anyio.current_time(), 0.001)):
+                with channel.waiting_until(self._last + pause):
                     packet = _answer(await self._inbox.next())
                 if packet is None:
                     break
@@ -483,8 +484,8 @@ class _FileReader:
                     return
             if self._pieces.reached > offset:
                 return
-            if channel.silence_since(sent, anyio.current_time()) >= channel.silence_max:
-                return
+            if channel.is_silent(self._began):
+                raise self._cut_off(offset, attempt + 1)
 
     def _end_of_burst(self, packet: Packet) -> None:
         if packet.code == FileErrorCode.EOF:
@@ -517,6 +518,8 @@ class _FileReader:
         paced_at = -math.inf
         while waiting or in_flight:
             now = anyio.current_time()
+            if channel.is_silent(began):
+                raise self._cut_off(min(wanted), max(attempts.values(), default=0))
             for at, (sent, due) in list(in_flight.items()):
                 if self._pieces.has(at):
                     timing.answered(attempts[at])
@@ -536,9 +539,8 @@ class _FileReader:
                 paced_at = now
                 allowed -= copies
                 tried = attempts.get(at, 0)
-                if channel.is_hopeless(tried, began, now):
-                    what = f"{self._path} of {channel.system}/{channel.component} at byte {at}"
-                    raise NoReply(what, attempts=tried, waited=now - began)
+                if channel.is_hopeless(tried, began):
+                    raise self._cut_off(at, tried)
                 await channel.gate.wait()
                 for _ in range(copies):
                     self._send_read(at)
@@ -548,8 +550,13 @@ class _FileReader:
                 due = min((due for _, due in in_flight.values()), default=math.inf)
                 if waiting:
                     due = min(due, now + BLOCK_INTERVAL * READS_AT_ONCE)
-                with anyio.move_on_after(max(due - now, 0.001)):
+                with channel.waiting_until(due):
                     self._take_read(_answer(await self._inbox.next()))
+
+    def _cut_off(self, offset: int, attempts: int) -> NoReply:
+        channel = self._channel
+        what = f"{self._path} of {channel.system}/{channel.component} at byte {offset}"
+        return NoReply(what, attempts=attempts, waited=anyio.current_time() - self._began)
 
     def _send_read(self, offset: int) -> None:
         sequence = self._channel.next_ftp_sequence()

@@ -243,11 +243,11 @@ class _Download:
             pause = PAUSE_TAIL
         if self._received:
             pause = max(pause, PAUSE_INTERVALS * (self._last - self._began) / len(self._received))
-        return anyio.current_time() - self._last > min(pause, self.channel.silence_max)
+        return anyio.current_time() - self._last > pause or self._is_silent()
 
     def _is_silent(self) -> bool:
         """Return whether the component is silent for so long that it counts as lost."""
-        return self.channel.silence_since(self._began, anyio.current_time()) >= self.channel.silence_max
+        return self.channel.is_silent(self._began)
 
     def _rate(self) -> float:
         """Return the values per second of the list so far."""

@@ -257,4 +257,6 @@ class Node:
                 presence.is_lost = True
                 self._doubt()
                 self._emit(Lost(silence))
+                if self.channel.gate.is_open:
+                    self.channel.lose()
             await anyio.sleep(min(max(timeout - silence, 0.001), 1.0) if not presence.is_lost else 1.0)

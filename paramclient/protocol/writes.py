@@ -269,14 +269,15 @@ class _Write:
                 is_silent = answer is None
                 if answer is None:
                     unanswered += 1
-                    if unanswered < SILENT_SETS_MAX:
+                    is_lost = channel.is_silent(began)
+                    if unanswered < SILENT_SETS_MAX and not is_lost:
                         continue
-                    try:
-                        answer = await self._read()
-                    except NoReply:
+                    with suppress(NoReply):
+                        answer = None if is_lost else await self._read()
+                    if answer is None:
                         what = f"the acknowledgement of {self.name} by {channel.system}/{channel.component}"
                         waited = anyio.current_time() - began
-                        raise NoReply(what, attempts=self.attempts, waited=waited) from None
+                        raise NoReply(what, attempts=self.attempts, waited=waited)
                 if answer.type_number != number:
                     self._retype(answer)
                     continue
