@@ -299,8 +299,8 @@ def keys_of(message: Message) -> tuple[Key, ...]:
             return ((ParamExtAck, name),)
         case CommandAck(command=command):
             return ((CommandAck, command),)
-        case FileTransfer():
-            return (FileTransfer,)
+        case FileTransfer(payload=payload):
+            return (FileTransfer, int.from_bytes(payload[:2], "little")), FileTransfer
         case _:
             return (type(message),)
 
@@ -460,7 +460,7 @@ class Channel:
         *,
         what: str,
         attempts: int | Callable[[], int] | None = None,
-        copies: int = 1,
+        copies: Callable[[int], int] = lambda attempt: 1,
         timeout_min: float = 0.0,
     ) -> T:
         """Send a request until it is answered. Cancellation leaves nothing behind.
@@ -472,7 +472,7 @@ class Channel:
                 error that the message tells.
             what: names the request in the error.
             attempts: at most, or a function that returns them; None for as many as loss explains.
-            copies: of the request in each attempt after the first.
+            copies: returns how often an attempt, counted from 0, is sent at once.
             timeout_min: seconds to wait in each attempt, at least.
 
         Raises:
@@ -485,7 +485,7 @@ class Channel:
             await self.gate.wait()
             sent = anyio.current_time()
             message = request(attempt) if callable(request) else request
-            for _ in range(copies if attempt else 1):
+            for _ in range(copies(attempt)):
                 self.send(message)
             answer = await self.wait_for(inbox, accept, sent, attempt, timeout_min)
             attempt += 1
