@@ -31,7 +31,6 @@ from paramclient.cli.options import LinkOptions
 from paramclient.errors import ClientClosed, ParamClientError, ParamErrorCode
 from paramclient.links import Peer, SimLink
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
-from paramclient.sim.param_table import Entry
 from paramclient.wire import frames, messages
 from tests.commands import Command, Outcome, Put, behind, in_process, leaping, strict
 from tests.shell import in_simulated_time
@@ -190,16 +189,8 @@ def test_fetch_prints_a_table_and_a_summary(command: Command, warm: Path) -> Non
     )
 
 
-class Gappy(GenericVehicle):
-    """A vehicle that never sends one of its parameters."""
-
-    def _send_value(self, entry: Entry, **where: Any) -> None:
-        if entry.name != "B":
-            super()._send_value(entry, **where)
-
-
 def test_missing_parameters_are_named(command: Command, put: Callable[[Endpoint], str]) -> None:
-    url = put(Gappy({"A": 1, "B": 2, "C": 3}))
+    url = put(GenericVehicle({"A": 1, "B": 2, "C": 3}, dead=["B"]))
     fetched = command("fetch", url, "--json", "--no-cache", "--timeout", 5)
     assert fetched.code == 1
     assert fetched.json["missing"] == [1]
@@ -213,9 +204,12 @@ class ListOnlyValues(PX4Vehicle):
 
     secret = next(row.name for row in px4_table() if row.volatile)
 
-    def _send_value(self, entry: Entry, **where: Any) -> None:
-        if entry.name != self.secret or self._position is not None:
-            super()._send_value(entry, **where)
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        secret = self.params[self.secret]
+        if not isinstance(message, messages.ParamRequestRead) or (
+            message.param_id != secret.name and message.param_index != secret.index
+        ):
+            super().respond(message, sender)
 
 
 def test_a_value_that_is_only_cached_is_missing(
@@ -300,24 +294,32 @@ def test_nan_can_be_forced(command: Command) -> None:
 class Unchanging(GenericVehicle):
     """A vehicle that keeps its values without a reason."""
 
-    def _write(self, entry: Entry, bits: int) -> None:
-        pass
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        if isinstance(message, messages.ParamSet):
+            message = messages.ParamRequestRead(self.system, self.component, message.param_id, -1)
+        super().respond(message, sender)
 
 
 class Mistyped(GenericVehicle):
     """A vehicle that reports a wrong type for every set."""
 
-    def _on_set(self, request: messages.ParamSet, sender: frames.Frame) -> None:
-        self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        if isinstance(message, messages.ParamSet):
+            self.send(
+                messages.ParamError(
+                    *(sender.system, sender.component, message.param_id, -1), ParamErrorCode.TYPE_MISMATCH
+                )
+            )
+        else:
+            super().respond(message, sender)
 
 
 class SilentOnParams(GenericVehicle):
     """A vehicle with heartbeats that answers no parameter requests."""
 
-    def _on_read(self, request: messages.ParamRequestRead, sender: frames.Frame) -> None:
-        pass
-
-    _on_set = _on_read  # type: ignore[assignment]  # the message is ignored
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        if not isinstance(message, messages.ParamRequestRead | messages.ParamSet):
+            super().respond(message, sender)
 
 
 @pytest.mark.parametrize(
@@ -521,15 +523,21 @@ def vehicle_lost_and_found() -> PX4Vehicle:
 
     class Restless(PX4Vehicle):
         begun_at: float | None = None
+        is_changed = False
 
         def tick(self, now: float) -> None:
             if self.begun_at is None:
                 self.begun_at = now
-            elif now > self.begun_at + 1.5 and self._heartbeat.base_mode:
-                self._heartbeat = replace(self._heartbeat, base_mode=0)
+            elif now > self.begun_at + 1.5 and not self.is_changed:
+                self.is_changed = True
                 self.set_param("B", 3)
                 self.reboot(now, down=8.0)
             super().tick(now)
+
+        def send(self, message: messages.Message) -> None:
+            if isinstance(message, messages.Heartbeat) and self.is_changed:
+                message = replace(message, base_mode=0)
+            super().send(message)
 
     return Restless(table={"A": 1, "B": 2})
 

@@ -26,7 +26,7 @@ from paramclient.errors import (
 )
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, WireValue, bits_of, from_bits
+from paramclient.model.values import ParamType, WireValue
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.provision import (
     MISSING,
@@ -42,9 +42,9 @@ from paramclient.provision import (
     verify_all,
 )
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, SimParam
-from paramclient.sim.param_table import Entry
-from paramclient.wire import messages
+from paramclient.wire import frames, messages
 from tests.shell import FlakyLink, Tap, a_client, in_simulated_time, residue
+from tests.simulation import clamped
 
 SETTINGS: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     f"TUNE_{number:02}": number / 4 if number % 3 else number for number in range(30)
@@ -72,19 +72,17 @@ GROUP: dict[str, WireValue | tuple[ParamType, WireValue]] = {
 class HidingGroup(ArduPilotVehicle):
     """An ArduPilot that answers no reads by name for the parameters of a hidden group."""
 
-    def _find(self, name: str) -> Entry | None:
-        entry = super()._find(name)
-        return entry if entry is not None and (not self._listed or self._is_listed(entry)) else None
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        name = getattr(message, "param_id", "")
+        if not name or name in self.params:
+            super().respond(message, sender)
 
 
 class ClampingVehicle(ArduPilotVehicle):
     """An ArduPilot that keeps TUNE_01 within 0 to 10."""
 
-    def _write(self, entry: Entry, bits: int) -> None:
-        value = from_bits(bits, entry.type)
-        if entry.name == "TUNE_01" and not isinstance(value, bytes):
-            bits = bits_of(min(max(value, 0.0), 10.0), entry.type)
-        super()._write(entry, bits)
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        super().respond(clamped(message, "TUNE_01", 0.0, 10.0), sender)
 
 
 CLAMPED: dict[str, WireValue | tuple[ParamType, WireValue]] = {
