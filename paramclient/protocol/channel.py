@@ -346,7 +346,7 @@ class Channel:
         self._transmit = transmit
         self._presence = presence
         self.inboxes: dict[Key, list[Inbox]] = {}
-        self._waits: dict[anyio.CancelScope, tuple[float, int] | None] = {}
+        self._waits: dict[anyio.CancelScope, tuple[float, int, float] | None] = {}
         self.window = anyio.Semaphore(WINDOW)
         self.window_size = WINDOW
 
@@ -431,14 +431,14 @@ class Channel:
 
     @contextmanager
     def waiting_until(
-        self, deadline: float, attempt: tuple[float, int] | None = None
+        self, deadline: float, attempt: tuple[float, int, float] | None = None
     ) -> Iterator[anyio.CancelScope]:
         """Run a block that waits for a message, until the deadline or until the component is lost.
 
         Args:
             deadline: on the clock of the event loop.
-            attempt: when a request was sent, and how often before; its timeout ends with the first round
-                trip that is measured.
+            attempt: when a request was sent, how often before, and the seconds to wait at least: a shorter
+                round trip that is measured meanwhile shortens the wait.
         """
         with anyio.CancelScope(deadline=deadline) as scope:
             self._waits[scope] = attempt
@@ -510,7 +510,7 @@ class Channel:
         """
         answer: T | None = None
         deadline = sent + max(self.timing.timeout(attempt), timeout_min)
-        with self.waiting_until(deadline, (sent, attempt)) as scope:
+        with self.waiting_until(deadline, (sent, attempt, timeout_min)) as scope:
             answer = await _accepted(inbox, accept)
         if answer is None and anyio.current_time() > scope.deadline + LATE_WAKE_UP:
             with anyio.move_on_after(LATE_GRACE):
@@ -518,22 +518,20 @@ class Channel:
         return answer
 
     def _measure(self, attempts: int, last: float, whole: float) -> None:
-        """Take the times of an answered exchange; the first round trip shortens the waits that are open."""
+        """Take the times of an answered exchange; it shortens the waits that are open."""
         timing = self.timing
         self.answered.set()
         if self.is_streaming:
             return
         timing.answered(attempts)
-        is_first = timing.round_trip is None
         if attempts == 1:
             timing.measure(last)
         else:
             timing.bound(whole)
-        if is_first:
-            for scope, request in self._waits.items():
-                if request is not None:
-                    sent, attempt = request
-                    scope.deadline = min(scope.deadline, sent + timing.timeout(attempt))
+        for scope, request in self._waits.items():
+            if request is not None:
+                sent, attempt, timeout_min = request
+                scope.deadline = min(scope.deadline, sent + max(timing.timeout(attempt), timeout_min))
 
 
 async def _accepted(inbox: Inbox, accept: Callable[[Message], T | None]) -> T:

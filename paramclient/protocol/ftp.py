@@ -45,9 +45,6 @@ BUSY_ATTEMPTS: Final = 2
 CLOSE_TIMEOUT: Final = 2.0
 """Seconds for the closing of a session, also when its reader is cancelled. ArduPilot has one session for all
 links: an open one blocks the file access of all stations for 3 s."""
-CLOSE_COPIES: Final = 4
-"""Copies of each request that closes a session: the time for it is short, and packets are lost in bursts.
-ArduPilot's queue of requests holds 5."""
 BURST_PAUSE_MIN: Final = 0.15
 """Seconds before the first block after which a burst counts as lost: at 57600 baud, ArduPilot begins one
 95 ms after the request."""
@@ -258,10 +255,10 @@ async def _request(
     offset: int = 0,
     size: int = 0,
     attempts: int | None = None,
-    copies: Callable[[int], int] = lambda attempt: 1,
+    copies: Callable[[int], int] | None = None,
     sequence: int | None = None,
 ) -> Packet:
-    """Send one request until its ACK arrives.
+    """Send one request until its ACK arrives; several copies at once from the second attempt on.
 
     All attempts have one sequence number, so the server repeats its response and does not act twice.
     """
@@ -284,7 +281,7 @@ async def _request(
             accept,
             what=f"MAVFTP {opcode.name} {path} of {channel.system}/{channel.component}",
             attempts=attempts,
-            copies=copies,
+            copies=copies or (lambda attempt: channel.timing.copies if attempt else 1),
         )
 
 
@@ -332,19 +329,13 @@ async def _close(channel: Channel, path: str, session: int | None, opening: int)
     One whose number never arrived is requested once more, with the sequence number of its opening. ArduPilot
     takes the number of the request, which is 0.
     """
-
-    def copies(attempt: int) -> int:
-        return CLOSE_COPIES if attempt else 1
-
     with suppress(FileTransferError, NoReply):  # closed by the server, which ends silent sessions by itself
         if session is None:
             with suppress(FileTransferError):
                 data = path_bytes(path)
-                answer = await _request(
-                    channel, Opcode.OPEN_FILE_RO, path, data, copies=copies, sequence=opening
-                )
+                answer = await _request(channel, Opcode.OPEN_FILE_RO, path, data, sequence=opening)
                 session = answer.session
-        await _request(channel, Opcode.TERMINATE_SESSION, path, session=session or 0, copies=copies)
+        await _request(channel, Opcode.TERMINATE_SESSION, path, session=session or 0)
 
 
 class FileCutOff(NoReply):
