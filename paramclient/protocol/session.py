@@ -36,7 +36,7 @@ class Shared(Generic[T]):
 
     Args:
         spawn: starts the work in the background.
-        gate: fails after the work was cancelled with all background work.
+        gate: fails after all background work was cancelled.
     """
 
     def __init__(self, spawn: Spawn, gate: Gate) -> None:
@@ -63,9 +63,9 @@ class Shared(Generic[T]):
             self._spawn(self._execute, run)
         run.waiters += 1
         try:
-            await run.done.wait()
-            if run.was_cancelled:
-                with self._gate.until_closed():
+            with self._gate.until_closed():  # a client that is being closed starts no work
+                await run.done.wait()
+                if run.was_cancelled:
                     await anyio.sleep_forever()
         finally:
             run.waiters -= 1

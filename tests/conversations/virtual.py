@@ -7,7 +7,7 @@ import inspect
 import random
 import selectors
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from functools import wraps
 from typing import Any, TypeVar
 
@@ -165,6 +165,10 @@ async def converse(endpoint: Endpoint, **options: Any) -> AsyncIterator[Conversa
     def changed(node: Node, session: Session, change: Change) -> None:
         conversation.changes.append(change)
 
+    async def supervise(work: Callable[..., Awaitable[object]], *arguments: object) -> None:
+        with suppress(ParamClientError):
+            await work(*arguments)
+
     async def read() -> None:
         while True:
             for peer, data in await link.receive():
@@ -183,7 +187,7 @@ async def converse(endpoint: Endpoint, **options: Any) -> AsyncIterator[Conversa
                 link="sim:test",
                 is_stream=False,
                 send=send,
-                spawn=tasks.start_soon,
+                spawn=lambda *work: tasks.start_soon(supervise, *work),
                 emit=emit,
                 changed=changed,
                 **options,
