@@ -314,6 +314,7 @@ class Component:
             TypeMismatch: the parameter has another type on the vehicle.
             ValueNotApplied: the vehicle keeps its previous value and reports no reason.
             NoReply: the vehicle did not respond. It is unknown whether it has the value.
+            AnotherVehicle: another vehicle has taken its place meanwhile. Nothing was written to it.
             AmbiguousVehicle: another vehicle uses the same ids. Nothing was written.
             NotDurable: the vehicle has accepted the value, but it could not be written to the disk.
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
@@ -342,8 +343,8 @@ class Component:
 
         Several writes are in flight at a time. A parameter that reveals or hides others, such as `*_ENABLE`,
         is written alone: all writes before it end first, and those after it begin afterwards. A value that is
-        refused does not stop the others. If the vehicle does not respond any more, the link fails or the
-        timeout expires, the call returns the outcomes so far.
+        refused does not stop the others. If the vehicle does not respond any more, another vehicle takes its
+        place, the link fails or the timeout expires, the call returns the outcomes so far.
 
         Args:
             values: values by name, or pairs of name and value. Values are as in `set`.

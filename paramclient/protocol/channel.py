@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from typing import Final, Protocol, TypeAlias, TypeVar
 
@@ -462,6 +462,7 @@ class Channel:
         attempts: int | Callable[[], int] | None = None,
         copies: Callable[[int], int] = lambda attempt: 1,
         timeout_min: float = 0.0,
+        ready: Callable[[], Awaitable[None]] | None = None,
     ) -> T:
         """Send a request until it is answered. Cancellation leaves nothing behind.
 
@@ -474,6 +475,7 @@ class Channel:
             attempts: at most, or a function that returns them; None for as many as loss explains.
             copies: returns how often an attempt, counted from 0, is sent at once.
             timeout_min: seconds to wait in each attempt, at least.
+            ready: awaited before each attempt, in place of the open link.
 
         Raises:
             NoReply: loss no longer explains the silence, or nothing at all was heard of the component.
@@ -482,7 +484,7 @@ class Channel:
         began = anyio.current_time()
         attempt = 0
         while True:
-            await self.gate.wait()
+            await (self.gate.wait if ready is None else ready)()
             sent = anyio.current_time()
             message = request(attempt) if callable(request) else request
             for _ in range(copies(attempt)):

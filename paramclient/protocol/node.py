@@ -110,10 +110,20 @@ class Node:
         self.channel = Channel(system, component, transmit, gate, self.presence)
         self.identification = Identification(system, link, encoding, listens_only=listens_only)
         self.plain = Session(
-            self.channel, self.identification, PLAIN, spawn, lambda change: changed(self.plain, change)
+            self.channel,
+            self.identification,
+            PLAIN,
+            spawn,
+            lambda change: changed(self.plain, change),
+            self.identified,
         )
         self.extended = Session(
-            self.channel, self.identification, EXTENDED, spawn, lambda change: changed(self.extended, change)
+            self.channel,
+            self.identification,
+            EXTENDED,
+            spawn,
+            lambda change: changed(self.extended, change),
+            self.identified,
         )
         self.sessions = (self.plain, self.extended)
         self.version = 2

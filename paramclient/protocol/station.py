@@ -319,6 +319,8 @@ class Station:
         if is_gone or node.peer in self._ended_peers or node.is_same_vehicle(message):
             node.peer = peer
             node.rival = None
+            if not node.is_same_vehicle(message):
+                node.resumed()
             return True
         node.rival = (peer, now)
         return False

@@ -159,16 +159,15 @@ class Table:
         elif place is not None:
             self._take_place(name, place)
         self.moments[name] = now
+        self._take_evidence(name, raw, number)
         if old is None:
             if len(self.params) >= NAMES_MAX:
                 return None
             new = self.dialect.param(name, raw, number, place, self._encoding)
-            self._take_evidence(name, raw, number)
         elif not is_exact and self._is_reported(old, raw, number):
             new = self._placed(old, place)
         else:
             new = self.dialect.param(name, raw, number, place, self._encoding)
-            self._take_evidence(name, raw, number)
             if new.type_number == old.type_number:
                 new = replace(new, default=old.default)
         if self._held is not None:

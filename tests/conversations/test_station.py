@@ -17,7 +17,7 @@ from paramclient.errors import (
     NoReply,
     VehicleArmed,
 )
-from paramclient.model.values import Encoding, ParamType, encode_value
+from paramclient.model.values import Encoding, ParamType, Trust, encode_value
 from paramclient.protocol.commands import reboot, request_message, send_command
 from paramclient.protocol.events import Found, Identified, Lost, Rebooted, Replaced
 from paramclient.protocol.fetch import fetch_all
@@ -448,6 +448,23 @@ async def test_the_same_hardware_id_proves_that_a_vehicle_has_moved() -> None:
         assert node.peer == "a"
         conversation.hear(AutopilotVersion(0, uid=7), peer="b")
         assert (node.peer, node.has_rival(anyio.current_time())) == ("b", False)
+
+
+@virtual
+async def test_a_vehicle_at_another_peer_may_be_another_one_until_it_is_identified() -> None:
+    async with converse(Nothing()) as conversation:
+        conversation.hear(HighLatency2(2, 12), peer="a")  # it counts as lost only after a minute
+        conversation.hear(AutopilotVersion(0, uid=7), peer="a")
+        conversation.hear(ParamValue("A", b"\1\0\0\0", 6, 10, 0), peer="a")
+        node = conversation.station.nodes[1, 1]
+        await anyio.sleep(5.5)
+        asked = len(conversation.sent_of(CommandLong))
+        conversation.hear(HighLatency2(2, 12), peer="b")
+        await anyio.sleep(0.1)
+        assert node.plain.table.params["A"].trust is Trust.CACHED
+        assert len(conversation.sent_of(CommandLong)) > asked
+        conversation.hear(AutopilotVersion(0, uid=8), peer="b")
+        assert (node.peer, len(conversation.of(Replaced))) == ("b", 1)
 
 
 @virtual

@@ -17,6 +17,7 @@ import sniffio
 import trio
 from trio.testing import MockClock
 
+from paramclient.errors import ParamClientError
 from paramclient.links.sim import SimLink
 from paramclient.protocol.events import Change, ComponentEvent
 from paramclient.protocol.node import Node
@@ -211,7 +212,7 @@ class Tap:
     """An endpoint behind a filter: messages to it and from it are passed on where a function says so.
 
     Args:
-        endpoint: the vehicle.
+        endpoint: the vehicle; another one may take its place.
         up, down: return whether a message to the vehicle, or from it, arrives.
     """
 
@@ -224,24 +225,24 @@ class Tap:
     ) -> None:
         self.up = up
         self.down = down
-        self._endpoint = endpoint
+        self.endpoint = endpoint
 
     def receive(self, data: bytes, now: float) -> None:
         """Pass a datagram on to the vehicle."""
         if all(map(self.up, messages_in(data))):
-            self._endpoint.receive(data, now)
+            self.endpoint.receive(data, now)
 
     def tick(self, now: float) -> None:
         """Pass the time on."""
-        self._endpoint.tick(now)
+        self.endpoint.tick(now)
 
     def next_deadline(self) -> float | None:
         """Return the vehicle's deadline."""
-        return self._endpoint.next_deadline()
+        return self.endpoint.next_deadline()
 
     def data_to_send(self) -> list[bytes]:
         """Return what arrives of the vehicle's frames."""
-        return [data for data in self._endpoint.data_to_send() if all(map(self.down, messages_in(data)))]
+        return [data for data in self.endpoint.data_to_send() if all(map(self.down, messages_in(data)))]
 
 
 QUIET = Heartbeat(2, 0, system_status=4)

@@ -24,7 +24,6 @@ from paramclient.errors import (
     UsageError,
     VehicleArmed,
 )
-from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, WireValue
 from paramclient.protocol.ftp import Opcode, Packet
@@ -660,17 +659,35 @@ async def test_a_system_id_of_another_vehicle_is_not_set() -> None:
     assert [vehicle.system for vehicle in vehicles] == [1, 7]
 
 
+@pytest.mark.parametrize("sent", [0, len(SETTINGS)])
 @in_simulated_time
-async def test_another_vehicle_at_the_same_address_ends_the_run() -> None:
-    vehicle = ardupilot()
+async def test_another_vehicle_at_the_same_address_ends_the_run(sent: int) -> None:
+    """Before the first value, or before the values are read again."""
+    vehicle, other = ardupilot(), ardupilot(uid2=b"another")
     tap = Tap(vehicle)
+
+    async def exchange() -> None:
+        while vehicle.requests["PARAM_SET"] < sent:  # noqa: ASYNC110 - in simulated time
+            await anyio.sleep(0.1)
+        tap.is_deaf = tap.is_mute = True
+        tap.endpoint = other
+        await anyio.sleep(1.5)
+        tap.is_deaf = tap.is_mute = False
+        await anyio.sleep(1.0)
+
     async with a_client(tap) as client:
         component = await client.component()
-        with mock.patch.object(Identity, "is_same_vehicle", return_value=False):
-            result = await apply(component, written(another()))
-    assert isinstance(result.error, AnotherVehicle)
-    assert not result.complete
-    assert len(tap.messages(messages.ParamSet)) == len(SETTINGS)
+        await anyio.sleep(30.0)
+        if sent:
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(exchange)
+                result = await apply(component, written(another()))
+            assert isinstance(result.error, AnotherVehicle)
+            assert not result.complete
+        else:
+            with pytest.raises(AnotherVehicle):
+                await apply(component, written(another()), before_writing=exchange)
+    assert (vehicle.requests["PARAM_SET"], other.requests["PARAM_SET"]) == (sent, 0)
 
 
 class EndpointWithEvent(Tap):
