@@ -33,7 +33,7 @@ STREAMS = {"Changes": "Change", "Events": "Event"}
 OWN = {name for names in CLASSES.values() for name in names} | {each.__name__ for each in FUNCTIONS}
 ATTRIBUTES = {
     "Component": ("system: int", "component: int", "params: ParamMap"),
-    "ParamClient": ("cache: ParamCache | None",),
+    "ParamClient": ("link: Link", "cache: ParamCache | None", "listens_only: bool"),
 }
 """The public attributes that `__init__` sets."""
 INTERNAL = {"emit", "limited", "wait_for_cache", "wait_until_identified"}

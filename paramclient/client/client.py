@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping
-from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Self
 
@@ -100,7 +99,9 @@ class ParamClient:
             for vehicles that share a system id.
 
     Attributes:
+        link: the link object.
         cache: cache of the tables, or None.
+        listens_only: whether the client sends nothing: by `listen_only`, or because the link is a log.
 
     Raises:
         UsageError: the link name, an id, the interval or the policy is not valid, or one of the latter two is
@@ -137,8 +138,9 @@ class ParamClient:
             raise UsageError(f"policy must be one of {', '.join(Policy)}, not {policy!r}") from None
         if listen_only and (watch_interval or self.policy is not Policy.AUTO):
             raise UsageError("the client only listens: it takes no policy, and no watch_interval but 0")
-        opened = create_link(link)
+        self.link = opened = create_link(link)
         is_log = isinstance(opened, ReplayLink)
+        self.listens_only = listen_only or is_log
         self.cache = choose_cache(cache, is_log=is_log)
         self.watch_interval = watch_interval
         self._components: dict[Address, Component] = {}
@@ -147,25 +149,26 @@ class ParamClient:
         forwarder = None if forward is None else Forwarder(create_link(forward))
         capture = None if tlog is None else Capture(tlog)
         self._traffic = Traffic() if traffic else None
-        self.core = ClientCore(
+        self.core = core = ClientCore(
             opened,
             CacheWriter(self.cache, owned=self.cache is not cache),
             [tap for tap in (forwarder, capture, self._traffic) if tap is not None],
             Signing(signing) if isinstance(signing, SigningKey) else signing,
-            partial(
-                Station,
-                link=opened.name,
-                is_stream=opened.is_stream,
-                system=system,
-                component=component,
-                encoding=encoding,
-                listens_only=listen_only or is_log,
-                split_peers=split_peers,
-                discovered=self._meet,
-                emit=self.emit,
-                changed=self._changed,
-            ),
             self._end_streams,
+        )
+        core.station = core.link_task.station = Station(
+            link=opened.name,
+            is_stream=opened.is_stream,
+            send=core.link_task.queue,
+            spawn=core.spawn,
+            system=system,
+            component=component,
+            encoding=encoding,
+            listens_only=self.listens_only,
+            split_peers=split_peers,
+            discovered=self._meet,
+            emit=self.emit,
+            changed=self._changed,
         )
 
     def __repr__(self) -> str:
@@ -211,16 +214,6 @@ class ParamClient:
         """The autopilot of each system, sorted by system id, without cameras, gimbals and the like."""
         found = autopilots_of(self.core.station.nodes.values())
         return [self._by_session[each.plain] for each in sorted(found, key=lambda node: node.system)]
-
-    @property
-    def link(self) -> Link:
-        """The link object of the client."""
-        return self.core.link
-
-    @property
-    def listens_only(self) -> bool:
-        """Whether the client sends nothing: because of `listen_only`, or because the link is a log."""
-        return self.core.station.listens_only
 
     @property
     def bytes_received(self) -> int:

@@ -89,9 +89,7 @@ class Owner(Protocol):
     core: ClientCore
     policy: Policy
     watch_interval: float | None
-
-    @property
-    def listens_only(self) -> bool: ...
+    listens_only: bool
 
     @property
     def components(self) -> Mapping[Address, Component]: ...
@@ -606,12 +604,12 @@ class Component:
             raise NotDurable(f"{address} has accepted {what}, but it is not on the disk: {error}") from error
 
     @contextmanager
-    def limited(self, timeout: float | None, what: str) -> Iterator[None]:
-        """Raise NoReply at a timeout, and add to each NoReply what was received meanwhile."""
+    def limited(self, timeout: float | None, what: str) -> Iterator[anyio.CancelScope]:
+        """Raise NoReply at a timeout, or when the scope is cancelled; add to each what was received."""
         began = anyio.current_time()
         try:
             with anyio.move_on_after(timeout) as scope:
-                yield
+                yield scope
             if scope.cancelled_caught:
                 raise NoReply(what, attempts=0, waited=anyio.current_time() - began)
         except NoReply as error:

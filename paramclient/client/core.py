@@ -43,14 +43,16 @@ class ClientCore:
         cache_writer: writes tables to the cache.
         taps: receivers of all frames of the link.
         signing: the key and its options, or None.
-        new_station: makes the station, of functions that queue bytes and start background work.
         ended: called when the streams end: with a log, with a link that has failed for good, or at closing.
 
     Attributes:
-        link_task, station, cache_writer: the parts.
+        link_task, cache_writer: the parts.
+        station: set before `open`.
         cache: the cache of the tables, or None.
         is_over: whether a log has ended.
     """
+
+    station: Station
 
     def __init__(
         self,
@@ -58,7 +60,6 @@ class ClientCore:
         cache_writer: CacheWriter,
         taps: Sequence[Tap],
         signing: Signing | None,
-        new_station: Callable[..., Station],
         ended: Callable[[], None],
     ) -> None:
         self.link = link
@@ -66,7 +67,6 @@ class ClientCore:
         self.cache = cache_writer.cache
         self.is_over = False
         self.link_task = LinkTask(link, taps=taps, ended=self._link_ended)
-        self.station = self.link_task.station = new_station(send=self.link_task.queue, spawn=self.spawn)
         self._taps = taps
         self._signing = signing
         self._ended = ended
