@@ -23,7 +23,7 @@ from paramclient.client.recording import Capture
 from paramclient.client.signing import Signing, refused_in_words
 from paramclient.client.streams import Subscribers
 from paramclient.client.traffic import Traffic, TrafficReport
-from paramclient.errors import AnotherVehicle, NoReply, ParamClientError, UsageError
+from paramclient.errors import AnotherVehicle, ClientClosed, NoReply, ParamClientError, UsageError
 from paramclient.links import Link, ReplayLink, SimLink, create_link
 from paramclient.model.values import Encoding
 from paramclient.model.wording import counted
@@ -168,7 +168,9 @@ class ParamClient:
             split_peers=split_peers,
             discovered=self._meet,
             emit=self.emit,
-            changed=self._changed,
+        )
+        core.station.gate.fail(
+            ClientClosed("the client is not open; use `async with` or `open`", link=opened.name)
         )
 
     def __repr__(self) -> str:
@@ -420,7 +422,7 @@ class ParamClient:
             LinkError: the link failed, or the client was closed.
         """
         if refresh:
-            self.core.check_may_send()
+            self.core.station.check_may_send()
         nodes = self.core.station.nodes
         deadline = math.inf if timeout is None else anyio.current_time() + timeout
         await self._wait_for(
@@ -446,7 +448,7 @@ class ParamClient:
         """
         if self._traffic is None:
             raise UsageError("this client does not count traffic; use ParamClient(..., traffic=True)")
-        self.core.check_open()
+        self.core.station.gate.check()
         return self._traffic.report(anyio.current_time(), self.core.link_task.cutter)
 
     def signing_report(self) -> SigningReport | None:
@@ -494,10 +496,6 @@ class ParamClient:
                 self._by_session[session].watch.doubt()
         self.core.link_task.notify()
 
-    def _changed(self, node: Node, session: Session, change: protocol.Change) -> None:
-        self._by_session[session].subscribers.push(change)
-        self.core.cache_writer.changed(node, session, change)
-
     async def _join_vehicle(self, node: Node) -> None:
         """Load the cached tables of a component whose vehicle is identified already, or never was."""
         await anyio.sleep_until(node.since + HEARTBEAT_WAIT)  # for the heartbeat of its autopilot
@@ -524,7 +522,7 @@ class ParamClient:
 
     async def _activity(self) -> None:
         await self.core.link_task.activity.wait()
-        self.core.check_open()
+        self.core.station.gate.check()
 
     async def _wait_for(
         self,
@@ -542,7 +540,7 @@ class ParamClient:
             timeout: seconds; None waits without limit.
             asked: system and component to which requests are sent; nothing is, without both.
         """
-        self.core.check_open()
+        self.core.station.gate.check()
         began = anyio.current_time()
         station = self.core.station
         system, component = asked

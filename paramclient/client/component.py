@@ -131,6 +131,7 @@ class Component:
         self.cache_is_read = anyio.Event()
         self._ext = ext
         self._last: FetchResult | None = None
+        session.table.changed = self._changed
         session.table.recounted = self.watch.doubt
         if client.listens_only:
             session.contradicted = self.watch.doubt
@@ -266,7 +267,7 @@ class Component:
             check_portable_name(name)
         elif not isinstance(name, int) or not 0 <= name < PARAMETERS_MAX:
             raise UsageError(f"parameter index {name}: indices are 0 to {PARAMETERS_MAX - 1}")
-        self.core.check_may_send()
+        self.core.station.check_may_send()
         with self.limited(timeout, f"parameter {name} of {self.system}/{self.component}"):
             return await read_param(self.session, name)
 
@@ -412,9 +413,9 @@ class Component:
             NoReply: no response arrived.
             LinkError: the link failed, or the client was closed.
         """
-        self.core.check_open()
+        self.core.station.gate.check()
         if refresh:
-            self.core.check_may_send()
+            self.core.station.check_may_send()
             if self.policy is not Policy.AUTO:
                 raise UsageError(f"refresh needs a download, and the policy is {self.policy}")
         began = anyio.current_time()
@@ -441,7 +442,7 @@ class Component:
         table = self.session.table
         while not self.core.is_over and not (self._waits_for_others and self._is_heard()):
             await self.core.link_task.activity.wait()
-            self.core.check_open()
+            self.core.station.gate.check()
         if not table.params:
             raise self._nothing(began)
         is_cached = self._is_heard() and _has(table.params, Trust.CACHED)
@@ -482,6 +483,10 @@ class Component:
             self.core.cache_writer.fetched(self.node, self.session, is_whole=result.source != "cache")
         return result
 
+    def _changed(self, change: Change) -> None:
+        self.subscribers.push(change)
+        self.core.cache_writer.changed(self.node, self.session, change)
+
     def _resynced(self, event: Resynced) -> None:
         self.core.cache_writer.fetched(self.node, self.session, is_whole=True)
         self.client.emit(self.node, event)
@@ -507,7 +512,7 @@ class Component:
             )
         if self.node.version == 1:
             raise UsageError(f"{self.system}/{self.component} uses MAVLink 1, which has no signing")
-        self.core.check_may_send()
+        self.core.station.check_may_send()
         await self.core.station.set_up_signing(self.node, key, 0 if key is None else timestamp_now())
 
     async def reboot(self, *, system: int | None = None, timeout: float | None = REBOOT_TIMEOUT) -> Component:
@@ -526,7 +531,7 @@ class Component:
             NoReply: it did not answer, or did not come back in time.
             LinkError: the link failed, or the client was closed.
         """
-        self.core.check_may_send()
+        self.core.station.check_may_send()
         moves = system is not None and system != self.system
         with self.limited(timeout, f"{self.system}/{self.component} to be back after its reboot"):
             await commands.reboot(self.node, returns=not moves)
@@ -562,7 +567,7 @@ class Component:
         if self.core.cache_writer.may_have(self.node):
             with anyio.CancelScope(deadline=self.node.since + CACHE_TIMEOUT):
                 await self.cache_is_read.wait()
-            self.core.check_open()
+            self.core.station.gate.check()
 
     async def _check_writes(
         self,
@@ -583,7 +588,7 @@ class Component:
             raise UsageError(f"{HASH_CHECK} is read-only: it is the hash of the parameters, not a parameter")
         if not 0.0 <= settle <= SETTLE_MAX:
             raise UsageError(f"settle must be 0 to {SETTLE_MAX:g} seconds, not {settle}")
-        self.core.check_may_send()
+        self.core.station.check_may_send()
         if self.node.has_rival(anyio.current_time()):
             words = node_in_words(self.node)
             raise AmbiguousVehicle(

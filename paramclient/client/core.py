@@ -84,26 +84,6 @@ class ClientCore:
             return "closed"
         return "reconnecting" if self.link_task.is_disconnected else "open"
 
-    def check_open(self) -> None:
-        """Check that requests can be sent.
-
-        Raises:
-            LinkError: the link failed, or the client is not open.
-        """
-        self.station.gate.check()
-        if self._work is None:
-            raise ClientClosed("the client is not open; use `async with` or `open`", link=self.link.name)
-
-    def check_may_send(self) -> None:
-        """Check that the client is open, and does not only listen.
-
-        Raises:
-            UsageError, LinkError.
-        """
-        self.check_open()
-        if self.station.listens_only:
-            raise UsageError("the client only listens, and sends no requests")
-
     def spawn(self, work: Callable[..., Any], *arguments: Any) -> None:
         """Run a function in the background. Its errors are logged, and never end the link."""
         if self._work is not None and not self._work.cancel_scope.cancel_called:
@@ -197,6 +177,7 @@ class ClientCore:
                 try:
                     async with anyio.create_task_group() as self._work:
                         self.spawn(self.station.send_heartbeats)
+                        self.station.gate.open()
                         self._is_opened.set()
                         await self._is_to_close.wait()
                         logger.debug("%s: closing", self.link.name)

@@ -13,7 +13,6 @@ from paramclient.protocol.addresses import Peer
 from paramclient.protocol.channel import WINDOW_PX4, Channel, Gate
 from paramclient.protocol.dialect import EXTENDED, PLAIN, Digest
 from paramclient.protocol.events import (
-    Change,
     ComponentEvent,
     Found,
     Identified,
@@ -69,7 +68,6 @@ class Node:
         listens_only: whether nothing is requested.
         spawn: starts an async function in the background.
         emit: called with each event.
-        changed: called with each change of a parameter, and its session.
 
     Attributes:
         channel, presence, identification: the parts.
@@ -97,7 +95,6 @@ class Node:
         listens_only: bool,
         spawn: Spawn,
         emit: Callable[[ComponentEvent], None],
-        changed: Callable[[Session, Change], None],
     ) -> None:
         self.system = system
         self.component = component
@@ -109,22 +106,8 @@ class Node:
         self.presence = Presence()
         self.channel = Channel(system, component, transmit, gate, self.presence)
         self.identification = Identification(system, link, encoding, listens_only=listens_only)
-        self.plain = Session(
-            self.channel,
-            self.identification,
-            PLAIN,
-            spawn,
-            lambda change: changed(self.plain, change),
-            self.identified,
-        )
-        self.extended = Session(
-            self.channel,
-            self.identification,
-            EXTENDED,
-            spawn,
-            lambda change: changed(self.extended, change),
-            self.identified,
-        )
+        self.plain = Session(self.channel, self.identification, PLAIN, spawn, self.identified)
+        self.extended = Session(self.channel, self.identification, EXTENDED, spawn, self.identified)
         self.sessions = (self.plain, self.extended)
         self.version = 2
         self.generation = 0

@@ -15,7 +15,6 @@ from paramclient.model.identity import Identity
 from paramclient.model.values import Encoding, Param, ParamType
 from paramclient.protocol.channel import Channel, Gate
 from paramclient.protocol.dialect import Dialect, Digest, ReportedValue
-from paramclient.protocol.events import Change
 from paramclient.protocol.identity import Identification
 from paramclient.protocol.table import Table
 from paramclient.wire.messages import NO_INDEX
@@ -135,7 +134,6 @@ class Session:
         channel, identification: the component's.
         dialect: plain or extended.
         spawn: starts an async function in the background.
-        changed: called with each change of a parameter.
         identified: requests the identity and waits for it.
 
     Attributes:
@@ -162,14 +160,13 @@ class Session:
         identification: Identification,
         dialect: Dialect,
         spawn: Spawn,
-        changed: Callable[[Change], None],
         identified: Callable[[], Awaitable[None]],
     ) -> None:
         self.channel = channel
         self.identification = identification
         self.dialect = dialect
         self.spawn = spawn
-        self.table = Table(dialect, changed)
+        self.table = Table(dialect)
         self.table.author_of = self._author_of
         self.fetching: Shared[Any] = Shared(spawn, channel.gate)
         self.reading: set[str | int] = set()

@@ -10,14 +10,14 @@ from typing import Final
 
 import anyio
 
-from paramclient.errors import LinkError
+from paramclient.errors import LinkError, UsageError
 from paramclient.model.values import Encoding
 from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_words
 from paramclient.protocol.channel import Gate
 from paramclient.protocol.dialect import EXTENDED, PLAIN
-from paramclient.protocol.events import Change, ComponentEvent
+from paramclient.protocol.events import ComponentEvent
 from paramclient.protocol.node import Node
-from paramclient.protocol.session import Session, Spawn
+from paramclient.protocol.session import Spawn
 from paramclient.wire.frames import BOOT_CLOCK_OFFSETS, Frame, Framer, sign_frame
 from paramclient.wire.messages import (
     AUTOPILOT_COMPONENT,
@@ -86,7 +86,6 @@ class Station:
         split_peers: whether equal ids at different peers are different components.
         discovered: called with a new component, before its first message is taken.
         emit: called with each event of a component.
-        changed: called with each change of a parameter.
 
     Attributes:
         nodes: every known component, by (system, component).
@@ -110,7 +109,6 @@ class Station:
         split_peers: bool = False,
         discovered: Callable[[Node], None] = lambda node: None,
         emit: Callable[[Node, ComponentEvent], None] = lambda node, event: None,
-        changed: Callable[[Node, Session, Change], None] = lambda node, session, change: None,
     ) -> None:
         self.link = link
         self.nodes: dict[Address, Node] = {}
@@ -127,7 +125,6 @@ class Station:
         self._splits_peers = split_peers
         self._discovered = discovered
         self._emit = emit
-        self._changed = changed
         self._datagrams = self._new_framer(stream=False)
         self._framers: dict[Peer, Framer] = {}
         self._ended_peers: set[Peer] = set()  # of components: another connection may take their ids
@@ -151,6 +148,17 @@ class Station:
             sum(framer.skipped for framer in framers),
             sum(framer.damaged for framer in framers),
         )
+
+    def check_may_send(self) -> None:
+        """Check that requests can be sent.
+
+        Raises:
+            UsageError: the client only listens.
+            LinkError: the link failed, or the client is not open.
+        """
+        self.gate.check()
+        if self.listens_only:
+            raise UsageError("the client only listens, and sends no requests")
 
     def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
         """Sign what is sent, and accept what the verifier accepts; call it before `receive`."""
@@ -355,7 +363,6 @@ class Station:
             listens_only=self.listens_only,
             spawn=self._spawn,
             emit=lambda event: self._emit(node, event),
-            changed=lambda session, change: self._changed(node, session, change),
         )
         if self._asked.get((node.system, node.component), 0) > 2:
             node.channel.reads_from = (node.system, COMP_ID_ALL)

@@ -37,7 +37,6 @@ class Table:
 
     Args:
         dialect: decodes the values.
-        changed: called with each change, after it is stored.
 
     Attributes:
         params: by name, in the order of first reception. Shared with readers; never replaced.
@@ -51,12 +50,11 @@ class Table:
         evidence: for each encoding, a value that shows it: name, bytes and type.
         is_growing: whether each value so far was the last one by its own param_count: a component that counts
             what it has sent, and whose list ends by a pause.
+        changed: called with each change, after it is stored.
         recounted: called when the count of a complete table changes, or may have changed.
     """
 
-    def __init__(
-        self, dialect: Dialect = PLAIN, changed: Callable[[Change], None] = lambda change: None
-    ) -> None:
+    def __init__(self, dialect: Dialect = PLAIN) -> None:
         self.dialect = dialect
         self.params: dict[str, Param] = {}
         self.count: int | None = None
@@ -67,8 +65,8 @@ class Table:
         self.left_out: set[str] = set()
         self.is_growing = True
         self.author_of: Callable[[str], str] = lambda name: "vehicle"
+        self.changed: Callable[[Change], None] = lambda change: None
         self.recounted: Callable[[], None] = lambda: None
-        self._changed = changed
         self._held: dict[str, Change] | None = {} if dialect is PLAIN else None
         self._encoding = Encoding.BYTEWISE
         self._wire: dict[str, tuple[bytes, int]] = {}  # as received, until the encoding is certain
@@ -304,7 +302,7 @@ class Table:
 
     def _report(self, change: Change) -> None:
         if self._held is None:
-            self._changed(change)
+            self.changed(change)
         else:
             self._held.setdefault(change.name, change)
 
@@ -314,7 +312,7 @@ class Table:
         self._wire.clear()
         for name, change in held.items():
             if change.new is not None and name in self.params:
-                self._changed(replace(change, new=self.params[name]))
+                self.changed(replace(change, new=self.params[name]))
 
     def with_default(self, param: Param) -> Param:
         """Return a parameter that was received earlier with the default that is known by now."""

@@ -21,7 +21,6 @@ from paramclient.errors import ParamClientError
 from paramclient.links.sim import SimLink
 from paramclient.protocol.events import Change, ComponentEvent
 from paramclient.protocol.node import Node
-from paramclient.protocol.session import Session
 from paramclient.protocol.station import Station
 from paramclient.sim import Endpoint
 from paramclient.wire.frames import Framer
@@ -163,8 +162,9 @@ async def converse(endpoint: Endpoint, **options: Any) -> AsyncIterator[Conversa
     def emit(node: Node, event: ComponentEvent) -> None:
         conversation.events.append(event)
 
-    def changed(node: Node, session: Session, change: Change) -> None:
-        conversation.changes.append(change)
+    def discovered(node: Node) -> None:
+        for session in node.sessions:
+            session.table.changed = conversation.changes.append
 
     async def supervise(work: Callable[..., Awaitable[object]], *arguments: object) -> None:
         with suppress(ParamClientError):
@@ -190,7 +190,7 @@ async def converse(endpoint: Endpoint, **options: Any) -> AsyncIterator[Conversa
                 send=send,
                 spawn=lambda *work: tasks.start_soon(supervise, *work),
                 emit=emit,
-                changed=changed,
+                discovered=discovered,
                 **options,
             )
         )
