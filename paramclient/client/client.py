@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Self
 
@@ -41,7 +42,6 @@ from paramclient.protocol.selection import (
     only_vehicle,
     vehicle_of,
 )
-from paramclient.protocol.session import Session
 from paramclient.protocol.station import Station
 from paramclient.protocol.watch import INTERVAL_MIN
 from paramclient.wire.signing import SigningKey, SigningReport
@@ -144,7 +144,7 @@ class ParamClient:
         self.cache = choose_cache(cache, is_log=is_log)
         self.watch_interval = watch_interval
         self._components: dict[Address, Component] = {}
-        self._by_session: dict[Session, Component] = {}
+        self._by_node: dict[Node, Component] = {}
         self._events: Subscribers[events.Event] = Subscribers()
         forwarder = None if forward is None else Forwarder(create_link(forward))
         capture = None if tlog is None else Capture(tlog)
@@ -167,7 +167,6 @@ class ParamClient:
             listens_only=self.listens_only,
             split_peers=split_peers,
             discovered=self._meet,
-            emit=self.emit,
         )
         core.station.gate.fail(
             ClientClosed("the client is not open; use `async with` or `open`", link=opened.name)
@@ -215,7 +214,7 @@ class ParamClient:
     def autopilots(self) -> list[Component]:
         """The autopilot of each system, sorted by system id, without cameras, gimbals and the like."""
         found = autopilots_of(self.core.station.nodes.values())
-        return [self._by_session[each.plain] for each in sorted(found, key=lambda node: node.system)]
+        return [self._by_node[each] for each in sorted(found, key=lambda node: node.system)]
 
     @property
     def bytes_received(self) -> int:
@@ -463,16 +462,15 @@ class ParamClient:
 
     def _meet(self, node: Node) -> None:
         """Follow a new component."""
-        ext = Component(self, node, node.extended, None)
-        component = Component(self, node, node.plain, ext)
-        self._by_session |= {node.extended: ext, node.plain: component}
+        component = self._by_node[node] = Component(self, node, node.plain)
         self._components[component.address] = component
+        node.emit = partial(self._emit, component)
         self._events.push(events.Discovered(component))
         self.core.spawn(self._join_vehicle, node)
 
-    def emit(self, node: Node, event: protocol.ComponentEvent) -> None:
+    def _emit(self, component: Component, event: protocol.ComponentEvent) -> None:
         """Tell the subscribers and the cache what has happened to a component."""
-        component = self._by_session[node.plain]
+        node = component.node
         match event:
             case protocol.Identified():
                 nodes = self.core.station.nodes.values()
@@ -492,8 +490,8 @@ class ParamClient:
             case protocol.Resynced(changed=changed, hash=confirmed):
                 self._events.push(events.Resynced(component, changed, confirmed))
         if isinstance(event, protocol.Found | protocol.Rebooted):
-            for session in node.sessions:
-                self._by_session[session].watch.doubt()
+            component.watch.doubt()
+            component.ext.watch.doubt()
         self.core.link_task.notify()
 
     async def _join_vehicle(self, node: Node) -> None:
@@ -510,14 +508,15 @@ class ParamClient:
         if vehicle is node and is_young and not node.identification.is_autopilot:
             return  # it may have an autopilot: `_join_vehicle` waits for its heartbeat
         await self.core.cache_writer.load(node, vehicle)
-        for session in node.sessions:
-            self._by_session[session].cache_is_read.set()
+        self._by_node[node].cache_is_read.set()
+        self._by_node[node].ext.cache_is_read.set()
 
     def _end_streams(self) -> None:
         error: ParamClientError | None = None if self.core.is_over else self.core.station.gate.error
-        for component in self._by_session.values():
-            component.subscribers.end(error)
-            component.cache_is_read.set()
+        for component in self._by_node.values():
+            for each in (component, component.ext):
+                each.subscribers.end(error)
+                each.cache_is_read.set()
         self._events.end(error)
 
     async def _activity(self) -> None:
@@ -557,9 +556,9 @@ class ParamClient:
                     await self._activity()
                 node, due = choose()
             if node is not None:
-                await self._by_session[node.plain].wait_for_cache()
+                await self._by_node[node].wait_for_cache()
         if node is not None:
-            return self._by_session[node.plain]
+            return self._by_node[node]
         refused = refused_in_words(self.signing_report())
         hint = "" if refused else hint_of_link(station, self.bytes_received)
         if due is not None:

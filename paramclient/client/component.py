@@ -89,12 +89,9 @@ class Owner(Protocol):
     core: ClientCore
     policy: Policy
     watch_interval: float | None
-    listens_only: bool
 
     @property
     def components(self) -> Mapping[Address, Component]: ...
-
-    def emit(self, node: Node, event: Resynced) -> None: ...
 
     async def successor(
         self, component: Component, system: int, *, timeout: float | None = ...
@@ -115,7 +112,7 @@ class Component:
             and follows the received messages.
     """
 
-    def __init__(self, client: Owner, node: Node, session: Session, ext: Component | None) -> None:
+    def __init__(self, client: Owner, node: Node, session: Session) -> None:
         self.client = client
         self.core = client.core
         self.node = node
@@ -124,16 +121,17 @@ class Component:
         self.component = node.component
         self.params = ParamMap(session.table.params)
         self.subscribers: Subscribers[Change] = Subscribers()
-        self.policy = Policy.CACHE_ONLY if client.listens_only else client.policy
+        listens_only = self.core.station.listens_only
+        self.policy = Policy.CACHE_ONLY if listens_only else client.policy
         self.watch = Watch(
             session, node.presence, self._resynced, interval=client.watch_interval, policy=self.policy
         )
         self.cache_is_read = anyio.Event()
-        self._ext = ext
+        self._ext = Component(client, node, node.extended) if session is node.plain else None
         self._last: FetchResult | None = None
         session.table.changed = self._changed
         session.table.recounted = self.watch.doubt
-        if client.listens_only:
+        if listens_only:
             session.contradicted = self.watch.doubt
         else:
             self.core.spawn(self.watch.run)
@@ -489,7 +487,7 @@ class Component:
 
     def _resynced(self, event: Resynced) -> None:
         self.core.cache_writer.fetched(self.node, self.session, is_whole=True)
-        self.client.emit(self.node, event)
+        self.node.emit(event)
 
     async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
         """Give the vehicle a signing key with SETUP_SIGNING, or with None, disable its signing.

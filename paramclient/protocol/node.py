@@ -67,11 +67,11 @@ class Node:
         encoding: chosen by the user, or None.
         listens_only: whether nothing is requested.
         spawn: starts an async function in the background.
-        emit: called with each event.
 
     Attributes:
         channel, presence, identification: the parts.
         plain, extended: the parameters.
+        emit: called with each event.
         peer, since, is_split: as given; a vehicle may move to another peer.
         rival: another live peer that uses the same ids, and when it was heard; None without one.
         told_rival: the one of which the user was warned.
@@ -94,7 +94,6 @@ class Node:
         encoding: Encoding | None,
         listens_only: bool,
         spawn: Spawn,
-        emit: Callable[[ComponentEvent], None],
     ) -> None:
         self.system = system
         self.component = component
@@ -109,10 +108,10 @@ class Node:
         self.plain = Session(self.channel, self.identification, PLAIN, spawn, self.identified)
         self.extended = Session(self.channel, self.identification, EXTENDED, spawn, self.identified)
         self.sessions = (self.plain, self.extended)
+        self.emit: Callable[[ComponentEvent], None] = lambda event: None
         self.version = 2
         self.generation = 0
         self._spawn = spawn
-        self._emit = emit
         self._identifying: Shared[None] = Shared(spawn, gate)
 
     def receive(self, message: Message, now: float, version: int = 2) -> None:
@@ -122,7 +121,7 @@ class Node:
         self.version = version
         if presence.is_lost:
             presence.is_lost = False
-            self._emit(Found(silence))
+            self.emit(Found(silence))
             self._spawn(self.identify)
         elif silence > REBOOT_SILENCE_MIN and self.identification.is_settled:
             self._spawn(self._request_clock)
@@ -155,7 +154,7 @@ class Node:
                 if self.identification.version(message):
                     self._replace()
                 self._settle_encoding()
-                self._emit(Identified())
+                self.emit(Identified())
         self.channel.dispatch(message)
 
     async def identified(self) -> None:
@@ -171,7 +170,7 @@ class Node:
         """Doubt all values: the vehicle has rebooted, and may have measured or loaded others."""
         self.presence.rebooted(now)
         self._doubt()
-        self._emit(Rebooted())
+        self.emit(Rebooted())
         self._spawn(self.identify)
 
     def resumed(self) -> None:
@@ -209,7 +208,7 @@ class Node:
         self.generation += 1
         for session in self.sessions:
             session.table.clear()
-        self._emit(Replaced())
+        self.emit(Replaced())
 
     async def identify(self) -> None:
         """Request the identity, unless that is in progress."""
@@ -220,7 +219,7 @@ class Node:
         await self.identified()
         self._settle_encoding()
         if not was_settled and self.identification.capabilities is None:
-            self._emit(Identified())
+            self.emit(Identified())
         if not self.identification.is_encoding_certain:
             await anyio.sleep(HEARTBEAT_WAIT)
             self.identification.miss_heartbeat()
@@ -249,7 +248,7 @@ class Node:
             if not presence.is_lost and silence >= timeout:
                 presence.is_lost = True
                 self._doubt()
-                self._emit(Lost(silence))
+                self.emit(Lost(silence))
                 if self.channel.gate.is_open:
                     self.channel.lose()
             await anyio.sleep(min(max(timeout - silence, 0.001), 1.0) if not presence.is_lost else 1.0)

@@ -15,7 +15,6 @@ from paramclient.model.values import Encoding
 from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_words
 from paramclient.protocol.channel import Gate
 from paramclient.protocol.dialect import EXTENDED, PLAIN
-from paramclient.protocol.events import ComponentEvent
 from paramclient.protocol.node import Node
 from paramclient.protocol.session import Spawn
 from paramclient.wire.frames import BOOT_CLOCK_OFFSETS, Frame, Framer, sign_frame
@@ -85,7 +84,6 @@ class Station:
         listens_only: whether nothing is ever sent.
         split_peers: whether equal ids at different peers are different components.
         discovered: called with a new component, before its first message is taken.
-        emit: called with each event of a component.
 
     Attributes:
         nodes: every known component, by (system, component).
@@ -108,7 +106,6 @@ class Station:
         listens_only: bool = False,
         split_peers: bool = False,
         discovered: Callable[[Node], None] = lambda node: None,
-        emit: Callable[[Node, ComponentEvent], None] = lambda node, event: None,
     ) -> None:
         self.link = link
         self.nodes: dict[Address, Node] = {}
@@ -124,7 +121,6 @@ class Station:
         self._encoding = encoding
         self._splits_peers = split_peers
         self._discovered = discovered
-        self._emit = emit
         self._datagrams = self._new_framer(stream=False)
         self._framers: dict[Peer, Framer] = {}
         self._ended_peers: set[Peer] = set()  # of components: another connection may take their ids
@@ -362,7 +358,6 @@ class Station:
             encoding=self._encoding,
             listens_only=self.listens_only,
             spawn=self._spawn,
-            emit=lambda event: self._emit(node, event),
         )
         if self._asked.get((node.system, node.component), 0) > 2:
             node.channel.reads_from = (node.system, COMP_ID_ALL)

@@ -30,7 +30,6 @@ def test_a_value_before_the_first_heartbeat_is_reported_as_the_vehicle_means_it(
                 is_stream=False,
                 send=lambda data, peer: None,
                 spawn=tasks.start_soon,
-                emit=lambda node, event: None,
                 discovered=discovered,
             )
             said = partial(messages.encode, system=1, component=1)
@@ -59,7 +58,6 @@ def test_the_heartbeat_of_a_vehicle_that_sends_other_messages_is_requested() -> 
                 is_stream=False,
                 send=lambda data, peer: sent.append(data),
                 spawn=tasks.start_soon,
-                emit=lambda node, event: None,
             )
             attitude = mavlink.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0)
             for number in range(5):

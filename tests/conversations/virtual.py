@@ -159,10 +159,8 @@ async def converse(endpoint: Endpoint, **options: Any) -> AsyncIterator[Conversa
         conversation.sent.append(data)
         wake[0].set()
 
-    def emit(node: Node, event: ComponentEvent) -> None:
-        conversation.events.append(event)
-
     def discovered(node: Node) -> None:
+        node.emit = conversation.events.append
         for session in node.sessions:
             session.table.changed = conversation.changes.append
 
@@ -189,7 +187,6 @@ async def converse(endpoint: Endpoint, **options: Any) -> AsyncIterator[Conversa
                 is_stream=False,
                 send=send,
                 spawn=lambda *work: tasks.start_soon(supervise, *work),
-                emit=emit,
                 discovered=discovered,
                 **options,
             )
