@@ -324,6 +324,7 @@ class _Write:
         await self.session.confirm(self._vehicle)
 
     def _request(self, attempt: int) -> Message:
+        """Return the set, and count it as sent."""
         self.attempts += 1
         self._sending()
         self.session.acknowledging.add(self.name)

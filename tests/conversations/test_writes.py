@@ -481,6 +481,24 @@ async def test_no_set_is_sent_to_another_vehicle_and_a_rebooted_one_gets_the_oth
         assert other.param(names[-1]).value == 0.5
 
 
+@virtual
+async def test_no_set_is_sent_to_a_vehicle_that_does_not_say_again_which_one_it_is() -> None:
+    async with converse(endpoint := Tap(PX4Vehicle())) as conversation:
+        session = (await conversation.node()).plain
+        await read(session, "MC_ROLL_P")
+        await anyio.sleep(1.0)
+        endpoint.up = lambda message: not isinstance(message, CommandLong)
+        conversation.station.interrupt()
+        conversation.station.resume(anyio.current_time())
+        began = anyio.current_time()
+        with pytest.raises(NoReply, match="the identity of 1/1"):
+            await write(session, "MC_ROLL_P", 3.5)
+        assert anyio.current_time() - began < 10.0
+        assert not conversation.sent_of(ParamSet)
+        endpoint.up = lambda message: True
+        assert (await write(session, "MC_ROLL_P", 3.5)).status == "accepted"
+
+
 @virtual_on_both
 async def test_another_vehicle_behind_a_value_ends_a_write_and_no_read() -> None:
     params = {"A": (struct.pack("<f", 5.0), 9), "B": (struct.pack("<f", 6.0), 9)}
