@@ -176,14 +176,14 @@ class CacheWriter:
             if cached.synced_at is not None:
                 self._synced_at[session] = cached.synced_at
             is_same_firmware = _firmware(cached.identity) == _firmware(identity)
-            params, ahead = cached.params.values(), self._seconds_ahead()
+            params, ahead, now = cached.params.values(), self._seconds_ahead(), anyio.current_time()
             session.table.load(
                 params if is_same_firmware else [replace(each, default=None) for each in params],
                 count=cached.count if cached.complete and is_same_firmware else None,
                 hash=cached.hash,
                 volatile=cached.volatile,
                 volatile_is_known=cached.volatile_known,
-                moments={name: at - ahead for name, at in cached.heard_at.items()},
+                moments={name: min(at - ahead, now) for name, at in cached.heard_at.items()},
             )
             if is_same_firmware and session.serves_file is None:
                 session.serves_file = cached.file_works

@@ -39,7 +39,7 @@ from paramclient.model.values import (
 from paramclient.protocol import commands
 from paramclient.protocol.addresses import Address, PeerAddress, peer_in_words
 from paramclient.protocol.events import Change, Resynced
-from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all, result_of
+from paramclient.protocol.fetch import FetchResult, FetchSource, Policy, Progress, fetch_all, result_of
 from paramclient.protocol.node import Node
 from paramclient.protocol.reads import read_param
 from paramclient.protocol.selection import hint_of_node, node_in_words, vehicle_of
@@ -416,7 +416,7 @@ class Component:
             self.core.station.check_may_send()
             if self.policy is not Policy.AUTO:
                 raise UsageError(f"refresh needs a download, and the policy is {self.policy}")
-        began = anyio.current_time()
+        began, generation = anyio.current_time(), self.node.generation
         if timeout is None and self._waits_for_others:
             timeout = PASSIVE_TIMEOUT
         with self.limited(None, "all parameters"):
@@ -429,11 +429,12 @@ class Component:
                     result = await fetch_all(
                         self.session, refresh=refresh, policy=self.policy, progress=progress
                     )
-                return self._fetched(replace(result, elapsed=anyio.current_time() - began))
+                return self._fetched(replace(result, elapsed=anyio.current_time() - began), generation)
             if self.session.table.count is None:
                 raise self._nothing(began)
         is_confirmed = _has(self.params, Trust.VERIFIED)
-        return result_of(self.session, "cache" if is_confirmed else "stream", began, [TIMEOUT_NOTE])
+        source: FetchSource = "cache" if is_confirmed else "stream"
+        return result_of(self.session, source, began, [TIMEOUT_NOTE], policy=self.policy)
 
     async def _listen(self, began: float) -> FetchResult:
         """Wait until the table is complete by what other stations request, or until a log has ended."""
@@ -446,7 +447,8 @@ class Component:
         is_cached = self._is_heard() and _has(table.params, Trust.CACHED)
         if not is_cached:
             self.session.confirm_announced()
-        return result_of(self.session, "cache" if is_cached else "stream", began, [])
+        source: FetchSource = "cache" if is_cached else "stream"
+        return result_of(self.session, source, began, [], policy=self.policy)
 
     def _is_heard(self) -> bool:
         """Return whether all values were received, or the hash of the cached ones was."""
@@ -467,7 +469,7 @@ class Component:
             what += ", which no other station has requested"
         return NoReply(what, attempts=0, waited=anyio.current_time() - began)
 
-    def _fetched(self, result: FetchResult) -> FetchResult:
+    def _fetched(self, result: FetchResult, generation: int) -> FetchResult:
         self._last = result
         logger.debug("%s: %r", self.core.link.name, result)
         if not result.params and self.policy is not Policy.AUTO:
@@ -478,7 +480,10 @@ class Component:
             self.watch.unconfirmed()
         elif result.complete:
             self.watch.fetched()
-            self.core.cache_writer.fetched(self.node, self.session, is_whole=result.source != "cache")
+            if self.node.generation != generation:
+                self.watch.doubt()
+            else:
+                self.core.cache_writer.fetched(self.node, self.session, is_whole=result.source != "cache")
         return result
 
     def _changed(self, change: Change) -> None:

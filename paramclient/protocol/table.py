@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Final
@@ -342,9 +343,14 @@ class Table:
             if param.trust is Trust.CACHED and param.index is not None and name not in but:
                 self.params[name] = param.with_trust(Trust.VERIFIED)
 
-    def unverified(self) -> list[str]:
-        """Return the names whose values are neither received on this link nor covered by the hash."""
-        return [name for name, param in self.params.items() if param.trust is Trust.CACHED]
+    def unverified(self, since: float = math.inf) -> list[str]:
+        """Return the names whose values are cached; with `since`, without those that were received since then
+        from a component that was lost afterwards."""
+        return [
+            name
+            for name, param in self.params.items()
+            if param.trust is Trust.CACHED and self.moments[name] < since
+        ]
 
     def clear(self) -> None:
         """Forget everything: another vehicle uses the address."""

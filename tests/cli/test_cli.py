@@ -33,6 +33,7 @@ from paramclient.links import Peer, SimLink
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.wire import frames, messages
 from tests.commands import Command, Outcome, Put, behind, in_process, leaping, strict
+from tests.conversations.virtual import Tap
 from tests.shell import in_simulated_time
 
 ROOT = Path(__file__).parents[2]
@@ -224,6 +225,21 @@ def test_a_value_that_is_only_cached_is_missing(
     assert fetched.json["missing"] == [known["params"][ListOnlyValues.secret]["index"]]
     assert fetched.json["received"] == len(fetched.json["params"]) == 902
     assert ListOnlyValues.secret not in fetched.json["params"]
+
+
+def test_what_came_of_a_refresh_until_the_vehicle_was_lost_is_printed(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    known = command("fetch", put(PX4Vehicle()), "--json", "--cache", cache).json
+    messages_left = iter(range(300))
+    dying = Tap(PX4Vehicle(), down=lambda message: next(messages_left, None) is not None)
+    fetched = command("fetch", put(dying), "--refresh", "--json", "--cache", cache)
+    assert fetched.code == 1
+    found = fetched.json
+    assert 200 < found["received"] == len(found["params"]) == 903 - len(found["missing"]) < 300
+    assert found["params"].items() <= known["params"].items()
+    assert "paramclient: incomplete: " in fetched.err
 
 
 def test_the_system_and_the_component_can_be_chosen(command: Command) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import anyio
 import pytest
 
-from paramclient import Component, ParamCache, ParamClient, SetStatus
+from paramclient import Component, ParamCache, ParamClient, SetStatus, SyncState
 from paramclient.cli.json_output import FetchJson, WriteJson, as_json
 from paramclient.cli.json_setup import ApplyJson
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -76,8 +76,6 @@ async def test_fetch(kind: str, delay: float) -> None:
                 component,
                 result,
                 result.params.values(),
-                missing=[*result.missing],
-                cached=[],
                 bytes_received=0,
                 bytes_sent=0,
                 described={},
@@ -89,6 +87,46 @@ async def test_fetch(kind: str, delay: float) -> None:
         await world.until_silent(
             lambda: received[-1] > 120 or anyio.current_time() > began + cut_off_after, call
         )
+
+
+@pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
+@in_simulated_time
+async def test_a_refresh_of_a_cached_table(kind: str, tmp_path: Path) -> None:
+    world = World(kind)
+    cache = tmp_path / "cache.sqlite3"
+    async with ParamClient(world.endpoint, cache=cache) as client:
+        count = (await (await client.component()).fetch_all()).count
+    with ParamCache(cache) as opened:
+        synced_at = opened.component(system=1).synced_at
+    received = [0]
+    world.vehicle.load(world.wanted)
+    async with ParamClient(world.endpoint, cache=cache) as client:
+        component = await client.component()
+        await anyio.sleep(2.0)
+
+        async def call() -> None:
+            result = await component.fetch_all(
+                refresh=True, progress=lambda each: received.append(each.received)
+            )
+            assert not result.complete
+            assert result.hash is None
+            assert (result.count, len(result.params)) == (count, count)
+            assert {result.params[name].index for name in result.cached} == set(result.missing)
+            assert 50 < result.received == count - len(result.cached)
+            wrong = {
+                name
+                for name, param in result.params.items()
+                if not param.same_value(world.vehicle.param(name))
+            }
+            assert wrong <= set(result.cached)
+
+        began = anyio.current_time()
+        await world.until_silent(lambda: received[-1] > 120 or anyio.current_time() > began + 0.3, call)
+        world.endpoint.at = 1e9
+        await anyio.sleep(2.0)
+        assert (component.state, component.sync_state) == ("cached", SyncState.UNSYNCED)
+    with ParamCache(cache) as opened:
+        assert opened.component(system=1).synced_at == synced_at
 
 
 @KINDS
