@@ -256,6 +256,7 @@ class _Write:
         self.before = self.wanted = before
         self.value = value
         self.attempts = 0
+        self._began = anyio.current_time()
         self._vehicle = vehicle
         self._sending = sending
         self._raw = b""
@@ -294,11 +295,11 @@ class _Write:
         Silence may be that of a firmware that acknowledges nothing, and another value may be an older one.
         """
         channel = self.channel
-        began = anyio.current_time()
         what = f"the acknowledgement of {self.name} by {channel.system}/{channel.component}"
+        answer: Param | ParamExtAck | None = None
         self._has_other_value = False
-        try:
-            answer: Param | ParamExtAck | None = await channel.exchange(
+        with suppress(NoReply):
+            answer = await channel.exchange(
                 self._request,
                 inbox,
                 self._accept,
@@ -306,19 +307,17 @@ class _Write:
                 attempts=lambda: 0 if self._has_other_value else SILENT_SETS_MAX,
                 ready=self._confirm,
             )
-            while isinstance(answer, ParamExtAck) and answer.param_result == ExtAckResult.IN_PROGRESS:
-                until = anyio.current_time() + EXT_PROGRESS_TIMEOUT
-                answer = await channel.wait_for(inbox, self._accept, until, 0)
-            if answer is None:
-                raise NoReply(what, attempts=self.attempts, waited=anyio.current_time() - began)
-        except NoReply:
-            if not channel.is_silent(began):
-                with suppress(NoReply):
-                    return await self._read(inbox)
-            raise
+        while isinstance(answer, ParamExtAck) and answer.param_result == ExtAckResult.IN_PROGRESS:
+            until = anyio.current_time() + EXT_PROGRESS_TIMEOUT
+            answer = await channel.wait_for(inbox, self._accept, until, 0)
         if isinstance(answer, Param) and answer.type_number == self.before.type_number:
             return answer
-        return await self._read(inbox)  # which alone shows a changed type, and the value of an extended one
+        if answer is not None:  # only a read shows a changed type, and the value of an extended parameter
+            return await self._read(inbox)
+        if not channel.is_silent(self._began):
+            with suppress(NoReply):
+                return await self._read(inbox)
+        raise NoReply(what, attempts=self.attempts, waited=anyio.current_time() - self._began)
 
     async def _confirm(self) -> None:
         await self.session.confirm(self._vehicle)
