@@ -31,6 +31,9 @@ THREAD_NAME: Final = "paramclient blocking client"
 WAIT_INTERVAL: Final = 0.1
 """Seconds after which a waiting thread wakes up: Windows delivers Ctrl-C only then."""
 
+CALLBACKS: Final = ("progress", "before_writing")
+"""Arguments that are called while a call runs, in the thread of the caller."""
+
 
 class _Session:
     """An asynchronous client in an event loop of its own thread.
@@ -122,9 +125,10 @@ class _Session:
     def _argument(self, calls: SimpleQueue[Callable[[], object] | None], name: str, value: Any) -> Any:
         """Return an argument of a call as the client is to see it."""
 
-        async def ask() -> None:
+        async def ask(*items: Any) -> None:
             answered = anyio.Event()
-            calls.put(lambda: (value(), self._portal.start_task_soon(answered.set)))
+            call = partial(value, *map(self.shown, items))
+            calls.put(lambda: (call(), self._portal.start_task_soon(answered.set)))
             await answered.wait()
 
         if name == "progress" and value is not None:
@@ -257,20 +261,25 @@ def blocking(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that takes a client or components with calls that block."""
 
     @wraps(function)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        if isinstance(args[0], Proxy):
-            return args[0]._session.run(function, *args, **kwargs)
-        vehicles, *rest = [list(args[0]), *args[1:]]
+    def call(first: Any, *args: Any, **kwargs: Any) -> Any:
+        if isinstance(first, Proxy):
+            return first._session.run(function, first, *args, **kwargs)
+        vehicles = list(first)
         sessions = {each._session for each in vehicles}
         if len(sessions) > 1:
             raise UsageError(
                 f"the vehicles belong to {len(sessions)} clients; make one call for those of each client"
             )
+
+        def answered(value: Any) -> Any:
+            """Return a function of a vehicle with its results, as it may make calls that block."""
+            return {each._target: value(each) for each in vehicles}.__getitem__ if callable(value) else value
+
+        args = tuple(map(answered, args))
+        kwargs = {name: each if name in CALLBACKS else answered(each) for name, each in kwargs.items()}
         if not sessions:
-            return anyio.run(partial(function, vehicles, *rest, **kwargs))
-        if callable(rest[0]):  # one result for each vehicle
-            rest[0] = {each._target: rest[0](each) for each in vehicles}.__getitem__
-        return sessions.pop().run(function, vehicles, *rest, **kwargs)
+            return anyio.run(partial(function, vehicles, *args, **kwargs))
+        return sessions.pop().run(function, vehicles, *args, **kwargs)
 
     return call
 
