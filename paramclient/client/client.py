@@ -29,19 +29,11 @@ from paramclient.links import Link, ReplayLink, SimLink, create_link
 from paramclient.model.values import Encoding
 from paramclient.model.wording import counted
 from paramclient.protocol import events as protocol
+from paramclient.protocol import selection
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.fetch import Policy
 from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.protocol.node import Node
-from paramclient.protocol.selection import (
-    address_in_words,
-    autopilots_of,
-    find,
-    hint_of_link,
-    node_in_words,
-    only_vehicle,
-    vehicle_of,
-)
 from paramclient.protocol.station import Station
 from paramclient.protocol.watch import INTERVAL_MIN
 from paramclient.wire.signing import SigningKey, SigningReport
@@ -213,7 +205,7 @@ class ParamClient:
     @property
     def autopilots(self) -> list[Component]:
         """The autopilot of each system, sorted by system id, without cameras, gimbals and the like."""
-        found = autopilots_of(self.core.station.nodes.values())
+        found = selection.autopilots_of(self.core.station.nodes.values())
         return [self._by_node[each] for each in sorted(found, key=lambda node: node.system)]
 
     @property
@@ -276,8 +268,8 @@ class ParamClient:
         """
         nodes = self.core.station.nodes
         return await self._wait_for(
-            lambda: (find(nodes.values(), system, component, peer), None),
-            address_in_words(system, component, peer),
+            lambda: selection.find(nodes.values(), system, component, peer),
+            selection.address_in_words(system, component, peer),
             timeout,
             asked=(system, component),
         )
@@ -312,7 +304,7 @@ class ParamClient:
             while expect is None or len(self.autopilots) < expect:
                 await self._activity()
         if expect is not None and len(self.autopilots) < expect:
-            heard = ", ".join(node_in_words(each.node) for each in self.autopilots)
+            heard = ", ".join(selection.node_in_words(each.node) for each in self.autopilots)
             waited = anyio.current_time() - began
             raise NoReply(f"{expect} vehicles; heard only {heard}", attempts=0, waited=waited)
         for each in self.autopilots:
@@ -351,14 +343,14 @@ class ParamClient:
             return await self.component(system, component, peer=peer, timeout=timeout)
         station = self.core.station
         return await self._wait_for(
-            lambda: only_vehicle(
+            lambda: selection.only_vehicle(
                 station.nodes.values(),
                 system,
                 component,
                 anyio.current_time(),
                 listening_since=station.listening_since,
             ),
-            address_in_words(system, component),
+            selection.address_in_words(system, component),
             timeout,
             asked=(system, component),
         )
@@ -384,11 +376,11 @@ class ParamClient:
         """
         before, began = component.identity, anyio.current_time()
 
-        def choose() -> tuple[Node | None, None]:
-            node = find(self.core.station.nodes.values(), system, component.component, None)
-            return node if node is not None and node.presence.received_at > began else None, None
+        def choose() -> Node | None:
+            node = selection.find(self.core.station.nodes.values(), system, component.component, None)
+            return node if node is not None and node.presence.received_at > began else None
 
-        found = await self._wait_for(choose, address_in_words(system, component.component), timeout)
+        found = await self._wait_for(choose, selection.address_in_words(system, component.component), timeout)
         with anyio.move_on_after(timeout), self.core.station.gate.until_closed():
             await found.node.identification.settled()
         if not before.is_same_vehicle(found.identity):
@@ -396,11 +388,7 @@ class ParamClient:
         return found
 
     async def fetch_all(
-        self,
-        system: int | None = None,
-        *,
-        refresh: bool = False,
-        timeout: float | None = None,
+        self, system: int | None = None, *, refresh: bool = False, timeout: float | None = None
     ) -> FetchedAll:
         """Update the tables of all components of one system, or of every system on the link.
 
@@ -425,7 +413,7 @@ class ParamClient:
         nodes = self.core.station.nodes
         deadline = math.inf if timeout is None else anyio.current_time() + timeout
         await self._wait_for(
-            lambda: (next((each for each in nodes.values() if system in (None, each.system)), None), None),
+            lambda: next((each for each in nodes.values() if system in (None, each.system)), None),
             "a component" if system is None else f"a component of system {system}",
             COMPONENT_TIMEOUT if timeout is None else timeout,
         )
@@ -475,7 +463,7 @@ class ParamClient:
             case protocol.Identified():
                 nodes = self.core.station.nodes.values()
                 for each in nodes:
-                    if vehicle_of(nodes, each) is node:
+                    if selection.vehicle_of(nodes, each) is node:
                         self.core.spawn(self._load, each)
                 return
             case protocol.Replaced():
@@ -497,13 +485,15 @@ class ParamClient:
     async def _join_vehicle(self, node: Node) -> None:
         """Load the cached tables of a component whose vehicle is identified already, or never was."""
         await anyio.sleep_until(node.since + HEARTBEAT_WAIT)  # for the heartbeat of its autopilot
-        if self.core.cache_writer.may_load(node, vehicle_of(self.core.station.nodes.values(), node)):
+        if self.core.cache_writer.may_load(
+            node, selection.vehicle_of(self.core.station.nodes.values(), node)
+        ):
             await self._load(node)
 
     async def _load(self, node: Node) -> None:
         """Load the cached tables of a component of an identified vehicle."""
         nodes = self.core.station.nodes.values()
-        vehicle = vehicle_of(nodes, node)
+        vehicle = selection.vehicle_of(nodes, node)
         is_young = anyio.current_time() < node.since + HEARTBEAT_WAIT
         if vehicle is node and is_young and not node.identification.is_autopilot:
             return  # it may have an autopilot: `_join_vehicle` waits for its heartbeat
@@ -525,7 +515,7 @@ class ParamClient:
 
     async def _wait_for(
         self,
-        choose: Callable[[], tuple[Node | None, float | None]],
+        choose: Callable[[], Node | float | None],
         awaited: str,
         timeout: float | None,
         *,
@@ -534,7 +524,7 @@ class ParamClient:
         """Wait until a choice is made, and its cached table is loaded.
 
         Args:
-            choose: called after each message; returns the choice, or when it may change without a message.
+            choose: called after each message; returns the choice, or when one may be made without a message.
             awaited: for the error.
             timeout: seconds; None waits without limit.
             asked: system and component to which requests are sent; nothing is, without both.
@@ -544,23 +534,23 @@ class ParamClient:
         station = self.core.station
         system, component = asked
         probe_at = 0.0 if system and component else math.inf
-        node, due = choose()
+        found = choose()
         with anyio.move_on_after(timeout):
-            while node is None and not self.core.is_over:
+            while not (isinstance(found, Node) or self.core.is_over):
                 now = anyio.current_time()
                 probe_at = max(probe_at, station.listening_since + HEARTBEAT_WAIT)
                 if system and component and now >= probe_at:
                     station.probe(system, component)
                     probe_at = now + PROBE_INTERVAL
-                with anyio.move_on_after(min(probe_at, math.inf if due is None else due) - now):
+                with anyio.move_on_after(min(probe_at, math.inf if found is None else found) - now):
                     await self._activity()
-                node, due = choose()
-            if node is not None:
-                await self._by_node[node].wait_for_cache()
-        if node is not None:
-            return self._by_node[node]
+                found = choose()
+            if isinstance(found, Node):
+                await self._by_node[found].wait_for_cache()
+        if isinstance(found, Node):
+            return self._by_node[found]
         refused = refused_in_words(self.signing_report())
-        hint = "" if refused else hint_of_link(station, self.bytes_received)
-        if due is not None:
+        hint = "" if refused else selection.hint_of_link(station, self.bytes_received)
+        if found is not None:
             hint, awaited = "", f"{awaited}, then {HEARTBEAT_WAIT} s without another vehicle"
         raise NoReply(f"{awaited}{refused}", attempts=0, waited=anyio.current_time() - began, hint=hint)

@@ -15,14 +15,7 @@ from paramclient.cache import check_author
 from paramclient.client.core import ClientCore
 from paramclient.client.signing import timestamp_now
 from paramclient.client.streams import Changes, Subscribers
-from paramclient.errors import (
-    AmbiguousVehicle,
-    CacheError,
-    NoReply,
-    NotDurable,
-    ParamClientError,
-    UsageError,
-)
+from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, NotDurable, ParamClientError, UsageError
 from paramclient.links.replay import ReplayLink
 from paramclient.model.ext_values import check_ext_value
 from paramclient.model.identity import Identity, autopilot_name
@@ -573,11 +566,7 @@ class Component:
             self.core.station.gate.check()
 
     async def _check_writes(
-        self,
-        values: Mapping[str, Settable] | Iterable[tuple[str, Settable]],
-        settle: float,
-        *,
-        durable: bool,
+        self, values: Mapping[str, Settable] | Iterable[tuple[str, Settable]], settle: float, *, durable: bool
     ) -> list[tuple[str, WireValue]]:
         """Check that values may be written, and return them with their names.
 

@@ -40,10 +40,7 @@ class FetchedAll:
 
 
 async def fetch_components(
-    components: Mapping[Address, Component],
-    *,
-    refresh: bool,
-    timeout: float | None,
+    components: Mapping[Address, Component], *, refresh: bool, timeout: float | None
 ) -> FetchedAll:
     """Fetch the tables of components in parallel; see `ParamClient.fetch_all`.
 

@@ -598,13 +598,12 @@ async def test_the_only_autopilot_is_chosen_and_peripherals_and_stations_do_not_
         conversation.hear(CAMERA, component=100)
         conversation.hear(GCS, system=254, component=190)
         conversation.hear(Heartbeat(18, 0, system_status=4), system=2, component=191)  # a companion computer
-        assert choose(None, None, 5.0)[0] is None
+        assert choose(None, None, 5.0) is None
         conversation.hear(PX4)
-        found, due = choose(None, None, 5.0)
-        assert (found, due) == (None, 6.2)
-        assert choose(None, None, 6.2)[0] is nodes[1, 1]
-        assert choose(1, None, 5.0)[0] is nodes[1, 1]
-        assert choose(1, 100, 5.0)[0] is nodes[1, 100]
+        assert choose(None, None, 5.0) == 6.2
+        assert choose(None, None, 6.2) is nodes[1, 1]
+        assert choose(1, None, 5.0) is nodes[1, 1]
+        assert choose(1, 100, 5.0) is nodes[1, 100]
         assert find(nodes.values(), None, None, None) is nodes[1, 1]
         conversation.hear(ARDUPILOT, system=3)
         with pytest.raises(AmbiguousVehicle, match="1/1 PX4 quadrotor, 3/1 ArduPilot rover"):
