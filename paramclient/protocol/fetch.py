@@ -246,7 +246,8 @@ class _Fetch:
             session.serves_file = False
         with session.channel.gate.until_closed(or_failed=True):
             await session.identification.encoding_certain()
-        self.table.complete()
+        if not self.listed.missing:
+            self.table.complete()
         return "stream"
 
     async def _settle(self, before: Digest | None) -> bool:

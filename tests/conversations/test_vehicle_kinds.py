@@ -28,8 +28,10 @@ from paramclient.wire.messages import (
     CAPABILITY_PARAM_ENCODE_BYTEWISE,
     AutopilotVersion,
     Heartbeat,
+    ParamRequestList,
     ParamRequestRead,
     ParamSet,
+    ParamValue,
 )
 from tests.conversations.partial import EVERYTHING, TABLE, Partial
 from tests.conversations.virtual import QUIET, Puppet, Tap, converse, virtual
@@ -127,6 +129,42 @@ async def test_odd_indices_and_counts_make_a_complete_table(options: dict[str, A
         assert {name: each.value for name, each in result.params.items()} == {
             f"P{number:02}": number for number in range(40)
         }
+
+
+@pytest.mark.parametrize("serves", [EVERYTHING, ("list",)], ids=["reads", "list only"])
+@pytest.mark.parametrize("loss", [0.1, 0.2])
+@virtual
+async def test_a_list_whose_count_grows_is_never_complete_without_its_end(
+    loss: float, serves: tuple[str, ...]
+) -> None:
+    table = {f"P{number:02}": (number, ParamType.INT32) for number in range(40)}
+    for seed in range(12):
+        vehicle = Partial(table, serves=serves, count=lambda index: index + 1)
+        async with converse(Air.symmetric([vehicle], loss=loss, seed=seed)) as conversation:
+            result = await fetch_all((await conversation.node()).plain)
+            assert not result.complete or len(result.params) == 40
+
+
+@pytest.mark.parametrize("interval", [0.3, 0.7, 1.0])
+@pytest.mark.parametrize("heartbeat", [QUIET, PX4], ids=["generic", "PX4"])
+@virtual
+async def test_a_slow_list_whose_count_grows_is_received_to_its_end(
+    interval: float, heartbeat: Heartbeat
+) -> None:
+    async with converse(Puppet(lambda message: (), heartbeat=heartbeat)) as conversation:
+        node = await conversation.node()
+
+        async def send_list() -> None:
+            while not conversation.sent_of(ParamRequestList):  # noqa: ASYNC110 - in virtual time
+                await anyio.sleep(0.01)
+            for index in range(12):
+                conversation.hear(ParamValue(f"P{index}", bytes(4), ParamType.REAL32, index + 1, index))
+                await anyio.sleep(interval)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(send_list)
+            result = await fetch_all(node.plain)
+            assert (result.complete, len(result.params)) == (True, 12)
 
 
 @pytest.mark.parametrize("too_many", [1, 3_000])
