@@ -206,11 +206,8 @@ class Ftp(Proxy):
     """See `paramclient.Ftp`."""
 
 
-class Stream(Proxy):
+class Stream(Proxy, Iterator[Any]):
     """Items as they arrive: a `for` loop waits for each. Ctrl-C loses none."""
-
-    def __iter__(self) -> Self:
-        return self
 
     def __next__(self) -> Any:
         return self.next()
