@@ -36,7 +36,7 @@ ATTRIBUTES = {
     "ParamClient": ("link: Link", "cache: ParamCache | None", "listens_only: bool"),
 }
 """The public attributes that `__init__` sets."""
-INTERNAL = {"limited", "wait_for_cache", "wait_until_identified"}
+INTERNAL = {"join_vehicle", "limited", "load", "vehicle", "wait_for_cache", "wait_until_identified"}
 """Methods for other modules of the asynchronous client."""
 
 

@@ -30,9 +30,10 @@ from paramclient.model.values import (
     check_value,
 )
 from paramclient.protocol import commands
-from paramclient.protocol.addresses import Address, PeerAddress, peer_in_words
+from paramclient.protocol.addresses import Address, peer_in_words
 from paramclient.protocol.events import Change, Resynced
 from paramclient.protocol.fetch import FetchResult, FetchSource, Policy, Progress, fetch_all, result_of
+from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.protocol.node import Node
 from paramclient.protocol.reads import read_param
 from paramclient.protocol.selection import hint_of_node, node_in_words, vehicle_of
@@ -150,10 +151,11 @@ class Component:
     @property
     def identity(self) -> Identity:
         """Identity of the vehicle from AUTOPILOT_VERSION: hardware id, firmware, capabilities, if known."""
-        return self._vehicle.identification.identity
+        return self.vehicle.identification.identity
 
     @property
-    def _vehicle(self) -> Node:
+    def vehicle(self) -> Node:
+        """The autopilot of its vehicle, whose identity is the vehicle's; without one, its own node."""
         return vehicle_of(self.core.station.nodes.values(), self.node)
 
     @property
@@ -198,9 +200,7 @@ class Component:
     @property
     def address(self) -> Address:
         """Its key in `ParamClient.components`: (system, component), with `split_peers` also the peer."""
-        if self.node.is_split:
-            return PeerAddress(self.system, self.component, self.node.peer)
-        return (self.system, self.component)
+        return self.node.address
 
     @property
     def peer(self) -> str:
@@ -549,10 +549,26 @@ class Component:
         self.subscribers.add(changes := Changes())
         return changes
 
+    async def join_vehicle(self) -> None:
+        """Load the cached tables of a component whose vehicle is identified already, or never was."""
+        await anyio.sleep_until(self.node.since + HEARTBEAT_WAIT)  # for the heartbeat of its autopilot
+        if self.core.cache_writer.may_load(self.node, self.vehicle):
+            await self.load()
+
+    async def load(self) -> None:
+        """Load the cached tables of a component of an identified vehicle."""
+        node, vehicle = self.node, self.vehicle
+        is_young = anyio.current_time() < node.since + HEARTBEAT_WAIT
+        if vehicle is node and is_young and not node.identification.is_autopilot:
+            return  # it may have an autopilot: `join_vehicle` waits for its heartbeat
+        await self.core.cache_writer.load(node, vehicle)
+        self.cache_is_read.set()
+        self.ext.cache_is_read.set()
+
     async def wait_until_identified(self, timeout: float) -> None:
         """Wait at most `timeout` seconds until the vehicle is identified, as its cache key requires."""
         with anyio.move_on_after(timeout):
-            await self._vehicle.identification.settled()
+            await self.vehicle.identification.settled()
 
     async def wait_for_cache(self) -> None:
         """Wait until the cached table, if there is one, is in the table; 1.5 s at most.
