@@ -96,10 +96,10 @@ class _Download:
         self._count: int | None = None
         self._began = self._last = 0.0
         self._reached = -1  # the highest index
-        self._advanced = 0.0  # when the highest index rose
+        self._listed_at = 0.0  # when the last value arrived that no read had asked for
         self._skipped: set[int] = set()  # missing indices below the highest one
         self._reading: set[int] = set()  # indices whose reads are in flight
-        self._given_up: dict[int, int] = {}  # attempts by index
+        self._tried: dict[int, int] = {}  # attempts in vain by index that was ever read
         self._has_answer = False  # to a read
 
     async def begin(self) -> None:
@@ -160,7 +160,7 @@ class _Download:
         self.channel.send(self.session.dialect.request_list(self.channel.reads_from))
         before, self._reached = self._reached, -1
         self._skipped.clear()
-        self._advanced = anyio.current_time()
+        self._listed_at = anyio.current_time()
         with anyio.move_on_after(seconds + self.channel.timing.timeout(0)):
             while self._missing() and not self._is_over():
                 await self._take_for(GAPS_INTERVAL)
@@ -181,6 +181,7 @@ class _Download:
                             break
                         if index not in self._reading and not self._is_given_up(index):
                             self._reading.add(index)
+                            self._tried.setdefault(index, 0)
                             self.result.lost += 1
                             tasks.start_soon(self._read, index)
                     await self.channel.gate.wait()
@@ -192,13 +193,15 @@ class _Download:
     def _is_read(self) -> bool:
         """Return whether the list has ended, and nothing more of it can be read."""
         now = anyio.current_time()
-        if not self._is_over() or (self.table.is_growing and now - self._advanced < PAUSE_GROWING):
+        if not self._is_over() or (self.table.is_growing and now - self._listed_at < PAUSE_GROWING):
             return False
-        is_fruitless = now - self._last >= UNANSWERED_MAX and len(self._given_up) >= self.channel.window_size
-        return is_fruitless or all(map(self._is_given_up, self._missing()))
+        missing = self._missing()
+        given_up = sum(map(self._is_given_up, missing))
+        is_fruitless = now - self._last >= UNANSWERED_MAX and given_up >= self.channel.window_size
+        return is_fruitless or given_up == len(missing)
 
     def _is_given_up(self, index: int) -> bool:
-        return self._given_up.get(index, 0) >= self._attempts_max()
+        return self._tried.get(index, 0) >= self._attempts_max()
 
     def _attempts_max(self) -> int:
         return 1 if self.session.reads_indices is False else self.channel.timing.attempts_max
@@ -228,7 +231,7 @@ class _Download:
         await self._take_received()
         self._reading.discard(index)
         if index not in self._received:
-            self._given_up[index] = attempts
+            self._tried[index] = attempts
 
     def _missing(self) -> list[int]:
         """Return the indices that are missing. They begin at 1 if the count itself is one, and 0 is none;
@@ -254,7 +257,7 @@ class _Download:
             pause = PAUSE_TAIL
         if self._received:
             pause = max(pause, PAUSE_INTERVALS / self._rate())
-        return anyio.current_time() - self._advanced > pause or self._is_silent()
+        return anyio.current_time() - self._listed_at > pause or self._is_silent()
 
     def _is_silent(self) -> bool:
         """Return whether the component is silent for so long that it counts as lost."""
@@ -262,7 +265,7 @@ class _Download:
 
     def _rate(self) -> float:
         """Return the values per second of the list so far."""
-        return len(self._received) / max(self._advanced - self._began, 0.01)
+        return len(self._received) / max(self._listed_at - self._began, 0.01)
 
     async def _take_for(self, seconds: float) -> None:
         """Take the values that arrive, at most for some seconds without one."""
@@ -292,8 +295,10 @@ class _Download:
             self._count = count
             self._received = {each for each in self._received if each in self.table.names}
             self._skipped.clear()
-            self._given_up.clear()
+            self._tried.clear()
             self._reached = -1
+        if index > self._reached or index not in self._tried:
+            self._listed_at = self._last
         self.result.repeated += index in self._received
         self._received.add(index)
         self._skipped.discard(index)
@@ -301,4 +306,4 @@ class _Download:
             self._skipped.update(
                 each for each in range(self._reached + 1, index) if each not in self._received
             )
-            self._reached, self._advanced = index, self._last
+            self._reached = index
