@@ -296,10 +296,9 @@ class ParamClient:
             raise UsageError(f"expect must be a number of vehicles from 1 up, not {expect}")
         began = anyio.current_time()
         await self.component(timeout=timeout)
-        wait = VEHICLES_LISTENING_TIME
-        if expect is not None:
-            wait = math.inf if timeout is None else began + timeout - anyio.current_time()
-        with anyio.move_on_after(wait):
+        if expect is None:
+            timeout = anyio.current_time() - began + VEHICLES_LISTENING_TIME
+        with anyio.CancelScope(deadline=math.inf if timeout is None else began + timeout):
             while expect is None or len(self.autopilots) < expect:
                 await self._activity()
         if expect is not None and len(self.autopilots) < expect:
