@@ -300,7 +300,7 @@ class ParamClient:
             timeout = anyio.current_time() - began + VEHICLES_LISTENING_TIME
         with anyio.CancelScope(deadline=math.inf if timeout is None else began + timeout):
             while expect is None or len(self.autopilots) < expect:
-                await self._activity()
+                await self.core.link_task.wait_for_activity()
         if expect is not None and len(self.autopilots) < expect:
             heard = ", ".join(selection.node_in_words(each.node) for each in self.autopilots)
             waited = anyio.current_time() - began
@@ -485,10 +485,6 @@ class ParamClient:
                 each.cache_is_read.set()
         self._events.end(error)
 
-    async def _activity(self) -> None:
-        await self.core.link_task.activity.wait()
-        self.core.station.gate.check()
-
     async def _wait_for(
         self,
         choose: Callable[[], Node | float | None],
@@ -519,7 +515,7 @@ class ParamClient:
                     station.probe(system, component)
                     probe_at = now + PROBE_INTERVAL
                 with anyio.move_on_after(min(probe_at, math.inf if found is None else found) - now):
-                    await self._activity()
+                    await self.core.link_task.wait_for_activity()
                 found = choose()
             if isinstance(found, Node):
                 await self._components[found.address].wait_for_cache()

@@ -430,8 +430,7 @@ class Component:
         """Wait until the table is complete by what other stations request, or until a log has ended."""
         table = self.session.table
         while not self.core.is_over and not (self._waits_for_others and self._is_heard()):
-            await self.core.link_task.activity.wait()
-            self.core.station.gate.check()
+            await self.core.link_task.wait_for_activity()
         if not table.params:
             raise self._nothing(began)
         is_cached = self._is_heard() and _has(table.params, Trust.CACHED)
