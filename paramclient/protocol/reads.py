@@ -222,9 +222,10 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
     px4 = session.identification.is_px4
     live = {name: param.index for name, param in session.table.params.items() if param.trust is Trust.LIVE}
     same = live.pop(which, None) if isinstance(which, str) else None
-    control = await _try(session, HASH_CHECK if px4 else next(iter(live), 0) if same is None else same)
-    if control is None and px4 and same is not None:
-        control = await _try(session, same)
+    other = next(iter(live), 0) if same is None else same
+    control = await _try(session, HASH_CHECK if px4 else other)
+    if control is None and px4:  # it may only call itself one
+        control = await _try(session, other)
     if control is None or not isinstance(which, str) or session.reads_names or control.param_id == which:
         return control
     return await _try(session, control.param_id)
@@ -271,7 +272,7 @@ async def _read_list(session: Session, inbox: Inbox, which: str | int) -> Report
     if not names or max(names) - min(names) >= len(names) or session.channel.is_lost(anyio.current_time()):
         return None
     is_short = not session.table.is_complete
-    sent = f": its list has {len(names)} of {session.table.count} parameters, and it answers no reads"
+    sent = f": its list has {len(names)} of {session.table.count} parameters"
     raise _unknown(session, which, sent * is_short)
 
 

@@ -218,6 +218,19 @@ async def test_a_name_that_is_not_in_the_list_of_an_ardupilot_without_reads_is_u
         assert anyio.current_time() < 20.0
 
 
+@pytest.mark.parametrize("serves", [EVERYTHING, ("list", "indices")], ids=["all reads", "by index"])
+@virtual
+async def test_an_unknown_name_of_a_px4_without_hash_is_told_as_what_it_is(serves: tuple[str, ...]) -> None:
+    vehicle = Partial(serves=serves, heartbeat=PX4, count=lambda index: len(TABLE) + 2)
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        with pytest.raises(UnknownParameter) as caught:
+            await read(session, "NOPE")
+        assert "answers no reads" not in str(caught.value)
+        assert vehicle.number_of(ParamRequestList) == (serves is not EVERYTHING)
+        assert anyio.current_time() < 15.0
+
+
 # the encoding
 
 
