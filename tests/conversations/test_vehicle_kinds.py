@@ -167,6 +167,13 @@ async def test_a_slow_list_whose_count_grows_is_received_to_its_end(
             assert (result.complete, len(result.params)) == (True, 12)
 
 
+@virtual
+async def test_a_count_of_more_than_can_be_requested_is_told_as_what_can() -> None:
+    async with converse(Partial(count=lambda index: 65_535)) as conversation:
+        result = await fetch_all((await conversation.node()).plain)
+        assert (set(result.params), result.received, result.count) == (set(TABLE), len(TABLE), 32_768)
+
+
 @pytest.mark.parametrize("too_many", [1, 3_000])
 @virtual
 async def test_a_count_that_is_too_large_costs_seconds_and_no_value(too_many: int) -> None:
