@@ -65,9 +65,9 @@ class ClientCore:
         self.cache_writer = cache_writer
         self.cache = cache_writer.cache
         self.is_over = False
-        self.link_task = LinkTask(link, taps=taps, ended=self._link_ended)
+        self._taps = list(taps)
+        self.link_task = LinkTask(link, taps=self._taps, ended=self._link_ended)
         self.station = self.link_task.station = new_station(send=self.link_task.queue, spawn=self.spawn)
-        self._taps = taps
         self._keeper = keeper
         self._ended = ended
         self._work: anyio.abc.TaskGroup | None = None
@@ -105,6 +105,10 @@ class ClientCore:
         self.check_open()
         if self.station.listens_only:
             raise UsageError("the client only listens, and sends no requests")
+
+    def add_tap(self, tap: Tap) -> None:
+        """Pass all frames of the link also to this receiver; before `open`."""
+        self._taps.append(tap)
 
     def spawn(self, work: Callable[..., Any], *arguments: Any) -> None:
         """Run a function in the background. Its errors are logged, and never end the link."""

@@ -1,0 +1,394 @@
+"""The gateway: every ground station is answered from the tables that the service keeps.
+
+Ground stations connect to an endpoint as to a vehicle. All frames pass, and the parameter conversation is
+answered from the table: one download over the vehicle's link serves all stations.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Hashable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import Final, TypeAlias
+
+import anyio
+import anyio.abc
+
+from paramclient.client.client import ParamClient
+from paramclient.client.taps import SeenFrame, Tap
+from paramclient.protocol.node import Node
+from paramclient.protocol.session import Session
+from paramclient.service.kept_table import Asker, KeptTable
+from paramclient.service.stations import GroundStation, MavlinkEndpoint, Source
+from paramclient.wire.frames import TARGET_OFFSETS, Frame, bears_key
+from paramclient.wire.messages import (
+    AUTOPILOT_COMPONENT,
+    COMP_ID_ALL,
+    HASH_CHECK,
+    MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
+    MAV_CMD_REQUEST_MESSAGE,
+    CommandLong,
+    FileTransfer,
+    Heartbeat,
+    Message,
+    ParamError,
+    ParamExtAck,
+    ParamExtRequestList,
+    ParamExtRequestRead,
+    ParamExtSet,
+    ParamExtValue,
+    ParamRequestList,
+    ParamRequestRead,
+    ParamSet,
+    ParamValue,
+    SystemTime,
+    decode,
+    encode,
+    message_id,
+)
+
+__all__ = ["GATEWAY_ADDRESS", "Gateway"]
+
+GATEWAY_ADDRESS: Final = (254, 191)
+"""System and component id of the gateway (MAV_COMP_ID_ONBOARD_COMPUTER): not those of a ground station, so
+that vehicles notice when they lose all of these."""
+OWN_TYPE: Final = 18
+"""MAV_TYPE_ONBOARD_CONTROLLER, for the same reason."""
+GROUND_STATION_PARAMS: Final = ("SYSID_MYGCS", "MAV_GCS_SYSID")
+"""ArduPilot's parameter with the system id of its ground station, whose heartbeats it watches."""
+LOOP_TIME: Final = 2.0
+"""Seconds after which a frame that was sent is not taken for its own copy any more."""
+
+Request: TypeAlias = (
+    ParamRequestList
+    | ParamRequestRead
+    | ParamSet
+    | ParamExtRequestList
+    | ParamExtRequestRead
+    | ParamExtSet
+    | FileTransfer
+)
+
+
+def _ids(*kinds: type[Message]) -> frozenset[int]:
+    return frozenset(map(message_id, kinds))
+
+
+REQUESTS: Final = _ids(
+    *(ParamRequestList, ParamRequestRead, ParamSet, ParamExtRequestList, ParamExtRequestRead, ParamExtSet),
+    FileTransfer,
+)
+"""Messages of a station that the gateway answers."""
+PLAIN_ANSWERS: Final = _ids(ParamValue, ParamError)
+EXTENDED_ANSWERS: Final = _ids(ParamExtValue, ParamExtAck)
+HARMLESS: Final = _ids(Heartbeat, SystemTime, FileTransfer, ParamRequestRead, ParamRequestList) | {4, 66, 111}
+"""What passes from the stations of a read-only endpoint, with PING, REQUEST_DATA_STREAM and TIMESYNC."""
+HARMLESS_COMMANDS: Final = (MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
+
+logger = logging.getLogger(__name__)
+
+
+class Gateway:
+    """The ground stations at some endpoints, and the clients of the vehicles' links.
+
+    `attach` each client before it is opened, and `run` the gateway. Clients may come and go.
+
+    Args:
+        endpoints: where stations connect.
+
+    Attributes:
+        endpoints: as given.
+        links: the open links to vehicles.
+    """
+
+    def __init__(self, endpoints: Iterable[MavlinkEndpoint]) -> None:
+        self.endpoints = list(endpoints)
+        self.links: list[VehicleLink] = []
+        self.copies = _Copies()
+        self._warned: set[Source] = set()
+        for endpoint in self.endpoints:
+            endpoint.sending = self.copies.sent
+
+    @property
+    def stations(self) -> list[GroundStation]:
+        """All connected stations."""
+        return [station for endpoint in self.endpoints for station in endpoint.stations.values()]
+
+    def attach(self, client: ParamClient) -> None:
+        """Serve the vehicles of a client, which is not open yet. It is no ground station any more."""
+        client.core.station.own_address, client.core.station.own_type = GATEWAY_ADDRESS, OWN_TYPE
+        client.core.add_tap(VehicleLink(self, client))
+
+    async def run(self, *, task_status: anyio.abc.TaskStatus[None] = anyio.TASK_STATUS_IGNORED) -> None:
+        """Serve the stations, until cancelled.
+
+        Raises:
+            LinkError: an endpoint cannot be opened.
+        """
+        for endpoint in self.endpoints:
+            await endpoint.open()
+        task_status.started()
+        async with anyio.create_task_group() as tasks:
+            for endpoint in self.endpoints:
+                tasks.start_soon(endpoint.run, self._take)
+
+    def pass_on(self, link: VehicleLink, seen: SeenFrame, peer: Hashable) -> None:
+        """Pass a frame of a vehicle to all stations, but for answers to the gateway."""
+        table = link.table_of_answer(seen, peer)
+        is_answer = table is not None and table.withholds
+        is_copy = not is_answer and self.copies.is_copy(seen.data, (link, peer), sees_number=False)
+        if bears_key(seen.data) or is_copy:
+            return
+        for station in self.stations:
+            if is_answer and table is not None and self._serves(station, table, link):
+                station.withhold(seen)
+            else:
+                station.relay(seen)
+
+    def announce(self, link: VehicleLink, table: KeptTable, message: Message) -> None:
+        """Send a value that has changed to all stations."""
+        for station in self.stations:
+            if self._serves(station, table, link):
+                station.say(message, table.source)
+
+    # requests
+
+    def _take(self, station: GroundStation, seen: SeenFrame) -> None:
+        """Take a frame of a station: answer it, or pass it to the vehicles."""
+        frame = seen.frame
+        source = (frame.system, frame.component)
+        is_vehicle = any(link.is_vehicle(source) for link in self.links)
+        if bears_key(seen.data) or is_vehicle or self.copies.is_copy(seen.data, station, sees_number=True):
+            return
+        self.copies.sent(seen.data)
+        message = decode(frame) if seen.is_proven else None
+        if frame.message_id in REQUESTS and message is not None:
+            station.requests[type(message).__name__] += 1
+            if self._answer(station, source, message, seen):  # type: ignore[arg-type]  # by its id
+                return
+        if not station.endpoint.is_readonly or _is_harmless(frame, message):
+            self._route(seen.data, _target_of(frame))
+
+    def _answer(self, station: GroundStation, source: Source, message: Request, seen: SeenFrame) -> bool:
+        """Answer a request about parameters; return False for one that passes to the vehicles."""
+        target, component = message.target_system, message.target_component
+        extended = isinstance(message, ParamExtRequestList | ParamExtRequestRead | ParamExtSet)
+        found = [
+            (link, table)
+            for link in self.links
+            for table in link.tables(target, component, extended=extended)
+        ]
+        served = [(link, table) for link, table in found if self._serves(station, table, link)]
+        if not served:
+            return False
+        askers = [
+            (Asker(station, *source, may_write=not link.is_signed or station.may_sign), table)
+            for link, table in served
+        ]
+        match message:
+            case ParamRequestList() | ParamExtRequestList():
+                for _, table in served:
+                    table.list(station)
+                for link, table in found:
+                    if (link, table) not in served and table.source[1] != AUTOPILOT_COMPONENT:
+                        link.send(_readdressed(message, seen.frame, table.source))
+            case ParamRequestRead() | ParamExtRequestRead():
+                which = message.param_id if message.param_index < 0 else message.param_index
+                having = [(asker, table) for asker, table in askers if table.has(which)]
+                for asker, table in having or _autopilot_of(askers):
+                    table.read(asker, which)
+            case ParamSet(param_id=name) if name == HASH_CHECK:
+                pass  # it would stop the gateway's own list
+            case ParamSet() | ParamExtSet():
+                for asker, table in _autopilot_of(askers):
+                    table.set(asker, message)
+            case FileTransfer(payload=payload):
+                asker, table = _autopilot_of(askers)[0]
+                return table.take_file_request(
+                    asker, payload, lambda: self._route(seen.data, message.target_system)
+                )
+        return True
+
+    def _serves(self, station: GroundStation, table: KeptTable, link: VehicleLink) -> bool:
+        """Return whether requests of a station to a component are answered from its table."""
+        if not table.is_kept or (table.source in link.signing and not station.may_sign):
+            return False
+        is_double = any(each is not link and each.is_vehicle(table.source) for each in self.links)
+        if is_double and table.source not in self._warned:
+            self._warned.add(table.source)
+            logger.warning(
+                "%d/%d is on two links: stations are not answered from its table, and all frames pass",
+                *table.source,
+            )
+        return not is_double
+
+    def _route(self, data: bytes, system: int) -> None:
+        """Send a frame to the links on which its target was heard; to all for an unknown one, and for all."""
+        heard = [link for link in self.links if system in link.systems]
+        for link in heard if system and heard else self.links:
+            link.send(data)
+
+
+class VehicleLink(Tap):
+    """A link to vehicles, as its client has opened it.
+
+    Args:
+        gateway: the gateway.
+        client: of the link.
+
+    Attributes:
+        systems: the system ids that were heard.
+        signing: the components that sign.
+    """
+
+    def __init__(self, gateway: Gateway, client: ParamClient) -> None:
+        self.systems: set[int] = set()
+        self.signing: set[Source] = set()
+        self._gateway = gateway
+        self._client = client
+        self._tables: dict[Session, KeptTable] = {}
+
+    @property
+    def _own_address(self) -> Source:
+        return self._client.core.station.own_address
+
+    @property
+    def is_signed(self) -> bool:
+        """Whether the client signs what it sends."""
+        return self._client.signing_report() is not None
+
+    async def run(self, to_vehicles: object) -> None:
+        """Take part in the gateway while the client is open."""
+        self._gateway.links.append(self)
+        try:
+            await anyio.sleep_forever()
+        finally:
+            self._gateway.links.remove(self)
+
+    def send(self, data: bytes) -> None:
+        """Send a frame of a station to the vehicles."""
+        self._client.core.link_task.forward(data)
+
+    def received(self, frames: Sequence[SeenFrame], size: int, peer: Hashable) -> None:
+        """Pass the frames of a chunk on; the client has taken them before."""
+        for seen in frames:
+            source = (seen.frame.system, seen.frame.component)
+            if source != self._own_address:
+                self.systems.add(source[0])
+                if seen.is_signed:
+                    self.signing.add(source)
+                self._gateway.pass_on(self, seen, peer)
+
+    def is_vehicle(self, source: Source) -> bool:
+        """Return whether a component with parameters is heard under these ids."""
+        node = self._client.core.station.nodes.get(source)
+        return node is not None and node.identification.has_parameters and not node.presence.is_lost
+
+    def tables(self, system: int, component: int, *, extended: bool) -> Iterator[KeptTable]:
+        """Return the tables of the components with an address; 0 stands for all."""
+        for node in list(self._client.core.station.nodes.values()):
+            is_meant = system in (0, node.system) and component in (COMP_ID_ALL, node.component)
+            if is_meant and node.identification.has_parameters:
+                yield self._table(node, extended=extended)
+
+    def table_of_answer(self, seen: SeenFrame, peer: Hashable) -> KeptTable | None:
+        """Return the table to which a value or an answer belongs; None for another frame."""
+        frame = seen.frame
+        node = self._client.core.station.nodes.get((frame.system, frame.component))
+        if node is None or node.peer != peer:
+            return None
+        table = self._table(node, extended=False)  # from its first frame on, for its changes
+        extended = self._table(node, extended=True)
+        if frame.message_id in EXTENDED_ANSWERS:
+            return extended
+        is_answer = frame.message_id in PLAIN_ANSWERS or (
+            frame.message_id == message_id(FileTransfer) and _target_of(frame) == self._own_address[0]
+        )
+        return table if is_answer else None
+
+    def _table(self, node: Node, *, extended: bool) -> KeptTable:
+        session = node.extended if extended else node.plain
+        table = self._tables.get(session)
+        if table is None:
+            component = self._client.components[node.system, node.component]
+
+            def announce(table: KeptTable, message: Message) -> None:
+                self._gateway.announce(self, table, message)
+
+            table = KeptTable(component.ext if extended else component, announce)
+            self._tables[session] = table
+        return table
+
+
+class _Copies:
+    """Recognizes frames that have come back: a link or an endpoint leads to the gateway itself.
+
+    A vehicle sends equal frames too, as its heartbeats: only those of another origin are copies.
+    """
+
+    def __init__(self) -> None:
+        self._recent: dict[int, Hashable] = {}
+        self._earlier: dict[int, Hashable] = {}
+        self._turned_at = 0.0
+
+    def sent(self, data: bytes) -> None:
+        """Take note of a frame that is sent to a station, or taken from one."""
+        self._turn()
+        key = _key_of(data, sees_number=False)
+        self._recent.setdefault(key, self._earlier.get(key))
+
+    def is_copy(self, data: bytes, origin: Hashable, *, sees_number: bool) -> bool:
+        """Return whether a frame has left the gateway, or came from another origin, a moment ago.
+
+        Vehicles' frames are renumbered for each station, so that their numbers are not compared.
+        """
+        self._turn()
+        key = _key_of(data, sees_number=sees_number)
+        before = self._recent.get(key, self._earlier.get(key, origin))
+        self._recent.setdefault(key, before)
+        return before != origin
+
+    def _turn(self) -> None:
+        now = anyio.current_time()
+        if now - self._turned_at > LOOP_TIME:
+            self._turned_at = now
+            self._recent, self._earlier = {}, self._recent
+
+
+def _key_of(data: bytes, *, sees_number: bool) -> int:
+    if sees_number:
+        return hash(data)
+    if data[0] == 0xFD:
+        return hash(data[:4] + data[5 : 10 + data[1]])
+    return hash(data[:2] + data[3 : 6 + data[1]])
+
+
+def _target_of(frame: Frame) -> int:
+    """Return the target system of a frame; 0 for all, and for a message without one."""
+    at = TARGET_OFFSETS.get(frame.message_id, len(frame.payload))
+    return frame.payload[at] if at < len(frame.payload) else 0
+
+
+def _autopilot_of(found: list[tuple[Asker, KeptTable]]) -> list[tuple[Asker, KeptTable]]:
+    """Return the autopilot among the components that a message to all of them reaches."""
+    autopilots = [each for each in found if each[1].source[1] == AUTOPILOT_COMPONENT]
+    return (autopilots or found)[:1]
+
+
+def _readdressed(message: ParamRequestList | ParamExtRequestList, frame: Frame, target: Source) -> bytes:
+    """Return a request for a list to one component, in the name of the station."""
+    system, component = target
+    single = replace(message, target_system=system, target_component=component)
+    return encode(
+        single,
+        system=frame.system,
+        component=frame.component,
+        sequence=frame.sequence,
+        version=frame.version,
+    )
+
+
+def _is_harmless(frame: Frame, message: Message | None) -> bool:
+    if isinstance(message, CommandLong):
+        return message.command in HARMLESS_COMMANDS
+    return frame.message_id in HARMLESS

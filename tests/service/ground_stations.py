@@ -1,0 +1,180 @@
+"""Ground stations in virtual time: a link with any number of them, and a gateway between it and vehicles."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any, TypeVar
+
+import anyio
+
+from paramclient import ParamClient
+from paramclient.errors import LinkError
+from paramclient.links import Peer
+from paramclient.protocol.ftp import Opcode, Packet
+from paramclient.service.gateway import Gateway
+from paramclient.service.stations import MavlinkEndpoint
+from paramclient.wire.frames import Frame, Framer
+from paramclient.wire.messages import DECODED_IDS, FileTransfer, Message, decode, encode
+from tests.shell import a_client
+
+T = TypeVar("T")
+
+
+class StationsLink:
+    """A link on which ground stations of the test speak to the gateway.
+
+    Attributes:
+        stations: by their peer.
+    """
+
+    is_stream = False
+    reconnects = True
+
+    def __init__(self, name: str = "udpin:stations:14551") -> None:
+        self.name = name
+        self.stations: dict[Peer, Partner] = {}
+        self.said: deque[tuple[Peer, bytes]] = deque()
+        self.activity = anyio.Event()
+        self._is_open = False
+
+    async def open(self) -> None:
+        self._is_open = True
+
+    async def receive(self) -> list[tuple[Peer, bytes]]:
+        while not self.said:
+            if not self._is_open:
+                raise LinkError(f"{self.name}: closed", link=self.name)
+            self.activity = anyio.Event()
+            await self.activity.wait()
+        found = list(self.said)
+        self.said.clear()
+        return found
+
+    async def send(self, data: bytes, peer: Peer | None) -> None:
+        await anyio.lowlevel.checkpoint()
+        for each, station in self.stations.items():
+            if peer in (None, each):
+                station.take(data)
+
+    async def close(self) -> None:
+        self._is_open = False
+        self.activity.set()
+
+
+class Partner:
+    """A ground station: it sends messages, and keeps what it receives.
+
+    Attributes:
+        datagrams, frames: received.
+        times: when each frame was received.
+        lost: frames that the sequence numbers say are lost, by sender.
+    """
+
+    def __init__(
+        self, link: StationsLink, *, system: int = 255, component: int = 190, version: int = 2
+    ) -> None:
+        self.datagrams: list[bytes] = []
+        self.frames: list[Frame] = []
+        self.times: list[float] = []
+        self.lost: dict[tuple[int, int], int] = {}
+        self.address = (system, component)
+        self._version = version
+        self._link = link
+        self._peer = ("station", len(link.stations))
+        self._framer = Framer(stream=False)
+        self._last: dict[tuple[int, int], int] = {}
+        self._sequence = 0
+        link.stations[self._peer] = self
+
+    def send(self, *messages: Message) -> None:
+        for message in messages:
+            system, component = self.address
+            options: dict[str, Any] = {"sequence": self._sequence, "version": self._version}
+            self.send_bytes(encode(message, system=system, component=component, **options))
+            self._sequence = (self._sequence + 1) & 0xFF
+
+    def send_bytes(self, data: bytes) -> None:
+        self._link.said.append((self._peer, data))
+        self._link.activity.set()
+
+    def take(self, data: bytes) -> None:
+        self.datagrams.append(data)
+        for frame in self._framer.receive(data):
+            source = (frame.system, frame.component)
+            if source in self._last:
+                gap = (frame.sequence - self._last[source] - 1) & 0xFF
+                self.lost[source] = self.lost.get(source, 0) + gap
+            self._last[source] = frame.sequence
+            self.frames.append(frame)
+            self.times.append(anyio.current_time())
+
+    def of(self, kind: type[T], *, system: int | None = None) -> list[T]:
+        """The received messages of a kind."""
+        found = [
+            decode(each)
+            for each in self.frames
+            if each.message_id in DECODED_IDS and system in (None, each.system)
+        ]
+        return [each for each in found if isinstance(each, kind)]
+
+    def clear(self) -> None:
+        self.datagrams.clear()
+        self.frames.clear()
+        self.times.clear()
+
+    async def ask(self, *messages: Message, seconds: float = 0.5) -> None:
+        """Forget what was received, send, and wait."""
+        self.clear()
+        self.send(*messages)
+        await anyio.sleep(seconds)
+
+    async def ask_file(self, opcode: Opcode, *, seconds: float = 0.5, **fields: Any) -> list[Packet]:
+        """Send a request of MAVFTP to 1/1, and return the answers."""
+        packet = Packet(**{"sequence": 1, "session": 0, "opcode": opcode} | fields)
+        await self.ask(FileTransfer(0, 1, 1, packet.pack()), seconds=seconds)
+        return [Packet.unpack(each.payload) for each in self.of(FileTransfer)]
+
+
+class Served:
+    """A gateway over the links of some vehicles, with ground stations.
+
+    Attributes:
+        gateway, clients, link: the parts.
+    """
+
+    def __init__(self, gateway: Gateway, clients: list[ParamClient], link: StationsLink) -> None:
+        self.gateway = gateway
+        self.clients = clients
+        self.link = link
+
+    def partner(self, **options: Any) -> Partner:
+        """A new ground station; it is known from its first frame on."""
+        return Partner(self.link, **options)
+
+    async def synced(self) -> None:
+        """Fetch all tables."""
+        for client in self.clients:
+            await (await client.component()).fetch_all()
+
+
+@asynccontextmanager
+async def gateway_over(
+    *links: Any, endpoint: dict[str, Any] | None = None, **options: Any
+) -> AsyncIterator[Served]:
+    """Open a gateway over vehicles. `endpoint`: options of the endpoint."""
+    link = StationsLink()
+    gateway = Gateway([MavlinkEndpoint(link, **(endpoint or {}))])
+    clients = [a_client(each, **options) for each in links]
+    async with anyio.create_task_group() as tasks:
+        await tasks.start(gateway.run)
+        for client in clients:
+            gateway.attach(client)
+            await client.open()
+        try:
+            yield Served(gateway, clients, link)
+        finally:
+            for client in clients:
+                await client.aclose()
+            tasks.cancel_scope.cancel()
