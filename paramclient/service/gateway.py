@@ -277,7 +277,18 @@ class VehicleLink(Tap):
                 self.systems.add(source[0])
                 if seen.is_signed:
                     self.signing.add(source)
+                if seen.frame.message_id == message_id(Heartbeat):
+                    self._avoid_watched_id(source)
                 self._gateway.pass_on(self, seen, peer)
+
+    def _avoid_watched_id(self, source: Source) -> None:
+        """Take another system id if the vehicle watches ours as that of its ground station."""
+        node, station = self._client.core.station.nodes.get(source), self._client.core.station
+        params = {} if node is None else node.plain.table.params
+        if any(
+            name in params and params[name].value == self._own_address[0] for name in GROUND_STATION_PARAMS
+        ):
+            station.own_address = (self._own_address[0] - 1, self._own_address[1])
 
     def is_vehicle(self, source: Source) -> bool:
         """Return whether a component with parameters is heard under these ids."""

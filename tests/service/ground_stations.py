@@ -10,13 +10,16 @@ from typing import Any, TypeVar
 import anyio
 
 from paramclient import ParamClient
+from paramclient.client.signing import timestamp_now
 from paramclient.errors import LinkError
 from paramclient.links import Peer
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.service.gateway import Gateway
 from paramclient.service.stations import MavlinkEndpoint
-from paramclient.wire.frames import Frame, Framer
+from paramclient.sim import Endpoint
+from paramclient.wire.frames import Frame, Framer, sign_frame
 from paramclient.wire.messages import DECODED_IDS, FileTransfer, Message, decode, encode
+from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier
 from tests.shell import a_client
 
 T = TypeVar("T")
@@ -27,6 +30,7 @@ class StationsLink:
 
     Attributes:
         stations: by their peer.
+        is_stuck: nothing is taken, and a sender waits.
     """
 
     is_stream = False
@@ -37,6 +41,7 @@ class StationsLink:
         self.stations: dict[Peer, Partner] = {}
         self.said: deque[tuple[Peer, bytes]] = deque()
         self.activity = anyio.Event()
+        self.is_stuck = False
         self._is_open = False
 
     async def open(self) -> None:
@@ -54,6 +59,8 @@ class StationsLink:
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
         await anyio.lowlevel.checkpoint()
+        while self.is_stuck:  # noqa: ASYNC110 - set by the test
+            await anyio.sleep(0.1)
         for each, station in self.stations.items():
             if peer in (None, each):
                 station.take(data)
@@ -69,11 +76,18 @@ class Partner:
     Attributes:
         datagrams, frames: received.
         times: when each frame was received.
+        signer, verifier: sign what is sent, and judge what is received; None without a key.
         lost: frames that the sequence numbers say are lost, by sender.
     """
 
     def __init__(
-        self, link: StationsLink, *, system: int = 255, component: int = 190, version: int = 2
+        self,
+        link: StationsLink,
+        *,
+        system: int = 255,
+        component: int = 190,
+        version: int = 2,
+        key: SigningKey | None = None,
     ) -> None:
         self.datagrams: list[bytes] = []
         self.frames: list[Frame] = []
@@ -84,6 +98,10 @@ class Partner:
         self._link = link
         self._peer = ("station", len(link.stations))
         self._framer = Framer(stream=False)
+        self.signer = None if key is None else Signer(key, link_id=100, timestamp=timestamp_now())
+        self.verifier = None if self.signer is None else Verifier(self.signer, SigningPolicy.SIGNED_ONLY)
+        if self.verifier is not None:
+            self._framer.guard = self.verifier.accepts
         self._last: dict[tuple[int, int], int] = {}
         self._sequence = 0
         link.stations[self._peer] = self
@@ -92,7 +110,8 @@ class Partner:
         for message in messages:
             system, component = self.address
             options: dict[str, Any] = {"sequence": self._sequence, "version": self._version}
-            self.send_bytes(encode(message, system=system, component=component, **options))
+            data = encode(message, system=system, component=component, **options)
+            self.send_bytes(data if self.signer is None else sign_frame(data, self.signer))
             self._sequence = (self._sequence + 1) & 0xFF
 
     def send_bytes(self, data: bytes) -> None:
@@ -137,6 +156,27 @@ class Partner:
         return [Packet.unpack(each.payload) for each in self.of(FileTransfer)]
 
 
+class _Behind:
+    """An endpoint whose data is what a partner of a gateway receives."""
+
+    def __init__(self, partner: Partner) -> None:
+        self._partner = partner
+
+    def receive(self, data: bytes, now: float) -> None:
+        self._partner.send_bytes(data)
+
+    def tick(self, now: float) -> None:
+        self._at = now + 0.005
+
+    def next_deadline(self) -> float:
+        return self._at
+
+    def data_to_send(self) -> list[bytes]:
+        data = list(self._partner.datagrams)
+        self._partner.datagrams.clear()
+        return data
+
+
 class Served:
     """A gateway over the links of some vehicles, with ground stations.
 
@@ -152,6 +192,10 @@ class Served:
     def partner(self, **options: Any) -> Partner:
         """A new ground station; it is known from its first frame on."""
         return Partner(self.link, **options)
+
+    def as_vehicles(self) -> Endpoint:
+        """The gateway as another one sees it: an endpoint with the vehicles."""
+        return _Behind(self.partner(system=254, component=191))
 
     async def synced(self) -> None:
         """Fetch all tables."""
