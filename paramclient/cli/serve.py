@@ -24,6 +24,7 @@ _UNSIGNED: Final = SigningOptions()
 
 async def serve(
     *links: str,
+    mavlink: tuple[str, ...] = (),
     listen: str = "127.0.0.1:8765",
     cache: str | None = None,
     no_cache: bool = False,
@@ -37,13 +38,20 @@ async def serve(
     verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False,
     options: SigningOptions = _UNSIGNED,
 ) -> int:
-    """Open links and the cache, and share them with programs and browsers over HTTP.
+    """Open links and the cache, and share them with ground stations, programs and browsers.
+
+    Ground stations connect to the endpoints of `--mavlink` as to a vehicle. All frames pass, and requests
+    about parameters are answered from the table.
 
     A link that cannot be opened, or that has failed, is retried. On SIGTERM and Ctrl-C, the service answers
     waiting requests, writes the cache and exits.
 
     Args:
         links: The links, such as udpin:0.0.0.0:14550 or serial:/dev/ttyACM0:57600.
+        mavlink: Endpoint for ground stations, such as udpin:14551, tcpin:5760, udpout:127.0.0.1:14550 or
+            serial:/dev/ttyUSB0:57600, with the options ?readonly, ?sign=KEYFILE and ?trusted (may write to a
+            signed vehicle without signing). Without an address, only this computer can connect. May be given
+            several times.
         listen: Address to listen on, HOST:PORT; with port 0, the system chooses the port.
         cache: The cache file, or the postgresql:// URL of a shared cache. Default: the user's own cache.
         no_cache: Neither read nor write a cache.
@@ -72,11 +80,18 @@ async def serve(
         links,
         cache=not no_cache if cache is None else cache,
         fetches=fetch,
+        mavlink=mavlink,
         listen_only=listen_only,
         signing=options.signing,
         **options.source,
     )
     stop = anyio.Event()
+
+    def started(url: str) -> None:
+        for endpoint in hub.gateway.endpoints:
+            print_line(f"ground stations: {endpoint.name}")
+        print_line(f"serving on {url}")
+
     with on_end_signal(lambda _: stop.set()):
         await service.serve(
             hub,
@@ -85,6 +100,6 @@ async def serve(
             hosts=host,
             origins=allow_origin,
             stop=stop,
-            listens=lambda url: print_line(f"serving on {url}"),
+            listens=started,
         )
     return ExitCode.DONE

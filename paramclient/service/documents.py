@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from paramclient.protocol.fetch import FetchResult, Progress
     from paramclient.protocol.set_results import SetManyResult, SetOutcome
     from paramclient.provision import ApplyResult, Plan
+    from paramclient.service.stations import GroundStation
     from paramclient.service.targets import Target
 
 CHANGING_MEMBERS: Final = frozenset({"silence_s", "round_trip_s", "params", "fetch"})
@@ -74,6 +75,22 @@ def vehicle(target: Target) -> dict[str, Any]:
             "count": ext.count,
             "params": len(ext.params),
         },
+    }
+
+
+def station(found: GroundStation) -> dict[str, Any]:
+    """Return the state of a ground station. `saved_bytes` did not have to come over the vehicle's link."""
+    return {
+        "name": found.name,
+        "endpoint": found.endpoint.name,
+        "ids": sorted(f"{system}/{component}" for system, component in found.sources),
+        "mavlink": found.version,
+        "silence_s": round(found.silence, 3),
+        "requests": dict(found.requests),
+        "relayed": found.relayed,
+        "answered": found.answered,
+        "dropped": found.dropped,
+        "saved_bytes": found.saved,
     }
 
 

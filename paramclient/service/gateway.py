@@ -12,10 +12,10 @@ from dataclasses import replace
 from typing import Final, TypeAlias
 
 import anyio
-import anyio.abc
 
 from paramclient.client.client import ParamClient
 from paramclient.client.taps import SeenFrame, Tap
+from paramclient.errors import LinkError
 from paramclient.protocol.node import Node
 from paramclient.protocol.session import Session
 from paramclient.service.kept_table import Asker, KeptTable
@@ -91,7 +91,7 @@ logger = logging.getLogger(__name__)
 class Gateway:
     """The ground stations at some endpoints, and the clients of the vehicles' links.
 
-    `attach` each client before it is opened, and `run` the gateway. Clients may come and go.
+    `open` the gateway and `run` it; `attach` each client before it is opened. Clients may come and go.
 
     Args:
         endpoints: where stations connect.
@@ -119,15 +119,22 @@ class Gateway:
         client.core.station.own_address, client.core.station.own_type = GATEWAY_ADDRESS, OWN_TYPE
         client.core.add_tap(VehicleLink(self, client))
 
-    async def run(self, *, task_status: anyio.abc.TaskStatus[None] = anyio.TASK_STATUS_IGNORED) -> None:
-        """Serve the stations, until cancelled.
+    async def open(self) -> None:
+        """Open the endpoints.
 
         Raises:
-            LinkError: an endpoint cannot be opened.
+            LinkError: one cannot be opened, and none is open then.
         """
-        for endpoint in self.endpoints:
-            await endpoint.open()
-        task_status.started()
+        try:
+            for endpoint in self.endpoints:
+                await endpoint.open()
+        except LinkError:
+            for endpoint in self.endpoints:
+                await endpoint.link.close()
+            raise
+
+    async def run(self) -> None:
+        """Serve the stations at the open endpoints, until cancelled."""
         async with anyio.create_task_group() as tasks:
             for endpoint in self.endpoints:
                 tasks.start_soon(endpoint.run, self._take)

@@ -24,7 +24,9 @@ from paramclient.metadata import Metadata, MetadataStore, metadata_of
 from paramclient.protocol.fetch import FetchResult, Progress
 from paramclient.service import documents
 from paramclient.service.event_feed import EventFeed
+from paramclient.service.gateway import Gateway
 from paramclient.service.problems import ServiceError
+from paramclient.service.stations import MavlinkEndpoint
 from paramclient.service.targets import ServiceLink, Target
 
 if TYPE_CHECKING:
@@ -52,17 +54,19 @@ class Hub:
         links: links by name, object or simulated vehicle, as for `ParamClient`.
         cache: as for `ParamClient`; shared by all links.
         fetches: whether the table of every component is fetched when it is heard.
+        mavlink: endpoints to which ground stations connect, see `MavlinkEndpoint`.
         options: options of each `ParamClient`.
 
     Attributes:
         cache: the cache, or None.
         feed: the event feed.
+        gateway: the ground stations.
         links: the links, by name.
         metadata_store: the metadata files beside the cache; None without a cache.
         started: `time.monotonic()` of the start.
 
     Raises:
-        UsageError: a link or option is invalid, or two links have one name.
+        UsageError: a link, endpoint or option is invalid, or two links have one name.
     """
 
     def __init__(
@@ -71,12 +75,18 @@ class Hub:
         *,
         cache: ParamCache | str | os.PathLike[str] | bool | None = None,
         fetches: bool = True,
+        mavlink: Iterable[str | MavlinkEndpoint] = (),
         **options: Any,
     ) -> None:
         self.cache = _open_cache(cache)
         self._owns_cache = self.cache is not cache
         self._fetches = fetches
         self.feed = EventFeed()
+        self.gateway = Gateway(
+            each if isinstance(each, MavlinkEndpoint) else MavlinkEndpoint(each) for each in mavlink
+        )
+        if self.gateway.endpoints and options.get("listen_only"):
+            raise UsageError("a client that only listens cannot answer ground stations")
         self.metadata_store = None if self.cache is None else MetadataStore.beside(self.cache.path)
         self.started = time.monotonic()
         self.links: dict[str, ServiceLink] = {}
@@ -87,14 +97,22 @@ class Hub:
             if name in self.links:
                 raise UsageError(f"the link {name} is given twice")
             is_log = isinstance(link, str) and link.startswith("replay:")
-            make = partial(ParamClient, link, cache=False if is_log else self.cache or False, **options)
+            make = partial(self._new_client, link, cache=False if is_log else self.cache or False, **options)
             make()  # an invalid option raises here
             self.links[name] = ServiceLink(name, make)
 
+    def _new_client(self, link: LinkChoice, **options: Any) -> ParamClient:
+        client = ParamClient(link, **options)
+        if self.gateway.endpoints:
+            self.gateway.attach(client)
+        return client
+
     async def __aenter__(self) -> Hub:
+        await self.gateway.open()
         self._tasks = await anyio.create_task_group().__aenter__()
         for link in self.links.values():
             self._tasks.start_soon(self._run_link, link)
+        self._tasks.start_soon(self.gateway.run)
         return self
 
     async def __aexit__(

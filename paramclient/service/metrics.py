@@ -25,6 +25,13 @@ _COUNTERS: Final = {
     "bytes_sent": "Sent bytes.",
 }
 """Help texts of the counters of a link, by attribute of `ParamClient`."""
+_STATION_COUNTERS: Final = {
+    "relayed": "Frames of vehicles.",
+    "answered": "Answers from the tables.",
+    "saved": "Bytes of answers that were not sent over the link of a vehicle.",
+    "dropped": "Frames dropped because a station did not read.",
+}
+"""Help texts of the counters of the connected stations of an endpoint, by attribute of `GroundStation`."""
 _GAUGES: Final = {
     "up": "1 if the vehicle is not lost.",
     "synced": "1 if the table matches that of the vehicle.",
@@ -56,6 +63,7 @@ class _HubCollector(Collector):
         yield GaugeMetricFamily("paramclient_listeners", "Open event streams.", hub.feed.listeners)
         yield from _link_metrics(hub)
         yield from _component_metrics(hub)
+        yield from _station_metrics(hub)
 
 
 def _link_metrics(hub: Hub) -> Iterator[Metric]:
@@ -86,3 +94,15 @@ def _component_metrics(hub: Hub) -> list[GaugeMetricFamily]:
         if component.round_trip is not None:
             families["round_trip_seconds"].add_metric(values, component.round_trip)
     return list(families.values())
+
+
+def _station_metrics(hub: Hub) -> Iterator[Metric]:
+    number = GaugeMetricFamily("paramclient_stations", "Connected ground stations.", labels=["endpoint"])
+    for endpoint in hub.gateway.endpoints:
+        number.add_metric([endpoint.name], len(endpoint.stations))
+    yield number
+    for name, text in _STATION_COUNTERS.items():
+        gauge = GaugeMetricFamily(f"paramclient_stations_{name}", text, labels=["endpoint"])
+        for endpoint in hub.gateway.endpoints:
+            gauge.add_metric([endpoint.name], sum(getattr(each, name) for each in endpoint.stations.values()))
+        yield gauge

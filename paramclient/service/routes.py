@@ -162,6 +162,12 @@ async def events(request: Request, hub: HubArgument) -> Response:
 # vehicles
 
 
+@reading.get("/api/stations")
+async def list_stations(hub: HubArgument) -> list[dict[str, Any]]:
+    """Return the ground stations at the endpoints, with what the answers to them have saved."""
+    return [documents.station(each) for each in hub.gateway.stations]
+
+
 @reading.get("/api/vehicles")
 async def vehicles(hub: HubArgument) -> Any:
     """Return the components on the links, the lowest ids first, and the tables in the cache."""

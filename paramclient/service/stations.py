@@ -136,6 +136,11 @@ class GroundStation:
         return self.endpoint.name if self.peer is None else f"{self.endpoint.name}#{self.peer}"
 
     @property
+    def silence(self) -> float:
+        """Seconds since its last frame."""
+        return anyio.current_time() - self.received_at
+
+    @property
     def may_sign(self) -> bool:
         """Whether what the station asks may be sent with the gateway's signature."""
         return self.endpoint.is_trusted or self.endpoint.signer is not None

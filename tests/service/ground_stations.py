@@ -212,7 +212,8 @@ async def gateway_over(
     gateway = Gateway([MavlinkEndpoint(link, **(endpoint or {}))])
     clients = [a_client(each, **options) for each in links]
     async with anyio.create_task_group() as tasks:
-        await tasks.start(gateway.run)
+        await gateway.open()
+        tasks.start_soon(gateway.run)
         for client in clients:
             gateway.attach(client)
             await client.open()

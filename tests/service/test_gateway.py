@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import socket
 import struct
 from collections.abc import Callable
 from functools import partial
@@ -14,11 +15,11 @@ import anyio
 import pytest
 
 from paramclient import ParamType
-from paramclient.errors import UsageError
+from paramclient.errors import LinkError, UsageError
 from paramclient.model.values import Encoding, encode_value
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.param_pck import decode, encode
-from paramclient.service import stations
+from paramclient.service import Hub, stations
 from paramclient.service.stations import MavlinkEndpoint, Numbering
 from paramclient.sim import Air, ArduPilotVehicle, Camera, Endpoint, PX4Vehicle
 from paramclient.wire import frames, messages
@@ -38,8 +39,9 @@ from paramclient.wire.messages import (
 )
 from paramclient.wire.signing import SigningKey
 from tests.conversations.virtual import Puppet
-from tests.service.ground_stations import Partner, gateway_over
-from tests.shell import PeersLink, Radio, Tap, generic, in_simulated_time, small_px4, until
+from tests.service.ground_stations import Partner, StationsLink, gateway_over
+from tests.service.hub import service, synced
+from tests.shell import PeersLink, Radio, Tap, a_client, bits, generic, in_simulated_time, small_px4, until
 
 LIST = ParamRequestList(1, 1)
 REQUESTS = (ParamRequestList, ParamRequestRead, ParamSet)
@@ -251,7 +253,11 @@ async def test_rule_2_the_parameter_file_in_the_requested_pieces(size: int, quer
         content = content_of(await station.ask_file(Opcode.BURST_READ_FILE, size=size, session=3))
         pack = decode(direct_file(path, size))
         rows = [each._replace(default=None) if each.default == each.bits else each for each in pack.entries]
-        options = {"total": pack.total, "with_defaults": pack.with_defaults, "read_size": size}
+        options: dict[str, Any] = {
+            "total": pack.total,
+            "with_defaults": pack.with_defaults,
+            "read_size": size,
+        }
         assert content == encode(rows, **options)
         [part] = await station.ask_file(Opcode.READ_FILE, offset=size, size=size, session=3)
         assert part.data == content[size : 2 * size]
@@ -752,3 +758,56 @@ def test_rule_13_names_of_endpoints(tmp_path: Path) -> None:
     assert MavlinkEndpoint(f"udpout:127.0.0.1:14550?sign={key}").name == "udpout:127.0.0.1:14550"
     with pytest.raises(UsageError, match="not an option"):
         MavlinkEndpoint("tcpin:5760?writeonly")
+
+
+# 14: visible, and the whole service
+
+
+@in_simulated_time
+async def test_rule_14_stations_are_shown_with_what_they_save() -> None:
+    link = StationsLink()
+    async with service(small_px4(), mavlink=[MavlinkEndpoint(link)]) as (_, browser):
+        await synced(browser)
+        station = Partner(link)
+        await station.ask(LIST)
+        [shown] = (await browser.get("/api/stations")).json()
+        assert shown["name"] == "udpin:stations:14551#('station', 0)"
+        assert (shown["ids"], shown["requests"]) == (["255/190"], {"ParamRequestList": 1})
+        assert shown["answered"] == 26
+        assert shown["saved_bytes"] == sum(map(len, station.datagrams)) > 700
+        metrics = (await browser.get("/metrics")).text
+        assert 'paramclient_stations_answered{endpoint="udpin:stations:14551"} 26.0' in metrics
+
+
+def test_rule_14_a_service_that_only_listens_has_no_stations() -> None:
+    with pytest.raises(UsageError, match="only listens"):
+        Hub([small_px4()], cache=False, mavlink=["tcpin:0"], listen_only=True)
+
+
+@pytest.mark.asyncio
+async def test_stations_on_tcp_and_udp() -> None:
+    """`ParamClient` works through a gateway like with a vehicle."""
+    endpoints = [MavlinkEndpoint("tcpin:0"), MavlinkEndpoint("udpin:0")]
+    vehicle = Tap(small_px4())
+    async with Hub([vehicle], cache=False, mavlink=endpoints) as hub:
+        ports = [each.link.address[1] for each in endpoints]  # type: ignore[attr-defined]  # of sockets
+        await until(lambda: hub.targets and hub.targets[0].component.sync_state == "synced")
+        vehicle.received.clear()
+        for name in (f"tcp:127.0.0.1:{ports[0]}", f"udpout:127.0.0.1:{ports[1]}"):
+            async with a_client(name) as client:
+                component = await client.component()
+                result = await component.fetch_all()
+                assert bits(result.params) == bits(hub.targets[0].component.params)
+                assert (await component.set("PARAM_01", ports[0] % 1000)).status == "accepted"
+        assert len(requested(vehicle)) <= 3  # the sets, and no list
+        assert not vehicle.messages(ParamRequestList)
+
+
+def test_an_endpoint_that_is_in_use_ends_the_start() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other, pytest.raises(LinkError, match="in use"):
+        anyio.run(_start, f"tcpin:{other.getsockname()[1]}")
+
+
+async def _start(endpoint: str) -> None:
+    async with Hub([small_px4()], cache=False, mavlink=[endpoint]):
+        raise AssertionError("it was opened")
