@@ -1,0 +1,102 @@
+"""Real ground stations behind the gateway: pymavlink and MAVSDK, each at an endpoint of its own."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from functools import partial
+from typing import Any
+
+import anyio
+import anyio.to_process
+import pytest
+
+from bench.peers import fetch_with_mavsdk, fetch_with_pymavlink, free_port
+from paramclient.service import Hub
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
+from paramclient.wire.messages import ParamRequestList, ParamRequestRead, ParamSet
+from tests.shell import TIMEOUT, Tap, small_px4, until
+
+TIME_LIMIT = 60.0
+"""Seconds for one download."""
+
+
+@asynccontextmanager
+async def stations_of(vehicle: Vehicle, stations: int, **faults: Any) -> AsyncIterator[tuple[Tap, list[int]]]:
+    """A service whose table is in sync, and the ports on which its stations listen."""
+    radio = Tap(Air.symmetric([vehicle], seed=1, **faults))
+    ports = [free_port() for _ in range(stations)]
+    async with Hub([radio], cache=False, mavlink=[f"udpout:127.0.0.1:{port}" for port in ports]) as hub:
+        await until(lambda: hub.targets and hub.targets[0].component.sync_state == "synced", 0.05)
+        radio.received.clear()
+        yield radio, ports
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", [PX4Vehicle, partial(ArduPilotVehicle, live_period=0.0)])
+async def test_stations_get_every_value_and_the_radio_carries_none(kind: Callable[[], Vehicle]) -> None:
+    vehicle = kind()
+    found: list[Any] = []
+
+    async def fetch(way: Any, port: int) -> None:
+        found.append(await anyio.to_process.run_sync(way, port, TIME_LIMIT))
+
+    async with stations_of(vehicle, 2, loss=0.2, delay=0.05) as (radio, ports):
+        async with anyio.create_task_group() as tasks:
+            for way, port in zip((fetch_with_pymavlink, fetch_with_mavsdk), ports, strict=True):
+                tasks.start_soon(fetch, way, port)
+        assert not radio.messages(ParamRequestList)
+        assert len(radio.messages(ParamRequestRead)) <= 5  # the proof of a table that was proven 5 s before
+    truth = {name: float(value) for name, value in vehicle.values.items() if not isinstance(value, bytes)}
+    for _, values in found:
+        assert {name: values[name] for name in truth} == pytest.approx(truth, rel=1e-6)
+
+
+def loss_with_pymavlink(port: int) -> float:
+    """Fetch a list, and return the share of lost frames by the sequence numbers, in percent."""
+    from pymavlink import mavutil
+
+    master = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}")
+    master.wait_heartbeat(timeout=TIMEOUT)
+    index = None
+    for _ in range(3):
+        master.mav.param_request_list_send(1, 1)
+        while index != 902:
+            index = master.recv_match(type="PARAM_VALUE", blocking=True, timeout=TIMEOUT).param_index
+        index = None
+        master.wait_heartbeat(timeout=TIMEOUT)
+    return float(master.packet_loss())
+
+
+@pytest.mark.asyncio
+async def test_pymavlink_counts_no_losses() -> None:
+    async with stations_of(PX4Vehicle(), 1) as (_, [port]):
+        assert await anyio.to_process.run_sync(loss_with_pymavlink, port) == 0.0
+
+
+def set_with_mavsdk(port: int) -> tuple[int, str]:
+    """Set a parameter, and another one as if it had another type; return what is read, and the error."""
+    from mavsdk import ComponentType, Configuration, Mavsdk, log_subscribe
+    from mavsdk.plugins.param import Param
+
+    log_subscribe(lambda *_: True)
+    with Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION)) as mavsdk:
+        mavsdk.add_any_connection(f"udpin://127.0.0.1:{port}")
+        param = Param(mavsdk.first_autopilot(timeout_s=TIMEOUT))
+        param.set_param_int("PARAM_01", 77)
+        error = ""
+        try:
+            param.set_param_float("PARAM_02", 1.5)
+        except Exception as refused:
+            error = str(refused)
+        return param.get_param_int("PARAM_01"), error
+
+
+@pytest.mark.asyncio
+async def test_mavsdk_sets_a_parameter() -> None:
+    vehicle = small_px4()
+    async with stations_of(vehicle, 1, loss=0.2, delay=0.05) as (radio, [port]):
+        value, error = await anyio.to_process.run_sync(set_with_mavsdk, port)
+        assert (value, vehicle.values["PARAM_01"]) == (77, 77)
+        assert error
+        assert {each.param_id for each in radio.messages(ParamSet)} == {"PARAM_01"}
