@@ -25,6 +25,7 @@ from paramclient.wire.messages import (
     AUTOPILOT_COMPONENT,
     COMP_ID_ALL,
     HASH_CHECK,
+    MAV_CMD_PREFLIGHT_STORAGE,
     MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
     MAV_CMD_REQUEST_MESSAGE,
     CommandLong,
@@ -175,6 +176,10 @@ class Gateway:
                 return
         if not station.endpoint.is_readonly or _is_harmless(frame, message):
             self._route(seen.data, _target_of(frame))
+            if isinstance(message, CommandLong) and message.command == MAV_CMD_PREFLIGHT_STORAGE:
+                target = (message.target_system, message.target_component)
+                for table in [each for link in self.links for each in link.tables(*target, extended=False)]:
+                    table.doubt()  # it may reset all parameters, which PX4 does not announce
 
     def _answer(self, station: GroundStation, source: Source, message: Request, seen: SeenFrame) -> bool:
         """Answer a request about parameters; return False for one that passes to the vehicles."""

@@ -246,6 +246,10 @@ class KeptTable:
                 value = now._replace(param_count=value.param_count, param_index=value.param_index)
             yield value
 
+    def doubt(self) -> None:
+        """Have the table checked soon: a station may have changed values that are not announced."""
+        self.component.watch.doubt()
+
     def load(self) -> None:
         """Fetch the table, unless that is in progress; all stations that wait share the fetch."""
         if self._loaded is None:
@@ -450,7 +454,7 @@ class KeptTable:
         """Send a PARAM_ERROR to each asker, with its ids: others would take it for their own requests."""
         name, index = (which, -1) if isinstance(which, str) else ("", which)
         for station, system, component, _ in askers:
-            if not self.session.dialect.has_ack:
+            if not (self.session.dialect.has_ack or self.is_lost):
                 station.say(ParamError(system, component, name, index, code), self.source)
 
     # the file
@@ -477,7 +481,7 @@ class KeptTable:
             case Opcode.TERMINATE_SESSION | Opcode.RESET_SESSIONS:
                 if self._uploads:
                     self._uploads.discard(key)
-                    self.component.watch.doubt()
+                    self.doubt()
                 if self._files.pop(key, None) is not None:
                     self._say(asker, reply(request))
                     return True

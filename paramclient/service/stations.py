@@ -16,6 +16,8 @@ from paramclient.client.signing import Signing, TimestampKeeper, read_key
 from paramclient.client.taps import FrameCutter, SeenFrame
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link
+from paramclient.links.tcp import TcpIn
+from paramclient.protocol.addresses import peer_in_words
 from paramclient.wire.frames import renumber_frame, sign_frame
 from paramclient.wire.messages import Message, encode, message_id
 from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier
@@ -133,7 +135,7 @@ class GroundStation:
     @property
     def name(self) -> str:
         """Its address, and that of the endpoint."""
-        return self.endpoint.name if self.peer is None else f"{self.endpoint.name}#{self.peer}"
+        return self.endpoint.name + ("" if self.peer is None else f"#{peer_in_words(self.peer)}")
 
     @property
     def silence(self) -> float:
@@ -322,7 +324,9 @@ class MavlinkEndpoint:
             async with anyio.create_task_group() as tasks:
                 if keeper is not None:
                     tasks.start_soon(keeper.run)
-                if not self._listens:
+                if isinstance(self.link, TcpIn):  # a station may wait for the first heartbeat
+                    self.link.accepted = lambda peer: self._station(peer, tasks)
+                elif not self._listens:
                     self._station(None, tasks)
                 await self._read(take, tasks)
         finally:

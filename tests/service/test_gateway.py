@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import random
 import socket
 import struct
 from collections.abc import Callable
@@ -771,7 +772,7 @@ async def test_rule_14_stations_are_shown_with_what_they_save() -> None:
         station = Partner(link)
         await station.ask(LIST)
         [shown] = (await browser.get("/api/stations")).json()
-        assert shown["name"] == "udpin:stations:14551#('station', 0)"
+        assert shown["name"] == "udpin:stations:14551#station:0"
         assert (shown["ids"], shown["requests"]) == (["255/190"], {"ParamRequestList": 1})
         assert shown["answered"] == 26
         assert shown["saved_bytes"] == sum(map(len, station.datagrams)) > 700
@@ -811,3 +812,96 @@ def test_an_endpoint_that_is_in_use_ends_the_start() -> None:
 async def _start(endpoint: str) -> None:
     async with Hub([small_px4()], cache=False, mavlink=[endpoint]):
         raise AssertionError("it was opened")
+
+
+# faults
+
+
+@in_simulated_time
+async def test_a_silent_reset_by_a_station_is_found() -> None:
+    model = small_px4()
+    async with gateway_over(model) as served:
+        await served.synced()
+        station = served.partner()
+        await station.ask(set_to("PARAM_01", 9), seconds=3.0)
+        model.load({"PARAM_01": 1})
+        await station.ask(CommandLong(1, 1, 245, 2.0), seconds=3.0)
+        assert by_name(station)["PARAM_01"] == struct.pack("<i", 1)
+
+
+@in_simulated_time
+async def test_a_restart_during_a_list() -> None:
+    model = PX4Vehicle()
+    async with gateway_over(model) as served:
+        await served.synced()
+        station = served.partner()
+        station.send(GCS, LIST)
+        await anyio.sleep(0.01)
+        model.reboot(down=2.0)
+        await anyio.sleep(20.0)
+        component = await served.clients[0].component()
+        assert component.sync_state == "synced"
+        await station.ask(LIST)
+        wanted = {name for name, param in component.params.items() if param.index is not None}
+        assert by_name(station).keys() - {"_HASH_CHECK"} == wanted
+
+
+@in_simulated_time
+async def test_a_switch_of_a_group_during_a_list() -> None:
+    """The list has one count; what the switch has shown is announced."""
+    hidden = {f"GRP_{number}": float(number) for number in range(20)}
+    table = {f"P_{number:03}": float(number) for number in range(300)} | {"GRP_ENABLE": 0.0}
+    model = ArduPilotVehicle(table=table, groups={"GRP_ENABLE": hidden})
+    async with gateway_over(model) as served:
+        await served.synced()
+        station = served.partner()
+        station.send(GCS, LIST)
+        await anyio.sleep(0.004)
+        component = await served.clients[0].component()
+        await component.set("GRP_ENABLE", 1.0)
+        await anyio.sleep(20.0)
+        indexed = [each for each in station.of(ParamValue) if each.param_index != 65535]
+        assert {each.param_count for each in indexed} == {301}
+        await station.ask(LIST)
+        assert {each.param_count for each in station.of(ParamValue)} == {321}
+        assert by_name(station).keys() == {*table, *hidden}
+
+
+@in_simulated_time
+async def test_a_station_that_floods_and_one_that_sends_garbage() -> None:
+    vehicle = Tap(PX4Vehicle())
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        flood, garbage, station = served.partner(system=7), served.partner(system=8), served.partner()
+        vehicle.received.clear()
+        noise = random.Random(1)
+        for number in range(100):
+            flood.send(*[LIST] * 30, *[ParamRequestRead(1, 1, f"N{number}", -1)] * 20)
+            flood.send(*(ParamRequestRead(1, 1, "", index) for index in range(900, 950)))
+            garbage.send_bytes(noise.randbytes(500))
+            await anyio.sleep(0.01)
+        await station.ask(LIST)
+        assert len(station.of(ParamValue)) >= 904
+        assert len(requested(vehicle)) < 200
+        assert station.of(Heartbeat)
+
+
+@in_simulated_time
+async def test_twenty_stations_and_ten_vehicles() -> None:
+    vehicles = [small_px4(system=number) for number in range(1, 11)]
+    async with gateway_over(Air.symmetric(vehicles, loss=0.1, delay=0.05, seed=2)) as served:
+        stations = [served.partner(system=number) for number in range(200, 220)]
+        for each in stations:
+            each.send(GCS)
+        await anyio.sleep(3.0)
+        for each in stations:
+            each.send(ParamRequestList(0, 0))
+        await anyio.sleep(30.0)
+        for each in stations:
+            for vehicle in vehicles:
+                known = {value.param_id: value.raw for value in each.of(ParamValue, system=vehicle.system)}
+                wanted = {
+                    param.name: encode_value(param.settable, param.type_number, Encoding.BYTEWISE)
+                    for param in vehicle.listed
+                }
+                assert {name: known[name] for name in wanted} == wanted
