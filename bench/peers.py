@@ -6,11 +6,11 @@ Simulated PX4 and ArduPilot vehicles communicate over real UDP on loopback, each
 link with packet loss in both directions. Every client starts without a cache and first receives a heartbeat;
 its time is measured from the request to the last value. The values are compared with those of the vehicle. An
 ArduPilot "by file" also serves its table over MAVFTP, and clients that support it download the file. "By
-list", it does not.
+list", it does not. "Warm", the client has just cached the table in a session before.
 
 With `--live`, the vehicle is the one on this link, real or in its firmware's own simulation; the relay of
-`tests/live/relay.py` drops the datagrams and, except in the rows "by file", refuses MAVFTP. Nothing is
-changed on the vehicle.
+`tests/live/relay.py` drops the datagrams and, in the rows "by list", refuses MAVFTP. Nothing is changed on
+the vehicle.
 
 Prints a Markdown table of the median seconds, each with its ratio to this library, and below it the date, the
 machine and its load, ready to be pasted; the progress is printed on stderr. A whole run takes about 25
@@ -41,7 +41,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import anyio
 
@@ -76,8 +76,10 @@ TOLERANCE = 1e-6
 SESSION_PAUSE = 3.5
 """Seconds before each download of a real vehicle: ArduPilot keeps a file that was not closed open for 3 s."""
 TITLES = {"px4": "PX4", "ardupilot": "ArduPilot"}
+WAYS = ("list", "file", "warm")
 
 Values = Mapping[str, float]
+Fetch = Callable[[int, float], tuple[float, Values]]
 spawn = multiprocessing.get_context("spawn")
 
 
@@ -103,12 +105,12 @@ class Case:
     Attributes:
         kind: the kind of vehicle.
         loss: the share of lost datagrams in each direction.
-        by_file: whether the vehicle also serves its table as a file.
+        way: "list"; or "file" or "warm", where the vehicle also serves its table as a file.
     """
 
     kind: str
     loss: float
-    by_file: bool = False
+    way: str = "list"
 
     @property
     def name(self) -> str:
@@ -116,9 +118,9 @@ class Case:
 
     @property
     def title(self) -> str:
-        """The kind of vehicle, and for one that may serve a file, how its table is downloaded."""
-        way = " by file" if self.by_file else " by list" if self.kind.endswith("ArduPilot") else ""
-        return f"{self.kind}{way}"
+        """The kind of vehicle, and for one that may serve a file, how its table is fetched."""
+        ways = {"list": " by list", "file": " by file", "warm": " warm"}
+        return f"{self.kind}{ways[self.way] if self.kind.endswith('ArduPilot') else ''}"
 
     @property
     def link(self) -> str:
@@ -134,7 +136,9 @@ class Case:
         return True
 
     def vehicle(self) -> Vehicle:
-        return PX4Vehicle() if self.kind == "PX4" else ArduPilotVehicle(live_period=0.0, ftp=self.by_file)
+        return (
+            PX4Vehicle() if self.kind == "PX4" else ArduPilotVehicle(live_period=0.0, ftp=self.way != "list")
+        )
 
     def air(self, seed: int) -> Air:
         return Air.symmetric(
@@ -185,7 +189,7 @@ class LiveCase(Case):
             loss=self.loss,
             round_trip=ROUND_TRIP if self.loss else 0.0,
             seed=seed,
-            refuses_files=not self.by_file,
+            refuses_files=self.way == "list",
         )
         self._field.relay.change(conditions)
         yield self._field.port, self._field
@@ -225,8 +229,8 @@ class LiveField:
 
     def cases(self) -> list[Case]:
         """Return the rows for this vehicle."""
-        ways = (False, True) if self.kind == "real ArduPilot" else (False,)
-        return [LiveCase(self.kind, loss, by_file, self) for by_file in ways for loss in LOSSES]
+        ways = WAYS if self.kind == "real ArduPilot" else WAYS[:1]
+        return [LiveCase(self.kind, loss, way, self) for way in ways for loss in LOSSES]
 
     async def _look(self) -> None:
         async with ParamClient(self.relay.link, cache=False) as client:
@@ -257,8 +261,8 @@ def main() -> None:
     with ExitStack() as stack:
         field: LiveField | None = None
         if arguments.live is None:
-            kinds = (("PX4", False), ("ArduPilot", False), ("ArduPilot", True))
-            cases = [Case(kind, loss, by_file) for kind, by_file in kinds for loss in LOSSES]
+            kinds = (("PX4", "list"), *(("ArduPilot", way) for way in WAYS))
+            cases = [Case(kind, loss, way) for kind, way in kinds for loss in LOSSES]
         else:
             port = free_port()
             relay = stack.enter_context(Relay(arguments.live, listeners=[port]))
@@ -278,7 +282,7 @@ def compare(cases: list[Case], arguments: argparse.Namespace, vehicle: str) -> N
     for seed in range(arguments.repeat):
         for case in chosen:
             for client in clients:
-                if case.by_file and not CLIENTS[client].fetches_files:
+                if case.way not in CLIENTS[client].ways:
                     continue
                 outcome = CLIENTS[client].run(case, seed, arguments.limit)
                 results.setdefault((client, case), []).append(outcome)
@@ -426,27 +430,21 @@ class PythonClient:
 
     Args:
         package: the package that must be installed.
-        fetch: takes the port and the timeout in seconds; returns the seconds used, and the values.
-        fetches_files: whether the client downloads the file if there is one.
+        fetches: by the ways that the client supports, a function that takes the port and the timeout in
+            seconds, and returns the seconds used, and the values.
     """
 
-    def __init__(
-        self,
-        package: str,
-        fetch: Callable[[int, float], tuple[float, Values]],
-        *,
-        fetches_files: bool = False,
-    ) -> None:
-        self.fetches_files = fetches_files
+    def __init__(self, package: str, fetches: Mapping[str, Fetch]) -> None:
+        self.ways = tuple(fetches)
         self._package = package
-        self._fetch = fetch
+        self._fetches = fetches
 
     def run(self, case: Case, seed: int, limit: float) -> Outcome:
         if installed(self._package) == "not installed":
             return Outcome(math.inf, "not installed")
         receiver, sender = spawn.Pipe(duplex=False)
         with case.flying(seed) as (port, _):
-            process = spawn.Process(target=call, args=(self._fetch, port, limit, sender))
+            process = spawn.Process(target=call, args=(self._fetches[case.way], port, limit, sender))
             process.start()
             sender.close()
             try:
@@ -461,9 +459,7 @@ class PythonClient:
         return Outcome(math.inf, problem) if problem else judge(case, seconds, values, limit)
 
 
-def call(
-    fetch: Callable[[int, float], tuple[float, Values]], port: int, limit: float, result: Connection
-) -> None:
+def call(fetch: Fetch, port: int, limit: float, result: Connection) -> None:
     try:
         seconds, values = fetch(port, limit)
     except Exception as error:
@@ -488,9 +484,11 @@ def judge(case: Case, seconds: float, values: Values, limit: float) -> Outcome:
     return Outcome(seconds, wrong=wrong)
 
 
-def fetch_with_paramclient(port: int, limit: float) -> tuple[float, Values]:
+def fetch_with_paramclient(
+    port: int, limit: float, cache: Path | Literal[False] = False
+) -> tuple[float, Values]:
     async def fetch() -> tuple[float, Values]:
-        async with ParamClient(f"udpin:127.0.0.1:{port}", cache=False) as client:
+        async with ParamClient(f"udpin:127.0.0.1:{port}", cache=cache) as client:
             component = await client.component(timeout=START_TIMEOUT)
             began = time.monotonic()
             result = await component.fetch_all(timeout=limit)
@@ -498,6 +496,14 @@ def fetch_with_paramclient(port: int, limit: float) -> tuple[float, Values]:
             return seconds, {name: float(param.value) for name, param in result.params.items()}
 
     return anyio.run(fetch)
+
+
+def start_paramclient_warm(port: int, limit: float) -> tuple[float, Values]:
+    """Fetch twice with one cache, each time with a new client; return the second time."""
+    with tempfile.TemporaryDirectory() as folder:
+        cache = Path(folder) / "cache.sqlite3"
+        fetch_with_paramclient(port, limit, cache)
+        return fetch_with_paramclient(port, limit, cache)
 
 
 def fetch_with_pymavlink(port: int, limit: float) -> tuple[float, Values]:
@@ -560,14 +566,14 @@ def fetch_with_mavsdk(port: int, limit: float) -> tuple[float, Values]:
 class MavProxy:
     """MAVProxy as a program. It requests the parameters itself after the first heartbeat."""
 
-    fetches_files = True
+    ways = ("list", "file")
 
     def run(self, case: Case, seed: int, limit: float) -> Outcome:
         if installed("MAVProxy") == "not installed":
             return Outcome(math.inf, "not installed")
         with tempfile.TemporaryDirectory() as folder, case.flying(seed) as (port, requested_at):
             # with its module for MAVFTP it always tries the file first, without it downloads by list
-            modules = "ftp,param" if case.by_file else "param"
+            modules = "ftp,param" if case.way == "file" else "param"
             command = [sys.executable, "-m", "MAVProxy.mavproxy", f"--master=udpin:127.0.0.1:{port}"]
             command += [
                 "--non-interactive",
@@ -612,9 +618,16 @@ class MavProxy:
 
 
 CLIENTS: dict[str, PythonClient | MavProxy] = {
-    "paramclient": PythonClient("paramclient", fetch_with_paramclient, fetches_files=True),
-    "pymavlink, the usual loop": PythonClient("pymavlink", fetch_with_pymavlink),
-    "MAVSDK": PythonClient("mavsdk", fetch_with_mavsdk),
+    "paramclient": PythonClient(
+        "paramclient",
+        {
+            "list": fetch_with_paramclient,
+            "file": fetch_with_paramclient,
+            "warm": start_paramclient_warm,
+        },
+    ),
+    "pymavlink, the usual loop": PythonClient("pymavlink", {"list": fetch_with_pymavlink}),
+    "MAVSDK": PythonClient("mavsdk", {"list": fetch_with_mavsdk}),
     "MAVProxy": MavProxy(),
 }
 

@@ -45,7 +45,9 @@ GROUP_GAP: Final = 16
 FOOT: Final = 50
 """Height of the axis and the notes."""
 FILE_GAP: Final = 6
-"""Distance between the bars of the list and those of the file."""
+"""Distance between the bars of the list, those of the file, and that of the warm start."""
+WAYS: Final = ("list", "file", "warm")
+"""The order of these bars."""
 TICK: Final = 30
 """Seconds between two lines of the axis."""
 FONT: Final = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
@@ -64,7 +66,7 @@ class Download:
 
     Attributes:
         autopilot: `PX4`, `ArduPilot`.
-        by_file: whether the vehicle's MAVFTP parameter file is read.
+        way: "list", "file" (the vehicle's MAVFTP parameter file), or "warm" (a proven cache).
         count: parameters of the vehicle.
         condition: `clean`, or the share of lost datagrams.
         client: the name of the client.
@@ -72,7 +74,7 @@ class Download:
     """
 
     autopilot: str
-    by_file: bool
+    way: str
     count: int
     condition: str
     client: str
@@ -81,7 +83,7 @@ class Download:
     @property
     def label(self) -> str:
         """The client and the way, short enough for the picture."""
-        return self.client.partition(",")[0] + (", by file" if self.by_file else "")
+        return self.client.partition(",")[0] + {"file": ", by file", "warm": ", warm"}.get(self.way, "")
 
     @property
     def is_ours(self) -> bool:
@@ -102,12 +104,12 @@ def downloads_in(text: str) -> list[Download]:
     (_, *clients), _, *rows = (_cells(line) for line in found[1].splitlines())
     downloads = []
     for what, *cells in rows:
-        row = re.fullmatch(r"(\w+)(?: by (list|file))?, (\d+), (\S+)", what)
+        row = re.fullmatch(r"(\w+)(?: (?:by )?(list|file|warm))?, (\d+), (\S+)", what)
         if row is None or row[4] not in CONDITIONS or len(cells) != len(clients):
             raise ValueError(f"unexpected row in the table of README.md: {what}")
         for client, cell in zip(clients, cells, strict=True):
             if seconds := re.match(r"\d+\.\d+\b", cell):
-                downloads.append(Download(row[1], row[2] == "file", int(row[3]), row[4], client, seconds[0]))
+                downloads.append(Download(row[1], row[2] or "list", int(row[3]), row[4], client, seconds[0]))
     return downloads
 
 
@@ -167,7 +169,7 @@ def _lines(downloads: list[Download], look: dict[str, str]) -> Iterator[str]:
     autopilots = _autopilots(downloads)
     heights = [
         GROUP_HEAD
-        + FILE_GAP
+        + FILE_GAP * max(WAYS.index(each.way) for each in downloads)
         + ROW * max(len(_group(downloads, autopilot, condition)) for autopilot in autopilots)
         for condition in CONDITIONS
     ]
@@ -210,7 +212,10 @@ def _lines(downloads: list[Download], look: dict[str, str]) -> Iterator[str]:
         )
     others = dict.fromkeys(each.client for each in downloads if ", " in each.client)
     notes = [each.replace(", ", ": ", 1) for each in others]
-    notes.append("By file: the vehicle's MAVFTP parameter file. All other bars: the parameter list")
+    notes.append("By file: the vehicle's MAVFTP parameter file")
+    if any(each.way == "warm" for each in downloads):
+        notes.append("Warm: a proven cache")
+    notes.append("All other bars: the parameter list")
     yield f'<text class="quiet" x="0" y="{height - 5}">{escape(". ".join(notes))}.</text>'
     yield "</svg>"
 
@@ -244,7 +249,7 @@ def _panel(
     for (condition, words), height in zip(CONDITIONS.items(), heights, strict=True):
         yield f'<text class="group" x="{left}" y="{top + 14}">{escape(words)}</text>'
         for row, each in enumerate(_group(downloads, autopilot, condition)):
-            base = top + GROUP_HEAD + row * ROW + each.by_file * FILE_GAP + BAR - 1
+            base = top + GROUP_HEAD + row * ROW + WAYS.index(each.way) * FILE_GAP + BAR - 1
             kind = "ours" if each.is_ours else "peer"
             text = ' class="ours"' if each.is_ours else ""
             width = float(each.seconds) * scale

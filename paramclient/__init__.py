@@ -20,7 +20,6 @@ from paramclient.client.client import ParamClient
 from paramclient.client.component import Component, ComponentState
 from paramclient.client.events import Discovered, Event, Events, Found, Lost, Rebooted, Resynced
 from paramclient.client.files import Ftp
-from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.signing import Signing, read_key
 from paramclient.client.streams import Changes
 from paramclient.errors import (
@@ -57,7 +56,6 @@ from paramclient.model.values import Encoding, Param, ParamType, Settable, Trust
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress
-from paramclient.protocol.reset import ResetResult
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
 from paramclient.protocol.watch import SyncState
 from paramclient.version import __version__
@@ -82,7 +80,6 @@ __all__ = [
     "Event",
     "Events",
     "FetchResult",
-    "FetchedAll",
     "FileError",
     "FileTransferError",
     "Found",
@@ -107,7 +104,6 @@ __all__ = [
     "Progress",
     "Rebooted",
     "Refused",
-    "ResetResult",
     "Resynced",
     "SetManyResult",
     "SetOutcome",

@@ -15,7 +15,7 @@ from unittest import mock
 import anyio
 import anyio.to_thread
 
-from paramclient import Component, Param, ParamClient, ParamType
+from paramclient import CacheError, Component, FetchResult, NoReply, Param, ParamClient, ParamType
 from paramclient.client import cache_writer
 from paramclient.errors import LinkError
 from paramclient.links import Peer, SimLink
@@ -190,7 +190,7 @@ class Tap:
         self.received: list[tuple[float, frames.Frame, messages.Message]] = []
         self.is_deaf = False
         self.is_mute = False
-        self._endpoint = endpoint
+        self.endpoint = endpoint
         self._framer = frames.Framer(messages.DECODED_IDS, stream=False)
 
     def messages(self, kind: type[T]) -> list[T]:
@@ -203,16 +203,16 @@ class Tap:
             assert message is not None
             self.received.append((now, frame, message))
         if not self.is_deaf:
-            self._endpoint.receive(data, now)
+            self.endpoint.receive(data, now)
 
     def tick(self, now: float) -> None:
-        self._endpoint.tick(now)
+        self.endpoint.tick(now)
 
     def next_deadline(self) -> float | None:
-        return self._endpoint.next_deadline()
+        return self.endpoint.next_deadline()
 
     def data_to_send(self) -> list[bytes]:
-        data = self._endpoint.data_to_send()
+        data = self.endpoint.data_to_send()
         return [] if self.is_mute else data
 
 
@@ -236,13 +236,13 @@ class Late:
     """
 
     def __init__(self, endpoint: Endpoint, by: float, until: float = math.inf) -> None:
-        self._endpoint = endpoint
+        self.endpoint = endpoint
         self._by, self._until = by, until
         self._on_at = self._off_at = math.inf  # known from the first tick on
 
     def receive(self, data: bytes, now: float) -> None:
         if self._on_at <= now < self._off_at:
-            self._endpoint.receive(data, now)
+            self.endpoint.receive(data, now)
 
     def tick(self, now: float) -> None:
         if self._on_at == math.inf:
@@ -250,16 +250,16 @@ class Late:
         if now >= self._off_at:
             self._on_at = self._off_at
         elif now >= self._on_at:
-            self._endpoint.tick(now)
+            self.endpoint.tick(now)
 
     def next_deadline(self) -> float | None:
         if self._on_at == self._off_at:
             return None
-        deadline = self._endpoint.next_deadline()
+        deadline = self.endpoint.next_deadline()
         return min(self._on_at if deadline is None else deadline, self._off_at)
 
     def data_to_send(self) -> list[bytes]:
-        return self._endpoint.data_to_send()
+        return self.endpoint.data_to_send()
 
 
 class Radio(Tap):
@@ -276,7 +276,7 @@ class Radio(Tap):
     def data_to_send(self) -> list[bytes]:
         sent, self.other = self.other, []
         for data in sent:
-            self._endpoint.receive(data, anyio.current_time())
+            self.endpoint.receive(data, anyio.current_time())
         return sent + super().data_to_send()
 
 
@@ -374,7 +374,7 @@ def residue(component: Component) -> list[object]:
 
     The request for its identity, which the client sends by itself, is none of them."""
     identity = (messages.AutopilotVersion, (messages.CommandAck, 512), (messages.CommandAck, 520))
-    waits = component.node.channel._inboxes.items()
+    waits = component.node.channel.inboxes.items()
     left: list[object] = [key for key, waiting in waits if waiting and key not in identity]
     return [*left, "fetch"] if component.session.fetching.is_running else left
 
@@ -411,3 +411,23 @@ def a_client(link: Any, **options: Any) -> ParamClient:
 
 def _nothing() -> None:
     return
+
+
+async def fetch_everyone(
+    client: ParamClient, *, refresh: bool = False
+) -> tuple[dict[object, FetchResult], dict[object, NoReply | CacheError]]:
+    """Fetch all components that are heard within 1.2 s side by side: the results, and the errors."""
+    await anyio.sleep(1.2)
+    results: dict[object, FetchResult] = {}
+    silent: dict[object, NoReply | CacheError] = {}
+
+    async def fetch(address: object, component: Component) -> None:
+        try:
+            results[address] = await component.fetch_all(refresh=refresh)
+        except (NoReply, CacheError) as error:
+            silent[address] = error
+
+    async with anyio.create_task_group() as tasks:
+        for address, component in client.components.items():
+            tasks.start_soon(fetch, address, component)
+    return results, silent

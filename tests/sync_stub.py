@@ -36,7 +36,7 @@ ATTRIBUTES = {
     "ParamClient": ("cache: ParamCache | None",),
 }
 """The public attributes that `__init__` sets."""
-INTERNAL = {"limited", "wait_for_cache", "wait_until_identified"}
+INTERNAL = {"emit", "limited", "wait_for_cache", "wait_until_identified"}
 """Methods for other modules of the asynchronous client."""
 
 

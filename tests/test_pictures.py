@@ -28,6 +28,16 @@ def test_the_pictures_are_those_of_the_table(pictures: ModuleType, look: str) ->
     assert kept == drawn, "run `make pictures`"
 
 
+def test_a_warm_start_is_a_bar_of_its_own(pictures: ModuleType) -> None:
+    row = "| ArduPilot by file, 1382, clean |"
+    warm = "| ArduPilot warm, 1382, clean | 0.04 (1.0) | not supported | not supported | not supported |"
+    downloads = pictures.downloads_in(README.replace(row, f"{warm}\n{row}"))
+    assert [each.label for each in downloads if each.way == "warm"] == ["paramclient, warm"]
+    drawn = pictures.draw(downloads, "light")
+    assert ">paramclient, warm<" in drawn
+    assert "Warm: a proven cache" in drawn
+
+
 def test_both_pages_show_the_pictures_with_their_figures_as_text(pictures: ModuleType) -> None:
     reported = pictures.alternative_text(pictures.downloads_in(README))
     [shown] = re.findall(r"<picture>\n(.*?)</picture>", README, re.DOTALL)

@@ -1,4 +1,4 @@
-"""Tests leave the user's folders alone: the cache, signing timestamps, the history of Python's prompt."""
+"""Tests leave the user's folders alone: the cache, the history of Python's prompt."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import sys
 
 import anyio
 
-from paramclient import ParamClient, Signing, SigningKey
+from paramclient import ParamClient
 
 
 def run(*arguments):
@@ -30,8 +30,6 @@ def test_in_this_process():
     async def session():
         async with ParamClient("sim:px4") as client:
             await (await client.component()).get("MC_ROLL_P")
-        async with ParamClient("sim:px4", signing=Signing(SigningKey(b"0123456789" * 3 + b"ab"))):
-            pass
 
     anyio.run(session)
 
@@ -64,4 +62,3 @@ def test_nothing_is_written_into_the_users_folders(tmp_path: Path, isolated: boo
     else:
         assert ".cache/paramclient/parameters.sqlite3" in written
         assert ".python_history" in written or not importlib.util.find_spec("readline")
-        assert any(name.startswith(".local/state/paramclient/signing/") for name in written)

@@ -2,9 +2,8 @@
 
 - `store`: `ParamCache`, the public class, and the default path of the file.
 - `records`: records that the cache stores and returns.
-- `schema`: the tables, and the interface of a place that stores them.
-- `sqlite`, `postgres`: a file, and a database.
-- `tables`, `updates`: reads and updates of tables.
+- `sqlite`: the one SQL text of the tables, and a file that stores them; `postgres`: a database.
+- `tables`: reads and updates of tables.
 - `history`: lines of changes, earlier states, insertion by time.
 - `snapshots`: snapshots, and tables at an earlier time.
 - `lookup`: vehicles by system id, address, kind, hardware id or key.
@@ -24,6 +23,7 @@ from paramclient.cache.records import (
     StoredParam,
     TableState,
     TableUpdate,
+    check_author,
 )
 from paramclient.cache.snapshots import SNAPSHOTS
 from paramclient.cache.store import ParamCache, default_path, is_database_url
@@ -44,6 +44,7 @@ __all__ = [
     "StoredParam",
     "TableState",
     "TableUpdate",
+    "check_author",
     "default_path",
     "is_database_url",
 ]

@@ -13,7 +13,7 @@ from operator import attrgetter, itemgetter
 from typing import Any, Final, NamedTuple
 
 from paramclient.cache.records import BY_VEHICLE, HistoryEntry, StoredParam, StoredValue
-from paramclient.cache.schema import Transaction
+from paramclient.cache.sqlite import Transaction
 
 __all__ = [
     "HISTORY_ENTRIES_MAX",

@@ -12,7 +12,7 @@ from urllib.parse import quote
 import psycopg
 from psycopg.conninfo import conninfo_to_dict
 
-from paramclient.cache.schema import SCHEMA_VERSION, TABLES, Transaction
+from paramclient.cache.sqlite import SCHEMA_VERSION, TABLES, Transaction
 from paramclient.errors import CacheError, UsageError
 
 __all__ = ["PostgresStore"]

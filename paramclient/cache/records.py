@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
+from paramclient.errors import UsageError
 from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.params import ParamMap
 from paramclient.model.values import (
@@ -29,17 +30,36 @@ __all__ = [
     "HistoryEntry",
     "SnapshotSummary",
     "StoredParam",
+    "StoredTable",
     "StoredValue",
     "TableState",
     "TableUpdate",
+    "check_author",
 ]
 
 BY_VEHICLE: Final = "vehicle"
 """Author of a change by the vehicle, and of a change that a download has shown."""
 BY_US: Final = "us"
 """Author of a change by a write of this client; `us for NAME` if the write names a user."""
+AUTHOR_LENGTH_MAX: Final = 128
+"""Characters of an author's name: enough for a name with an address, and a program's own description."""
 BITS_SIZE: Final = 8
 """Bytes of a stored plain value: `Param.bits`, little-endian, in the size of the largest type."""
+
+
+def check_author(author: str | None) -> str:
+    """Check the author of a change, and return how the history names it.
+
+    Raises:
+        UsageError: it is empty, too long, or contains more than printable ASCII.
+    """
+    if author is None:
+        return BY_US
+    if not 1 <= len(author) <= AUTHOR_LENGTH_MAX or not (author.isascii() and author.isprintable()):
+        raise UsageError(
+            f"author must have 1 to {AUTHOR_LENGTH_MAX} printable ASCII characters, not {author!r:.200}"
+        )
+    return f"{BY_US} for {author}"
 
 
 class StoredValue(NamedTuple):
@@ -136,6 +156,31 @@ class TableState:
     volatile_known: bool = False
     synced_at: float | None = None
     file_works: bool | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StoredTable:
+    """A stored table without its parameters.
+
+    Attributes:
+        owner: its id in this cache.
+        key: key of the vehicle.
+        component: component id.
+        autopilot: MAV_AUTOPILOT of the component's heartbeat.
+        size: number of parameters.
+        updated_at: time of the last update.
+        known_since: time since which its states are known, or None.
+        state: its state.
+    """
+
+    owner: int
+    key: str
+    component: int
+    autopilot: int
+    size: int
+    updated_at: float
+    known_since: float | None
+    state: TableState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

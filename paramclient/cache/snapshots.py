@@ -9,10 +9,16 @@ from datetime import UTC, datetime
 from typing import Any, Final, NamedTuple, TypeAlias
 
 from paramclient.cache.history import values_at
-from paramclient.cache.records import SnapshotSummary, StoredParam, StoredValue, default_value, written_value
-from paramclient.cache.schema import Transaction
-from paramclient.cache.tables import (
+from paramclient.cache.records import (
+    SnapshotSummary,
+    StoredParam,
     StoredTable,
+    StoredValue,
+    default_value,
+    written_value,
+)
+from paramclient.cache.sqlite import Transaction
+from paramclient.cache.tables import (
     identity_cells,
     load_rows,
     load_vehicles,

@@ -22,11 +22,11 @@ from paramclient.cache.records import (
     HistoryEntry,
     SnapshotSummary,
     StoredParam,
+    StoredTable,
     TableUpdate,
 )
-from paramclient.cache.schema import Transaction
-from paramclient.cache.sqlite import SqliteStore
-from paramclient.cache.updates import ensure_table, save_table
+from paramclient.cache.sqlite import SqliteStore, Transaction
+from paramclient.cache.tables import ensure_table, save_table
 from paramclient.errors import NotInCache, UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
@@ -419,9 +419,7 @@ class ParamCache:
     def _read(self, work: Callable[[Transaction], T]) -> T:
         return self._store.run(work, writing=False)
 
-    def _table(
-        self, tx: Transaction, vehicle: str, component: int, *, extended: bool = False
-    ) -> tables.StoredTable:
+    def _table(self, tx: Transaction, vehicle: str, component: int, *, extended: bool = False) -> StoredTable:
         """Return the table of the only vehicle with this name."""
         key = self._choose(tx, vehicle, component=component)
         table = tables.find_table(tx, key, component, extended=extended)

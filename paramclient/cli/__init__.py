@@ -2,17 +2,17 @@
 
 - `app`: all subcommands, the main function, signals and errors.
 - Subcommands: `read_commands` (fetch, get), `set_command`, `reset_command`, `watch`, `offline` (show, cache),
-  `logs` (import), `apply`, `restore`, `save`, `diff`, `history`, `search` (search, info), `metadata_files`,
-  `link`, `check`, `ports`, `signing`, `serve`, `token` and `simulate` (sim).
+  `logs` (import), `apply`, `restore`, `save`, `diff`, `history`, `search` (search, info), `metadata`,
+  `link`, `check`, `ports`, `signing`, `serve` (serve, token) and `simulate` (sim).
 - `session`: open links with the vehicles of --vehicle, on which a subcommand works. `options`: options.
 - `sources`: the parameters that an argument names: of a file, a link or the cache. `time_arguments`: times.
 - `param_names`: names and patterns of parameters, and suggestions.
-- `extended`, `extended_sources`: extended parameters in these subcommands.
 - `metadata`, `default_sources`: descriptions and defaults that a subcommand uses.
 - `write_outcomes`, `setup_results`, `confirmation`: outcomes of writes, and the question before them.
 - `check_measurements`: what check measures.
-- `output`: tables, lines, progress. `json_output`, `json_cache`, `json_setup`: JSON. `file_output`: files.
-- `exit_codes`, `signals`, `waiting`: exit codes; SIGINT and SIGTERM; what a command waits for, on a terminal.
+- `output`: tables, lines, progress, what a command waits for. `file_output`: files.
+- `json_output`, `json_cache`, `json_setup`: JSON.
+- `exit_codes`: exit codes.
 """
 
 from __future__ import annotations

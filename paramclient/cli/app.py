@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 import logging
 import re
+import signal
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
+from types import FrameType
 from typing import Final
 
 import anyio
@@ -15,11 +18,12 @@ from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, Unknow
 
 from paramclient.cli.exit_codes import ExitCode, code_of, text_of
 from paramclient.cli.output import in_local_time, printable, report, say
-from paramclient.cli.signals import on_end_signal
 from paramclient.errors import CacheError, ParamClientError
 from paramclient.version import __version__
 
-__all__ = ["run"]
+__all__ = ["on_end_signal", "run"]
+
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -87,6 +91,30 @@ def _load(app: App) -> None:
     """Import all subcommands, so that the help can describe each of them."""
     for name in app:
         _load(app[name])
+
+
+@contextmanager
+def on_end_signal(end: Callable[[int], object]) -> Iterator[None]:
+    """Call `end` in the event loop on SIGINT or SIGTERM. A second signal ends the process immediately.
+
+    Args:
+        end: takes the signal number.
+    """
+    loop = asyncio.get_running_loop()
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+
+    def receive(number: int, _: FrameType | None) -> None:
+        for each in _SIGNALS:
+            signal.signal(each, signal.SIG_DFL)
+        loop.call_soon_threadsafe(end, number)
+
+    for number in _SIGNALS:
+        signal.signal(number, receive)  # not by the event loop, which has no signal handlers on Windows
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 async def _until_signal(work: Callable[[], Awaitable[int | None]]) -> int | None:
@@ -231,16 +259,16 @@ _add(
 _add(_app, "restore:restore", "URL [WHEN|FILE]", "sim:px4 --dry-run", "udpin:0.0.0.0:14550 '2h ago'")
 _add(_app, "logs:import_", "FILE [FILE...]", "flight.tlog")
 _add(_app, "serve:serve", "LINK [LINK...]", "serial:/dev/ttyACM0:57600 --listen 127.0.0.1:0")
-_add(_app, "token:token", None, "anna --file tokens", "wall-display --file tokens --read")
+_add(_app, "serve:token", None, "anna --file tokens", "wall-display --file tokens --read")
 _add(_app, "ports:ports")
 _add(_app, "simulate:sim", None, "px4 --link udpout:127.0.0.1:14550 --loss 0.05 --seed 1")
 for _group in (_cache, _metadata, _signing):
     _app.command(_group)
 _add(_signing, "signing:setup", None, "udpin:0.0.0.0:14550 --signing-key vehicle.key")
 _add(_signing, "signing:disable", None, "udpin:0.0.0.0:14550 --signing-key vehicle.key")
-_add(_metadata, "metadata_files:metadata_add", None, "apm.pdef.xml --firmware 4.6")
-_add(_metadata, "metadata_files:metadata_list")
-_add(_metadata, "metadata_files:metadata_remove", None, "copter --firmware 4.6")
+_add(_metadata, "metadata:metadata_add", None, "apm.pdef.xml --firmware 4.6")
+_add(_metadata, "metadata:metadata_list")
+_add(_metadata, "metadata:metadata_remove", None, "copter --firmware 4.6")
 _add(_cache, "offline:cache_list")
 _add(_cache, "offline:cache_path")
 _add(_cache, "offline:cache_remove", None, "1")

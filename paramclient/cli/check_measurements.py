@@ -363,8 +363,8 @@ class Measurements:
         report = client.traffic_report()
         address = (component.system, component.component)
         mine = next((each for each in report.components if (each.system, each.component) == address), None)
-        lost = 0 if mine is None else max(mine.lost, 0)
-        sent = 0 if mine is None else mine.frames - mine.repeated + lost
+        lost = 0 if mine is None else max(mine.totals["lost"], 0)
+        sent = 0 if mine is None else mine.totals["frames"] - mine.totals["repeated"] + lost
         others = [
             f"{each.system}/{each.component}"
             for each in report.components

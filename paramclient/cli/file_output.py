@@ -10,7 +10,7 @@ from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_output import SetJson
 from paramclient.cli.output import local_time, print_json, print_table, printable, say
 from paramclient.files import ParamFile
-from paramclient.files.param_file import address
+from paramclient.files.formats import address
 from paramclient.metadata import Metadata
 from paramclient.model.comparison import non_defaults
 from paramclient.model.defaults import Default, add_defaults, default_of

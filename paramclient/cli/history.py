@@ -18,8 +18,8 @@ from paramclient.cli.param_names import cached_names, check_given, unmatched_tex
 from paramclient.cli.sources import component_of, tables_in
 from paramclient.cli.time_arguments import parse_time
 from paramclient.errors import NotInCache, UsageError
+from paramclient.model.names import NameChoice
 from paramclient.model.notation import hash_text
-from paramclient.model.patterns import NameChoice
 from paramclient.model.values import Param, format_value
 
 __all__ = ["history"]

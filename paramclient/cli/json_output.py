@@ -24,7 +24,7 @@ from paramclient.model.notation import (
     value_written,
 )
 from paramclient.model.values import Param, ParamType, format_value, type_name
-from paramclient.protocol.kinds import kind_in_words
+from paramclient.protocol.identity import kind_in_words
 
 if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler, TypeAdapter

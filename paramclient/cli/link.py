@@ -20,7 +20,7 @@ from paramclient.client.traffic import ComponentTraffic, TrafficReport
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import rounded
-from paramclient.wire.frames import enum_word
+from paramclient.wire.frames import enum_word, message_name
 from paramclient.wire.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS
 from paramclient.wire.signing import SigningReport
 
@@ -64,7 +64,7 @@ async def link(
     limit = seconds if is_live or seconds is not None else LINK_LISTENING_TIME
     async with listen(url, options, listen_only=listen_only) as client:
         report = await _run_with_measurements(client, _show if is_live else _listen, limit)
-        if not report.frames:
+        if not report.totals["frames"]:
             hint = received_in_words(client)
             raise NoReply(
                 f"a MAVLink frame on {client.link.name}", attempts=0, waited=report.seconds, hint=hint
@@ -110,7 +110,7 @@ async def _show(client: ParamClient, seconds: float | None) -> TrafficReport:
         deadline = Deadline(seconds)  # starts after rich is loaded
         while True:
             report = client.traffic_report()
-            if report.frames:
+            if report.totals["frames"]:
                 draw(_COLUMNS, _rows(client, report), _lines(client, report))
             else:
                 draw(_COLUMNS, (), ["", f"nothing received yet: {_pace(client, report)}"])
@@ -149,11 +149,11 @@ def _rows(client: ParamClient, report: TrafficReport) -> Iterator[tuple[object, 
             f"{each.system}/{each.component}",
             _what(each),
             each.version,
-            f"{each.frame_rate:.1f}",
-            f"{each.byte_rate:,.0f}",
+            f"{each.recent['frames']:.1f}",
+            f"{each.recent['bytes']:,.0f}",
             None if each.loss is None else f"{each.loss:.1%}",
             None if trip is None else milliseconds(trip),
-            None if each.heartbeat_age is None else f"{each.heartbeat_age:.1f} s",
+            None if each.heartbeat_at is None else f"{report.at - each.heartbeat_at:.1f} s",
         )
 
 
@@ -161,8 +161,11 @@ def _lines(client: ParamClient, report: TrafficReport) -> Iterator[str]:
     yield ""
     for each in report.components:
         state = "" if each.heartbeat is None else f" {_state(each.heartbeat.system_status)}"
-        current = [message for message in each.messages if message.rate]
-        shown = [f"{message.name} {message.rate:.1f}/s" for message in current[:MESSAGES_SHOWN_MAX]]
+        current = [message for message in each.messages if each.recent[message]]
+        shown = [
+            f"{message_name(message)} {each.recent[message]:.1f}/s"
+            for message in current[:MESSAGES_SHOWN_MAX]
+        ]
         more = len(current) - len(shown)
         kinds = f"{', '.join(shown)}{f' and {more} more' if more else ''}" if shown else "silent"
         yield f"{each.system}/{each.component}{state}: {kinds}"
@@ -174,11 +177,11 @@ def _lines(client: ParamClient, report: TrafficReport) -> Iterator[str]:
             )
     yield ""
     yield _pace(client, report)
-    signed = sum(each.signed for each in report.components)
-    lost = sum(each.lost for each in report.components)
+    signed = sum(each.totals["signed"] for each in report.components)
+    lost = sum(each.totals["lost"] for each in report.components)
     yield (
-        f"{report.frames:,} frames, {lost:,} lost, {report.damaged:,} with a wrong checksum, "
-        f"{report.unknown:,} of unknown ids, {signed:,} signed; {report.other_bytes:,} other bytes"
+        f"{report.totals['frames']:,} frames, {lost:,} lost, {report.damaged:,} with a wrong checksum, "
+        f"{report.totals['unknown']:,} of unknown ids, {signed:,} signed; {report.other_bytes:,} other bytes"
     )
     signing = client.signing_report()
     if signing is not None:
@@ -192,7 +195,7 @@ def _lines(client: ParamClient, report: TrafficReport) -> Iterator[str]:
 def _pace(client: ParamClient, report: TrafficReport) -> str:
     return (
         f"{client.link.name}, {report.seconds:.1f} s: "
-        f"{report.received_rate:,.0f} bytes/s received, {report.sent_rate:,.0f} sent"
+        f"{report.recent['received']:,.0f} bytes/s received, {report.recent['sent']:,.0f} sent"
     )
 
 
@@ -227,16 +230,18 @@ def _json(client: ParamClient, report: TrafficReport) -> dict[str, object]:
     return {
         "link": client.link.name,
         "seconds": round(report.seconds, 3),
-        "bytes_received": report.bytes_received,
-        "bytes_sent": report.bytes_sent,
-        "received_per_s": round(report.received_rate, 1),
-        "sent_per_s": round(report.sent_rate, 1),
-        "frames": report.frames,
-        "unknown": report.unknown,
+        "bytes_received": report.totals["received"],
+        "bytes_sent": report.totals["sent"],
+        "received_per_s": round(report.recent["received"], 1),
+        "sent_per_s": round(report.recent["sent"], 1),
+        "frames": report.totals["frames"],
+        "unknown": report.totals["unknown"],
         "damaged": report.damaged,
         "other_bytes": report.other_bytes,
         "signing": None if signing is None else _signing_json(signing),
-        "components": [_component_json(each, _round_trip(client, each)) for each in report.components],
+        "components": [
+            _component_json(report.at, each, _round_trip(client, each)) for each in report.components
+        ],
     }
 
 
@@ -252,7 +257,7 @@ def _signing_json(signing: SigningReport) -> dict[str, object]:
     }
 
 
-def _component_json(each: ComponentTraffic, round_trip: float | None) -> dict[str, object]:
+def _component_json(now: float, each: ComponentTraffic, round_trip: float | None) -> dict[str, object]:
     beat = each.heartbeat
     return {
         "system": each.system,
@@ -261,23 +266,23 @@ def _component_json(each: ComponentTraffic, round_trip: float | None) -> dict[st
         "autopilot": None if beat is None else autopilot_name(beat.autopilot),
         "type": None if beat is None else _type(beat.type),
         "state": None if beat is None else _state(beat.system_status),
-        "heartbeat_age_s": rounded(each.heartbeat_age),
-        "age_s": round(each.age, 4),
-        "frames": each.frames,
-        "bytes": each.bytes,
-        "frames_per_s": round(each.frame_rate, 2),
-        "bytes_per_s": round(each.byte_rate, 1),
-        "lost": each.lost,
+        "heartbeat_age_s": None if each.heartbeat_at is None else rounded(now - each.heartbeat_at),
+        "age_s": round(now - each.received_at, 4),
+        "frames": each.totals["frames"],
+        "bytes": each.totals["bytes"],
+        "frames_per_s": round(each.recent["frames"], 2),
+        "bytes_per_s": round(each.recent["bytes"], 1),
+        "lost": each.totals["lost"],
         "loss": rounded(each.loss),
-        "repeated": each.repeated,
-        "late": each.late,
-        "signed": each.signed,
+        "repeated": each.totals["repeated"],
+        "late": each.totals["late"],
+        "signed": each.totals["signed"],
         "round_trip_s": rounded(round_trip),
         "messages": {
-            message.name: {
-                "id": message.message_id,
-                "count": message.count,
-                "per_s": round(message.rate, 2),
+            message_name(message): {
+                "id": message,
+                "count": each.totals[message],
+                "per_s": round(each.recent[message], 2),
             }
             for message in each.messages
         },

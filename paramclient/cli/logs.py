@@ -18,9 +18,8 @@ from paramclient.cli.output import print_json, print_table, report
 from paramclient.errors import FileError, LinkError, ParamClientError
 from paramclient.files import read_file
 from paramclient.links import LinkKind, parse_link
-from paramclient.logs.imported_table import ImportedTable
-from paramclient.logs.onboard import is_onboard_log
-from paramclient.logs.onboard_import import import_onboard_log
+from paramclient.logs.logged_params import ImportedTable
+from paramclient.logs.onboard import import_onboard_log, is_onboard_log
 from paramclient.logs.telemetry import import_log
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import hash_text

@@ -1,4 +1,7 @@
-"""Metadata in the command line: where it comes from, names of values, units, descriptions."""
+"""Metadata in the command line: where it comes from, names of values, units, descriptions.
+
+The subcommands metadata add, list and remove: metadata files that are stored for a firmware.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,9 @@ import anyio.to_thread
 from cyclopts import Parameter
 
 from paramclient.cache import CachedComponent, ParamCache
-from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import print_line, printable, say
+from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.options import CacheOptions, LinkOptions
+from paramclient.cli.output import print_json, print_line, print_table, printable, say
 from paramclient.cli.session import (
     FIRMWARE_POLL_INTERVAL,
     FIRMWARE_TIMEOUT,
@@ -23,18 +27,21 @@ from paramclient.cli.session import (
 from paramclient.errors import UsageError
 from paramclient.links import LinkKind
 from paramclient.metadata import (
+    AddedMetadata,
     Metadata,
     MetadataStore,
     ParamInfo,
+    VehicleKind,
     metadata_of,
     read_metadata,
 )
-from paramclient.metadata.added_files import file_address
+from paramclient.metadata.added_files import AddedFiles, file_address
 from paramclient.metadata.info import number_of
 from paramclient.model.ext_values import check_ext_value, encode_ext_value
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import HEX, Param, ParamType, WireValue, check_name, format_value, type_name
+from paramclient.model.wording import counted
 
 __all__ = [
     "DESCRIBED_COLUMNS",
@@ -49,6 +56,9 @@ __all__ = [
     "known_of_sets",
     "known_of_table",
     "meaning_of",
+    "metadata_add",
+    "metadata_list",
+    "metadata_remove",
     "needs_reboot",
     "parse_pairs",
     "parse_value",
@@ -70,6 +80,8 @@ ARDUPILOT_NAME: Final = "ardupilot"
 """The autopilot that does not serve its metadata."""
 ANNOUNCED_SIZE_MIN: Final = 5_000
 """Bytes from which the download of a metadata file is announced: the first, general file is smaller."""
+
+_DEFAULTS: Final = CacheOptions()
 
 
 def from_file(choice: str | None, *, offline: bool = False) -> Metadata | None:
@@ -395,3 +407,71 @@ def _number_or_none(name: str, text: str) -> int | float | None:
         return None if text != text.strip() else number_of(text)
     except UsageError as error:
         raise UsageError(f"{name}: {error}") from None
+
+
+def metadata_add(
+    file: Path,
+    /,
+    *,
+    vehicle: VehicleKind | None = None,
+    firmware: str | None = None,
+    options: CacheOptions = _DEFAULTS,
+) -> ExitCode:
+    """Store a metadata file for a vehicle type and a firmware version, for all commands and the service.
+
+    ArduPilot's vehicles do not provide their metadata; its files are at autotest.ardupilot.org/Parameters. A
+    file that was added before for the same vehicle type and version is replaced.
+
+    Args:
+        file: The file: apm.pdef.xml or apm.pdef.json of ArduPilot, or parameters.json of PX4.
+        vehicle: The vehicle type, if the file does not name it.
+        firmware: Use the file only for this firmware version, such as 4.6 for 4.6.0, 4.6.1 and so on.
+            Default: for every version for which no other file was added.
+    """
+    added, metadata = _files(options).add(file, vehicle, firmware)
+    if options.json:
+        print_json(_added_json(added, len(metadata)))
+    else:
+        say(printable(f"{counted(len(metadata), 'description')} from {file} for {added}"))
+    return ExitCode.DONE
+
+
+def metadata_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
+    """Print the metadata files that were added."""
+    rows = [(each, len(read_metadata(each.path))) for each in _files(options)]
+    if options.json:
+        print_json({"metadata": [_added_json(*row) for row in rows]})
+    elif rows:
+        cells = ((each.kind, each.firmware or "any", count) for each, count in rows)
+        print_table(["vehicle", "firmware", "descriptions"], cells, right="descriptions")
+    else:
+        say("no metadata was added")
+    return ExitCode.DONE
+
+
+def metadata_remove(
+    vehicle: VehicleKind, /, *, firmware: str | None = None, options: CacheOptions = _DEFAULTS
+) -> ExitCode:
+    """Remove a metadata file that was added.
+
+    Args:
+        vehicle: The vehicle type.
+        firmware: The firmware version for which the file was added. Default: the file for every version.
+    """
+    removed = _files(options).remove(vehicle, firmware)
+    if options.json:
+        print_json({"vehicle": removed.kind, "firmware": removed.firmware})
+    else:
+        say(f"the metadata for {removed} was removed")
+    return ExitCode.DONE
+
+
+def _added_json(added: AddedMetadata, count: int) -> dict[str, object]:
+    """Return the JSON of an added file with this number of descriptions."""
+    return {"vehicle": added.kind, "firmware": added.firmware, "descriptions": count}
+
+
+def _files(options: CacheOptions) -> AddedFiles:
+    """Return the added files beside the cache that the options name."""
+    with ParamCache(options.cache) as cache:
+        return MetadataStore.beside(cache.path).added

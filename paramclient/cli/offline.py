@@ -38,9 +38,9 @@ from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.metadata import Metadata, MetadataStore
 from paramclient.model.defaults import add_default, default_of
 from paramclient.model.identity import autopilot_name
+from paramclient.model.names import NameChoice
 from paramclient.model.notation import hash_text
 from paramclient.model.paramset import ParamSet
-from paramclient.model.patterns import NameChoice
 from paramclient.model.values import Param, format_value, type_name
 from paramclient.model.wording import counted
 

@@ -1,4 +1,4 @@
-"""Output of the command line: JSON, tables, lines, progress bars and errors.
+"""Output of the command line: JSON, tables, lines, progress bars, awaited responses and errors.
 
 Results go to stdout; progress, summaries, warnings and errors to stderr. Text from the wire is never printed
 unchanged: JSON escapes all characters outside ASCII, and all other output is `printable` text.
@@ -11,11 +11,11 @@ import re
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Container, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
-from typing import TYPE_CHECKING, Final, TextIO, TypeAlias
+from typing import TYPE_CHECKING, Final, TextIO, TypeAlias, TypeVar
 
 import anyio
 
@@ -44,6 +44,7 @@ __all__ = [
     "progress_bar",
     "report",
     "say",
+    "while_waiting",
     "wrapped",
 ]
 
@@ -55,6 +56,8 @@ WIDTH_UNLIMITED: Final = 10_000
 
 NOTICE_DELAY: Final = 0.5
 """Seconds after which a terminal shows the awaited response: most responses arrive earlier."""
+NOTICE_INTERVAL: Final = 0.5
+"""Seconds between two updates of the line that names the awaited response."""
 ERASE: Final = "\r\x1b[K"
 """Moves the cursor of a terminal to the start of the line, and erases the line."""
 ELLIPSIS: Final = "..."
@@ -64,7 +67,7 @@ GAP: Final = 2
 SENTENCE_WIDTH_MIN: Final = 20
 """Columns that sentences in the last column of a table take at least; in less they are hard to read."""
 
-
+Result = TypeVar("Result")
 _UTC_TIME: Final = re.compile(
     r"(?<!\S)[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]{3})?Z(?![^\s;,])"
 )
@@ -448,3 +451,45 @@ def _cell_text(cell: object) -> str:
 def _escaped(character: str) -> str:
     code = ord(character)
     return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+
+
+async def while_waiting(
+    work: Callable[[Callable[[], None]], Awaitable[Result]],
+    awaited: str,
+    received: Callable[[], str] = lambda: "",
+) -> Result:
+    """Await `work`; meanwhile, name the awaited response on a terminal. The line is erased at the end.
+
+    Args:
+        work: the function to await. Its argument is a function that erases the line for good, to call before
+            anything else is printed.
+        awaited: the awaited response in words.
+        received: returns what was received so far, as a sentence.
+
+    Raises:
+        Exception: as from `work`.
+    """
+    line = StatusLine()
+    if not sys.stderr.isatty():
+        return await work(line.end)
+    outcome: list[Result] = []
+    failure: Exception | None = None
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(_draw, line, awaited, received)
+        try:
+            outcome.append(await work(line.end))
+        except Exception as error:  # raised here, the task group would wrap it in a group
+            failure = error
+        finally:
+            line.end()
+        tasks.cancel_scope.cancel()
+    if failure is not None:
+        raise failure
+    return outcome[0]
+
+
+async def _draw(line: StatusLine, awaited: str, received: Callable[[], str]) -> None:
+    began = anyio.current_time()
+    while True:
+        line.draw(f"waiting for {awaited}", anyio.current_time() - began, received())
+        await anyio.sleep(NOTICE_INTERVAL)

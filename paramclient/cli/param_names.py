@@ -13,10 +13,8 @@ from paramclient.cache import ParamCache
 from paramclient.cli.session import CommandSession
 from paramclient.client.component import Component
 from paramclient.errors import CacheError, ParamClientError, UnknownParameter, UsageError
-from paramclient.model.group_switches import is_group_switch
 from paramclient.model.identity import autopilot_name
-from paramclient.model.patterns import NameChoice, is_pattern
-from paramclient.model.similar_names import did_you_mean, nearest_names
+from paramclient.model.names import NameChoice, did_you_mean, is_group_switch, is_pattern, nearest_names
 from paramclient.model.values import check_name
 
 __all__ = [

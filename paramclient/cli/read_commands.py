@@ -32,6 +32,7 @@ from paramclient.cli.output import (
     progress_bar,
     report,
     say,
+    while_waiting,
 )
 from paramclient.cli.param_names import ChosenNames, check_given, learn_spelling, suggest
 from paramclient.cli.session import (
@@ -43,12 +44,11 @@ from paramclient.cli.session import (
     run_on_all,
     sessions,
 )
-from paramclient.cli.waiting import while_waiting
 from paramclient.errors import ParamClientError, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import Default, add_default, default_of
+from paramclient.model.names import NameChoice, is_pattern
 from paramclient.model.notation import hash_text
-from paramclient.model.patterns import NameChoice, is_pattern
 from paramclient.model.values import Param, Trust, format_value, type_name
 from paramclient.model.wording import first_of
 from paramclient.protocol.fetch import FetchResult, Policy
@@ -75,7 +75,7 @@ async def fetch(
     extended: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
-    """Fetch all parameters. Uses the cache if the vehicle's hash matches, otherwise downloads.
+    """Fetch all parameters. Uses the cache if the vehicle confirms it, otherwise downloads.
 
     Args:
         url: The link: udpin:0.0.0.0:14550, tcp:HOST:PORT, serial:PATH, sim:px4.
@@ -122,7 +122,7 @@ async def get(
     Args:
         url: The link.
         name: The parameter, in upper or lower case, or a pattern such as "MC_*": then the whole table is
-            fetched, from the cache if the vehicle's hash matches.
+            fetched, from the cache if the vehicle confirms it.
         names: Further parameters and patterns.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
         extended: Extended parameters (PARAM_EXT_*), such as a camera's.

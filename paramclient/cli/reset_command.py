@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -41,16 +41,14 @@ from paramclient.cli.write_outcomes import (
     write_all,
     writes_json,
 )
-from paramclient.client.arguments import SETTLE_MAX
+from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import NoReply, ParamClientError, UsageError, VehicleError
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import DefaultSource, default_of
-from paramclient.model.group_switches import is_group_switch
+from paramclient.model.names import is_group_switch, is_pattern
 from paramclient.model.notation import typed, value_json
-from paramclient.model.patterns import is_pattern
-from paramclient.model.values import Param, format_value
+from paramclient.model.values import Param, Trust, WireValue, bits_of, format_value, same_bits
 from paramclient.model.wording import counted, first_of
-from paramclient.protocol.reset import ResetChoice, read_unconfirmed
 from paramclient.protocol.set_results import SetOutcome
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
 
@@ -112,7 +110,7 @@ async def reset(
             report(f"incomplete: {counted(len(fetched.missing), 'parameter')} were not received")
             code = ExitCode.INCOMPLETE
         component, deadline = session.component, session.deadline
-        params = await read_unconfirmed(
+        params = await _read_unconfirmed(
             component.params, lambda name: component.get(name, timeout=deadline.left()), chosen
         )
         if described is None:
@@ -205,6 +203,42 @@ async def _known(session: CommandSession, choice: str | None, params: Sequence[P
 
 
 @dataclass(frozen=True, slots=True)
+class _ResetChoice:
+    """The values that a reset writes.
+
+    Attributes:
+        values: the defaults to write, by name, in the order of the names.
+        unchanged: names of parameters that have their default already.
+        without_default: names of parameters without a known default.
+    """
+
+    values: Mapping[str, WireValue]
+    unchanged: tuple[str, ...]
+    without_default: tuple[str, ...]
+
+    @classmethod
+    def of(cls, params: Iterable[Param], defaults: Mapping[str, WireValue]) -> _ResetChoice:
+        """Choose the values to write.
+
+        Args:
+            params: the current parameters.
+            defaults: defaults of parameters whose default the vehicle has not given; the vehicle's own
+                default has priority.
+        """
+        values: dict[str, WireValue] = {}
+        unchanged, unknown = [], []
+        for param in params:
+            default = defaults.get(param.name) if param.default is None else param.default
+            if default is None:
+                unknown.append(param.name)
+            elif _has_value(param, default):
+                unchanged.append(param.name)
+            else:
+                values[param.name] = default
+        return cls(values, tuple(unchanged), tuple(unknown))
+
+
+@dataclass(frozen=True, slots=True)
 class _ResetPlan:
     """The values that a reset writes, and their output.
 
@@ -217,7 +251,7 @@ class _ResetPlan:
     """
 
     session: CommandSession
-    choice: ResetChoice
+    choice: _ResetChoice
     params: Mapping[str, Param]
     described: Metadata | None
     read_only: tuple[str, ...]
@@ -244,7 +278,7 @@ class _ResetPlan:
         defaults = {} if described is None else described.defaults_of(each.name for each in params)
         if not lists_unknown:
             params = [each for each in params if each.default is not None or each.name in defaults]
-        choice = ResetChoice.of(params, defaults)
+        choice = _ResetChoice.of(params, defaults)
         return cls(session, choice, {each.name: each for each in params}, described, read_only)
 
     @property
@@ -341,3 +375,35 @@ class _ResetPlan:
 
 _NO_DEFAULT: Final = Coloured("no known default", "yellow")
 """The cell of a parameter that is not written."""
+
+
+async def _read_unconfirmed(
+    table: Mapping[str, Param], read: Callable[[str], Awaitable[Param]], names: Iterable[str]
+) -> list[Param]:
+    """Return parameters of a fetched table in the order of the names; read those that are only cached.
+
+    Args:
+        table: `Component.params`.
+        read: reads a parameter into the table.
+        names: param_ids; of equal ones the first counts.
+
+    Raises:
+        UnknownParameter: the vehicle has no parameter with one of the names.
+        ParamClientError: as from `Component.get`.
+    """
+    params = []
+    for name in dict.fromkeys(names):
+        param = table.get(name)
+        if param is None or param.trust is Trust.CACHED:
+            await read(name)
+            param = table[name]
+        params.append(param)
+    return params
+
+
+def _has_value(param: Param, value: WireValue) -> bool:
+    """Return whether a parameter has this value, as far as its type can represent the value."""
+    try:
+        return same_bits(param.type_number, param.bits, bits_of(value, param.type_number))
+    except UsageError:  # not in the range of the type; the write reports it
+        return False

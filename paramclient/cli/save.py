@@ -36,12 +36,11 @@ from paramclient.cli.sources import (
 )
 from paramclient.errors import UsageError, VehicleError
 from paramclient.files import FileFormat, write_file
-from paramclient.files.formats import format_of_name
-from paramclient.files.param_file import AUTOPILOT, address
+from paramclient.files.formats import AUTOPILOT, address, format_of_name
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import default_of
+from paramclient.model.names import NameChoice
 from paramclient.model.paramset import ParamSet
-from paramclient.model.patterns import NameChoice
 from paramclient.model.wording import counted
 from paramclient.provision.vehicle_params import NO_DEFAULTS, cached_param_set, select_non_defaults
 

@@ -1,4 +1,4 @@
-"""The subcommand serve: runs the service, which shares links and cache over HTTP."""
+"""The subcommands serve, which shares links and cache over HTTP, and token: access tokens for it."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Annotated, Final
 import anyio
 from cyclopts import Parameter
 
+from paramclient.cli.app import on_end_signal
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import SigningOptions
-from paramclient.cli.output import print_line
-from paramclient.cli.signals import on_end_signal
+from paramclient.cli.output import print_line, say
 from paramclient.errors import UsageError
 
-__all__ = ["serve"]
+__all__ = ["serve", "token"]
 
 SERVICE_LIBRARIES: Final = ("fastapi", "prometheus_client", "uvicorn")
 """Libraries that the extra `service` installs."""
@@ -103,3 +103,23 @@ async def serve(
             listens=started,
         )
     return ExitCode.DONE
+
+
+def token(name: str, /, *, file: Path, read: bool = False) -> None:
+    """Create an access token for `paramclient serve`, and print it once.
+
+    The token file stores only its digest, with the name for the history; the file is created if it does not
+    exist. To revoke the token, remove its line and restart the service.
+
+    Args:
+        name: The user or computer, such as anna or bench-laptop.
+        file: The token file of serve --tokens.
+        read: Allow only reading.
+    """
+    if find_spec("fastapi") is None:
+        raise UsageError("the service needs fastapi: pip install 'paramclient[service]'")
+    from paramclient.service import add_token  # only here: needs the extra
+
+    made = add_token(file, name, "read" if read else "write")
+    say(f"token for {name} ({'read' if read else 'read and write'}), which is shown only once:")
+    print_line(made)

@@ -16,9 +16,13 @@ import anyio.to_thread
 from paramclient.cache import CachedSummary
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import LinkOptions, TrafficOptions
-from paramclient.cli.output import local_time, printable, report, say
-from paramclient.cli.waiting import while_waiting
-from paramclient.client.arguments import address_in_words
+from paramclient.cli.output import (
+    local_time,
+    printable,
+    report,
+    say,
+    while_waiting,
+)
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, ParamClientError, UsageError
@@ -26,8 +30,8 @@ from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.model.identity import version_text
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.fetch import Policy
-from paramclient.protocol.kinds import expects_extended, kind_in_words
-from paramclient.protocol.selection import LOOK_TIME, hint_of_link, node_in_words
+from paramclient.protocol.identity import expects_extended, kind_in_words
+from paramclient.protocol.selection import LOOK_TIME, address_in_words, hint_of_link, node_in_words
 from paramclient.wire.messages import MAV_AUTOPILOT_INVALID
 
 __all__ = [

@@ -46,7 +46,7 @@ from paramclient.cli.write_outcomes import (
     write_all,
     writes_json,
 )
-from paramclient.client.arguments import SETTLE_MAX
+from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.values import ParamType, WireValue, format_value

@@ -173,7 +173,7 @@ async def _read_value(
 
 def _count_signed(client: ParamClient, address: tuple[int, int]) -> int:
     components = client.traffic_report().components
-    return sum(each.signed for each in components if (each.system, each.component) == address)
+    return sum(each.totals["signed"] for each in components if (each.system, each.component) == address)
 
 
 def _refused(address: tuple[int, int], failure: str) -> VehicleError:

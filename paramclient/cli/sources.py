@@ -25,8 +25,7 @@ from paramclient.cli.output import progress_bar, report
 from paramclient.cli.session import ChosenVehicle, CommandSession, report_others, sessions
 from paramclient.errors import FileError, NotInCache, UnknownVehicle, UsageError
 from paramclient.files import ParamFile, read_file, read_renames
-from paramclient.files.formats import ENDINGS
-from paramclient.files.param_file import AUTOPILOT
+from paramclient.files.formats import AUTOPILOT, ENDINGS
 from paramclient.links import FORMS, parse_link
 from paramclient.logs.onboard import is_onboard_log, read_onboard_log
 from paramclient.model.paramset import ParamSet
@@ -79,7 +78,7 @@ async def resolve(
 ) -> ParamSet:
     """Return the parameters of the source that an argument names: a file, a vehicle in the cache, or a link.
 
-    Opens a link and fetches the whole table, from the cache if the vehicle's hash matches.
+    Opens a link and fetches the whole table, from the cache if the vehicle confirms it.
 
     Args:
         text: the argument; see the docstring of this module.

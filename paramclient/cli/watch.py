@@ -18,8 +18,8 @@ from paramclient.cli.session import CommandSession, connect, report_others
 from paramclient.client.events import Discovered, Event, Events, Found, Lost, Rebooted, Resynced
 from paramclient.client.streams import Changes
 from paramclient.errors import CacheError, ParamClientError
+from paramclient.model.names import NameChoice, is_pattern
 from paramclient.model.notation import hash_text, time_text, value_json
-from paramclient.model.patterns import NameChoice, is_pattern
 from paramclient.model.values import format_value
 from paramclient.model.wording import counted
 from paramclient.protocol.events import Change

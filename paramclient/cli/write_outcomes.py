@@ -13,10 +13,16 @@ import anyio
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.json_output import WriteJson
 from paramclient.cli.metadata import info_of, meaning_of, needs_reboot
-from paramclient.cli.output import Coloured, printable, progress_bar, report, say
+from paramclient.cli.output import (
+    Coloured,
+    printable,
+    progress_bar,
+    report,
+    say,
+    while_waiting,
+)
 from paramclient.cli.param_names import suggest
 from paramclient.cli.session import CommandSession
-from paramclient.cli.waiting import while_waiting
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.values import ParamType, WireValue, format_value

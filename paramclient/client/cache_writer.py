@@ -7,18 +7,17 @@ import math
 import os
 import time
 from collections.abc import Callable, Collection
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, TypeVar
 
 import anyio
 import anyio.to_thread
 
 from paramclient.cache import BY_VEHICLE, ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.errors import CacheError, UsageError
-from paramclient.links.clock_offset import seconds_ahead
 from paramclient.model.identity import Identity
-from paramclient.model.values import Param
 from paramclient.protocol.events import Change
 from paramclient.protocol.node import Node
 from paramclient.protocol.selection import vehicle_of
@@ -41,29 +40,19 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
-class _Observation(NamedTuple):
-    """A changed value, when it arrived by the clock of the event loop, whether it is volatile, its author."""
-
-    param: Param
-    at: float
-    volatile: bool | None
-    by: str = BY_VEHICLE
-
-
 @dataclass(eq=False)
 class _Pending:
-    """What is to be written of one table. Times are of the event loop, as the computer's clock may be wrong.
+    """What is to be written of one table.
 
     Attributes:
         generation: of the component, when the first of it was received.
-        observations: changed values, in order.
-        removed: names that the vehicle no longer has, and when that was found.
+        changes: changed parameters in order, each with the time by the clock of the event loop, as the
+            computer's clock may be wrong.
         is_whole: whether the whole table is to be written, as it is.
     """
 
     generation: int
-    observations: list[_Observation] = field(default_factory=list)
-    removed: dict[str, float] = field(default_factory=dict)
+    changes: list[tuple[Change, float]] = field(default_factory=list)
     is_whole: bool = False
 
 
@@ -92,10 +81,9 @@ class CacheWriter:
         self._synced_at: dict[Session, float] = {}  # when each table was last proven, as the cache knows
         self._fetched_at: dict[Session, float] = {}  # and in this session, by the event loop's clock
         self._pending: dict[Session, _Pending] = {}
-        self._flushing = anyio.Lock()
+        self._writing = anyio.Lock()
         self._is_closing = False
-        self._durable_calls = 0
-        self._durable_until = 0  # the last of these whose values are safe from power loss
+        self._is_synced = True  # what was written is safe from power loss
         self._something_to_write = anyio.Event()
         self._known: set[tuple[int | str, int]] = set()  # systems and keys of vehicles, with components
         self._ahead = -math.inf  # of unix time to the time of the event loop, in seconds
@@ -104,8 +92,9 @@ class CacheWriter:
     async def open(self) -> None:
         """Load the list of cached components."""
         if self.cache is not None:
-            summaries = await self._try(self.cache.components) or ()
-            self._known = {(which, each.component) for each in summaries for which in (each.system, each.key)}
+            with suppress(CacheError):
+                found = await self._call(self.cache.components)
+                self._known = {(which, each.component) for each in found for which in (each.system, each.key)}
 
     async def close(self, nodes: Collection[Node]) -> None:
         """Write all new values, warn of lost ones, and close the cache if it is owned.
@@ -123,7 +112,10 @@ class CacheWriter:
                 is_known = node.identification.is_settled
                 if is_known or any(each.table.is_complete for each in node.sessions):
                     await self.load(node, vehicle_of(nodes, node))
-            is_written = await self.flush() and await self.flush()  # the second one after a replaced file
+            with suppress(CacheError):
+                await self.write_all()
+                await self.write_all()  # after a replaced file
+                is_written = True
         if not is_written and not was_warned:
             self._warn_of_lost()
         if self._owned:
@@ -132,7 +124,7 @@ class CacheWriter:
 
     def _warn_of_lost(self) -> None:
         for node, identity in self._identities.items():
-            if any(session in self._pending for session in node.sessions):
+            if any(self._waits(session) for session in node.sessions):
                 logger.warning(
                     "the last values of %d/%d (%s) are not in the cache, and lost: %s",
                     *(node.system, node.component, identity.key, self.failure or "timeout"),
@@ -165,7 +157,11 @@ class CacheWriter:
         cache = self.cache
         for session in node.sessions:
             is_extended = session is node.extended
-            cached = await self._try(partial(cache.load, identity.key, node.component, extended=is_extended))
+            cached = None
+            with suppress(CacheError):
+                cached = await self._call(
+                    partial(cache.load, identity.key, node.component, extended=is_extended)
+                )
             if vehicle.identification.identity.key != identity.key:
                 return  # another vehicle has taken the address meanwhile, and its table is loaded
             if identity.uid is not None:
@@ -206,13 +202,9 @@ class CacheWriter:
         if self.cache is None:
             return
         pending = self._pending_of(node, session)
-        table = session.table
-        at = min(table.moments.get(change.name, math.inf), anyio.current_time())
-        if change.new is None:
-            pending.removed[change.name] = at
-        elif len(pending.observations) < PENDING_MAX:
-            is_volatile = change.name in table.volatile if table.volatile_is_known else None
-            pending.observations.append(_Observation(change.new, at, is_volatile, change.by))
+        if len(pending.changes) < PENDING_MAX:
+            at = min(session.table.moments.get(change.name, math.inf), anyio.current_time())
+            pending.changes.append((change, at))
         else:
             pending.is_whole = True
         self._wake()
@@ -241,42 +233,49 @@ class CacheWriter:
             await self._something_to_write.wait()
             await anyio.sleep(FLUSH_INTERVAL / 2)
             self._something_to_write = anyio.Event()
-            if not await self.flush():
+            try:
+                await self.write_all()
+            except CacheError:
                 await anyio.sleep(RETRY_INTERVAL)
                 self._wake()
 
-    async def flush(self, *, durable: bool = False) -> bool:
-        """Write all received values now; return False if the write failed. Cancellation loses no value.
+    async def write_all(self, *, durable: bool = False) -> None:
+        """Write all received values now. Cancellation loses no value.
 
         Args:
             durable: whether to wait until they are safe from power loss.
+
+        Raises:
+            CacheError: the write failed. The values stay in memory and are written later.
         """
         cache = self.cache
         if cache is None:
-            return not durable
-        self._durable_calls += durable
-        call = self._durable_calls
-        async with self._flushing:
-            if durable and self._durable_until >= call:
-                return True
-            last_call = self._durable_calls
+            return
+        async with self._writing:
             certain = [node for node in self._identities if self._is_certain(node)]
-            taken = [(node, each) for node in certain for each in node.sessions if each in self._pending]
-            before = {session: self._pending.pop(session) for _, session in taken}
-            updates = [self._update(node, session, before[session]) for node, session in taken]
-            is_saved = False
-
-            def save() -> bool:
-                cache.save(updates, durable=durable)
-                return True
-
+            taken = [
+                (node, session, self._pending[session])
+                for node in certain
+                for session in node.sessions
+                if self._waits(session)
+            ]
+            if durable and self._is_synced and not taken:
+                return
+            updates = [self._update(*each) for each in taken]
+            before = [(pending, len(pending.changes), pending.is_whole) for _, _, pending in taken]
+            for _, _, pending in taken:
+                pending.is_whole = False
+            is_saved = self._is_synced = False
             try:
-                is_saved = await self._try(save) is True
+                await self._call(partial(cache.save, updates, durable=durable))
+                is_saved = True
             finally:
-                if not is_saved:
-                    for session, pending in before.items():
-                        self._put_back(session, pending)
-        if is_saved:
+                for pending, count, was_whole in before:
+                    if is_saved:
+                        del pending.changes[:count]
+                    else:
+                        pending.is_whole |= was_whole
+            self._is_synced = durable
             self.failure = None
             if cache.replacements != self._replacements:  # a new file, without the earlier values
                 self._replacements = cache.replacements
@@ -284,28 +283,15 @@ class CacheWriter:
                     for session in node.sessions:
                         self._pending_of(node, session).is_whole = True
                 self._wake()
-            if durable:
-                self._durable_until = last_call
-        return is_saved
-
-    async def write_all(self) -> None:
-        """Write all received values, before a query of the cache.
-
-        Raises:
-            CacheError: the write failed. The values stay in memory and are written later.
-        """
-        if not await self.flush():
-            raise CacheError(f"the last received values could not be written: {self.failure}")
 
     async def write_durably(self, node: Node) -> None:
         """Write all received values, safe from power loss.
 
         Raises:
-            CacheError: the write failed. The values stay in memory and are written later.
+            UsageError, CacheError: as from `check_kept` and `write_all`.
         """
         self.check_kept(node)
-        if not await self.flush(durable=True):
-            raise CacheError(f"it could not be written: {self.failure}")
+        await self.write_all(durable=True)
 
     def check_kept(self, node: Node) -> None:
         """Check that the values of a component are written.
@@ -328,13 +314,9 @@ class CacheWriter:
         identity, heard = self._identities[node], vehicle.identification
         if heard.autopilot is not None:
             identity = replace(identity, autopilot=heard.autopilot, vehicle_type=heard.vehicle_type or 0)
-        observations = list(pending.observations)
+        observations = [(each.new, at, each.by) for each, at in pending.changes if each.new is not None]
         if pending.is_whole:
-            outside = table.volatile if table.volatile_is_known else None
-            observations += [
-                _Observation(param, table.moments[name], None if outside is None else name in outside)
-                for name, param in table.params.items()
-            ]
+            observations += [(param, table.moments[name], BY_VEHICLE) for name, param in table.params.items()]
         ahead = self._seconds_ahead()
         fetched_at = self._fetched_at.get(session)
         is_extended = session is node.extended
@@ -353,28 +335,30 @@ class CacheWriter:
             at=time.time(),
             table=state,
             params=[
-                StoredParam.of(table.with_default(param), at + ahead, volatile, by)
-                for param, at, volatile, by in observations
+                StoredParam.of(
+                    table.with_default(param),
+                    at + ahead,
+                    param.name in table.volatile if table.volatile or table.volatile_is_known else None,
+                    by,
+                )
+                for param, at, by in observations
             ],
-            removed={name: at + ahead for name, at in pending.removed.items()},
+            removed={each.name: at + ahead for each, at in pending.changes if each.new is None},
             replace=pending.is_whole and table.is_complete,
             extended=is_extended,
         )
 
-    def _put_back(self, session: Session, pending: _Pending) -> None:
-        """Keep what could not be written, before what has come since."""
-        since = self._pending.get(session, _Pending(pending.generation))
-        pending.observations += since.observations
-        pending.removed |= since.removed
-        pending.is_whole = pending.is_whole or since.is_whole or len(pending.observations) > PENDING_MAX
-        self._pending[session] = pending
+    def _waits(self, session: Session) -> bool:
+        """Return whether something of a table is to be written."""
+        pending = self._pending.get(session)
+        return pending is not None and (pending.is_whole or bool(pending.changes))
 
     def _seconds_ahead(self) -> float:
         """Return the seconds from the event loop's clock to unix time, always the same.
 
         The two clocks are compared once, and again where the computer's clock was set or was suspended.
         """
-        ahead = seconds_ahead(time.time, anyio.current_time)
+        ahead = time.time() - anyio.current_time()
         if not abs(ahead - self._ahead) <= CLOCK_STEP:  # also where the clock is NaN
             self._ahead = ahead
         return self._ahead
@@ -386,15 +370,19 @@ class CacheWriter:
         """Run a blocking call in the cache's thread after earlier calls. Cancellation does not stop it."""
         return await anyio.to_thread.run_sync(work, abandon_on_cancel=True, limiter=self._thread)
 
-    async def _try(self, work: Callable[[], T]) -> T | None:
-        """Run a cache call in the thread; return None if it failed, with one warning for several failures."""
+    async def _call(self, work: Callable[[], T]) -> T:
+        """Run a cache call in the thread, with one warning in the log for several failures.
+
+        Raises:
+            CacheError: it failed.
+        """
         try:
             return await self.run_in_thread(work)
         except (CacheError, UsageError) as error:  # UsageError: the clock has an impossible time
             if self.failure is None and not self._is_closing:
                 logger.warning("continuing without the cache: %s", error)
             self.failure = error
-            return None
+            raise CacheError(f"the last received values could not be written: {error}") from error
 
 
 def choose_cache(

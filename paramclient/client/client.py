@@ -13,16 +13,14 @@ import anyio
 
 from paramclient.cache import ParamCache
 from paramclient.client import events
-from paramclient.client.arguments import COMPONENT_TIMEOUT, address_in_words
 from paramclient.client.cache_writer import CacheWriter, choose_cache
 from paramclient.client.component import Component
 from paramclient.client.core import ClientCore
 from paramclient.client.events import Events
 from paramclient.client.files import Ftp
-from paramclient.client.fleet_fetch import FetchedAll, fetch_components
 from paramclient.client.forwarding import Forwarder
 from paramclient.client.recording import Capture
-from paramclient.client.signing import Signing, TimestampKeeper, refused_in_words
+from paramclient.client.signing import Signing, refused_in_words
 from paramclient.client.streams import Subscribers
 from paramclient.client.traffic import Traffic, TrafficReport
 from paramclient.errors import AnotherVehicle, NoReply, ParamClientError, UsageError
@@ -31,10 +29,11 @@ from paramclient.model.values import Encoding
 from paramclient.model.wording import counted
 from paramclient.protocol import events as protocol
 from paramclient.protocol.addresses import Address
-from paramclient.protocol.fetch import Policy, Progress
+from paramclient.protocol.fetch import Policy
 from paramclient.protocol.node import Node
 from paramclient.protocol.selection import (
     LOOK_TIME,
+    address_in_words,
     autopilots_of,
     find,
     hint_of_link,
@@ -44,22 +43,22 @@ from paramclient.protocol.selection import (
 )
 from paramclient.protocol.session import Session
 from paramclient.protocol.station import Station
-from paramclient.protocol.watch import INTERVAL_MIN, Watch
+from paramclient.protocol.watch import INTERVAL_MIN
 from paramclient.wire.signing import SigningKey, SigningReport
 
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint
 
-__all__ = ["ParamClient"]
+__all__ = ["COMPONENT_TIMEOUT", "ParamClient"]
 
+COMPONENT_TIMEOUT: Final = 10.0
+"""Default timeout in seconds for the first component on a link."""
 VEHICLES_LISTENING_TIME: Final = 3.0
 """Seconds after the first autopilot in which further ones are looked for: three heartbeats, two of which may
 be lost."""
 PROBE_INTERVAL: Final = 0.5
 """Seconds between two requests to a component that is named in full and was not heard; the first one after
 `LOOK_TIME`, in which a component with heartbeats is heard."""
-LISTENING_TIME: Final = 1.2
-"""Seconds after the client was opened in which components are waited for, by a fetch of all."""
 
 
 class ParamClient:
@@ -83,7 +82,7 @@ class ParamClient:
         system, component: MAVLink ids of this client, 1 to 255.
         encoding: parameter encoding of all components; None detects it for each component.
         watch_interval: seconds between two checks of each fetched table against the vehicle, at least 1.
-            None: every 30 s for a vehicle with a hash, and for others if a download takes no more than 1.5 s.
+            None: every 30 s for a vehicle with a hash or checksum (PX4, ArduPilot), never for others.
             0 disables the checks. See `Component.sync_state`.
         policy: which requests may update tables, see `Policy`: "auto", "hash-only" or "cache-only". Any value
             but "auto" also disables the checks of `watch_interval`.
@@ -130,19 +129,18 @@ class ParamClient:
         if watch_interval is not None and watch_interval != 0 and not watch_interval >= INTERVAL_MIN:
             raise UsageError(f"watch_interval must be 0 or at least {INTERVAL_MIN:g} s, not {watch_interval}")
         try:
-            self._policy = Policy(policy)
+            self.policy = Policy(policy)
         except ValueError:
             raise UsageError(f"policy must be one of {', '.join(Policy)}, not {policy!r}") from None
-        if listen_only and (watch_interval or self._policy is not Policy.AUTO):
+        if listen_only and (watch_interval or self.policy is not Policy.AUTO):
             raise UsageError("the client only listens: it takes no policy, and no watch_interval but 0")
         opened = create_link(link)
         is_log = isinstance(opened, ReplayLink)
         self.cache = choose_cache(cache, is_log=is_log)
-        self._interval = watch_interval
+        self.watch_interval = watch_interval
         self._components: dict[Address, Component] = {}
         self._by_session: dict[Session, Component] = {}
         self._events: Subscribers[events.Event] = Subscribers()
-        signing = Signing(signing) if isinstance(signing, SigningKey) else signing
         forwarder = None if forward is None else Forwarder(create_link(forward))
         capture = None if tlog is None else Capture(tlog)
         self._traffic = Traffic() if traffic else None
@@ -150,7 +148,7 @@ class ParamClient:
             opened,
             CacheWriter(self.cache, owned=self.cache is not cache),
             [tap for tap in (forwarder, capture, self._traffic) if tap is not None],
-            None if signing is None else TimestampKeeper(signing),
+            Signing(signing) if isinstance(signing, SigningKey) else signing,
             partial(
                 Station,
                 link=opened.name,
@@ -161,7 +159,7 @@ class ParamClient:
                 listens_only=listen_only or is_log,
                 split_peers=split_peers,
                 discovered=self._meet,
-                emit=self._emit,
+                emit=self.emit,
                 changed=self._changed,
             ),
             self._end_streams,
@@ -279,8 +277,9 @@ class ParamClient:
             NoReply: no message of the component arrived in time.
             LinkError: the link failed, or the client was closed.
         """
+        nodes = self.core.station.nodes
         return await self._wait_for(
-            lambda: find(self.core.station.nodes.values(), system, component, peer),
+            lambda: (find(nodes.values(), system, component, peer), None),
             address_in_words(system, component, peer),
             timeout,
             asked=(system, component),
@@ -309,16 +308,16 @@ class ParamClient:
             raise UsageError(f"expect must be a number of vehicles from 1 up, not {expect}")
         began = anyio.current_time()
         await self.component(timeout=timeout)
-        if expect is None:
-            await anyio.sleep(VEHICLES_LISTENING_TIME)
-        else:
-            with anyio.move_on_after(None if timeout is None else began + timeout - anyio.current_time()):
-                while len(self.autopilots) < expect:
-                    await self._activity()
-            if len(self.autopilots) < expect:
-                heard = ", ".join(node_in_words(each.node) for each in self.autopilots)
-                waited = anyio.current_time() - began
-                raise NoReply(f"{expect} vehicles; heard only {heard}", attempts=0, waited=waited)
+        wait = VEHICLES_LISTENING_TIME
+        if expect is not None:
+            wait = math.inf if timeout is None else began + timeout - anyio.current_time()
+        with anyio.move_on_after(wait):
+            while expect is None or len(self.autopilots) < expect:
+                await self._activity()
+        if expect is not None and len(self.autopilots) < expect:
+            heard = ", ".join(node_in_words(each.node) for each in self.autopilots)
+            waited = anyio.current_time() - began
+            raise NoReply(f"{expect} vehicles; heard only {heard}", attempts=0, waited=waited)
         for each in self.autopilots:
             await each.wait_for_cache()
         return self.autopilots
@@ -354,18 +353,18 @@ class ParamClient:
         if self.listens_only or (isinstance(link, SimLink) and link.has_one_vehicle) or peer is not None:
             return await self.component(system, component, peer=peer, timeout=timeout)
         station = self.core.station
-        due: float | None = None
-
-        def choose() -> Node | None:
-            nonlocal due
-            since = station.listening_since
-            node, due = only_vehicle(
-                station.nodes.values(), system, component, anyio.current_time(), listening_since=since
-            )
-            return node
-
-        awaited = address_in_words(system, component)
-        return await self._wait_for(choose, awaited, timeout, until=lambda: due, asked=(system, component))
+        return await self._wait_for(
+            lambda: only_vehicle(
+                station.nodes.values(),
+                system,
+                component,
+                anyio.current_time(),
+                listening_since=station.listening_since,
+            ),
+            address_in_words(system, component),
+            timeout,
+            asked=(system, component),
+        )
 
     async def successor(
         self, component: Component, system: int, *, timeout: float | None = COMPONENT_TIMEOUT
@@ -388,61 +387,16 @@ class ParamClient:
         """
         before, began = component.identity, anyio.current_time()
 
-        def choose() -> Node | None:
+        def choose() -> tuple[Node | None, None]:
             node = find(self.core.station.nodes.values(), system, component.component, None)
-            return node if node is not None and node.presence.received_at > began else None
+            return node if node is not None and node.presence.received_at > began else None, None
 
-        awaited = address_in_words(system, component.component)
-        found = await self._wait_for(choose, awaited, timeout)
+        found = await self._wait_for(choose, address_in_words(system, component.component), timeout)
         with anyio.move_on_after(timeout), self.core.station.gate.until_closed():
             await found.node.identification.settled()
         if not before.is_same_vehicle(found.identity):
             raise AnotherVehicle(system, found.component, str(before), str(found.identity))
         return found
-
-    async def fetch_all(
-        self,
-        system: int | None = None,
-        *,
-        refresh: bool = False,
-        timeout: float | None = None,
-        progress: Callable[[Mapping[Address, Progress]], None] | None = None,
-    ) -> FetchedAll:
-        """Update the tables of all components of one system, or of every system on the link.
-
-        The fetches run in parallel. Components that appear within 1.2 s after the client was opened are
-        included. A component that does not respond is given up; it may have no parameters. Where another
-        component responds, that takes 1.75 s.
-
-        Args:
-            system: fetch only this system; None for all.
-            refresh: as in `Component.fetch_all`.
-            timeout: seconds after which partial results are returned; None: no limit.
-            progress: called with the progress by (system, component), as values arrive.
-
-        Returns:
-            The results by (system, component), and the errors of the components that did not respond.
-
-        Raises:
-            NoReply: no component was found, or none responded.
-            LinkError: the link failed, or the client was closed.
-        """
-        if refresh:
-            self.core.check_may_send()
-        deadline = math.inf if timeout is None else anyio.current_time() + timeout
-        await self._wait_for(
-            lambda: next((n for n in self.core.station.nodes.values() if system in (None, n.system)), None),
-            "a component" if system is None else f"a component of system {system}",
-            COMPONENT_TIMEOUT if timeout is None else timeout,
-        )
-        await anyio.sleep_until(self.core.station.listening_since + LISTENING_TIME)
-        chosen = {
-            address: each
-            for address, each in self._components.items()
-            if system in (None, each.system) and each.node.identification.has_parameters
-        }
-        left = None if timeout is None else deadline - anyio.current_time()
-        return await fetch_components(chosen, refresh=refresh, timeout=left, progress=progress)
 
     def traffic_report(self) -> TrafficReport:
         """Return the traffic statistics of the link: components, message rates, packet loss.
@@ -468,31 +422,15 @@ class ParamClient:
 
     def _meet(self, node: Node) -> None:
         """Follow a new component."""
-        ext = self._new_component(node, node.extended, None)
-        component = self._new_component(node, node.plain, ext)
+        ext = Component(self, node, node.extended, None)
+        component = Component(self, node, node.plain, ext)
+        self._by_session |= {node.extended: ext, node.plain: component}
         self._components[component.address] = component
         self._events.push(events.Discovered(component))
         self.core.spawn(self._join_vehicle, node)
 
-    def _new_component(self, node: Node, session: Session, ext: Component | None) -> Component:
-        def emit(event: protocol.Resynced) -> None:
-            self.core.cache_writer.fetched(node, session, is_whole=True)
-            self._emit(node, event)
-
-        policy = Policy.CACHE_ONLY if self.listens_only else self._policy
-        watch = Watch(session, node.presence, emit, interval=self._interval, policy=policy)
-        session.table.recounted = watch.doubt
-        component = self._by_session[session] = Component(
-            self.core, node, session, watch, ext, self._components, self.successor
-        )
-        component.policy = self._policy
-        if self.listens_only:
-            session.contradicted = watch.doubt
-        else:
-            self.core.spawn(watch.run)
-        return component
-
-    def _emit(self, node: Node, event: protocol.ComponentEvent) -> None:
+    def emit(self, node: Node, event: protocol.ComponentEvent) -> None:
+        """Tell the subscribers and the cache what has happened to a component."""
         component = self._by_session[node.plain]
         match event:
             case protocol.Identified():
@@ -551,47 +489,42 @@ class ParamClient:
 
     async def _wait_for(
         self,
-        choose: Callable[[], Node | None],
+        choose: Callable[[], tuple[Node | None, float | None]],
         awaited: str,
         timeout: float | None,
         *,
-        until: Callable[[], float | None] = lambda: None,
         asked: tuple[int | None, int | None] = (None, None),
     ) -> Component:
         """Wait until a choice is made, and its cached table is loaded.
 
         Args:
-            choose: called after each message, and at the time of `until`.
+            choose: called after each message; returns the choice, or when it may change without a message.
             awaited: for the error.
             timeout: seconds; None waits without limit.
-            until: returns when the choice may change without a message, or None.
             asked: system and component to which requests are sent; nothing is, without both.
         """
         self.core.check_open()
         began = anyio.current_time()
-        station, node = self.core.station, None
+        station = self.core.station
         system, component = asked
-        probed_at = -math.inf
+        probe_at = 0.0 if system and component else math.inf
+        node, due = choose()
         with anyio.move_on_after(timeout):
-            while (node := choose()) is None and not self.core.is_over:
+            while node is None and not self.core.is_over:
                 now = anyio.current_time()
-                due = until()
-                wake_at = math.inf if due is None else due
-                if system and component:
-                    probe_at = max(probed_at + PROBE_INTERVAL, station.listening_since + LOOK_TIME)
-                    if now >= probe_at:
-                        station.probe(system, component)
-                        probed_at, probe_at = now, now + PROBE_INTERVAL
-                    wake_at = min(wake_at, probe_at)
-                with anyio.move_on_after(wake_at - now):
+                probe_at = max(probe_at, station.listening_since + LOOK_TIME)
+                if system and component and now >= probe_at:
+                    station.probe(system, component)
+                    probe_at = now + PROBE_INTERVAL
+                with anyio.move_on_after(min(probe_at, math.inf if due is None else due) - now):
                     await self._activity()
+                node, due = choose()
             if node is not None:
                 await self._by_session[node.plain].wait_for_cache()
         if node is not None:
             return self._by_session[node.plain]
         refused = refused_in_words(self.signing_report())
-        hint = "" if refused else hint_of_link(self.core.station, self.bytes_received)
-        if (due := until()) is not None:
+        hint = "" if refused else hint_of_link(station, self.bytes_received)
+        if due is not None:
             hint, awaited = "", f"{awaited}, then {LOOK_TIME} s without another vehicle"
-        waited = anyio.current_time() - began
-        raise NoReply(f"{awaited}{refused}", attempts=0, waited=waited, hint=hint)
+        raise NoReply(f"{awaited}{refused}", attempts=0, waited=anyio.current_time() - began, hint=hint)

@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
-from typing import Final
+from typing import Final, Protocol
 
 import anyio
 
-from paramclient.client.arguments import (
-    check_author,
-    check_portable_name,
-    check_requested_name,
-    check_settle,
-    check_writes,
-)
+from paramclient.cache import check_author
 from paramclient.client.core import ClientCore
 from paramclient.client.signing import timestamp_now
 from paramclient.client.streams import Changes, Subscribers
@@ -31,31 +24,41 @@ from paramclient.errors import (
     UsageError,
 )
 from paramclient.links.replay import ReplayLink
+from paramclient.model.ext_values import check_ext_value
 from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.params import ParamMap
-from paramclient.model.values import Encoding, Param, Settable, Trust, WireValue
+from paramclient.model.values import (
+    Encoding,
+    Param,
+    Settable,
+    Trust,
+    WireValue,
+    check_portable_name,
+    check_value,
+)
 from paramclient.protocol import commands
 from paramclient.protocol.addresses import Address, PeerAddress, peer_in_words
-from paramclient.protocol.events import Change
+from paramclient.protocol.events import Change, Resynced
 from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all, result_of
 from paramclient.protocol.node import Node
 from paramclient.protocol.reads import read_param
-from paramclient.protocol.reset import ResetChoice, ResetResult, read_unconfirmed
 from paramclient.protocol.selection import hint_of_node, node_in_words, vehicle_of
 from paramclient.protocol.session import Session
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.watch import SyncState, Watch
 from paramclient.protocol.writes import write, write_many
-from paramclient.wire.messages import MAV_MODE_FLAG_SAFETY_ARMED
+from paramclient.wire.messages import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, PARAMETERS_MAX
 from paramclient.wire.signing import SigningKey
 
-__all__ = ["Component", "ComponentState"]
+__all__ = ["SETTLE_MAX", "Component", "ComponentState"]
 
 CACHE_TIMEOUT: Final = 1.5
 """Seconds to wait for the identity of a component, without which its cached table cannot be loaded."""
 REBOOT_TIMEOUT: Final = 60.0
 """Seconds for a vehicle to reboot and report its identity, by default: small autopilot boards take up to 30
 seconds, and boards that calibrate sensors first a little longer."""
+SETTLE_MAX: Final = 60.0
+"""Maximum `settle` in seconds: further writes to the same name wait for it."""
 PASSIVE_TIMEOUT: Final = 20.0
 """Seconds of a fetch where nothing is sent, by default: another station may never request a list."""
 TIMEOUT_NOTE: Final = "The fetch ended at its timeout."
@@ -80,6 +83,26 @@ class ComponentState(StrEnum):
     """The component is lost."""
 
 
+class Owner(Protocol):
+    """What a component and its callers use of its client; see `paramclient.client.client`."""
+
+    core: ClientCore
+    policy: Policy
+    watch_interval: float | None
+
+    @property
+    def listens_only(self) -> bool: ...
+
+    @property
+    def components(self) -> Mapping[Address, Component]: ...
+
+    def emit(self, node: Node, event: Resynced) -> None: ...
+
+    async def successor(
+        self, component: Component, system: int, *, timeout: float | None = ...
+    ) -> Component: ...
+
+
 class Component:
     """One component of a vehicle; see `ParamClient.component`.
 
@@ -94,30 +117,27 @@ class Component:
             and follows the received messages.
     """
 
-    def __init__(
-        self,
-        core: ClientCore,
-        node: Node,
-        session: Session,
-        watch: Watch,
-        ext: Component | None,
-        siblings: Mapping[Address, Component],
-        successor: Callable[..., Awaitable[Component]],
-    ) -> None:
-        self.core = core
+    def __init__(self, client: Owner, node: Node, session: Session, ext: Component | None) -> None:
+        self.client = client
+        self.core = client.core
         self.node = node
         self.session = session
-        self.watch = watch
-        self.siblings = siblings  # all components of the client, this one included
         self.system = node.system
         self.component = node.component
         self.params = ParamMap(session.table.params)
         self.subscribers: Subscribers[Change] = Subscribers()
-        self.policy = Policy.AUTO
+        self.policy = Policy.CACHE_ONLY if client.listens_only else client.policy
+        self.watch = Watch(
+            session, node.presence, self._resynced, interval=client.watch_interval, policy=self.policy
+        )
         self.cache_is_read = anyio.Event()
-        self.successor = successor
         self._ext = ext
         self._last: FetchResult | None = None
+        session.table.recounted = self.watch.doubt
+        if client.listens_only:
+            session.contradicted = self.watch.doubt
+        else:
+            self.core.spawn(self.watch.run)
 
     @property
     def ext(self) -> Component:
@@ -163,7 +183,7 @@ class Component:
 
     @property
     def hash(self) -> int | None:
-        """The PX4 hash (`_HASH_CHECK`) of the complete table; None if it is not known."""
+        """PX4's hash or ArduPilot's checksum of the complete table; None if it is not known."""
         return self.session.table.hash if self.session.table.is_complete else None
 
     @property
@@ -244,11 +264,13 @@ class Component:
             NoReply: the vehicle did not respond in time.
             LinkError: the link failed, or the client was closed.
         """
-        check_requested_name(name)
+        if isinstance(name, str):
+            check_portable_name(name)
+        elif not isinstance(name, int) or not 0 <= name < PARAMETERS_MAX:
+            raise UsageError(f"parameter index {name}: indices are 0 to {PARAMETERS_MAX - 1}")
         self.core.check_may_send()
         with self.limited(timeout, f"parameter {name} of {self.system}/{self.component}"):
             return await read_param(self.session, name)
-        raise AssertionError("the timeout has raised")
 
     async def set(
         self,
@@ -297,9 +319,8 @@ class Component:
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link failed, or the client was closed.
         """
-        ((name, checked),) = check_writes([(name, value)], extended=self.is_extended)
-        settle, by = check_settle(settle), check_author(author)
-        await self._check_may_write(durable=durable)
+        by = check_author(author)
+        ((name, checked),) = await self._check_writes([(name, value)], settle, durable=durable)
         with self.limited(timeout, f"the acknowledgement of {name} by {self.system}/{self.component}"):
             result = await write(self.session, name, checked, settle=settle, force=force, author=by)
         if durable:
@@ -340,9 +361,8 @@ class Component:
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link had failed already, or the client was closed.
         """
-        pairs = check_writes(values, extended=self.is_extended)
-        settle, by = check_settle(settle), check_author(author)
-        await self._check_may_write(durable=durable)
+        by = check_author(author)
+        pairs = await self._check_writes(values, settle, durable=durable)
         result = await write_many(
             self.session, pairs, progress=progress, timeout=timeout, settle=settle, force=force, author=by
         )
@@ -358,53 +378,6 @@ class Component:
                 outcomes = [replace(each, error=failure) if each.is_set else each for each in outcomes]
         return replace(result, outcomes=tuple(outcomes), error=error)
 
-    async def reset(
-        self,
-        *names: str,
-        defaults: Mapping[str, WireValue] | None = None,
-        progress: Callable[[SetOutcome], None] | None = None,
-        timeout: float | None = None,
-        settle: float = 0.0,
-        durable: bool = False,
-        author: str | None = None,
-    ) -> ResetResult:
-        """Set parameters to the firmware's defaults, and verify each as `set` does.
-
-        The parameters are fetched first: ArduPilot, and PX4 from 1.18 on, give the defaults in the file
-        `param.pck`. Parameters without a known default, and those that have it already, are not written.
-
-        Args:
-            names: param_ids, at least one.
-            defaults: defaults of parameters whose default the vehicle does not give, by name, such as
-                `Metadata.defaults_of`.
-            progress, settle, durable, author: as in `set_many`.
-            timeout: seconds for the whole call; None: no limit besides the number of attempts.
-
-        Returns:
-            The outcomes of the written values, and the names that were not written.
-
-        Raises:
-            UsageError: no name, or another argument is not valid, or the client only listens.
-            UnknownParameter: the vehicle has no parameter with one of the names. Nothing was written.
-            ParamClientError: as from `fetch_all` and `set_many`.
-        """
-        if not names:
-            raise UsageError("reset needs the name of at least one parameter")
-        deadline = math.inf if timeout is None else anyio.current_time() + timeout
-
-        def left() -> float | None:
-            return None if timeout is None else max(deadline - anyio.current_time(), 0.0)
-
-        await self.fetch_all(timeout=timeout)
-        present = await read_unconfirmed(
-            self.params, lambda name: self.get(name, timeout=left()), map(check_portable_name, names)
-        )
-        choice = ResetChoice.of(present, defaults or {})
-        written = await self.set_many(
-            choice.values, progress=progress, timeout=left(), settle=settle, durable=durable, author=author
-        )
-        return ResetResult(written, choice.unchanged, choice.without_default)
-
     async def fetch_all(
         self,
         *,
@@ -414,10 +387,11 @@ class Component:
     ) -> FetchResult:
         """Fetch all parameters. Uses the cache if the vehicle confirms it, otherwise downloads.
 
-        If the cache has a table and the vehicle a hash, the client requests the hash first. If it matches,
-        nothing is downloaded but the values outside the hash. Otherwise the client downloads the packed file
-        `param.pck` over MAVFTP if the component serves it: it is faster than the list, exact, and has the
-        firmware's defaults. If not, it downloads the list. `source` and `notes` of the result tell which.
+        If the cache has a table, the client first requests PX4's hash or ArduPilot's checksum. If it matches,
+        nothing is downloaded but the values outside the hash. Values that ArduPilot has changed are found by
+        checksums of ranges, and named in `changed` of the result. Otherwise the client downloads the packed
+        file `param.pck` over MAVFTP if the component serves it: it is faster than the list, exact, and has
+        the firmware's defaults. If not, it downloads the list. `source` and `notes` of the result tell which.
 
         The fetch always ends: indices without a response after all attempts are in `missing`, and a vehicle
         that is lost ends it with the values that arrived. Concurrent calls share one fetch. Cancellation
@@ -425,7 +399,7 @@ class Component:
         station requests.
 
         Args:
-            refresh: download even if the hash would confirm the cached table.
+            refresh: download even if the vehicle would confirm the cached table.
             timeout: seconds after which the partial table is returned with `missing`; None: no limit, except
                 20 s if the client only listens.
             progress: called as values arrive.
@@ -440,13 +414,12 @@ class Component:
             LinkError: the link failed, or the client was closed.
         """
         self.core.check_open()
-        if refresh and (self.policy is not Policy.AUTO or self.core.station.listens_only):
-            is_auto = self.policy is Policy.AUTO
-            why = "the client only listens" if is_auto else f"the policy is {self.policy}"
-            raise UsageError(f"refresh needs a download, and {why}")
+        if refresh:
+            self.core.check_may_send()
+            if self.policy is not Policy.AUTO:
+                raise UsageError(f"refresh needs a download, and the policy is {self.policy}")
         began = anyio.current_time()
-        is_log = isinstance(self.core.link, ReplayLink)
-        if timeout is None and self.core.station.listens_only and not is_log:
+        if timeout is None and self._waits_for_others:
             timeout = PASSIVE_TIMEOUT
         with self.limited(None, "all parameters"):
             with anyio.move_on_after(timeout):
@@ -466,8 +439,8 @@ class Component:
 
     async def _listen(self, began: float) -> FetchResult:
         """Wait until the table is complete by what other stations request, or until a log has ended."""
-        table, is_log = self.session.table, isinstance(self.core.link, ReplayLink)
-        while not self.core.is_over and (is_log or not self._is_heard()):
+        table = self.session.table
+        while not self.core.is_over and not (self._waits_for_others and self._is_heard()):
             await self.core.link_task.activity.wait()
             self.core.check_open()
         if not table.params:
@@ -485,9 +458,14 @@ class Component:
             table.verify()
         return is_confirmed or (table.is_complete and not _has(table.params, Trust.CACHED))
 
+    @property
+    def _waits_for_others(self) -> bool:
+        """Whether only other stations request values, on a link that is no log."""
+        return self.core.station.listens_only and not isinstance(self.core.link, ReplayLink)
+
     def _nothing(self, began: float) -> NoReply:
         what = f"the parameters of {self.system}/{self.component}"
-        if self.core.station.listens_only and not isinstance(self.core.link, ReplayLink):
+        if self._waits_for_others:
             what += ", which no other station has requested"
         return NoReply(what, attempts=0, waited=anyio.current_time() - began)
 
@@ -504,6 +482,10 @@ class Component:
             self.watch.fetched()
             self.core.cache_writer.fetched(self.node, self.session, is_whole=result.source != "cache")
         return result
+
+    def _resynced(self, event: Resynced) -> None:
+        self.core.cache_writer.fetched(self.node, self.session, is_whole=True)
+        self.client.emit(self.node, event)
 
     async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
         """Give the vehicle a signing key with SETUP_SIGNING, or with None, disable its signing.
@@ -551,8 +533,7 @@ class Component:
             await commands.reboot(self.node, returns=not moves)
             if system is None or not moves:
                 return self
-            return await self.successor(self, system, timeout=None)
-        raise AssertionError("the timeout has raised")
+            return await self.client.successor(self, system, timeout=None)
 
     def changes(self) -> Changes:
         """Return a stream of parameter changes from now on: `async for change in component.changes()`.
@@ -584,7 +565,25 @@ class Component:
                 await self.cache_is_read.wait()
             self.core.check_open()
 
-    async def _check_may_write(self, *, durable: bool) -> None:
+    async def _check_writes(
+        self,
+        values: Mapping[str, Settable] | Iterable[tuple[str, Settable]],
+        settle: float,
+        *,
+        durable: bool,
+    ) -> list[tuple[str, WireValue]]:
+        """Check that values may be written, and return them with their names.
+
+        Raises:
+            UsageError, AmbiguousVehicle, CacheError, LinkError: as from `set_many`.
+        """
+        check = check_ext_value if self.is_extended else check_value
+        pairs = values.items() if isinstance(values, Mapping) else values
+        checked = [(check_portable_name(name), check(value)) for name, value in pairs]
+        if any(name == HASH_CHECK for name, _ in checked):
+            raise UsageError(f"{HASH_CHECK} is read-only: it is the hash of the parameters, not a parameter")
+        if not 0.0 <= settle <= SETTLE_MAX:
+            raise UsageError(f"settle must be 0 to {SETTLE_MAX:g} seconds, not {settle}")
         self.core.check_may_send()
         if self.node.has_rival(anyio.current_time()):
             words = node_in_words(self.node)
@@ -596,6 +595,7 @@ class Component:
                 with anyio.move_on_after(CACHE_TIMEOUT):
                     await self.cache_is_read.wait()
             self.core.cache_writer.check_kept(self.node)
+        return checked
 
     async def _write_durably(self, what: str) -> None:
         try:

@@ -14,7 +14,7 @@ import anyio.lowlevel
 
 from paramclient.client.cache_writer import CacheWriter
 from paramclient.client.link_task import LinkTask
-from paramclient.client.signing import TimestampKeeper
+from paramclient.client.signing import Signing
 from paramclient.client.taps import Tap
 from paramclient.errors import ClientClosed, ParamClientError, UsageError
 from paramclient.links import Link
@@ -42,7 +42,7 @@ class ClientCore:
         link: the link, not open.
         cache_writer: writes tables to the cache.
         taps: receivers of all frames of the link.
-        keeper: stores the signature timestamps; None without a key.
+        signing: the key and its options, or None.
         new_station: makes the station, of functions that queue bytes and start background work.
         ended: called when the streams end: with a log, with a link that has failed for good, or at closing.
 
@@ -57,7 +57,7 @@ class ClientCore:
         link: Link,
         cache_writer: CacheWriter,
         taps: Sequence[Tap],
-        keeper: TimestampKeeper | None,
+        signing: Signing | None,
         new_station: Callable[..., Station],
         ended: Callable[[], None],
     ) -> None:
@@ -68,7 +68,7 @@ class ClientCore:
         self._taps = list(taps)
         self.link_task = LinkTask(link, taps=self._taps, ended=self._link_ended)
         self.station = self.link_task.station = new_station(send=self.link_task.queue, spawn=self.spawn)
-        self._keeper = keeper
+        self._signing = signing
         self._ended = ended
         self._work: anyio.abc.TaskGroup | None = None
         self._scope: anyio.CancelScope | None = None  # from `open` on: it needs an event loop
@@ -91,8 +91,6 @@ class ClientCore:
             LinkError: the link failed, or the client is not open.
         """
         self.station.gate.check()
-        if self._is_to_close.is_set() or self._is_closed.is_set():
-            raise ClientClosed("the client was closed", link=self.link.name)
         if self._work is None:
             raise ClientClosed("the client is not open; use `async with` or `open`", link=self.link.name)
 
@@ -190,8 +188,8 @@ class ClientCore:
             await self.cache_writer.open()
             for tap in self._taps:
                 await tap.open()
-            if self._keeper is not None:
-                self.station.begin_signing(*await self._keeper.open())
+            if self._signing is not None:
+                self.station.begin_signing(*self._signing.begin())
             logger.debug("%s: open", self.link.name)
             self.station.listening_since = anyio.current_time()
             async with anyio.create_task_group() as io:
@@ -200,8 +198,6 @@ class ClientCore:
                 io.start_soon(self.cache_writer.run, name="paramclient cache writer")
                 for tap in self._taps:
                     io.start_soon(tap.run, self.link_task.forward)
-                if self._keeper is not None:
-                    io.start_soon(self._keeper.run, name="paramclient timestamp keeper")
                 try:
                     async with anyio.create_task_group() as self._work:
                         self.spawn(self.station.send_heartbeats)
@@ -233,8 +229,6 @@ class ClientCore:
                     await close()
                 except ParamClientError as error:
                     logger.warning("%s: %s", self.link.name, error)
-            if self._keeper is not None:
-                await self._keeper.close()
 
     def _link_ended(self) -> None:
         self.is_over = not self.station.gate.is_closed

@@ -72,7 +72,7 @@ class Resynced:
     Attributes:
         component: the component of the table.
         changed: names of the parameters that had changed.
-        hash: the vehicle's hash that confirms the table; None for a vehicle without a hash.
+        hash: PX4's hash or ArduPilot's checksum that confirms the table; None without one.
     """
 
     component: Component

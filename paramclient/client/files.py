@@ -31,7 +31,6 @@ class Ftp:
         self,
         path: str,
         *,
-        read_size: int = ftp.DATA_SIZE_MAX,
         size_max: int = ftp.FILE_SIZE_MAX,
         progress: Callable[[int, int | None], None] | None = None,
         timeout: float | None = None,
@@ -40,7 +39,6 @@ class Ftp:
 
         Args:
             path: of the file, as the component names it.
-            read_size: bytes of each read, 1 to 239.
             size_max: bytes, at most.
             progress: called with the bytes received and the size, which is an estimate for generated files.
             timeout: seconds; None waits as long as the component answers.
@@ -52,9 +50,7 @@ class Ftp:
             LinkError: the link failed, or the client was closed.
         """
         with self._channel(path, timeout) as channel:
-            return await ftp.read_file(
-                channel, path, read_size=read_size, size_max=size_max, progress=progress
-            )
+            return await ftp.read_file(channel, path, size_max=size_max, progress=progress)
 
     async def list(self, path: str, *, timeout: float | None = None) -> list[ftp.DirectoryEntry]:
         """Return the entries of a directory.

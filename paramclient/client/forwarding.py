@@ -20,10 +20,8 @@ __all__ = ["Forwarder"]
 QUEUED_FRAMES_MAX: Final = 1_000
 """Maximum number of frames queued for a slow program; further frames are dropped. A parameter list, which PX4
 sends in bursts, fits."""
-PROGRAM_BACKOFF_MIN: Final = 0.5
-"""Seconds before the first attempt to reopen the link to the program; doubled after each attempt."""
-PROGRAM_BACKOFF_MAX: Final = 5.0
-"""Maximum seconds between two attempts to reopen the link to the program."""
+PROGRAM_RETRY_INTERVAL: Final = 1.0
+"""Seconds between two attempts to reopen the link to the program, which is usually on this machine."""
 
 logger = logging.getLogger(__name__)
 
@@ -104,11 +102,9 @@ class Forwarder(Tap):
             await self._something_waits.wait()
 
     async def _reach(self) -> None:
-        """Reopen the link with backoff, without a time limit."""
-        backoff = PROGRAM_BACKOFF_MIN
+        """Reopen the link, without a time limit."""
         while not self._is_there:
-            await anyio.sleep(backoff)
-            backoff = min(2 * backoff, PROGRAM_BACKOFF_MAX)
+            await anyio.sleep(PROGRAM_RETRY_INTERVAL)
             with suppress(LinkError):
                 await self._link.open()
                 self._is_there = True

@@ -98,13 +98,11 @@ class LinkTask:
             try:
                 chunks = await self._link.receive()
             except LinkError as error:
-                if not self._link.reconnects:
-                    self.station.fail(error, for_good=True)
-                    self._ended()
-                    self.notify()
-                    return
-                await self._reconnect(error)
-                continue
+                if self._link.reconnects:
+                    await self._reconnect(error)
+                    continue
+                self.station.fail(error, for_good=True)
+                chunks = []
             if not chunks:
                 self._ended()
                 self.notify()

@@ -1,6 +1,6 @@
 """Parameter files: formats of QGroundControl, MAVProxy and Mission Planner, packed files, JSON.
 
-- `formats`, `param_file`: the known formats, the content of a file.
+- `formats`: the known formats, and the content of a file.
 - `conversion`, `disk`: from and to bytes, reading and replacing a file.
 - `line_formats`, `param_pck`, `json_format`: lists of ground stations, packed files, JSON.
 - `rename_file`: files of names that firmware versions have changed.
@@ -9,8 +9,7 @@
 
 from paramclient.files.conversion import LARGEST_FILE, dumps, loads
 from paramclient.files.disk import read_file, write_file
-from paramclient.files.formats import FileFormat
-from paramclient.files.param_file import ParamFile
+from paramclient.files.formats import FileFormat, ParamFile
 from paramclient.files.rename_file import loads_renames, read_renames
 
 __all__ = [

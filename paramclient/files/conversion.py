@@ -8,9 +8,8 @@ from typing import Final, TypeAlias
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files import json_format, line_formats, param_pck
-from paramclient.files.formats import ENDINGS, FileFormat, parse_format
+from paramclient.files.formats import AUTOPILOT, ENDINGS, FileFormat, ParamFile, address, parse_format
 from paramclient.files.includes import Includes
-from paramclient.files.param_file import AUTOPILOT, ParamFile, address
 from paramclient.files.text import decode_text, lines_of, time_of
 from paramclient.model.identity import autopilot_name, version_text
 from paramclient.model.paramset import ParamSet

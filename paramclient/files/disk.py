@@ -13,9 +13,8 @@ from typing import Final
 
 from paramclient.errors import FileError
 from paramclient.files.conversion import LARGEST_FILE, dumps, loads
-from paramclient.files.formats import FileFormat, format_of_name, parse_format
+from paramclient.files.formats import FileFormat, ParamFile, format_of_name, parse_format
 from paramclient.files.includes import Includes
-from paramclient.files.param_file import ParamFile
 from paramclient.model.paramset import ParamSet
 
 __all__ = [

@@ -1,15 +1,30 @@
-"""FileFormat: the supported file formats, and their file extensions."""
+"""Parameter files: FileFormat, the supported formats with their extensions, and ParamFile, the content."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import PurePath
 from typing import Final
 
 from paramclient.errors import FileError, UsageError
+from paramclient.model.paramset import ParamSet
 
-__all__ = ["ENDINGS", "FileFormat", "LogFormat", "format_of_name", "parse_format"]
+__all__ = [
+    "AUTOPILOT",
+    "ENDINGS",
+    "FileFormat",
+    "LogFormat",
+    "ParamFile",
+    "TooManyParams",
+    "address",
+    "format_of_name",
+    "parse_format",
+]
+
+AUTOPILOT: Final = 1
+"""MAV_COMP_ID_AUTOPILOT1: the component of a file that names no component."""
 
 
 class FileFormat(StrEnum):
@@ -79,3 +94,73 @@ def format_of_name(name: str) -> FileFormat:
 
 def _listed(names: Iterable[str]) -> str:
     return ", ".join(names)
+
+
+@dataclass(frozen=True, slots=True)
+class ParamFile:
+    """The content of a parameter file.
+
+    Attributes:
+        sets: the parameters, one set per component, in the order of the file.
+        file_format: the format.
+        source: the file's name, as given.
+        header: the comment lines at the top, without comment characters.
+        footer: the comment lines after the last parameter. All others belong to the parameter below them.
+        notes: remarks for the user, in sentences: repeated lines, parts left out.
+    """
+
+    sets: tuple[ParamSet, ...]
+    file_format: FileFormat | LogFormat
+    source: str = ""
+    header: tuple[str, ...] = ()
+    footer: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def is_extended(self) -> bool:
+        """Whether the file has extended parameters."""
+        return any(each.is_extended for each in self.sets)
+
+    def choose(self, component: int | None = None, *, system: int | None = None) -> ParamSet:
+        """Return the set of a component.
+
+        A set without system or component id matches every id.
+
+        Args:
+            component: component id; None for the autopilot, or for the only component.
+            system: system id; None for the only one that matches.
+
+        Raises:
+            FileError: no set or several sets match. The error lists the sets.
+        """
+        fits = [each for each in self.sets if system is None or each.system in (None, system)]
+        if component is not None:
+            fits = [each for each in fits if each.component in (None, component)]
+        elif len(fits) > 1:
+            fits = [each for each in fits if each.component in (None, AUTOPILOT)]
+        if len(fits) == 1:
+            return fits[0]
+        wanted = f"{'any system' if system is None else f'system {system}'}, "
+        wanted += "the autopilot" if component is None else f"component {component}"
+        there = ", ".join(map(address, self.sets))
+        many = "several sets match" if fits else "no set matches"
+        raise FileError(f"{many} ({wanted}); the file contains {there}", source=self.source)
+
+    def __repr__(self) -> str:
+        description = ", ".join(f"{address(each)}: {len(each)}" for each in self.sets)
+        return f"<ParamFile {self.source or 'unnamed'} {self.file_format} {description}>"
+
+
+class TooManyParams(FileError):
+    """A file holds more parameters than its reader takes. The rest of the file was not read."""
+
+    @classmethod
+    def check(cls, count: int, params_max: int | None, source: str) -> None:
+        """Raise it if there are more than `params_max`; None is no limit."""
+        if params_max is not None and count > params_max:
+            raise cls(f"the file holds more than {params_max:,} parameters", source=source)
+
+
+def address(params: ParamSet) -> str:
+    """Return the system and component id of a set, `1/100`, with a question mark for an unknown id."""
+    return "/".join("?" if each is None else str(each) for each in (params.system, params.component))

@@ -26,9 +26,8 @@ from datetime import datetime
 from typing import Final
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.formats import FileFormat
+from paramclient.files.formats import FileFormat, ParamFile, TooManyParams
 from paramclient.files.json_reader import Checks, Place, Reader, between, found, read_json_text, typed
-from paramclient.files.param_file import ParamFile, TooManyParams
 from paramclient.files.text import as_type, is_plain, time_of
 from paramclient.model.ext_values import (
     EXT_VALUE_SIZE,

@@ -15,9 +15,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.formats import FileFormat
+from paramclient.files.formats import AUTOPILOT, FileFormat, ParamFile, TooManyParams
 from paramclient.files.includes import Includes
-from paramclient.files.param_file import AUTOPILOT, ParamFile, TooManyParams
 from paramclient.files.text import (
     Builder,
     Problems,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from paramclient.errors import FileError, PackError, UsageError
-from paramclient.files.formats import FileFormat
-from paramclient.files.param_file import ParamFile
+from paramclient.files.formats import FileFormat, ParamFile
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, bits_of, from_bits, same_bits, type_name
 from paramclient.protocol import param_pck

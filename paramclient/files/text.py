@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.param_file import TooManyParams
+from paramclient.files.formats import TooManyParams
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, WireValue, bits_of, format_value, from_bits, type_name
 

@@ -28,11 +28,14 @@ class Transport(asyncio.Protocol):
 
     Takes bytes from the operating system as they arrive, up to `UNREAD_BYTES_MAX`. Bytes to send wait for the
     operating system, one frame at a time.
+
+    Attributes:
+        unread: received bytes that wait for a reader.
     """
 
     def __init__(self) -> None:
         self._chunks: deque[bytes] = deque()
-        self._unread = 0
+        self.unread = 0
         self._changed = anyio.Event()
         self._may_write = anyio.Event()
         self._may_write.set()
@@ -63,7 +66,7 @@ class Transport(asyncio.Protocol):
             raise self._loss
         data = b"".join(self._chunks)
         self._chunks.clear()
-        self._unread = 0
+        self.unread = 0
         self._transport.resume_reading()
         return data
 
@@ -87,8 +90,8 @@ class Transport(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         self._chunks.append(data)
-        self._unread += len(data)
-        if self._unread >= UNREAD_BYTES_MAX:
+        self.unread += len(data)
+        if self.unread >= UNREAD_BYTES_MAX:
             self._transport.pause_reading()
         self._changed.set()
 

@@ -1,6 +1,6 @@
 """Telemetry logs and on-board logs as sources of parameters.
 
-- `telemetry`, `onboard_import`, `imported_table`: import of both kinds into a cache, and its result.
-- `onboard`, `logged_params`: reading of on-board logs, and their content.
+- `telemetry`, `onboard`: both kinds of logs, and their import into a cache.
+- `logged_params`: the content of logs.
 - `dataflash`, `ulog`: one module for each format of on-board logs.
 """

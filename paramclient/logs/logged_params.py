@@ -1,4 +1,4 @@
-"""OnboardLog: the parameters of one flight as an autopilot recorded them, with their changes."""
+"""Contents of logs: OnboardLog, the parameters of one flight; ImportedTable, the result of an import."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from paramclient.files.formats import LogFormat
-from paramclient.files.param_file import AUTOPILOT
+from paramclient.files.formats import AUTOPILOT, LogFormat
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import WireValue
 
-__all__ = ["LoggedChange", "OnboardLog", "log_link"]
+__all__ = ["ImportedTable", "LoggedChange", "OnboardLog", "log_link"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +84,30 @@ class OnboardLog:
             at=self.unix_time(time),
             source=self.source,
         )
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedTable:
+    """The imported table of one component.
+
+    Attributes:
+        key: the key of the vehicle's tables in the cache.
+        system, component: its address.
+        autopilot: MAV_AUTOPILOT of its heartbeat, or None.
+        params: the number of received parameters, plain and extended.
+        complete: whether the plain table is complete; the extended one if there are no plain parameters.
+        hash: the PX4 hash that confirms the table at the end of the log, or None.
+        notes: parts that were skipped of files that a ground station read over MAVFTP, in sentences.
+    """
+
+    key: str
+    system: int
+    component: int
+    autopilot: int | None
+    params: int
+    complete: bool
+    hash: int | None
+    notes: tuple[str, ...] = ()
 
 
 def log_link(path: str) -> str:

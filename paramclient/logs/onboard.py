@@ -1,20 +1,27 @@
-"""Reading of on-board logs: ArduPilot's dataflash logs and PX4's ULog files."""
+"""On-board logs, ArduPilot's dataflash logs and PX4's ULog files: reading, and import into a cache."""
 
 from __future__ import annotations
 
 import io
 import os
 import stat
-from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from functools import partial
 from pathlib import Path
 from typing import Final
 
-from paramclient.errors import FileError, UsageError
-from paramclient.files.formats import LogFormat
-from paramclient.logs.logged_params import OnboardLog
+import anyio.to_thread
 
-__all__ = ["is_onboard_log", "read_onboard_log"]
+from paramclient.cache import ParamCache, StoredParam, TableUpdate
+from paramclient.errors import FileError, UsageError
+from paramclient.files.formats import AUTOPILOT, LogFormat
+from paramclient.logs.logged_params import ImportedTable, OnboardLog
+from paramclient.model.paramset import WrittenParam
+from paramclient.model.values import Param, ParamType, Trust, bits_of, from_bits
+
+__all__ = ["import_onboard_log", "is_onboard_log", "read_onboard_log"]
 
 ULOG_MAGIC: Final = b"ULog\x01\x12\x35"
 """The first bytes of a ULog file."""
@@ -78,3 +85,95 @@ def _reader_of(file_format: LogFormat, source: str) -> Callable[[str], OnboardLo
     except ImportError:
         raise UsageError(f"{source}: ULog files need pyulog: pip install 'paramclient[logs]'") from None
     return read_ulog
+
+
+async def import_onboard_log(path: str | os.PathLike[str], cache: ParamCache) -> ImportedTable:
+    """Import the parameters of an on-board log into a cache, in one transaction.
+
+    Each value and each change has the time of the log. Later observations in the cache stay unchanged, so
+    logs may be imported in any order and repeatedly. A log does not say whether it has all parameters of the
+    vehicle: the table is complete only after a fetch. A dataflash log has no types: they are those of the
+    vehicle's cached table, else those that most cached vehicles of the same autopilot have, else REAL32.
+
+    Args:
+        path: the log.
+        cache: the cache to write to.
+
+    Raises:
+        FileError: as from `read_onboard_log`; or the log has no UTC time or no system id.
+        UsageError: a ULog file, and pyulog is not installed.
+        CacheError: the cache cannot be written.
+    """
+    log = await anyio.to_thread.run_sync(read_onboard_log, path)
+    return await anyio.to_thread.run_sync(partial(_store, log, cache))
+
+
+def _store(log: OnboardLog, cache: ParamCache) -> ImportedTable:
+    identity = log.identity
+    if log.boot_time is None:
+        raise FileError(
+            "not imported: the log has no UTC time, as no GPS receiver had a fix, so its values cannot be "
+            "ordered with those in the cache. show, diff and save can read it",
+            source=log.source,
+        )
+    if not identity.system:
+        raise FileError("not imported: the log has no system id", source=log.source)
+    types = _types(log, cache)
+    update = partial(TableUpdate, identity=identity, component=AUTOPILOT, autopilot=identity.autopilot)
+    at = log.boot_time + log.began
+    initial = [StoredParam.of(_param(written, types), at) for written in log.initial.values()]
+    updates = [update(at=at, params=initial)]
+    for change in log.changes:
+        first = log.initial.get(change.name, WrittenParam(change.name, change.value))
+        at = log.boot_time + change.time
+        changed = WrittenParam(change.name, change.value, first.type_number, first.default)
+        param = _param(changed, types)
+        updates.append(update(at=at, params=[StoredParam.of(param, at)]))
+    cache.merge(updates)
+    notes = log.notes
+    if untyped := sum(param.type_number is None and name not in types for name, param in log.initial.items()):
+        notes += (f"the log has no types: {untyped} parameters that no cached table has are REAL32",)
+    return ImportedTable(
+        identity.key,
+        identity.system,
+        AUTOPILOT,
+        identity.autopilot,
+        params=len(log.at_end()),
+        complete=False,
+        hash=None,
+        notes=notes,
+    )
+
+
+def _types(log: OnboardLog, cache: ParamCache) -> Mapping[str, ParamType | int]:
+    """Return types by name: those of the vehicle's cached table, else the most frequent ones."""
+    if all(param.type_number is not None for param in log.initial.values()):
+        return {}
+    own: dict[str, ParamType | int] = {}
+    others: dict[str, Counter[ParamType | int]] = {}
+    for summary in cache.components():
+        if summary.autopilot != log.identity.autopilot:
+            continue
+        table = cache.load(summary.key, summary.component)
+        if table is None:  # another process may have removed it
+            continue
+        if summary.key == log.identity.key and summary.component == AUTOPILOT:
+            own = {name: param.type_number for name, param in table.params.items()}
+        for name, param in table.params.items():
+            others.setdefault(name, Counter())[param.type_number] += 1
+    return {name: types.most_common(1)[0][0] for name, types in others.items()} | own
+
+
+def _param(written: WrittenParam, types: Mapping[str, ParamType | int]) -> Param:
+    """Return a logged value as a parameter; as a REAL32 if its type is unknown or cannot hold it."""
+    kind = types.get(written.name, ParamType.REAL32) if written.type_number is None else written.type_number
+    try:
+        bits = written.bits_as(kind)
+    except UsageError:
+        kind = ParamType.REAL32
+        bits = written.bits_as(kind)
+    default = None
+    if written.default is not None:
+        with suppress(UsageError):
+            default = from_bits(bits_of(written.default, kind), kind)
+    return Param(written.name, from_bits(bits, kind), kind, None, bits, Trust.CACHED, default)

@@ -15,7 +15,7 @@ import anyio.to_thread
 from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.links.replay import LOG_PEER
 from paramclient.links.tlog import Record, open_log, read_records
-from paramclient.logs.imported_table import ImportedTable
+from paramclient.logs.logged_params import ImportedTable
 from paramclient.model.identity import Identity
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.events import Change

@@ -148,7 +148,7 @@ class _Files:
         number, path = found.groups()
         other: Component | None = self.component
         if number is not None and int(number) != self.component.component:
-            other = self.component.siblings.get((self.component.system, int(number)))
+            other = self.component.client.components.get((self.component.system, int(number)))
         if other is None:
             raise MetadataError(
                 f"{self.label} announces its metadata at {uri}, but component {number} has not been heard",

@@ -5,10 +5,9 @@ words.
   identity.
 - `ext_values`: values of extended parameters, with text and bytes.
 - `defaults`: the firmware's default of a parameter, of the vehicle or its metadata.
-- `comparison`, `patterns`, `notation`: comparison of sets, selection of names, JSON notation.
-- `group_switches`: parameters that others depend on.
+- `comparison`, `notation`: comparison of sets, JSON notation.
+- `names`: selection of names, similar names, switches of groups.
 - `px4_hash`: PX4's hash of its parameters, and the ones that it excludes.
 - `renames`: names that firmware versions have changed, and the conversion of their values.
-- `similar_names`: names that are similar to a mistyped one.
 - `wording`: counts and lists of names in messages.
 """

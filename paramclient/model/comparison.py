@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from paramclient.errors import UsageError
+from paramclient.model.names import NameChoice
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.patterns import NameChoice
 from paramclient.model.renames import Renames
 from paramclient.model.values import ParamType, Value, WireValue, bits_of, from_bits, same_bits
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import TypeVar, overload
 
 from paramclient.model.defaults import add_default
-from paramclient.model.similar_names import unknown_name
+from paramclient.model.names import unknown_name
 from paramclient.model.values import Param, WireValue
 from paramclient.model.wording import counted
 
@@ -18,8 +18,7 @@ T = TypeVar("T")
 class ParamMap(Mapping[str, Param]):
     """Parameters by name: a read-only view of a table that may still change.
 
-    Copy the view, `dict(params)`, before iterating over it across an `await`: names may be added and removed
-    meanwhile.
+    An iteration is over the names at its start.
 
     Args:
         params: the table. It is not copied; its order is kept.
@@ -50,7 +49,7 @@ class ParamMap(Mapping[str, Param]):
         return name in self._params
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._params)
+        return iter(tuple(self._params))
 
     def __len__(self) -> int:
         return len(self._params)
@@ -65,7 +64,7 @@ class ParamMap(Mapping[str, Param]):
                 name, such as `Metadata.defaults_of`. They become the `default` of the returned parameters.
         """
         described = defaults or {}
-        known = (add_default(param, described.get(name)) for name, param in self._params.items())
+        known = (add_default(param, described.get(name)) for name, param in tuple(self._params.items()))
         return {param.name: param for param in known if param.is_changed}
 
     def __repr__(self) -> str:

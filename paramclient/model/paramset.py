@@ -8,8 +8,7 @@ from typing import TypeVar, overload
 
 from paramclient.errors import UsageError
 from paramclient.model.identity import Identity
-from paramclient.model.patterns import NameChoice
-from paramclient.model.similar_names import unknown_name
+from paramclient.model.names import NameChoice, unknown_name
 from paramclient.model.values import (
     WIRE_SIZE,
     Param,

@@ -35,6 +35,7 @@ __all__ = [
     "as_reported",
     "bits_of",
     "check_name",
+    "check_portable_name",
     "check_value",
     "decode_value",
     "encode_value",
@@ -295,6 +296,21 @@ def is_portable_name(name: str) -> bool:
     ArduPilot consist of capitals, digits and `_`.
     """
     return _portable(name) is not None
+
+
+def check_portable_name(name: str) -> str:
+    """Check and return a parameter name.
+
+    Raises:
+        UsageError: the name is not a valid param_id, or no parameter file can hold it. The client ignores
+            such names when a vehicle sends them.
+    """
+    if not is_portable_name(check_name(name)):
+        raise UsageError(
+            f"parameter name {name!r}: no parameter file can hold it, so the client ignores it; a name has"
+            " a letter, no space and none of # , ; = ; it begins with neither @ nor / and does not end with :"
+        )
+    return name
 
 
 def check_value(value: Settable) -> WireValue:

@@ -24,13 +24,13 @@ from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, en
 from paramclient.protocol.session import Session
 from paramclient.protocol.table import Table
 
-__all__ = ["CHECKED_READ_SIZE", "ChecksumUnavailable", "may_be_rounded", "prove"]
+__all__ = ["CHECKED_READ_SIZE", "ChecksumUnavailable", "TableDiffers", "may_be_rounded", "prove"]
 
 CHECKED_READ_SIZE: Final = 64
 """Bytes that ArduPilot reads at a time for a checksum: the padding of the file depends on it (measured)."""
 AT_ONCE: Final = 5
 """Requests sent at once: ArduPilot's queue has 5 places, and drops the surplus silently (measured)."""
-INTERVAL: Final = 0.004
+INTERVAL: Final = 0.005
 """Seconds between further requests: ArduPilot keeps up with one in 3 ms (measured)."""
 LOST: Final = 1e-3
 """Probability that all first requests are lost, at which MAVFTP counts as silent."""
@@ -44,7 +44,7 @@ MEASURED: Final = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|ARSPD\d?_O
 """Names that each start of the vehicle measures again (measured)."""
 MOVING_MAX: Final = 12
 """Values that are read one by one for their own sake; a table with more of them is downloaded."""
-PASSES_MAX: Final = 4
+SEARCHES_MAX: Final = 4
 """Searches for changed values; each finds one at least."""
 PLACES_MAX: Final = 4
 """Ranges that differ, at most, for a search to go on."""
@@ -54,7 +54,9 @@ PARTS_MAX: Final = 12
 PART_TIME: Final = 0.01
 """Seconds of round trip for each further part: on a quick link halving takes the fewest bytes, and on a slow
 one many parts take the fewest round trips."""
-SEARCH_TIME_MAX: Final = 0.2
+QUICK_ROUND_TRIP: Final = 0.05
+"""Seconds of round trip up to which values that move are read before anything is searched."""
+SEARCH_TIME_MAX: Final = 0.3
 """Seconds that the last requests took, above which a download of the file is quicker than a search."""
 
 
@@ -72,6 +74,10 @@ class ChecksumUnavailable(Exception):
         self.is_silent = is_silent
 
 
+class TableDiffers(ChecksumUnavailable):
+    """The vehicle's table is another one, and a search is not worth it."""
+
+
 async def prove(session: Session) -> tuple[str, ...]:
     """Prove a complete table by the vehicle's checksum, after reading the values that have changed.
 
@@ -79,7 +85,8 @@ async def prove(session: Session) -> tuple[str, ...]:
         The names whose values have changed, except for those that move by themselves.
 
     Raises:
-        ChecksumUnavailable: the vehicle computes no checksum now, or its table is too different.
+        ChecksumUnavailable: the vehicle computes no checksum now.
+        TableDiffers: its table is too different.
         LinkError: the link is closed for good.
     """
     table = session.table
@@ -114,24 +121,27 @@ class _Proof:
         """Compare, and read what differs.
 
         Raises:
-            ChecksumUnavailable: the tables are too different.
+            TableDiffers: the tables are too different.
         """
         if await self._agrees():
             return
         moving = list(self._moving())
         if len(moving) > MOVING_MAX:
-            raise ChecksumUnavailable(f"{len(moving)} values of the cached table are not exact")
-        await self._read(moving)
+            raise TableDiffers(f"{len(moving)} values of the cached table are not exact")
+        whole = range(len(self._rows))
+        places = await self._round([whole] if self._round_trip > QUICK_ROUND_TRIP else [], moving)
         boot_count = next((at for at, row in enumerate(self._rows) if row.name == BOOT_COUNT), None)
         if boot_count is None or boot_count in self._changed:
-            await self._read([at for at, row in enumerate(self._rows) if MEASURED.fullmatch(row.name)])
-        for _ in range(PASSES_MAX):
-            if self._is_equal() or self._last_time > SEARCH_TIME_MAX:
-                break
-            await self._search()
+            places = await self._round(
+                [], [at for at, row in enumerate(self._rows) if MEASURED.fullmatch(row.name)]
+            )
+        searches = 0
+        while not self._is_equal() and self._last_time <= SEARCH_TIME_MAX and searches < SEARCHES_MAX:
+            places = await self._round(places or [whole])
+            searches += not places
         if self._is_equal() or await self._agrees():
             return
-        raise ChecksumUnavailable(TOO_MANY)
+        raise TableDiffers(TOO_MANY)
 
     def _moving(self) -> Iterator[int]:
         """Return the indices of values that probably are others, or that may be rounded."""
@@ -149,31 +159,30 @@ class _Proof:
     def _is_equal(self) -> bool:
         return self._checksum == self._computed(range(len(self._rows)))
 
-    async def _read(self, indices: Sequence[int]) -> None:
-        """Take over the values at some indices."""
-        began = anyio.current_time()
-        found = await self._request([range(at, at + 1) for at in indices])
-        for at, each in zip(indices, found, strict=True):
-            self._solve(at, each, began)
+    async def _round(self, places: list[range], indices: Sequence[int] = ()) -> list[range]:
+        """Take over the values at some indices, and ask for the parts of ranges that differ.
 
-    async def _search(self) -> None:
-        """Take over at least one value that differs: split what differs, until single ones are left."""
-        places = [range(len(self._rows))]
-        while places:
-            if len(places) > PLACES_MAX:
-                raise ChecksumUnavailable(TOO_MANY)
-            began = anyio.current_time()
-            splits = [self._split(place) for place in places]
-            asked = [part for parts in splits for part in parts[:-1] or parts]
-            found = dict(zip(asked, await self._request(asked), strict=True))
-            places.clear()
-            for parts in splits:
-                differing = [part for part in parts if part in found and found[part] != self._computed(part)]
-                for part in differing or parts[-1:]:  # if no other one does, the last one differs
-                    if len(part) == 1 and part in found:
-                        self._solve(part.start, found[part], began)
-                    else:
-                        places.append(part)
+        Returns:
+            The parts that differ; the value of a part of one parameter is taken over instead.
+        """
+        if len(places) > PLACES_MAX:
+            raise TableDiffers(TOO_MANY)
+        began = anyio.current_time()
+        single = [range(at, at + 1) for at in indices]
+        splits = [self._split(place) for place in places]
+        asked = [*single, *(part for parts in splits for part in parts[:-1] or parts)]
+        found = dict(zip(asked, await self._request(asked), strict=True))
+        for part in single:
+            self._solve(part.start, found[part], began)
+        remaining = []
+        for parts in splits:
+            differing = [part for part in parts if part in found and found[part] != self._computed(part)]
+            for part in differing or parts[-1:]:  # if no other one does, the last one differs
+                if len(part) == 1 and part in found:
+                    self._solve(part.start, found[part], began)
+                else:
+                    remaining.append(part)
+        return remaining
 
     def _split(self, place: range) -> list[range]:
         count = min(1 + max(1, int(self._round_trip / PART_TIME)), PARTS_MAX)
@@ -185,7 +194,7 @@ class _Proof:
         row = self._rows[at]
         difference = crc32_px4_before(found ^ self._computed(range(at, at + 1)), row.type.size)
         if difference >> 8 * row.type.size:
-            raise ChecksumUnavailable("the vehicle has other parameters than the cached table")
+            raise TableDiffers("the vehicle has other parameters than the cached table")
         if difference:
             self._rows[at] = row._replace(bits=row.bits ^ difference)
             self._changed[at] = requested_at
@@ -227,20 +236,15 @@ class _Proof:
         await anyio.sleep(max(self._turn_at - now, 0.0))
 
     def take_over(self) -> tuple[str, ...]:
-        """Put the proven file into the table; return the names of changed values that do not move."""
+        """Put the proven file into the table, and learn which values change; return their names."""
         table = self._session.table
         names = [self._rows[at].name for at in self._changed]
-        moving = table.volatile
         if names:
             table.volatile = frozenset(names)
         for at, moment in self._changed.items():
             table.store_entry(self._rows[at], at, moment, with_defaults=False)
         table.prove(self._checksum)
-        return tuple(
-            name
-            for name in names
-            if name not in moving and not MOVING.fullmatch(name) and not MEASURED.fullmatch(name)
-        )
+        return tuple(name for name in names if not (MOVING.fullmatch(name) or MEASURED.fullmatch(name)))
 
 
 def _row(table: Table, name: str) -> PackedParam:

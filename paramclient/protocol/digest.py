@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from paramclient.errors import NoReply, UnknownParameter
-from paramclient.protocol.checksum import ChecksumUnavailable, prove
+from paramclient.protocol.checksum import ChecksumUnavailable, TableDiffers, prove
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK
 
-__all__ = ["Answer", "ask", "is_answered", "request_digest"]
+__all__ = ["Answer", "ask", "may_confirm", "request_digest"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +28,7 @@ class Answer:
         changed: the names whose values were others, and were read.
         reason: why an ArduPilot confirms nothing, as a sentence; or empty.
         is_silent: whether that was because it does not answer to MAVFTP.
+        is_other: whether that was because its table is another one.
     """
 
     is_current: bool = False
@@ -35,11 +36,12 @@ class Answer:
     changed: tuple[str, ...] = ()
     reason: str = ""
     is_silent: bool = False
+    is_other: bool = False
 
 
-def is_answered(session: Session) -> bool:
-    """Return whether the vehicle has answered the question."""
-    return session.table.hash is not None or session.serves_checksum is True
+def may_confirm(session: Session) -> bool:
+    """Return whether the vehicle has confirmed the table, or computes a checksum as far as known."""
+    return session.table.hash is not None or _may_prove(session)
 
 
 async def ask(session: Session) -> Answer:
@@ -52,7 +54,8 @@ async def ask(session: Session) -> Answer:
         try:
             return Answer(is_current=True, changed=await prove(session))
         except ChecksumUnavailable as error:
-            return Answer(reason=error.reason, is_silent=error.is_silent)
+            is_other = isinstance(error, TableDiffers)
+            return Answer(reason=error.reason, is_silent=error.is_silent, is_other=is_other)
     digest = await request_digest(session)
     if not session.table.agrees_with(digest):
         return Answer(digest=digest)
@@ -76,7 +79,8 @@ async def request_digest(session: Session) -> Digest | None:
 
 
 def _may_prove(session: Session) -> bool:
-    identification = session.identification
-    is_possible = identification.is_ardupilot and identification.may_serve_file and session.table.is_complete
+    identification, table = session.identification, session.table
+    has_table = bool(table.names) and table.is_complete
+    is_possible = identification.is_ardupilot and identification.may_serve_file and has_table
     is_served = session.serves_file is not False and session.serves_checksum is not False
     return is_possible and is_served and not session.dialect.has_ack

@@ -66,7 +66,7 @@ class Resynced:
 
     Attributes:
         changed: the names of parameters that had changed.
-        hash: the hash that confirms the table, or None without one.
+        hash: PX4's hash or ArduPilot's checksum that confirms the table, or None.
     """
 
     changed: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Identity and parameter encoding of a component, from HEARTBEAT and AUTOPILOT_VERSION."""
+"""Identity, kind and parameter encoding of a component, from HEARTBEAT and AUTOPILOT_VERSION."""
 
 from __future__ import annotations
 
@@ -12,16 +12,19 @@ from paramclient.errors import CommandResult, NoReply
 from paramclient.model.identity import Identity
 from paramclient.model.values import Encoding
 from paramclient.protocol.channel import Channel
+from paramclient.wire.frames import enum_word
 from paramclient.wire.messages import (
     CAPABILITY_FTP,
     CAPABILITY_PARAM_ENCODE_BYTEWISE,
     CAPABILITY_PARAM_ENCODE_C_CAST,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
+    MAV_AUTOPILOT_GENERIC,
     MAV_AUTOPILOT_INVALID,
     MAV_AUTOPILOT_PX4,
     MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
     MAV_CMD_REQUEST_MESSAGE,
     MAV_TYPE_GCS,
+    MAV_TYPE_GENERIC,
     AutopilotVersion,
     CommandAck,
     CommandLong,
@@ -31,7 +34,7 @@ from paramclient.wire.messages import (
     message_id,
 )
 
-__all__ = ["HEARTBEAT_WAIT", "Identification", "judge_encoding"]
+__all__ = ["HEARTBEAT_WAIT", "Identification", "expects_extended", "judge_encoding", "kind_in_words"]
 
 HEARTBEAT_WAIT: Final = 1.2
 """Seconds in which a component's first heartbeat is awaited: its interval, and a fifth of it for jitter."""
@@ -41,6 +44,13 @@ VERSION_ATTEMPTS_MAX: Final = 12
 """Requests for AUTOPILOT_VERSION: cameras and radios often have none."""
 VERSION_ATTEMPTS_REFUSED: Final = 4
 """Requests after the first refusal, by both commands in turns: a refusal may concern only one of them."""
+_AUTOPILOTS: Final = {MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot", MAV_AUTOPILOT_PX4: "PX4"}
+_VEHICLES: Final = {1: "plane", MAV_TYPE_GCS: "ground station", 10: "rover", 11: "boat"}
+"""Names of MAV_TYPE for users, where they differ from those of the enumeration."""
+_EXTENDED_TYPES: Final = frozenset({26, 30, 42, 44, 48})
+"""MAV_TYPE of payloads: GIMBAL, CAMERA, WINCH, ILLUMINATOR, GRIPPER (MAVLink common message set)."""
+_EXTENDED_COMPONENTS: Final = frozenset({*range(100, 106), 154, 159, 169, *range(171, 176), 243})
+"""MAV_COMP_ID of payloads: CAMERA to CAMERA6, GIMBAL, QX1_GIMBAL, WINCH, GIMBAL2 to GIMBAL6, ILLUMINATOR."""
 
 
 def judge_encoding(
@@ -262,3 +272,35 @@ class Identification:
         self.encoding, self.encoding_reason = judge_encoding(self.chosen, self.capabilities, self.autopilot)
         self._changed.set()
         self._changed = anyio.Event()
+
+
+def kind_in_words(autopilot: int | None, kind: int | None) -> str:
+    """Return autopilot and vehicle type as text, `PX4 quadrotor`; "" where neither is known or says
+    anything.
+
+    Args:
+        autopilot: MAV_AUTOPILOT, or None.
+        kind: MAV_TYPE, or None.
+    """
+    words = []
+    if autopilot not in (None, MAV_AUTOPILOT_GENERIC, MAV_AUTOPILOT_INVALID):
+        words.append(_AUTOPILOTS.get(autopilot) or _name_or_number("MAV_AUTOPILOT", "autopilot", autopilot))
+    if kind is not None and (kind != MAV_TYPE_GENERIC or not words):
+        words.append(_VEHICLES.get(kind) or _name_or_number("MAV_TYPE", "type", kind))
+    return " ".join(words)
+
+
+def expects_extended(vehicle_type: int | None, component: int) -> bool:
+    """Return whether a component is of a kind that usually has extended parameters.
+
+    Args:
+        vehicle_type: MAV_TYPE of its heartbeat, or None before the first one.
+        component: its component id.
+    """
+    return vehicle_type in _EXTENDED_TYPES or component in _EXTENDED_COMPONENTS
+
+
+def _name_or_number(enum: str, what: str, number: int) -> str:
+    """Return the name of a number, or the number with the kind of number."""
+    word = enum_word(enum, number)
+    return f"{what} {word}" if word.isdecimal() else word

@@ -78,6 +78,7 @@ class Node:
         plain, extended: the parameters.
         peer, since, is_split: as given; a vehicle may move to another peer.
         rival: another live peer that uses the same ids, and when it was heard; None without one.
+        told_rival: the one of which the user was warned.
         version: of MAVLink, 1 or 2, by its last message.
         generation: counts how often the component was lost, has rebooted or was replaced: a conversation that
             sees another number than at its begin knows that values are of different times.
@@ -106,6 +107,7 @@ class Node:
         self.since = since
         self.is_split = is_split
         self.rival: tuple[Peer, float] | None = None
+        self.told_rival: Peer | None = None
         self.presence = Presence()
         self.channel = Channel(system, component, transmit, gate, self.presence)
         self.identification = Identification(system, link, encoding, listens_only=listens_only)

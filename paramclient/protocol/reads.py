@@ -17,7 +17,7 @@ from paramclient.errors import (
     UnknownParameter,
     VehicleError,
 )
-from paramclient.model.similar_names import did_you_mean, nearest_names
+from paramclient.model.names import did_you_mean, nearest_names
 from paramclient.model.values import Param, Trust
 from paramclient.protocol.channel import Inbox
 from paramclient.protocol.dialect import ReportedValue

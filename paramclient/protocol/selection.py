@@ -12,13 +12,14 @@ from typing import Final
 from paramclient.errors import AmbiguousVehicle
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.addresses import peer_in_words
-from paramclient.protocol.kinds import kind_in_words
+from paramclient.protocol.identity import kind_in_words
 from paramclient.protocol.node import Node
 from paramclient.protocol.station import Station
 from paramclient.wire.messages import AUTOPILOT_COMPONENT, MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS
 
 __all__ = [
     "LOOK_TIME",
+    "address_in_words",
     "autopilots_of",
     "find",
     "hint_of_link",
@@ -214,3 +215,11 @@ def _is_at(node: Node, peer: str | None) -> bool:
 
 def _is_peripheral(node: Node) -> bool:
     return node.component >= PERIPHERAL_IDS_MIN or node.identification.vehicle_type in _PERIPHERALS
+
+
+def address_in_words(system: int | None, component: int | None, peer: str | None = None) -> str:
+    """Return the component that a call waits for, for messages."""
+    at = "" if peer is None else f" at {peer}"
+    if component is None:
+        return f"an autopilot{at}" if system is None else f"an autopilot with system id {system}{at}"
+    return f"component {'*' if system is None else system}/{component}{at}"

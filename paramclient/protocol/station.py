@@ -302,8 +302,15 @@ class Station:
             if not is_sign or len(self.nodes) >= COMPONENTS_MAX:
                 return
             node = self._add(address, peer, now)
-        if peer != node.peer and not self._moves(node, peer, message, now):
-            return
+        if peer != node.peer:
+            if not self._moves(node, peer, message, now):
+                return
+        elif node.rival is not None and node.told_rival != node.rival[0]:  # both are there
+            node.told_rival = node.rival[0]
+            logger.warning(
+                "%s: messages of %d/%d arrive from %s too, and are ignored: two vehicles have the same ids",
+                *(self.link, node.system, node.component, peer_in_words(node.told_rival)),
+            )
         self._ended_peers.discard(peer)
         node.receive(message, now, frame.version)
 
@@ -315,11 +322,6 @@ class Station:
             node.peer = peer
             node.rival = None
             return True
-        if node.rival is None or node.rival[0] != peer:
-            logger.warning(
-                "%s: messages of %d/%d arrive from %s too, and are ignored: two vehicles have the same ids",
-                *(self.link, node.system, node.component, peer_in_words(peer)),
-            )
         node.rival = (peer, now)
         return False
 

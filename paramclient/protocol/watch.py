@@ -12,7 +12,7 @@ import anyio
 
 from paramclient.errors import NoReply
 from paramclient.model.values import Param, Trust
-from paramclient.protocol.digest import ask, is_answered
+from paramclient.protocol.digest import ask, may_confirm
 from paramclient.protocol.events import Resynced
 from paramclient.protocol.fetch import Policy, fetch_all
 from paramclient.protocol.presence import Presence
@@ -100,7 +100,7 @@ class Watch:
     def check(self, *, older_than: float) -> None:
         """Check soon whether the table is current, if the vehicle confirms tables and did not so recently."""
         is_old = anyio.current_time() - self.confirmed_at > older_than
-        if is_old and self._is_fetched and is_answered(self._session):
+        if is_old and self._is_fetched and may_confirm(self._session):
             self._is_due = True
             self._signal.set()
 
@@ -154,7 +154,7 @@ class Watch:
         """Seconds until the next check without a sign of change."""
         if self._interval is not None:
             return self._interval or math.inf
-        return INTERVAL_DEFAULT if is_answered(self._session) else math.inf
+        return INTERVAL_DEFAULT if may_confirm(self._session) else math.inf
 
     @property
     def _may_check(self) -> bool:
@@ -170,7 +170,7 @@ class Watch:
         was_doubted = self._is_doubted
         before = self._before if was_doubted else table.view()
         answer = await ask(session)
-        if answer.reason and not was_doubted:
+        if answer.reason and not answer.is_other and not was_doubted:
             return  # another station's file is open, for example
         if not answer.is_current or any(param.trust is Trust.CACHED for param in table.params.values()):
             result = await fetch_all(session, refresh=not answer.is_current)

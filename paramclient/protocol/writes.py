@@ -22,8 +22,8 @@ from paramclient.errors import (
     ValueNotApplied,
     ValueUnsupported,
 )
-from paramclient.model.group_switches import is_group_switch
 from paramclient.model.identity import autopilot_name, reason_against_non_finite
+from paramclient.model.names import is_group_switch
 from paramclient.model.values import (
     Encoding,
     Param,

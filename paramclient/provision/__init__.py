@@ -11,7 +11,6 @@ A component with extended parameters, `component.ext`, is set up by the same cal
 - `restore_point`: reads the snapshot that the last `apply` stored, and what has changed since.
 - `apply_rules`: parameters that `apply` leaves out, writes first or last, or reboots for; the list is
   `apply_rules.toml`.
-- `callbacks`: calls `before_writing`.
 """
 
 from __future__ import annotations

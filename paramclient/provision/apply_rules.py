@@ -12,8 +12,7 @@ from importlib import resources
 from typing import Any, Final
 
 from paramclient.errors import UsageError
-from paramclient.model.group_switches import is_group_switch
-from paramclient.model.patterns import NameChoice
+from paramclient.model.names import NameChoice, is_group_switch
 
 __all__ = ["CATEGORIES", "OUT_OF_RANGE", "READ_ONLY", "ApplyRule", "ApplyRules", "Choice", "rules_for"]
 

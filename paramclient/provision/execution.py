@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
 import anyio
 
-from paramclient.client.arguments import check_author
+from paramclient.cache import check_author
 from paramclient.client.component import Component
 from paramclient.errors import (
     AnotherVehicle,
@@ -31,7 +31,6 @@ from paramclient.model.renames import Renames
 from paramclient.model.values import WireValue
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
-from paramclient.provision.callbacks import call_and_wait
 from paramclient.provision.inspection import (
     POLL_INTERVAL,
     Inspection,
@@ -177,7 +176,7 @@ class ApplyRun:
             if self._options.before_writing is None:
                 await self._store_state()
         if self._options.before_writing is not None:
-            await call_and_wait(self._options.before_writing)
+            await _call_and_wait(self._options.before_writing)
             await self._store_state()
 
     def _check_plan(self) -> None:
@@ -417,7 +416,9 @@ class ApplyRun:
     async def _write_system_id(self, step: Step) -> None:
         """Set the system id, and continue with the vehicle under its new one."""
         system = int(step.value) if not isinstance(step.value, bytes) else 0
-        if any(self._is_other_vehicle_with(system, known) for known in self._component.siblings.values()):
+        if any(
+            self._is_other_vehicle_with(system, known) for known in self._component.client.components.values()
+        ):
             reason = f"another vehicle on this link has system id {system}"
             self._record(step, ApplyStatus.SKIPPED, step.before, reason, WRONG)
             return
@@ -440,7 +441,7 @@ class ApplyRun:
         async with anyio.create_task_group() as sending:
             sending.start_soon(cancel_if_id_is_kept)
             try:
-                self._component = await self._component.successor(
+                self._component = await self._component.client.successor(
                     self._component, system, timeout=SYSTEM_CHANGE_TIMEOUT
                 )
             except ParamClientError as error:  # raised here, the task group would wrap it in a group
@@ -527,7 +528,7 @@ class ApplyRun:
         with anyio.move_on_after(ARMED_STATE_TIMEOUT):
             while component.is_armed is None and component.state != "lost":  # noqa: ASYNC110 - no event
                 await anyio.sleep(POLL_INTERVAL)
-        own = [each for each in component.siblings.values() if each.system == component.system]
+        own = [each for each in component.client.components.values() if each.system == component.system]
         if any(each.is_armed for each in own):
             message = f"{self._address} is armed; nothing is set then"
         elif component.is_armed is None and component.state != "lost":
@@ -666,3 +667,10 @@ class ApplyRun:
         if self._is_action(name):
             return row(ApplyStatus.SET, "done by the vehicle")
         return row(ApplyStatus.ADJUSTED, "the vehicle acknowledged it, and changed it afterwards")
+
+
+async def _call_and_wait(function: Callable[[], object]) -> None:
+    """Call a function; if it is asynchronous, wait for its end."""
+    result = function()
+    if isinstance(result, Awaitable):
+        await result

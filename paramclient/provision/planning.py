@@ -15,9 +15,9 @@ from typing import Final, Protocol
 
 from paramclient.errors import UsageError
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite, version_difference
+from paramclient.model.names import nearest_names
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Renames
-from paramclient.model.similar_names import nearest_names
 from paramclient.model.values import (
     Encoding,
     Param,

@@ -20,7 +20,7 @@ from paramclient.cli.json_output import (
 from paramclient.cli.json_setup import ApplyJson, PlanJson
 from paramclient.model.notation import bits_text, hash_text, rounded
 from paramclient.model.values import ParamType, Trust
-from paramclient.protocol.kinds import expects_extended
+from paramclient.protocol.identity import expects_extended
 
 if TYPE_CHECKING:
     from paramclient.cache import CachedSummary, CachedVehicle, HistoryEntry, SnapshotSummary

@@ -20,8 +20,7 @@ from starlette.types import Receive, Scope, Send
 
 from paramclient.errors import NotInCache, UnknownParameter
 from paramclient.metadata import Metadata
-from paramclient.model.patterns import NameChoice
-from paramclient.model.similar_names import did_you_mean, nearest_names
+from paramclient.model.names import NameChoice, did_you_mean, nearest_names
 from paramclient.model.values import Param, WireValue
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetStatus
 from paramclient.service import documents

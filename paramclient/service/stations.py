@@ -12,7 +12,7 @@ from typing import Final, NamedTuple, TypeAlias
 import anyio
 import anyio.abc
 
-from paramclient.client.signing import Signing, TimestampKeeper, read_key
+from paramclient.client.signing import Signing, read_key
 from paramclient.client.taps import FrameCutter, SeenFrame
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link
@@ -41,9 +41,9 @@ STATIONS_MAX: Final = 64
 """Stations of one endpoint, at most; the one that was silent for longest is forgotten first."""
 ENDPOINT_BACKOFF: Final = 1.0
 """Seconds before an endpoint that failed is opened again."""
-ANSWER_LINK_IDS: Final = range(200, 256)
-"""Link ids of the signatures of answers: vehicles number their links from 0, and a newer timestamp under an
-id of theirs would make their own frames replays."""
+ANSWER_LINK_ID: Final = 200
+"""Link id of the signatures of answers: vehicles number their links from 0, and a newer timestamp under an id
+of theirs would make their own frames replays."""
 
 V1_MESSAGE_ID_MAX: Final = 255
 """The highest message id in MAVLink 1."""
@@ -195,12 +195,14 @@ class GroundStation:
 
     async def send(self) -> None:
         """Send what is queued, until cancelled."""
+        turn_at = anyio.current_time()
         while True:
             self._something_to_send = anyio.Event()
             while data := self.next_datagram():
+                await anyio.sleep_until(turn_at)
+                turn_at = max(turn_at, anyio.current_time() - DATAGRAM_INTERVAL) + DATAGRAM_INTERVAL
                 with suppress(LinkError):  # the endpoint opens its link again
                     await self.endpoint.link.send(data, self.peer)
-                await anyio.sleep(DATAGRAM_INTERVAL)
             await self._something_to_send.wait()
 
     def _put(self, item: _Relayed | _Inserted | _Withheld) -> None:
@@ -293,10 +295,12 @@ class MavlinkEndpoint:
         self.is_readonly = options.is_readonly
         self.is_trusted = options.is_trusted
         self.signer: Signer | None = None
+        self._verifier: Verifier | None = None
+        if options.key is not None:
+            signing = Signing(options.key, SigningPolicy.SIGNED_ONLY, ANSWER_LINK_ID)
+            self.signer, self._verifier = signing.begin()
         self.stations: dict[Peer | None, GroundStation] = {}
         self.sending: Callable[[bytes], None] = lambda data: None
-        self._key = options.key
-        self._verifier: Verifier | None = None
         self._scopes: dict[Peer | None, anyio.CancelScope] = {}
         self._listens = self.name.startswith(("udpin:", "tcpin:"))
 
@@ -319,11 +323,8 @@ class MavlinkEndpoint:
         Args:
             take: called with each frame of a station.
         """
-        keeper = await self._begin_signing()
         try:
             async with anyio.create_task_group() as tasks:
-                if keeper is not None:
-                    tasks.start_soon(keeper.run)
                 if isinstance(self.link, TcpIn):  # a station may wait for the first heartbeat
                     self.link.accepted = lambda peer: self._station(peer, tasks)
                 elif not self._listens:
@@ -332,20 +333,6 @@ class MavlinkEndpoint:
         finally:
             with anyio.CancelScope(shield=True):
                 await self.link.close()
-                if keeper is not None:
-                    await keeper.close()
-
-    async def _begin_signing(self) -> TimestampKeeper | None:
-        if self._key is None:
-            return None
-        for link_id in ANSWER_LINK_IDS:
-            keeper = TimestampKeeper(Signing(self._key, SigningPolicy.SIGNED_ONLY, link_id))
-            try:
-                self.signer, self._verifier = await keeper.open()
-            except UsageError:  # another gateway of this computer has the id
-                continue
-            return keeper
-        raise UsageError(f"{self.name}: all link ids for signed answers are in use")
 
     async def _read(
         self, take: Callable[[GroundStation, SeenFrame], None], tasks: anyio.abc.TaskGroup

@@ -66,7 +66,7 @@ class ArduPilotVehicle(Vehicle):
       only on request. It is not sent before the main loop runs, 1.4 s after the first heartbeat; an earlier
       request is acknowledged, and SYSTEM_TIME sent then.
     - After every start but the first, the vehicle measures gyroscopes and barometers again (INS_GYR*OFFS_*,
-      INS_GYR*_CALTEMP, BARO*_GND_PRESS of existing sensors) when the main loop starts, and counts the start
+      INS_GYR2_CALTEMP, BARO*_GND_PRESS of existing sensors) when the main loop starts, and counts the start
       (STAT_BOOTCNT), without announcement.
     - Some values change on their own and are sent unsolicited, index 65535.
 
@@ -143,7 +143,7 @@ class ArduPilotVehicle(Vehicle):
         if not 0.0 <= live_period < math.inf:
             raise UsageError(f"live_period must be a number of seconds from 0 up, not {live_period}")
         if ftp:
-            self._ftp = FileServer(self._packed_params, ftp_rate)
+            self.file_server = FileServer(self._packed_params, ftp_rate)
         self._in_groups = (
             frozenset(row.name for row in rows[_NOT_IN_GROUPS:]) if table is None else frozenset()
         )
@@ -329,7 +329,7 @@ class ArduPilotVehicle(Vehicle):
 
     def _measure(self) -> None:
         """Change the values that are measured at a start by 0.1 %, and count the start."""
-        for entry in self._entries:
+        for entry in self.entries:
             if entry.name == _BOOT_COUNT:
                 entry.store(entry.bits + 1 & 0x7FFF)
             value = from_bits(entry.bits, entry.type)
@@ -402,10 +402,12 @@ class ArduPilotVehicle(Vehicle):
         self._look_up()
 
     def _serve_files(self, now: float) -> None:
-        if self._ftp is None:
+        if self.file_server is None:
             return
         is_held = self._window_at < math.inf
-        self._file_answers += self._ftp.work(now, _FILE_QUEUE - len(self._file_answers) if is_held else None)
+        self._file_answers += self.file_server.work(
+            now, _FILE_QUEUE - len(self._file_answers) if is_held else None
+        )
         if is_held:
             return
         for answer, sender in self._file_answers:
@@ -451,7 +453,7 @@ class ArduPilotVehicle(Vehicle):
                 self._ready.append(messages.ParamValue(name, entry.raw, entry.type, len(self._listed), index))
 
     def _change_live(self) -> None:
-        for entry in self._entries:
+        for entry in self.entries:
             if entry.name in self._live:
                 value = entry.value
                 if isinstance(value, int) and isinstance(entry.type, ParamType):
@@ -462,10 +464,10 @@ class ArduPilotVehicle(Vehicle):
 
 
 _INTERNAL = re.compile(r"MIS_TOTAL|BARO\d_(GND_PRESS|DEVID)|ARSPD\d?_DEVID|MNT\d_DEVID")
-_MEASURED = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|BARO\d_GND_PRESS")
+_MEASURED = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR2_CALTEMP|BARO\d_GND_PRESS")
 _NO_SENSOR = -300.0
-_BOOT_COUNT = "STAT_BOOTCNT"
 """Calibration temperature without a sensor, in °C."""
+_BOOT_COUNT = "STAT_BOOTCNT"
 _SYSTEM_ID = "SYSID_THISMAV"
 _STANDBY = 3
 _CALIBRATING = 2

@@ -90,7 +90,7 @@ class Device(ABC):
         self._reboot_ack = reboot_ack
         self._reboot_down = reboot_down
         self._heartbeat = heartbeat
-        self._version = version
+        self.version = version
         self._boot_time = boot_time
         self._telemetry_period = 1.0 / telemetry if telemetry else math.inf
         self._mavlink_version = mavlink_version
@@ -360,10 +360,10 @@ class Device(ABC):
             return
         requested: messages.Message | None = None
         if request.command == messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES:
-            requested = self._version
+            requested = self.version
         elif request.command == messages.MAV_CMD_REQUEST_MESSAGE:
             known: dict[float, messages.Message] = {
-                messages.message_id(messages.AutopilotVersion): self._version,
+                messages.message_id(messages.AutopilotVersion): self.version,
                 messages.message_id(messages.Heartbeat): self._beat,
             }
             requested = known.get(request.param1)  # a float, possibly NaN

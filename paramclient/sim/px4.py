@@ -168,12 +168,12 @@ class PX4Vehicle(BytewiseVehicle):
         if clamp_delay is not None and not clamp_delay >= 0.0:
             raise UsageError(f"clamp_delay must be a number of seconds from 0 up, not {clamp_delay}")
         self._clamp_delay = clamp_delay
-        self._ftp = FileServer(self._packed_params if ftp else lambda: None, ftp_rate, is_px4=True)
+        self.file_server = FileServer(self._packed_params if ftp else lambda: None, ftp_rate, is_px4=True)
         self._has_metadata = metadata
         if metadata:
             if options.get("mavlink_version") == 1:
                 raise UsageError("COMPONENT_METADATA does not exist in MAVLink 1")
-            self._ftp.files |= metadata_files(rows)
+            self.file_server.files |= metadata_files(rows)
         self._first_bits = {row.name: row.bits for row in rows}
         self._hash: int | None = None
         self._hash_check = hash_check
@@ -333,12 +333,12 @@ class PX4Vehicle(BytewiseVehicle):
         self._has_stored = True
         for name, bits in self._unkept.items():
             self._entry(name).store(bits)
-        for entry in self._entries:
+        for entry in self.entries:
             if entry.default is not None and _is_near(entry, bits_of(entry.default, entry.type)):
                 entry.store(bits_of(entry.default, entry.type))
         autoconfig = self._find("SYS_AUTOCONFIG")
         if autoconfig is not None and autoconfig.bits != 0:
-            for entry in self._entries:
+            for entry in self.entries:
                 if not entry.name.startswith(RESET_KEEPS):
                     entry.store(self._first_bits[entry.name])
             autoconfig.store(0)

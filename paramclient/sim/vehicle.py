@@ -44,6 +44,10 @@ class Vehicle(Device):
         armed: whether the heartbeat says armed, which prevents reboots; can be changed at any time.
         requests: number of received messages for this vehicle, by their MAVLink names
             (`requests["PARAM_REQUEST_READ"]`).
+        version: its AUTOPILOT_VERSION; can be changed while the vehicle is off.
+        entries: all parameters, listed or not.
+        dead: indices and names as in the argument; can be changed at any time.
+        file_server: its MAVFTP, or None; can be taken away and given back at any time.
 
     Args of every vehicle:
         burst, period: parameters per burst of the list, and the seconds between two bursts.
@@ -69,7 +73,7 @@ class Vehicle(Device):
         usb: whether the link counts as safe: all frames are accepted, as by ArduPilot over USB.
     """
 
-    _ftp: FileServer | None = None
+    file_server: FileServer | None = None
     _position: int | None
     """The next index of the list, None while no list is being sent."""
     _last_listed: Entry | None
@@ -108,14 +112,14 @@ class Vehicle(Device):
             raise UsageError(f"list_stops_at must be a number of values from 0 up, not {list_stops_at}")
         if not list_stops >= 0:
             raise UsageError(f"list_stops must be a number of lists from 0 up, not {list_stops}")
-        self._entries = [Entry(row, order, encoding) for order, row in enumerate(rows)]
-        self._by_name = {self._key(entry.name): entry for entry in reversed(self._entries)}
+        self.entries = [Entry(row, order, encoding) for order, row in enumerate(rows)]
+        self._by_name = {self._key(entry.name): entry for entry in reversed(self.entries)}
         self._listed: list[Entry] = []
-        self._dead: set[int | str] = set()
+        self.dead: set[int | str] = set()
         for each in dead:
             if isinstance(each, int) and not 0 <= each < _TABLE_SIZE_MAX:
                 raise UsageError(f"an index must be a number from 0 to {_TABLE_SIZE_MAX - 1}, not {each}")
-            self._dead.add(self._entry(each).name if isinstance(each, str) else each)
+            self.dead.add(self._entry(each).name if isinstance(each, str) else each)
         self._list_stops_at = math.inf if list_stops_at is None else list_stops_at
         self._list_stops = list_stops
         self._when_listed: dict[int, list[Callable[[], object]]] = {}
@@ -183,14 +187,14 @@ class Vehicle(Device):
         Raises:
             UsageError: this vehicle has no MAVFTP.
         """
-        if self._ftp is None:
+        if self.file_server is None:
             raise UsageError("this vehicle has no MAVFTP")
-        return self._ftp.files
+        return self.file_server.files
 
     @property
     def open_files(self) -> list[str]:
         """The paths of the files that are open in a MAVFTP session."""
-        return [] if self._ftp is None else self._ftp.open_files
+        return [] if self.file_server is None else self.file_server.open_files
 
     def set_param(self, name: str, value: WireValue) -> None:
         """Change a value as if on board or by another station; announced as this kind of vehicle does.
@@ -260,7 +264,7 @@ class Vehicle(Device):
         return True
 
     def _is_dead(self, entry: Entry) -> bool:
-        return bool(self._dead) and (entry.index in self._dead or entry.name in self._dead)
+        return bool(self.dead) and (entry.index in self.dead or entry.name in self.dead)
 
     def _on_request(self, message: messages.Message, sender: frames.Frame) -> None:
         if isinstance(message, messages.ParamRequestRead):
@@ -269,15 +273,15 @@ class Vehicle(Device):
             self._on_list()
         elif isinstance(message, messages.ParamSet):
             self._on_set(message, sender)
-        elif isinstance(message, messages.FileTransfer) and self._ftp is not None:
-            self._ftp.receive(message.payload, (sender.system, sender.component), self._now)
+        elif isinstance(message, messages.FileTransfer) and self.file_server is not None:
+            self.file_server.receive(message.payload, (sender.system, sender.component), self._now)
 
     def _next_transmission(self) -> float:
         return min(super()._next_transmission(), self._next_burst, self._next_file_work())
 
     def _next_file_work(self) -> float:
         """Return the time of the next work of MAVFTP."""
-        return math.inf if self._ftp is None else self._ftp.next_deadline()
+        return math.inf if self.file_server is None else self.file_server.next_deadline()
 
     def _skip_suppressed(self) -> None:
         super()._skip_suppressed()
@@ -288,8 +292,8 @@ class Vehicle(Device):
         self._position = None
         self._last_listed = None
         self._list_sent = 0
-        if self._ftp is not None:
-            self._ftp.reset()
+        if self.file_server is not None:
+            self.file_server.reset()
         self._relist()
         super()._switch_on(at)
 
@@ -310,8 +314,8 @@ class Vehicle(Device):
 
     def _serve_files(self, now: float) -> None:
         """Send the due MAVFTP responses."""
-        if self._ftp is not None:
-            for answer, sender in self._ftp.work(now):
+        if self.file_server is not None:
+            for answer, sender in self.file_server.work(now):
                 self._send(messages.FileTransfer(0, *sender, answer.pack()))
 
     # Helpers for subclasses
@@ -349,7 +353,7 @@ class Vehicle(Device):
         """Assign indices to the listed parameters."""
         for entry in self._listed:
             entry.index = None
-        self._listed = [entry for entry in self._entries if self._is_listed(entry)]
+        self._listed = [entry for entry in self.entries if self._is_listed(entry)]
         for index, entry in enumerate(self._listed):
             entry.index = index
 

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Self, TypeAlias
 
 from paramclient.cache import ParamCache
-from paramclient.client.arguments import COMPONENT_TIMEOUT
+from paramclient.client.client import COMPONENT_TIMEOUT
 from paramclient.client.component import REBOOT_TIMEOUT, ComponentState
-from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.signing import Signing
 from paramclient.client.traffic import TrafficReport
 from paramclient.links import Link
@@ -18,12 +17,11 @@ from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
-from paramclient.model.values import Encoding, Param, Settable, WireValue
+from paramclient.model.values import Encoding, Param, Settable
 from paramclient.protocol import ftp
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress
-from paramclient.protocol.reset import ResetResult
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.watch import SyncState
 from paramclient.provision.planning import ParamInfo, Plan
@@ -60,7 +58,6 @@ class Ftp:
         self,
         path: str,
         *,
-        read_size: int = ftp.DATA_SIZE_MAX,
         size_max: int = ftp.FILE_SIZE_MAX,
         progress: Callable[[int, int | None], None] | None = None,
         timeout: float | None = None,
@@ -100,7 +97,7 @@ class Component:
         """The `param_count` of the component; None before its first value."""
     @property
     def hash(self) -> int | None:
-        """The PX4 hash (`_HASH_CHECK`) of the complete table; None if it is not known."""
+        """PX4's hash or ArduPilot's checksum of the complete table; None if it is not known."""
     @property
     def state(self) -> ComponentState:
         """State of the table."""
@@ -148,17 +145,6 @@ class Component:
         author: str | None = None,
     ) -> SetManyResult:
         """Write many parameters in one call, and verify each as `set` does."""
-    def reset(
-        self,
-        *names: str,
-        defaults: Mapping[str, WireValue] | None = None,
-        progress: Callable[[SetOutcome], None] | None = None,
-        timeout: float | None = None,
-        settle: float = 0.0,
-        durable: bool = False,
-        author: str | None = None,
-    ) -> ResetResult:
-        """Set parameters to the firmware's defaults, and verify each as `set` does."""
     def fetch_all(
         self,
         *,
@@ -295,15 +281,6 @@ class ParamClient:
         self, component: Component, system: int, *, timeout: float | None = COMPONENT_TIMEOUT
     ) -> Component:
         """Return the component of the same vehicle under its new system id, after its first message there."""
-    def fetch_all(
-        self,
-        system: int | None = None,
-        *,
-        refresh: bool = False,
-        timeout: float | None = None,
-        progress: Callable[[Mapping[Address, Progress]], None] | None = None,
-    ) -> FetchedAll:
-        """Update the tables of all components of one system, or of every system on the link."""
     def traffic_report(self) -> TrafficReport:
         """Return the traffic statistics of the link: components, message rates, packet loss."""
     def signing_report(self) -> SigningReport | None:

@@ -8,9 +8,9 @@ import os
 import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent import futures
-from contextlib import ExitStack, nullcontext, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial, wraps
 from queue import Empty, SimpleQueue
@@ -23,7 +23,6 @@ from anyio.from_thread import BlockingPortal, start_blocking_portal
 import paramclient.client.client as asynchronous
 from paramclient.client import component, events, files, streams
 from paramclient.errors import ClientClosed, UsageError
-from paramclient.model.params import ParamMap
 
 __all__ = ["Changes", "Component", "Events", "Ftp", "ParamClient", "blocking"]
 
@@ -31,9 +30,6 @@ THREAD_NAME: Final = "paramclient blocking client"
 """Name of the thread of a client, in debuggers."""
 WAIT_INTERVAL: Final = 0.1
 """Seconds after which a waiting thread wakes up: Windows delivers Ctrl-C only then."""
-CANCEL_TIMEOUT: Final = 0.5
-"""Seconds for which an interrupted call waits until the client has cancelled it. Most calls take 1 ms. A file
-transfer also closes its session on board, which continues in the background."""
 
 
 class _Session:
@@ -77,26 +73,17 @@ class _Session:
             UsageError: the caller is in the event loop itself, or in a forked process.
         """
         calls: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
-        ended = threading.Event()
         values = [self._argument(calls, "", value) for value in args]
         options = {name: self._argument(calls, name, value) for name, value in kwargs.items()}
-
-        async def work() -> Any:
-            try:
-                result = function(*values, **options)
-                return await result if inspect.isawaitable(result) else result
-            finally:
-                ended.set()
-                calls.put(None)
-
         if os.getpid() != self._process:
             raise UsageError("a client cannot be used in a forked process; create a new one there")
         try:
-            future = self._portal.start_task_soon(work)
+            future = self._portal.start_task_soon(partial(function, *values, **options))
         except RuntimeError as error:
             if "event loop thread" in str(error):
                 raise UsageError("a blocking call cannot be made in the event loop of its client") from None
             raise ClientClosed("the client was closed", link=self.client.link.name) from None
+        future.add_done_callback(lambda _: calls.put(None))
         try:
             while (call := _next(calls)) is not None:
                 call()
@@ -104,27 +91,16 @@ class _Session:
         except futures.CancelledError:
             raise ClientClosed("the client was closed", link=self.client.link.name) from None
         except BaseException:
-            if not future.done():
-                future.cancel()
-                ended.wait(CANCEL_TIMEOUT)
+            future.cancel()
             raise
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the event loop runs."""
-        return self._end.alive
-
-    def read(self, function: Callable[[], Any]) -> Any:
-        """Call a function in the event loop, or after its end, when nothing waits, in this thread."""
-        if self.is_open:
-            return self.run(function)
-        result = function()
-        if inspect.iscoroutine(result):
-            try:
-                result.send(None)
-            except StopIteration as end:
-                result = end.value
-        return self.shown(result)
+    def read(self, function: Callable[..., Any], *args: Any) -> Any:
+        """Call a function that also works with a closed client: in the event loop, or after its end, when
+        nothing waits, in another one."""
+        if self._end.alive:
+            return self.run(function, *args)
+        with start_blocking_portal() as portal:
+            return self.shown(portal.call(function, *map(_target_of, args)))
 
     def shown(self, value: Any) -> Any:
         """Return a value of the client as the caller is to see it."""
@@ -137,39 +113,27 @@ class _Session:
             return found
         if isinstance(value, list):
             return [self.shown(each) for each in value]
-        if isinstance(value, ParamMap):
-            return ParamMap(_LiveMapping(self, value))
         if isinstance(value, MappingProxyType):
-            return _LiveMapping(self, value)
+            return {key: self.shown(each) for key, each in value.items()}
         if isinstance(value, events.Event):
             return replace(value, component=self.shown(value.component))
         return value
 
     def _argument(self, calls: SimpleQueue[Callable[[], object] | None], name: str, value: Any) -> Any:
         """Return an argument of a call as the client is to see it."""
+
+        async def ask() -> None:
+            answered = anyio.Event()
+            calls.put(lambda: (value(), self._portal.start_task_soon(answered.set)))
+            await answered.wait()
+
         if name == "progress" and value is not None:
             return lambda *items: calls.put(partial(value, *map(self.shown, items)))
         if name == "before_writing" and value is not None:
-            return partial(self._ask, calls, value)
+            return ask
         if isinstance(value, list | tuple):
             return type(value)(map(_target_of, value))
         return list(value) if isinstance(value, Iterator) else _target_of(value)
-
-    async def _ask(
-        self,
-        calls: SimpleQueue[Callable[[], object] | None],
-        question: Callable[..., object],
-        *items: object,
-    ) -> None:
-        """Call a function in the thread of the caller, and wait for its end."""
-        answered = anyio.Event()
-
-        def answer() -> None:
-            question(*map(self.shown, items))
-            self._portal.start_task_soon(answered.set)
-
-        calls.put(answer)
-        await answered.wait()
 
 
 _sessions: weakref.WeakSet[_Session] = weakref.WeakSet()
@@ -186,19 +150,18 @@ class Proxy:
             raise AttributeError(name)
         target, session = self._target, self._session
         method = getattr(type(target), name, None)
-        if inspect.iscoroutinefunction(method):
-            return wraps(method)(partial(session.run, getattr(target, name)))
         if inspect.isfunction(method):
-            return wraps(method)(lambda *args: session.read(partial(method, target, *map(_target_of, args))))
+            call = session.run if inspect.iscoroutinefunction(method) else session.read
+            return wraps(method)(partial(call, getattr(target, name)))
         if name in vars(target):
             return session.shown(vars(target)[name])
-        return session.read(partial(getattr, target, name))
+        return session.read(getattr, target, name)
 
     def __dir__(self) -> list[str]:
         return sorted(name for name in dir(self._target) if not name.startswith("_"))
 
     def __repr__(self) -> str:
-        shown: str = self._session.read(partial(repr, self._target))
+        shown: str = self._session.read(repr, self._target)
         return shown
 
 
@@ -262,14 +225,14 @@ class Stream(Proxy):
         taken: deque[Any] = self.__dict__.setdefault("_taken", deque())  # an interrupted call leaves its item
         if not taken:
             try:
-                self._session.read(partial(self._take, taken, timeout))
+                self._session.read(self._take, taken, timeout)
             except StopAsyncIteration:
                 raise StopIteration from None
         return self._session.shown(taken.popleft())
 
     async def _take(self, taken: deque[Any], timeout: float | None) -> None:
-        """Move one item into `taken`; a closed client has no event loop, and its streams do not wait."""
-        with anyio.fail_after(timeout) if self._session.is_open else nullcontext():
+        """Move one item into `taken`."""
+        with anyio.fail_after(timeout):
             taken.append(await anext(self._target))
 
 
@@ -288,26 +251,6 @@ _PROXIES: dict[type, type[Proxy]] = {
     streams.Changes: Changes,
     events.Events: Events,
 }
-
-
-class _LiveMapping(Mapping[Any, Any]):
-    """A view of a mapping that the event loop may change at any moment: an iteration is one over a copy."""
-
-    def __init__(self, session: _Session, mapping: Mapping[Any, Any]) -> None:
-        self._session = session
-        self._mapping = mapping
-
-    def __getitem__(self, key: Any) -> Any:
-        return self._session.shown(self._mapping[key])
-
-    def __iter__(self) -> Iterator[Any]:
-        return iter(self._session.read(partial(list, self._mapping)))
-
-    def __len__(self) -> int:
-        return len(self._mapping)
-
-    def __repr__(self) -> str:
-        return repr(dict(self))
 
 
 def blocking(function: Callable[..., Any]) -> Callable[..., Any]:

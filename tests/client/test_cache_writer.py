@@ -40,6 +40,7 @@ from tests.shell import (
     Radio,
     Tap,
     bits,
+    fetch_everyone,
     generic,
     in_simulated_time,
     outcome,
@@ -98,7 +99,7 @@ async def test_an_unchanged_vehicle_is_not_downloaded_again(
     path: Path, make: Callable[[], PX4Vehicle]
 ) -> None:
     vehicle = make()
-    volatile = {name for name in vehicle.params if vehicle._entry(name).volatile}
+    volatile = {entry.name for entry in vehicle.entries if entry.volatile and entry.name in vehicle.params}
     first = await session(vehicle, path)
     assert first.source == "stream"
     tap = Tap(vehicle)
@@ -243,12 +244,10 @@ async def test_everyone_on_the_link_starts_from_the_cache(path: Path) -> None:
     camera = generic(system=1, component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
     for source in ("stream", "cache"):
         async with ParamClient(Air([*vehicles, camera]), cache=path) as client:
-            everything = await client.fetch_all()
-            assert {result.source for address, result in everything.results.items() if address[1] == 1} == {
-                source
-            }
-            assert everything.results.keys() == {(1, 1), (2, 1), (3, 1), (1, 100)}
-            assert not everything.silent
+            results, silent = await fetch_everyone(client)
+            assert {result.source for result in results.values() if result.component == 1} == {source}
+            assert results.keys() == {(1, 1), (2, 1), (3, 1), (1, 100)}
+            assert not silent
     assert [vehicle.requests["PARAM_REQUEST_LIST"] for vehicle in vehicles] == [1, 1, 1]
     with ParamCache(path) as cache:
         assert len(cache.components()) == 4
@@ -275,13 +274,13 @@ async def test_a_silent_component_with_a_cached_table_delays_no_other_component(
 ) -> None:
     vehicle, silent = small_px4(), Reticent(system=2, table=VALUES)
     async with ParamClient(Air([vehicle, silent]), cache=path) as client:
-        assert not (await client.fetch_all()).silent
+        assert not (await fetch_everyone(client))[1]
     silent.unanswered = unanswered
     async with ParamClient(Air([vehicle, silent]), cache=path) as client:
-        everything = await client.fetch_all()
-        assert everything.results[1, 1].elapsed < 0.5
-        assert everything.results.keys() == {(1, 1)}
-        assert everything.silent.keys() == {(2, 1)}
+        results, errors = await fetch_everyone(client)
+        assert results[1, 1].elapsed < 0.5
+        assert results.keys() == {(1, 1)}
+        assert errors.keys() == {(2, 1)}
 
 
 # Who it is
@@ -661,7 +660,7 @@ async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Pa
         component = await client.component()
         assert {name: param.default for name, param in component.params.items()} == defaults
         assert len(component.params.changed()) == 41
-    vehicle._version = replace(vehicle._version, git_hash=b"01234567")
+    vehicle.version = replace(vehicle.version, git_hash=b"01234567")
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.component()
         assert component.params.changed() == {}
@@ -686,19 +685,31 @@ async def test_a_value_before_the_first_heartbeat_is_right_and_keeps_its_default
     assert kept(path) == bits(vehicle.params)
 
 
+@in_simulated_time
+async def test_names_that_change_by_themselves_are_learnt_for_later_sessions(path: Path) -> None:
+    vehicle = ArduPilotVehicle(live_period=0)
+    await session(vehicle, path)
+    vehicle.load({"RTL_ALT": 2100, "STAT_RUNTIME": 60})
+    assert (await session(vehicle, path)).changed == ("RTL_ALT",)
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        assert component.session.table.volatile == {"RTL_ALT", "STAT_RUNTIME"}
+        assert (await component.fetch_all()).source == "cache"
+
+
 @pytest.mark.parametrize("kind", ["no file", "silent"])
 @in_simulated_time
 async def test_a_vehicle_without_the_parameter_file_is_remembered_for_its_firmware(
     path: Path, kind: str
 ) -> None:
     vehicle = ArduPilotVehicle(live_period=0)
-    server = vehicle._ftp
+    server = vehicle.file_server
     assert server is not None
     rows = server.params
     if kind == "no file":
         server.params = lambda: None
     else:
-        vehicle._ftp = None
+        vehicle.file_server = None
     requested = Tap(vehicle)
     first = await session(requested, path)
     assert (first.source, first.complete) == ("stream", True)
@@ -709,8 +720,8 @@ async def test_a_vehicle_without_the_parameter_file_is_remembered_for_its_firmwa
     second = await session(requested, path)
     assert (second.source, second.notes) == ("stream", ())
     assert not requested.messages(messages.FileTransfer)
-    vehicle._ftp, server.params = server, rows
+    vehicle.file_server, server.params = server, rows
     assert (await session(requested, path)).source == "stream", "nothing was requested"
-    vehicle._version = replace(vehicle._version, flight_sw_version=67502081)
+    vehicle.version = replace(vehicle.version, flight_sw_version=67502081)
     assert (await session(requested, path)).source == "ftp"
     assert said(path)[1] is True

@@ -1,4 +1,4 @@
-"""Signing as users have it: keys, timestamps over restarts, clients, commands, and what never shows."""
+"""Signing as users have it: keys, clients, commands, and what never shows."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ import os
 import pty
 import re
 import select
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -22,8 +20,6 @@ from unittest import mock
 
 import anyio
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 import paramclient
 from paramclient import NoReply, ParamClient, Signing, SigningKey, SigningPolicy, UsageError, read_key
@@ -31,15 +27,10 @@ from paramclient.cli import run
 from paramclient.cli import session as cli_session
 from paramclient.cli import signing as signing_commands
 from paramclient.client import signing
-from paramclient.client.signing import (
-    TIMESTAMP_CHECK_INTERVAL,
-    TIMESTAMP_RESERVE,
-    TimestampKeeper,
-    key_from_environment,
-)
+from paramclient.client.signing import key_from_environment
 from paramclient.links import SimLink
 from paramclient.sim import ArduPilotVehicle, Vehicle
-from paramclient.wire.signing import Refusal
+from paramclient.wire.signing import UNITS_PER_SECOND, Refusal
 from tests.shell import VALUES, in_simulated_time, simulated_time_loop, small_px4
 
 SECRET = bytes(range(101, 133))
@@ -54,12 +45,10 @@ FORMS += [repr(SECRET)[2:-1].encode(), ", ".join(map(str, SECRET[:8])).encode()]
 
 
 @pytest.fixture(autouse=True)
-def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of the user's state, empty; and an environment without a key."""
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+def no_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An environment without a key."""
     for name in ("KEY", "KEY_FILE", "PASSPHRASE"):
         monkeypatch.delenv(f"PARAMCLIENT_SIGNING_{name}", raising=False)
-    return tmp_path / "state" / "paramclient" / "signing"
 
 
 @pytest.fixture
@@ -146,150 +135,28 @@ def test_invalid_signing_settings_are_refused_at_once() -> None:
 # Timestamps
 
 
-async def link_ids(*clients: ParamClient) -> list[int]:
-    reports = [client.signing_report() for client in clients]
-    return [report.link_id for report in reports if report is not None]
-
-
 @in_simulated_time
-async def test_each_session_has_the_lowest_link_id_that_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with a_client(small_px4()) as first, a_client(small_px4()) as second:
-        async with a_client(small_px4(), signing=OTHER_KEY) as other, a_client(small_px4()) as third:
-            assert await link_ids(first, second, third, other) == [0, 1, 2, 0]
-        async with (
-            a_client(small_px4()) as again,
-            a_client(small_px4(), signing=Signing(KEY, link_id=7)) as own,
-        ):
-            assert await link_ids(again, own) == [2, 7]
-        with pytest.raises(UsageError, match="link id 1 of this signing key is in use by other sessions"):
-            await a_client(small_px4(), signing=Signing(KEY, link_id=1)).open()
-        monkeypatch.setattr(signing, "LINK_IDS", 2)
-        with pytest.raises(UsageError, match="every link id"):
-            await a_client(small_px4()).open()
-
-
-def test_another_process_keeps_its_link_id_until_it_ends() -> None:
-    program = (
-        "import anyio; from paramclient import ParamClient, SigningKey\n"
-        "async def main():\n"
-        f"    async with ParamClient('sim:px4', cache=False, signing=SigningKey({SECRET!r})) as client:\n"
-        "        print(client.signing_report().link_id, flush=True); await anyio.sleep_forever()\n"
-        "anyio.run(main)"
-    )
-
-    async def own() -> list[int]:
-        async with a_client(small_px4()) as client:
-            return await link_ids(client)
-
-    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as other:
-        assert other.stdout is not None
-        assert other.stdout.readline() == "0\n"
-        assert anyio.run(own) == [1]
-        other.kill()
-    assert anyio.run(own) == [0]
-
-
-def test_the_timestamp_file_is_private_and_contains_no_key(state: Path) -> None:
-    session(state.parent)
-    names = {path.name for path in state.iterdir()}
-    assert names == {f"{KEY.fingerprint}-0.lock", f"{KEY.fingerprint}-0.timestamp"}
-    assert (state / f"{KEY.fingerprint}-0.timestamp").read_text().strip().isdecimal()
-    assert {path.stat().st_mode & 0o777 for path in state.iterdir()} == {0o600}
-    assert state.stat().st_mode & 0o777 == 0o700
-
-
-class Clock:
-    """The system's clock, which can be set."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.now = NOW
-        monkeypatch.setattr(signing, "timestamp_now", lambda: self.now)
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    return Clock(monkeypatch)
-
-
-def session(state: Path, length: int = 0, *, crash: Path | None = None) -> tuple[int, int]:
-    """A session that uses timestamps of this length; its first and its last one.
-
-    With `crash`, the state that a crash leaves behind is copied there.
-    """
-
-    @in_simulated_time
-    async def live() -> tuple[int, int]:
-        keeper = TimestampKeeper(Signing(KEY, state=state))
-        signer, _ = await keeper.open()
-        first = signer.timestamp
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(keeper.run)
-            signer.catch_up(first + length)
-            await anyio.sleep(TIMESTAMP_CHECK_INTERVAL + 1.0)
-            signer.sign(b"")
-            tasks.cancel_scope.cancel()
-        if crash is not None:
-            shutil.copytree(state, crash)
-        await keeper.close()
-        return first, signer.timestamp
-
-    return live()
-
-
-@pytest.mark.parametrize("text", ["", "soon", "-5", "9" * 30, "\xff"])
-def test_a_damaged_file_is_reported_and_the_time_of_day_counts(
-    state: Path, clock: Clock, text: str, caplog: pytest.LogCaptureFixture
+async def test_a_client_whose_clock_was_set_back_adopts_the_timestamp_of_the_vehicle(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    state.mkdir(parents=True)
-    (state / f"{KEY.fingerprint}-0.timestamp").write_text(text, encoding="latin-1")
-    assert session(state.parent)[0] == NOW
-    assert "no valid signature timestamp" in caplog.text
-
-
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    sessions=st.lists(
-        st.tuples(st.integers(-(10**9), 10**9), st.integers(0, 10**8), st.booleans()), min_size=2, max_size=5
-    )
-)
-def test_no_timestamp_is_used_twice_whatever_clock_and_crashes_do(
-    tmp_path: Path, clock: Clock, sessions: list[tuple[int, int, bool]]
-) -> None:
-    state, used = Path(tempfile.mkdtemp(dir=tmp_path)), 0
-    for offset, length, crashes in sessions:
-        clock.now = NOW + offset
-        left = state.with_name(f"{state.name}-") if crashes else None
-        first, last = session(state, length, crash=left)
-        assert first >= max(used, clock.now)
-        used, state = last, left or state
-
-
-def test_after_a_crash_at_most_a_minute_is_skipped(clock: Clock, tmp_path: Path) -> None:
-    _, last = session(tmp_path / "state", 5, crash=tmp_path / "left")
-    first, _ = session(tmp_path / "left")
-    assert last < first <= last + TIMESTAMP_RESERVE
-
-
-@in_simulated_time
-async def test_an_unusable_folder_is_reported_and_the_session_continues(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    file = a_file(tmp_path / "file", b"")
-    async with a_client(signed_vehicle(), signing=Signing(KEY, state=file)) as client:
-        vehicle = await client.component()
-        assert (await vehicle.fetch_all()).complete
-        await anyio.sleep(3 * TIMESTAMP_CHECK_INTERVAL)
-    assert len(caplog.records) == 1
-    assert "cannot store signature timestamps (Not a directory)" in caplog.text
+    vehicle = signed_vehicle(signing_timestamp=NOW)
+    for now in (NOW, NOW - 50 * UNITS_PER_SECOND):
+        monkeypatch.setattr(signing, "timestamp_now", lambda now=now: now)
+        async with a_client(vehicle) as client:
+            component = await client.component()
+            assert (await component.get("PARAM_04", timeout=2.0)).name == "PARAM_04"
 
 
 # Clients
 
 
 @in_simulated_time
-async def test_a_signed_client(state: Path) -> None:
+async def test_a_signed_client() -> None:
     vehicle = signed_vehicle()
-    async with a_client(vehicle) as client, a_client(signed_vehicle()) as other:
+    async with (
+        a_client(vehicle) as client,
+        a_client(signed_vehicle(), signing=Signing(KEY, link_id=1)) as other,
+    ):
         component = await client.component()
         assert dict((await component.fetch_all()).params).keys() == vehicle.params.keys()
         assert (await component.set("PARAM_04", 44)).actual == 44
@@ -359,7 +226,7 @@ async def test_accept_all_answers_a_mavlink_1_vehicle_unsigned() -> None:
 
 
 def test_the_key_shows_nowhere(
-    tmp_path: Path, state: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A life with everything in it; then all that was written is looked through."""
     caplog.set_level(logging.DEBUG)
@@ -384,7 +251,6 @@ def test_the_key_shows_nowhere(
                 component.setup_signing(OTHER_KEY),
                 component.get("NO_SUCH_NAME", timeout=1.0),
                 component.set("NO_SUCH_NAME", 1, timeout=1.0),
-                a_client(vehicle, signing=Signing(KEY, link_id=0)).__aenter__(),
             ):
                 with pytest.raises(paramclient.ParamClientError) as caught:
                     await call
@@ -398,7 +264,7 @@ def test_the_key_shows_nowhere(
     live()
     printed = capsys.readouterr()
     written = [path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()]
-    assert len(written) >= 3
+    assert written
     assert any(KEY.fingerprint in text for text in shown)
     everything = [*shown, caplog.text, printed.out, printed.err]
     for data in [*written, *(text.encode("utf-8", "surrogateescape") for text in everything)]:

@@ -192,7 +192,7 @@ async def test_nothing_is_checked_or_changed_by_a_refresh_or_without_a_complete_
     del cached["STAT_RESET"]
     for table, refresh in (({}, False), (cached, False), (vehicle.params, True)):
         async with converse(vehicle) as conversation:
-            node = await with_cached_table(conversation, table, count=len(vehicle.params))
+            node = await with_cached_table(conversation, table, count=len(table) and len(vehicle.params))
             result = await fetch_all(node.plain, refresh=refresh)
             assert result.source == "ftp"
             assert Opcode.CALC_FILE_CRC32 not in opcodes(conversation)
@@ -246,11 +246,13 @@ def test_no_difference_is_ever_taken_for_equal(changes: dict[str, int], kind: st
     run(main)
 
 
+@pytest.mark.parametrize("is_cached", [True, False], ids=["cached", "downloaded"])
 @virtual_on_both
-async def test_a_watch_finds_a_lost_announcement_for_one_request() -> None:
+async def test_a_watch_finds_a_lost_announcement_for_one_request(is_cached: bool) -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
     async with converse(vehicle) as conversation:
-        node = await with_cached_table(conversation, vehicle.params)
+        table = vehicle.params if is_cached else {}
+        node = await with_cached_table(conversation, table, count=len(vehicle.params))
         await fetch_all(node.plain)
         watch = Watch(node.plain, node.presence, lambda event: None)
         watch.fetched()
@@ -262,5 +264,9 @@ async def test_a_watch_finds_a_lost_announcement_for_one_request() -> None:
             vehicle.load({"ATC_RAT_RLL_P": 0.25})
             await anyio.sleep(31.0)
             assert node.plain.table.params["ATC_RAT_RLL_P"].value == 0.25
+            assert Opcode.OPEN_FILE_RO not in opcodes(conversation)[before:]
+            vehicle.load(dict.fromkeys(NAMES[300:700:20], 3))  # as a written param.pck: not announced
+            await anyio.sleep(31.0)
+            assert all(node.plain.table.params[name].value == 3 for name in NAMES[300:700:20])
             assert not conversation.sent_of(ParamRequestList)
             tasks.cancel_scope.cancel()

@@ -182,6 +182,4 @@ def test_sessions_end_with_the_vehicles_table() -> None:
 
 @pytest.mark.slow
 def test_many_sessions() -> None:
-    run_state_machine_as_test(
-        Sessions, settings=settings(SETTINGS, max_examples=1_500, stateful_step_count=25)
-    )
+    run_state_machine_as_test(Sessions, settings=settings(SETTINGS, max_examples=200, stateful_step_count=25))

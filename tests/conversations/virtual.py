@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import random
 import selectors
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from contextlib import asynccontextmanager
@@ -62,6 +63,9 @@ def run(test: Callable[..., Awaitable[T]], *arguments: Any, backend: str = "trio
             return await test(*arguments)
 
     if backend == "trio":
+        # trio runs its tasks in a random order, which it lets only pytest-trio decide
+        scheduling: Any = trio._core._run
+        scheduling._ALLOW_DETERMINISTIC_SCHEDULING, scheduling._r = True, random.Random(0)
         options: dict[str, Any] = {"clock": MockClock(autojump_threshold=0)}
     else:
         options = {"loop_factory": _VirtualLoop}

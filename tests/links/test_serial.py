@@ -186,14 +186,14 @@ async def test_a_transport_pauses_at_its_limit(cable: Cable) -> None:
     try:
         sent = 0
         with anyio.fail_after(TIMEOUT):
-            while port._unread < UNREAD_BYTES_MAX:
+            while port.unread < UNREAD_BYTES_MAX:
                 sent += cable.offer(bytes(500))
                 await anyio.sleep(0.0001)
-            unread = port._unread
+            unread = port.unread
             for _ in range(100):
                 sent += cable.offer(bytes(500))
                 await anyio.sleep(0.0001)
-            assert port._unread == unread
+            assert port.unread == unread
             read = 0
             while read < sent:
                 read += len(await port.read())

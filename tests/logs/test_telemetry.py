@@ -21,7 +21,7 @@ from paramclient import (
 from paramclient.cache import BY_US, StoredParam, TableUpdate
 from paramclient.links import LinkKind, ReplayLink, create_link, parse_link
 from paramclient.links.replay import PAUSE_MAX
-from paramclient.logs.imported_table import ImportedTable
+from paramclient.logs.logged_params import ImportedTable
 from paramclient.logs.telemetry import import_log
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param
@@ -99,7 +99,6 @@ async def test_a_recording_gives_a_complete_table(name: str, crc: int | None, sp
         assert (result.missing, result.hash, result.source) == ((), crc, "stream")
         assert component.sync_state is SyncState.SYNCED
         assert {param.trust for param in result.params.values()} == {Trust.LIVE}
-        assert (await client.fetch_all()).complete
         assert client.bytes_received == sum(len(each.data) for each in read(name))
         assert client.bytes_sent == 0
 
@@ -133,8 +132,6 @@ async def test_missing_parameters_are_reported_at_the_end_of_the_log(tmp_path: P
         for _ in range(2):  # also after its end
             result = await component.fetch_all()
             assert (result.missing, result.count) == ((1,), 3)
-        together = await client.fetch_all()
-        assert together.results[1, 1].missing == (1,)
         await anyio.sleep(60.0)
         # the clock stops at the end of the log, so no component is lost
         assert component.state == "partial"
@@ -152,7 +149,7 @@ async def test_requests_to_a_log_fail(tmp_path: Path) -> None:
             lambda: component.fetch_all(refresh=True),
         )
         for call in calls:
-            with pytest.raises(UsageError, match="only listens|may not request"):
+            with pytest.raises(UsageError, match=r"only listens|may not request"):
                 await call()
         began = anyio.current_time()
         with pytest.raises(NoReply, match="component 9/9"):

@@ -29,6 +29,15 @@ def test_a_param_map_is_a_live_read_only_view() -> None:
         params.anything = 1  # type: ignore[attr-defined]
 
 
+def test_an_iteration_is_over_the_names_at_its_start() -> None:
+    table = {name: Param(name, 1, ParamType.INT32, 0, 1) for name in "AB"}
+    names = []
+    for name in ParamMap(table):  # the event loop of a blocking client adds names meanwhile
+        table[f"{name}2"] = table[name]
+        names.append(name)
+    assert names == ["A", "B"]
+
+
 def test_changed_returns_values_that_differ_from_defaults() -> None:
     nan = float("nan")
     table = {

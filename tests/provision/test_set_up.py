@@ -44,7 +44,7 @@ from paramclient.provision import (
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, SimParam
 from paramclient.sim.param_table import Entry
 from paramclient.wire import messages
-from tests.shell import FlakyLink, Tap, a_client, in_simulated_time, residue
+from tests.shell import FlakyLink, Tap, a_client, fetch_everyone, in_simulated_time, residue
 
 SETTINGS: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     f"TUNE_{number:02}": number / 4 if number % 3 else number for number in range(30)
@@ -175,7 +175,7 @@ async def test_a_value_that_is_not_reported_any_more_is_unproven() -> None:
     def lose(progress: ApplyProgress) -> None:
         if progress.row is not None and progress.row.name == "TUNE_02":
             vehicle.set_param("TUNE_01", 0)
-            vehicle._dead.add("TUNE_01")
+            vehicle.dead.add("TUNE_01")
 
     async with a_client(vehicle) as client:
         result = await apply(await client.component(), written(another("TUNE_01", "TUNE_02")), progress=lose)
@@ -473,7 +473,7 @@ async def test_several_vehicles_are_set_up_concurrently() -> None:
     vehicles = [ardupilot(), px4(system=2), ardupilot(system=3, read_only=["TUNE_01"])]
     base = written(another())
     async with a_client(Air(vehicles)) as client:
-        await client.fetch_all()
+        await fetch_everyone(client)
         components = [client.components[vehicle.system, 1] for vehicle in vehicles]
         over = {
             (1, 1): base,
@@ -504,7 +504,7 @@ async def test_several_vehicles_are_restored_each_to_its_own_state() -> None:
     for vehicle in vehicles:
         vehicle.set_param("TUNE_02", 10.0 + vehicle.system)
     async with a_client(Air(vehicles)) as client:
-        await client.fetch_all()
+        await fetch_everyone(client)
         components = [client.components[vehicle.system, 1] for vehicle in vehicles]
         applied = await apply_all(components, written({"TUNE_02": 42.0}))
         before = {address: result.before for address, result in applied.results.items()}
@@ -719,7 +719,7 @@ class Scenario:
 
     def truth(self) -> dict[str, WireValue]:
         """Return all values of the vehicle, hidden ones included."""
-        return {entry.name: entry.value for entry in self.vehicle._entries}
+        return {entry.name: entry.value for entry in self.vehicle.entries}
 
 
 async def run_interrupted(

@@ -78,7 +78,7 @@ class Desk:
 @pytest.mark.parametrize(("make", "delay"), [(PX4Vehicle, 0.4), (ArduPilotVehicle, 0.2), (generic, 0.3)])
 def test_a_vehicle_acknowledges_switches_off_and_returns(make: Any, delay: float) -> None:
     desk = Desk(make(reboot_down=5.0))
-    version = desk.vehicle._version
+    version = desk.vehicle.version
     desk.run(10.25)
     assert desk.command() == [CommandResult.ACCEPTED]
     desk.run(30.0)
@@ -86,7 +86,7 @@ def test_a_vehicle_acknowledges_switches_off_and_returns(make: Any, delay: float
     assert desk.silence(10.25 + delay, on_at)
     started_at = [when for when, frame, _ in desk.received if frame.sequence == 0][-1]
     assert started_at == pytest.approx(on_at)
-    assert desk.vehicle._version == version
+    assert desk.vehicle.version == version
     assert [each for _, each, _ in desk.received if each.sequence == 0][-1].message_id == 0
     assert desk.vehicle.system == 1
 
@@ -196,7 +196,7 @@ def test_plane_and_rover_change_their_system_id_within_a_second() -> None:
     desk.received.clear()
     desk.run(12.0)
     assert {frame.system for _, frame, _ in desk.received} == {9}
-    assert desk.vehicle._version.uid2 == ArduPilotVehicle()._version.uid2
+    assert desk.vehicle.version.uid2 == ArduPilotVehicle().version.uid2
     desk.command()
     desk.run(20.0)
     assert desk.vehicle.system == 9

@@ -638,6 +638,18 @@ class TestArduPilot:
         assert vehicle.values["BARO1_GND_PRESS"] == pytest.approx(before["BARO1_GND_PRESS"])
         assert values[0].raw != values[2].raw
 
+    def test_a_restart_changes_ten_values(self) -> None:
+        vehicle = ArduPilotVehicle(live_period=0.0)
+        before = vehicle.values
+        station = Station(vehicle).wait(3.0)
+        assert vehicle.values == before
+        vehicle.reboot(station.now)
+        station.wait(5.0)
+        assert sorted(name for name, value in vehicle.values.items() if value != before[name]) == [
+            *("BARO1_GND_PRESS", "BARO2_GND_PRESS", "INS_GYR2OFFS_X", "INS_GYR2OFFS_Y", "INS_GYR2OFFS_Z"),
+            *("INS_GYR2_CALTEMP", "INS_GYROFFS_X", "INS_GYROFFS_Y", "INS_GYROFFS_Z", "STAT_BOOTCNT"),
+        ]
+
     def test_identity_after_its_acknowledgement(self) -> None:
         station = Station(ArduPilotVehicle())
         station.log.clear()

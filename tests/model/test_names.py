@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from paramclient.model.patterns import NameChoice
-from paramclient.model.similar_names import did_you_mean, nearest_names
+from paramclient.model.names import NameChoice, did_you_mean, nearest_names
 
 NAMES = ["MC_YAWRATE_P", "MC_YAW_P", "MC_ROLL_P", "MC_ROLLRATE_P", "MPC_XY_P", "ringBuffer"]
 
