@@ -4,8 +4,8 @@
 - `app`: the FastAPI application: middleware, routes, the page.
 - `documents`: JSON of vehicles, parameters and results.
 - `event_feed`: events for any number of listeners, with resume.
-- `gateway`: answers ground stations from the tables; `kept_table`: the answers for one component; `answers`:
-  messages and files made from a table; `stations`: endpoints, queues and sequence numbers.
+- `gateway`: passes frames between vehicles and ground stations; `kept_table`: answers for one component from
+  its table; `kept_file`: from its parameter file; `stations`: endpoints, queues and sequence numbers.
 - `hub`: opens the links, follows their components, and reads the cache.
 - `metrics`: metrics for Prometheus.
 - `problems`: errors as problem documents (RFC 9457).

@@ -18,6 +18,7 @@ from paramclient.client.taps import SeenFrame, Tap
 from paramclient.errors import LinkError
 from paramclient.protocol.node import Node
 from paramclient.protocol.session import Session
+from paramclient.service.kept_file import KeptFile
 from paramclient.service.kept_table import Asker, KeptTable
 from paramclient.service.stations import GroundStation, MavlinkEndpoint, Source
 from paramclient.wire.frames import TARGET_OFFSETS, Frame, bears_key
@@ -69,6 +70,8 @@ Request: TypeAlias = (
     | ParamExtSet
     | FileTransfer
 )
+
+Answering: TypeAlias = "tuple[Asker, VehicleLink, KeptTable]"
 
 
 def _ids(*kinds: type[Message]) -> frozenset[int]:
@@ -179,7 +182,7 @@ class Gateway:
             if isinstance(message, CommandLong) and message.command == MAV_CMD_PREFLIGHT_STORAGE:
                 target = (message.target_system, message.target_component)
                 for table in [each for link in self.links for each in link.tables(*target, extended=False)]:
-                    table.doubt()  # it may reset all parameters, which PX4 does not announce
+                    table.component.watch.doubt()  # it may reset all, which PX4 does not announce
 
     def _answer(self, station: GroundStation, source: Source, message: Request, seen: SeenFrame) -> bool:
         """Answer a request about parameters; return False for one that passes to the vehicles."""
@@ -194,31 +197,30 @@ class Gateway:
         if not served:
             return False
         askers = [
-            (Asker(station, *source, may_write=not link.is_signed or station.may_sign), table)
+            (Asker(station, *source, may_write=not link.is_signed or station.may_sign), link, table)
             for link, table in served
+            if not table.is_lost
         ]
         match message:
             case ParamRequestList() | ParamExtRequestList():
-                for _, table in served:
-                    table.list(station)
+                for _, _, table in askers:
+                    table.send_list(station)
                 for link, table in found:
                     if (link, table) not in served and table.source[1] != AUTOPILOT_COMPONENT:
                         link.send(_readdressed(message, seen.frame, table.source))
             case ParamRequestRead() | ParamExtRequestRead():
                 which = message.param_id if message.param_index < 0 else message.param_index
-                having = [(asker, table) for asker, table in askers if table.has(which)]
-                for asker, table in having or _autopilot_of(askers):
+                having = [each for each in askers if each[2].known(which) is not None]
+                for asker, _, table in having or _chosen(askers):
                     table.read(asker, which)
             case ParamSet(param_id=name) if name == HASH_CHECK:
                 pass  # it would stop the gateway's own list
             case ParamSet() | ParamExtSet():
-                for asker, table in _autopilot_of(askers):
+                for asker, _, table in _chosen(askers):
                     table.set(asker, message)
             case FileTransfer(payload=payload):
-                asker, table = _autopilot_of(askers)[0]
-                return table.take_file_request(
-                    asker, payload, lambda: self._route(seen.data, message.target_system)
-                )
+                for asker, link, table in _chosen(askers):
+                    return link.file(table).take(asker, payload, lambda: self._route(seen.data, target))
         return True
 
     def _serves(self, station: GroundStation, table: KeptTable, link: VehicleLink) -> bool:
@@ -259,6 +261,7 @@ class VehicleLink(Tap):
         self._gateway = gateway
         self._client = client
         self._tables: dict[Session, KeptTable] = {}
+        self._files: dict[KeptTable, KeptFile] = {}
 
     @property
     def _own_address(self) -> Source:
@@ -313,6 +316,12 @@ class VehicleLink(Tap):
             is_meant = system in (0, node.system) and component in (COMP_ID_ALL, node.component)
             if is_meant and node.identification.has_parameters:
                 yield self._table(node, extended=extended)
+
+    def file(self, table: KeptTable) -> KeptFile:
+        """Return the parameter file of a component."""
+        if table not in self._files:
+            self._files[table] = KeptFile(table)
+        return self._files[table]
 
     def table_of_answer(self, seen: SeenFrame, peer: Hashable) -> KeptTable | None:
         """Return the table to which a value or an answer belongs; None for another frame."""
@@ -392,10 +401,9 @@ def _target_of(frame: Frame) -> int:
     return frame.payload[at] if at < len(frame.payload) else 0
 
 
-def _autopilot_of(found: list[tuple[Asker, KeptTable]]) -> list[tuple[Asker, KeptTable]]:
-    """Return the autopilot among the components that a message to all of them reaches."""
-    autopilots = [each for each in found if each[1].source[1] == AUTOPILOT_COMPONENT]
-    return (autopilots or found)[:1]
+def _chosen(found: list[Answering]) -> list[Answering]:
+    """Return the component that answers a request to one: the autopilot, if all components are asked."""
+    return ([each for each in found if each[2].source[1] == AUTOPILOT_COMPONENT] or found)[:1]
 
 
 def _readdressed(message: ParamRequestList | ParamExtRequestList, frame: Frame, target: Source) -> bytes:

@@ -26,7 +26,7 @@ from paramclient.service import documents
 from paramclient.service.event_feed import EventFeed
 from paramclient.service.gateway import Gateway
 from paramclient.service.problems import ServiceError
-from paramclient.service.stations import MavlinkEndpoint
+from paramclient.service.stations import MavlinkEndpoint, parse_endpoint
 from paramclient.service.targets import ServiceLink, Target
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class Hub:
         links: links by name, object or simulated vehicle, as for `ParamClient`.
         cache: as for `ParamClient`; shared by all links.
         fetches: whether the table of every component is fetched when it is heard.
-        mavlink: endpoints to which ground stations connect, see `MavlinkEndpoint`.
+        mavlink: endpoints to which ground stations connect, see `parse_endpoint`.
         options: options of each `ParamClient`.
 
     Attributes:
@@ -82,9 +82,7 @@ class Hub:
         self._owns_cache = self.cache is not cache
         self._fetches = fetches
         self.feed = EventFeed()
-        self.gateway = Gateway(
-            each if isinstance(each, MavlinkEndpoint) else MavlinkEndpoint(each) for each in mavlink
-        )
+        self.gateway = Gateway(parse_endpoint(each) if isinstance(each, str) else each for each in mavlink)
         if self.gateway.endpoints and options.get("listen_only"):
             raise UsageError("a client that only listens cannot answer ground stations")
         self.metadata_store = None if self.cache is None else MetadataStore.beside(self.cache.path)

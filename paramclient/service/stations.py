@@ -6,8 +6,7 @@ import logging
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, TypeAlias
 
 import anyio
 import anyio.abc
@@ -22,7 +21,7 @@ from paramclient.wire.frames import renumber_frame, sign_frame
 from paramclient.wire.messages import Message, encode, message_id
 from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier
 
-__all__ = ["GroundStation", "MavlinkEndpoint", "Numbering"]
+__all__ = ["GroundStation", "MavlinkEndpoint", "Numbering", "Source", "parse_endpoint"]
 
 FRAMES_PER_DATAGRAM: Final = 37
 """Frames in one datagram, at most: as many PARAM_VALUEs as fit in `DATAGRAM_SIZE`."""
@@ -33,18 +32,19 @@ DATAGRAM_INTERVAL: Final = 0.002
 buffer holds 256 of them (measured)."""
 STATION_QUEUE_MAX: Final = 4_000
 """Frames that wait for a station, at most: two seconds of a busy link. Further ones are dropped."""
-STREAMS_PER_STATION_MAX: Final = 32
-"""Lists and files in progress for one station, at most."""
+STREAMS_PER_STATION_MAX: Final = 256
+"""Lists and files in progress for one station, at most: one of each vehicle."""
 STATION_TIMEOUT: Final = 60.0
 """Seconds of silence after which a station on UDP is forgotten."""
 STATIONS_MAX: Final = 64
 """Stations of one endpoint, at most; the one that was silent for longest is forgotten first."""
+SOURCES_MAX: Final = 64
+"""Senders that are named of one station, at most."""
 ENDPOINT_BACKOFF: Final = 1.0
 """Seconds before an endpoint that failed is opened again."""
 ANSWER_LINK_ID: Final = 200
 """Link id of the signatures of answers: vehicles number their links from 0, and a newer timestamp under an id
 of theirs would make their own frames replays."""
-
 V1_MESSAGE_ID_MAX: Final = 255
 """The highest message id in MAVLink 1."""
 
@@ -82,26 +82,11 @@ class Numbering:
             self._offset -= 1
 
 
-class _Relayed(NamedTuple):
-    source: Source
-    data: bytes
-    is_signed: bool
-
-
-class _Inserted(NamedTuple):
-    source: Source
-    message: Message
-
-
-class _Withheld(NamedTuple):
-    source: Source
-
-
 class GroundStation:
     """One partner at an endpoint.
 
     Frames are numbered as they leave, so that the numbers follow the order on the wire. Lists and files are
-    streams: their messages are made as the station takes them.
+    streams, whose messages are made as the station takes them; they take turns with the frames of vehicles.
 
     Args:
         endpoint: where it is connected.
@@ -109,6 +94,7 @@ class GroundStation:
 
     Attributes:
         endpoint, peer: as given.
+        scope: of `send`.
         received_at: when its last frame arrived.
         sources: the system and component ids under which it sends.
         version: of MAVLink, of the answers: 1 only for a station that has sent version 1 and never 2.
@@ -120,6 +106,7 @@ class GroundStation:
     def __init__(self, endpoint: MavlinkEndpoint, peer: Peer | None) -> None:
         self.endpoint = endpoint
         self.peer = peer
+        self.scope = anyio.CancelScope()
         self.received_at = anyio.current_time()
         self.sources: set[Source] = set()
         self.version = 2
@@ -127,14 +114,15 @@ class GroundStation:
         self.relayed = self.answered = self.dropped = self.saved = 0
         self._has_sent_version_2 = False
         self._numbering: dict[Source, Numbering] = {}
-        self._queue: deque[_Relayed | _Inserted | _Withheld] = deque()
+        self._queue: deque[tuple[Source, bytes | Message | None]] = deque()  # relayed, inserted, withheld
         self._streams: dict[Hashable, tuple[Source, Iterator[Message]]] = {}
+        self._is_turn_of_streams = False
         self._held: bytes | None = None  # numbered, but too long for the last datagram
         self._something_to_send = anyio.Event()
 
     @property
     def name(self) -> str:
-        """Its address, and that of the endpoint."""
+        """The endpoint's name, and its address there."""
         return self.endpoint.name + ("" if self.peer is None else f"#{peer_in_words(self.peer)}")
 
     @property
@@ -150,24 +138,23 @@ class GroundStation:
     def received(self, seen: SeenFrame) -> None:
         """Take note of a frame of the station."""
         self.received_at = anyio.current_time()
-        frame = seen.frame
-        self.sources.add((frame.system, frame.component))
-        self._has_sent_version_2 |= frame.version == 2
+        if len(self.sources) < SOURCES_MAX:
+            self.sources.add((seen.frame.system, seen.frame.component))
+        self._has_sent_version_2 |= seen.frame.version == 2
         self.version = 2 if self._has_sent_version_2 else 1
 
     def relay(self, seen: SeenFrame) -> None:
         """Queue a frame of a vehicle."""
-        source = (seen.frame.system, seen.frame.component)
-        self._put(_Relayed(source, seen.data, seen.is_signed))
+        self._put((seen.frame.system, seen.frame.component), seen.data)
 
     def withhold(self, seen: SeenFrame) -> None:
         """Leave a frame of a vehicle out, so that it does not count as lost."""
-        self._put(_Withheld((seen.frame.system, seen.frame.component)))
+        self._put((seen.frame.system, seen.frame.component), None)
 
     def say(self, message: Message, source: Source) -> None:
         """Queue a message in the name of a component; none that MAVLink 1 lacks for a station of that."""
         if self.version == 2 or message_id(type(message)) <= V1_MESSAGE_ID_MAX:
-            self._put(_Inserted(source, message))
+            self._put(source, message)
 
     def stream(self, key: Hashable, source: Source, messages: Iterator[Message]) -> None:
         """Send messages one by one as the station takes them, in place of an earlier stream of this key."""
@@ -194,63 +181,64 @@ class GroundStation:
         return b"".join(frames)
 
     async def send(self) -> None:
-        """Send what is queued, until cancelled."""
+        """Send what is queued, until the scope is cancelled."""
         turn_at = anyio.current_time()
-        while True:
-            self._something_to_send = anyio.Event()
-            while data := self.next_datagram():
-                await anyio.sleep_until(turn_at)
-                turn_at = max(turn_at, anyio.current_time() - DATAGRAM_INTERVAL) + DATAGRAM_INTERVAL
-                with suppress(LinkError):  # the endpoint opens its link again
-                    await self.endpoint.link.send(data, self.peer)
-            await self._something_to_send.wait()
+        with self.scope:
+            while True:
+                self._something_to_send = anyio.Event()
+                while data := self.next_datagram():
+                    await anyio.sleep_until(turn_at)
+                    turn_at = max(turn_at, anyio.current_time() - DATAGRAM_INTERVAL) + DATAGRAM_INTERVAL
+                    with suppress(LinkError):  # the endpoint opens its link again
+                        await self.endpoint.link.send(data, self.peer)
+                await self._something_to_send.wait()
 
-    def _put(self, item: _Relayed | _Inserted | _Withheld) -> None:
+    def _put(self, source: Source, item: bytes | Message | None) -> None:
         if len(self._queue) < STATION_QUEUE_MAX:
-            self._queue.append(item)
+            self._queue.append((source, item))
             self._something_to_send.set()
         else:
             self.dropped += 1
 
     def _next_frame(self) -> bytes | None:
+        self._is_turn_of_streams = not self._is_turn_of_streams
+        if self._is_turn_of_streams:  # so that more telemetry than the link carries holds no list up
+            return self._next_of_streams() or self._next_of_queue()
+        return self._next_of_queue() or self._next_of_streams()
+
+    def _next_of_queue(self) -> bytes | None:
         while self._queue:
-            item = self._queue.popleft()
-            numbering = self._numbering.setdefault(item.source, Numbering())
-            match item:
-                case _Withheld():
-                    numbering.withhold()
-                case _Inserted(source, message):
-                    return self._inserted(numbering, source, message)
-                case _Relayed(_, data, is_signed):
-                    self.relayed += 1
-                    if is_signed:  # renumbered, it would be rejected
-                        return data
-                    return renumber_frame(data, numbering.relay(data[4 if data[0] == 0xFD else 2]))
+            source, item = self._queue.popleft()
+            numbering = self._numbering.setdefault(source, Numbering())
+            if item is None:
+                numbering.withhold()
+            elif not isinstance(item, bytes):
+                return self._inserted(source, item)
+            else:
+                self.relayed += 1
+                is_version_2 = item[0] == 0xFD
+                if is_version_2 and item[2]:  # signed: renumbered, it would be rejected
+                    return item
+                return renumber_frame(item, numbering.relay(item[4 if is_version_2 else 2]))
+        return None
+
+    def _next_of_streams(self) -> bytes | None:
         for key, (source, messages) in list(self._streams.items()):
             for message in messages:
-                return self._inserted(self._numbering.setdefault(source, Numbering()), source, message)
+                return self._inserted(source, message)
             del self._streams[key]
         return None
 
-    def _inserted(self, numbering: Numbering, source: Source, message: Message) -> bytes:
-        number, signer = numbering.insert(), self.endpoint.signer
+    def _inserted(self, source: Source, message: Message) -> bytes:
+        number = self._numbering.setdefault(source, Numbering()).insert()
         system, component = source
         data = encode(message, system=system, component=component, sequence=number, version=self.version)
-        if signer is not None:
-            signer.advance(anyio.current_time())
-            data = sign_frame(data, signer)
+        if self.endpoint.signer is not None:
+            self.endpoint.signer.advance(anyio.current_time())
+            data = sign_frame(data, self.endpoint.signer)
         self.answered += 1
         self.saved += len(data)
         return data
-
-
-@dataclass(frozen=True, slots=True)
-class _Options:
-    """The options of an endpoint's name."""
-
-    is_readonly: bool = False
-    is_trusted: bool = False
-    key: SigningKey | None = None
 
 
 class MavlinkEndpoint:
@@ -259,8 +247,7 @@ class MavlinkEndpoint:
     `udpin:` and `tcpin:` take any number of stations; on any other link, there is one.
 
     Args:
-        link: its name with options, such as `tcpin:5760?readonly`, or a link object. A listening one without
-            an address listens on the loopback address.
+        link: its name, or a link.
         is_readonly: whether nothing of its stations changes a vehicle.
         is_trusted: whether its stations, which need not sign, may write to a signed vehicle.
         key: with which its stations and the answers are signed; None for unsigned stations.
@@ -270,9 +257,6 @@ class MavlinkEndpoint:
         signer: signs the answers; None without a key.
         stations: the connected stations.
         sending: called with each frame that is about to be sent to a station.
-
-    Raises:
-        UsageError: the name or an option is invalid.
     """
 
     def __init__(
@@ -283,25 +267,16 @@ class MavlinkEndpoint:
         is_trusted: bool = False,
         key: SigningKey | None = None,
     ) -> None:
-        options = _Options(is_readonly, is_trusted, key)
-        if isinstance(link, str):
-            link, _, text = link.partition("?")
-            options = _options(text) if text else options
-            kind, _, port = link.partition(":")
-            if kind in ("udpin", "udp", "tcpin") and port.isdecimal():
-                link = f"{kind}:127.0.0.1:{port}"
         self.link = create_link(link)
         self.name = self.link.name
-        self.is_readonly = options.is_readonly
-        self.is_trusted = options.is_trusted
+        self.is_readonly = is_readonly
+        self.is_trusted = is_trusted
         self.signer: Signer | None = None
-        self._verifier: Verifier | None = None
-        if options.key is not None:
-            signing = Signing(options.key, SigningPolicy.SIGNED_ONLY, ANSWER_LINK_ID)
-            self.signer, self._verifier = signing.begin()
         self.stations: dict[Peer | None, GroundStation] = {}
         self.sending: Callable[[bytes], None] = lambda data: None
-        self._scopes: dict[Peer | None, anyio.CancelScope] = {}
+        self._verifier: Verifier | None = None
+        if key is not None:
+            self.signer, self._verifier = Signing(key, SigningPolicy.SIGNED_ONLY, ANSWER_LINK_ID).begin()
         self._listens = self.name.startswith(("udpin:", "tcpin:"))
 
     async def open(self) -> None:
@@ -350,14 +325,15 @@ class MavlinkEndpoint:
                 frames = cutter.cut(data, peer)
                 if self._verifier is not None:
                     frames = [each for each in frames if self._verifier.accepts(each.data)]
-                if frames:
+                for seen in frames:
                     station = self._station(peer if self._listens else None, tasks)
-                    for seen in frames:
-                        station.received(seen)
-                        take(station, seen)
+                    station.received(seen)
+                    take(station, seen)
                 if not data and self._listens:
                     self._forget(peer)
-            self._forget_silent()
+            if self._listens and not self.link.is_stream:
+                for peer in [peer for peer, each in self.stations.items() if each.silence > STATION_TIMEOUT]:
+                    self._forget(peer)
 
     async def _reopen(self) -> None:
         for peer in list(self.stations) if self._listens else ():
@@ -372,44 +348,41 @@ class MavlinkEndpoint:
         station = self.stations.get(peer)
         if station is None:
             if len(self.stations) >= STATIONS_MAX:
-                self._forget(min(self.stations, key=lambda each: self.stations[each].received_at))
+                self._forget(max(self.stations, key=lambda each: self.stations[each].silence))
             station = self.stations[peer] = GroundStation(self, peer)
-            scope = self._scopes[peer] = anyio.CancelScope()
             logger.info("%s: connected", station.name)
-
-            async def send() -> None:
-                with scope:
-                    await station.send()
-
-            tasks.start_soon(send)
+            tasks.start_soon(station.send)
         return station
 
     def _forget(self, peer: Peer | None) -> None:
-        if peer in self.stations:
-            logger.info("%s: disconnected", self.stations.pop(peer).name)
-            self._scopes.pop(peer).cancel()
-
-    def _forget_silent(self) -> None:
-        if self._listens and not self.link.is_stream:
-            oldest = anyio.current_time() - STATION_TIMEOUT
-            for peer in [peer for peer, each in self.stations.items() if each.received_at < oldest]:
-                self._forget(peer)
+        station = self.stations.pop(peer, None)
+        if station is not None:
+            logger.info("%s: disconnected", station.name)
+            station.scope.cancel()
 
 
-def _options(text: str) -> _Options:
-    """Parse the options behind the question mark of an endpoint's name."""
-    is_readonly = is_trusted = False
-    key = None
-    for each in text.split("&"):
-        name, _, value = each.partition("=")
-        if each == "readonly":
-            is_readonly = True
-        elif each == "trusted":
-            is_trusted = True
-        elif name == "sign" and value:
-            key = read_key(value)
-        else:
+def parse_endpoint(text: str) -> MavlinkEndpoint:
+    """Return the endpoint with this name: that of a link, with options, such as `tcpin:5760?readonly`.
+
+    A listening link without an address listens on the loopback address.
+
+    Raises:
+        UsageError: the name or an option is invalid.
+    """
+    link, _, query = text.partition("?")
+    kind, _, port = link.partition(":")
+    if kind in ("udpin", "udp", "tcpin") and port.isdecimal():
+        link = f"{kind}:127.0.0.1:{port}"
+    options = [each for each in query.split("&") if each]
+    keys = [each.removeprefix("sign=") for each in options if each.startswith("sign=")]
+    for each in options:
+        if each not in ("readonly", "trusted") and not each.startswith("sign="):
             raise UsageError(
                 f"{each!r} is not an option of an endpoint; these are readonly, trusted and sign=KEYFILE"
             )
-    return _Options(is_readonly, is_trusted, key)
+    return MavlinkEndpoint(
+        link,
+        is_readonly="readonly" in options,
+        is_trusted="trusted" in options,
+        key=read_key(keys[0]) if keys else None,
+    )

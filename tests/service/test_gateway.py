@@ -21,7 +21,7 @@ from paramclient.model.values import Encoding, encode_value
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.param_pck import decode, encode
 from paramclient.service import Hub, stations
-from paramclient.service.stations import MavlinkEndpoint, Numbering
+from paramclient.service.stations import MavlinkEndpoint, Numbering, parse_endpoint
 from paramclient.sim import Air, ArduPilotVehicle, Camera, Endpoint, PX4Vehicle
 from paramclient.wire import frames, messages
 from paramclient.wire.messages import (
@@ -754,11 +754,13 @@ def test_rule_13_names_of_endpoints(tmp_path: Path) -> None:
     key = tmp_path / "key"
     key.write_bytes(bytes(range(32)))
     key.chmod(0o600)
-    assert MavlinkEndpoint("tcpin:5760").name == "tcpin:127.0.0.1:5760"
-    assert MavlinkEndpoint("udpin:0.0.0.0:14551?readonly&trusted").is_trusted
-    assert MavlinkEndpoint(f"udpout:127.0.0.1:14550?sign={key}").name == "udpout:127.0.0.1:14550"
+    assert parse_endpoint("tcpin:5760").name == "tcpin:127.0.0.1:5760"
+    assert parse_endpoint("udpin:0.0.0.0:14551?readonly&trusted").is_trusted
+    signed = parse_endpoint(f"udpout:127.0.0.1:14550?sign={key}")
+    assert signed.name == "udpout:127.0.0.1:14550"
+    assert signed.signer is not None
     with pytest.raises(UsageError, match="not an option"):
-        MavlinkEndpoint("tcpin:5760?writeonly")
+        parse_endpoint("tcpin:5760?writeonly")
 
 
 # 14: visible, and the whole service
@@ -788,7 +790,7 @@ def test_rule_14_a_service_that_only_listens_has_no_stations() -> None:
 @pytest.mark.asyncio
 async def test_stations_on_tcp_and_udp() -> None:
     """`ParamClient` works through a gateway like with a vehicle."""
-    endpoints = [MavlinkEndpoint("tcpin:0"), MavlinkEndpoint("udpin:0")]
+    endpoints = [parse_endpoint("tcpin:0"), parse_endpoint("udpin:0")]
     vehicle = Tap(small_px4())
     async with Hub([vehicle], cache=False, mavlink=endpoints) as hub:
         ports = [each.link.address[1] for each in endpoints]  # type: ignore[attr-defined]  # of sockets
