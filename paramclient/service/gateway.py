@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Final, TypeAlias
 
 import anyio
@@ -16,34 +17,19 @@ import anyio
 from paramclient.client.client import ParamClient
 from paramclient.client.taps import SeenFrame, Tap
 from paramclient.errors import LinkError
+from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.node import Node
 from paramclient.protocol.session import Session
 from paramclient.service.kept_file import KeptFile
 from paramclient.service.kept_table import Asker, KeptTable
 from paramclient.service.stations import GroundStation, MavlinkEndpoint, Source
+from paramclient.wire import messages
 from paramclient.wire.frames import TARGET_OFFSETS, Frame, bears_key
 from paramclient.wire.messages import (
     AUTOPILOT_COMPONENT,
     COMP_ID_ALL,
     HASH_CHECK,
-    MAV_CMD_PREFLIGHT_STORAGE,
-    MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
-    MAV_CMD_REQUEST_MESSAGE,
-    CommandLong,
-    FileTransfer,
-    Heartbeat,
     Message,
-    ParamError,
-    ParamExtAck,
-    ParamExtRequestList,
-    ParamExtRequestRead,
-    ParamExtSet,
-    ParamExtValue,
-    ParamRequestList,
-    ParamRequestRead,
-    ParamSet,
-    ParamValue,
-    SystemTime,
     decode,
     encode,
     message_id,
@@ -61,33 +47,24 @@ GROUND_STATION_PARAMS: Final = ("SYSID_MYGCS", "MAV_GCS_SYSID")
 LOOP_TIME: Final = 2.0
 """Seconds after which a frame that was sent is not taken for its own copy any more."""
 
-Request: TypeAlias = (
-    ParamRequestList
-    | ParamRequestRead
-    | ParamSet
-    | ParamExtRequestList
-    | ParamExtRequestRead
-    | ParamExtSet
-    | FileTransfer
-)
-
-Answering: TypeAlias = "tuple[Asker, VehicleLink, KeptTable]"
-
-
-def _ids(*kinds: type[Message]) -> frozenset[int]:
-    return frozenset(map(message_id, kinds))
-
-
-REQUESTS: Final = _ids(
-    *(ParamRequestList, ParamRequestRead, ParamSet, ParamExtRequestList, ParamExtRequestRead, ParamExtSet),
-    FileTransfer,
-)
+ListRequest: TypeAlias = messages.ParamRequestList | messages.ParamExtRequestList
+ReadRequest: TypeAlias = messages.ParamRequestRead | messages.ParamExtRequestRead
+SetRequest: TypeAlias = messages.ParamSet | messages.ParamExtSet
+Request: TypeAlias = ListRequest | ReadRequest | SetRequest | messages.FileTransfer
 """Messages of a station that the gateway answers."""
-PLAIN_ANSWERS: Final = _ids(ParamValue, ParamError)
-EXTENDED_ANSWERS: Final = _ids(ParamExtValue, ParamExtAck)
-HARMLESS: Final = _ids(Heartbeat, SystemTime, FileTransfer, ParamRequestRead, ParamRequestList) | {4, 66, 111}
+PLAIN_ANSWERS: Final = {message_id(messages.ParamValue), message_id(messages.ParamError)}
+EXTENDED_REQUESTS: Final = {
+    message_id(each)
+    for each in (messages.ParamExtRequestList, messages.ParamExtRequestRead, messages.ParamExtSet)
+}
+EXTENDED_ANSWERS: Final = {message_id(messages.ParamExtValue), message_id(messages.ParamExtAck)}
+HEARTBEAT: Final = message_id(messages.Heartbeat)
+FILE_TRANSFER: Final = message_id(messages.FileTransfer)
+HARMLESS: Final = frozenset({HEARTBEAT, message_id(messages.SystemTime), 4, 66, 111})
 """What passes from the stations of a read-only endpoint, with PING, REQUEST_DATA_STREAM and TIMESYNC."""
-HARMLESS_COMMANDS: Final = (MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
+HARMLESS_COMMANDS: Final = (messages.MAV_CMD_REQUEST_MESSAGE, messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
+HARMLESS_OPCODES: Final = frozenset(Opcode) - {Opcode.CREATE_FILE, Opcode.WRITE_FILE}
+"""The requests of MAVFTP that write nothing."""
 
 logger = logging.getLogger(__name__)
 
@@ -173,54 +150,52 @@ class Gateway:
             return
         self.copies.sent(seen.data)
         message = decode(frame) if seen.is_proven else None
-        if frame.message_id in REQUESTS and message is not None:
+        if isinstance(message, Request):
             station.requests[type(message).__name__] += 1
-            if self._answer(station, source, message, seen):  # type: ignore[arg-type]  # by its id
+            if self._answer(station, source, message, seen):
                 return
         if not station.endpoint.is_readonly or _is_harmless(frame, message):
             self._route(seen.data, _target_of(frame))
-            if isinstance(message, CommandLong) and message.command == MAV_CMD_PREFLIGHT_STORAGE:
-                target = (message.target_system, message.target_component)
-                for table in [each for link in self.links for each in link.tables(*target, extended=False)]:
-                    table.component.watch.doubt()  # it may reset all, which PX4 does not announce
+            if getattr(message, "command", None) == messages.MAV_CMD_PREFLIGHT_STORAGE:
+                for link in self.links:
+                    for table in link.tables(_target_of(frame), COMP_ID_ALL, extended=False):
+                        table.component.watch.doubt()  # it may reset all, which PX4 does not announce
 
     def _answer(self, station: GroundStation, source: Source, message: Request, seen: SeenFrame) -> bool:
         """Answer a request about parameters; return False for one that passes to the vehicles."""
-        target, component = message.target_system, message.target_component
-        extended = isinstance(message, ParamExtRequestList | ParamExtRequestRead | ParamExtSet)
-        found = [
-            (link, table)
-            for link in self.links
-            for table in link.tables(target, component, extended=extended)
-        ]
-        served = [(link, table) for link, table in found if self._serves(station, table, link)]
+        address = (message.target_system, message.target_component)
+        extended = message_id(type(message)) in EXTENDED_REQUESTS
+        found = {table: link for link in self.links for table in link.tables(*address, extended=extended)}
+        served = [table for table, link in found.items() if self._serves(station, table, link)]
         if not served:
             return False
-        askers = [
-            (Asker(station, *source, may_write=not link.is_signed or station.may_sign), link, table)
-            for link, table in served
-            if not table.is_lost
-        ]
+        present = [table for table in served if not table.is_lost]
+        autopilots = [table for table in present if table.source[1] == AUTOPILOT_COMPONENT]
+        one = (autopilots or present)[:1]  # that answers a request which all components receive
+        may_write = station.may_sign or not any(link.is_signed for link in found.values())
+        asker = Asker(station, *source, may_write)
         match message:
-            case ParamRequestList() | ParamExtRequestList():
-                for _, _, table in askers:
+            case messages.ParamRequestList() | messages.ParamExtRequestList():
+                for table in present:
                     table.send_list(station)
-                for link, table in found:
-                    if (link, table) not in served and table.source[1] != AUTOPILOT_COMPONENT:
+                for table, link in found.items():
+                    if table not in served and table.source[1] != AUTOPILOT_COMPONENT:
                         link.send(_readdressed(message, seen.frame, table.source))
-            case ParamRequestRead() | ParamExtRequestRead():
+            case messages.ParamRequestRead() | messages.ParamExtRequestRead():
                 which = message.param_id if message.param_index < 0 else message.param_index
-                having = [each for each in askers if each[2].known(which) is not None]
-                for asker, _, table in having or _chosen(askers):
+                for table in [each for each in present if each.known(which) is not None] or one:
                     table.read(asker, which)
-            case ParamSet(param_id=name) if name == HASH_CHECK:
-                pass  # it would stop the gateway's own list
-            case ParamSet() | ParamExtSet():
-                for asker, _, table in _chosen(askers):
-                    table.set(asker, message)
-            case FileTransfer(payload=payload):
-                for asker, link, table in _chosen(askers):
-                    return link.file(table).take(asker, payload, lambda: self._route(seen.data, target))
+            case messages.ParamSet() | messages.ParamExtSet():
+                if message.param_id != HASH_CHECK:  # it would stop the gateway's own list
+                    for table in one:
+                        table.set(asker, message)
+            case messages.FileTransfer(payload=payload):
+                for table in one:
+                    return (
+                        found[table]
+                        .file(table)
+                        .take(asker, payload, lambda: self._route(seen.data, message.target_system))
+                    )
         return True
 
     def _serves(self, station: GroundStation, table: KeptTable, link: VehicleLink) -> bool:
@@ -292,18 +267,17 @@ class VehicleLink(Tap):
                 self.systems.add(source[0])
                 if seen.is_signed:
                     self.signing.add(source)
-                if seen.frame.message_id == message_id(Heartbeat):
+                if seen.frame.message_id == HEARTBEAT:
                     self._avoid_watched_id(source)
                 self._gateway.pass_on(self, seen, peer)
 
     def _avoid_watched_id(self, source: Source) -> None:
         """Take another system id if the vehicle watches ours as that of its ground station."""
-        node, station = self._client.core.station.nodes.get(source), self._client.core.station
+        station, (system, component) = self._client.core.station, self._own_address
+        node = station.nodes.get(source)
         params = {} if node is None else node.plain.table.params
-        if any(
-            name in params and params[name].value == self._own_address[0] for name in GROUND_STATION_PARAMS
-        ):
-            station.own_address = (self._own_address[0] - 1, self._own_address[1])
+        if any(name in params and params[name].value == system for name in GROUND_STATION_PARAMS):
+            station.own_address = (system - 1, component)
 
     def is_vehicle(self, source: Source) -> bool:
         """Return whether a component with parameters is heard under these ids."""
@@ -334,22 +308,17 @@ class VehicleLink(Tap):
         if frame.message_id in EXTENDED_ANSWERS:
             return extended
         is_answer = frame.message_id in PLAIN_ANSWERS or (
-            frame.message_id == message_id(FileTransfer) and _target_of(frame) == self._own_address[0]
+            frame.message_id == FILE_TRANSFER and _target_of(frame) == self._own_address[0]
         )
         return table if is_answer else None
 
     def _table(self, node: Node, *, extended: bool) -> KeptTable:
         session = node.extended if extended else node.plain
-        table = self._tables.get(session)
-        if table is None:
+        if session not in self._tables:
             component = self._client.components[node.system, node.component]
-
-            def announce(table: KeptTable, message: Message) -> None:
-                self._gateway.announce(self, table, message)
-
-            table = KeptTable(component.ext if extended else component, announce)
-            self._tables[session] = table
-        return table
+            announce = partial(self._gateway.announce, self)
+            self._tables[session] = KeptTable(component.ext if extended else component, announce)
+        return self._tables[session]
 
 
 class _Copies:
@@ -401,25 +370,22 @@ def _target_of(frame: Frame) -> int:
     return frame.payload[at] if at < len(frame.payload) else 0
 
 
-def _chosen(found: list[Answering]) -> list[Answering]:
-    """Return the component that answers a request to one: the autopilot, if all components are asked."""
-    return ([each for each in found if each[2].source[1] == AUTOPILOT_COMPONENT] or found)[:1]
-
-
-def _readdressed(message: ParamRequestList | ParamExtRequestList, frame: Frame, target: Source) -> bytes:
+def _readdressed(message: ListRequest, frame: Frame, target: Source) -> bytes:
     """Return a request for a list to one component, in the name of the station."""
     system, component = target
     single = replace(message, target_system=system, target_component=component)
-    return encode(
-        single,
-        system=frame.system,
-        component=frame.component,
-        sequence=frame.sequence,
-        version=frame.version,
-    )
+    sender = {"system": frame.system, "component": frame.component, "version": frame.version}
+    return encode(single, sequence=frame.sequence, **sender)
 
 
 def _is_harmless(frame: Frame, message: Message | None) -> bool:
-    if isinstance(message, CommandLong):
-        return message.command in HARMLESS_COMMANDS
-    return frame.message_id in HARMLESS
+    """Return whether a frame changes nothing on a vehicle."""
+    match message:
+        case messages.CommandLong(command=command):
+            return command in HARMLESS_COMMANDS
+        case messages.FileTransfer(payload=payload):
+            return Packet.unpack(payload).opcode in HARMLESS_OPCODES
+        case messages.ParamSet() | messages.ParamExtSet():
+            return False
+        case _:
+            return frame.message_id in HARMLESS or isinstance(message, Request)

@@ -29,17 +29,8 @@ from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
 from paramclient.protocol.watch import SyncState
 from paramclient.service.stations import GroundStation
-from paramclient.wire.messages import (
-    HASH_CHECK,
-    NO_INDEX,
-    Message,
-    ParamError,
-    ParamExtAck,
-    ParamExtSet,
-    ParamExtValue,
-    ParamSet,
-    ParamValue,
-)
+from paramclient.wire import messages
+from paramclient.wire.messages import HASH_CHECK, NO_INDEX, Message
 
 __all__ = ["Asker", "KeptTable", "digest_of", "listed", "value_of"]
 
@@ -87,7 +78,7 @@ class Asker(NamedTuple):
     station: GroundStation
     system: int
     component: int
-    may_write: bool = True
+    may_write: bool
 
 
 # Messages from parameters
@@ -108,21 +99,21 @@ def value_of(session: Session, param: Param, *, index: int | None = None) -> Rep
         index = NO_INDEX if param.index is None or is_ardupilot else param.index
     if session.dialect.has_ack:
         raw = ext_bytes(param).ljust(EXT_VALUE_SIZE, b"\0")
-        return ParamExtValue(param.name, raw, param.type_number, count, index)
+        return messages.ParamExtValue(param.name, raw, param.type_number, count, index)
     if param.is_raw:
         raw = param.bits.to_bytes(WIRE_SIZE, "little")
     else:
         raw = as_reported(param.bits, param.type_number, session.table.encoding)
-    return ParamValue(param.name, raw, param.type_number, count, index)
+    return messages.ParamValue(param.name, raw, param.type_number, count, index)
 
 
-def digest_of(session: Session) -> ParamValue | None:
+def digest_of(session: Session) -> messages.ParamValue | None:
     """Return the `_HASH_CHECK` of a PX4; None for another vehicle, or while it is unknown."""
     table = session.table
     if not session.identification.is_px4 or table.hash is None or table.count is None:
         return None
     raw = table.hash.to_bytes(WIRE_SIZE, "little")
-    return ParamValue(HASH_CHECK, raw, ParamType.UINT32, table.count, NO_INDEX)
+    return messages.ParamValue(HASH_CHECK, raw, ParamType.UINT32, table.count, NO_INDEX)
 
 
 def listed(session: Session) -> list[ReportedValue]:
@@ -364,7 +355,7 @@ class KeptTable:
             value = await read(self.session, which)
         return value._replace(param_id=which) if isinstance(which, str) else value
 
-    def set(self, asker: Asker, message: ParamSet | ParamExtSet) -> None:
+    def set(self, asker: Asker, message: messages.ParamSet | messages.ParamExtSet) -> None:
         """Carry out a set as a verified write; equal ones at the same time are one."""
         key = (message.param_id, message.raw, message.param_type)
         if asker.station.endpoint.is_readonly:
@@ -412,7 +403,7 @@ class KeptTable:
             value, _ = decode_value(raw, known, session.table.encoding)
         result = await self.component.set(name, value, author=author)
         done = value_of(session, result.param)
-        answer = ParamExtAck(name, done.raw, number, ExtAckResult.ACCEPTED) if is_extended else done
+        answer = messages.ParamExtAck(name, done.raw, number, ExtAckResult.ACCEPTED) if is_extended else done
         for asker in askers:
             asker.station.say(answer, self.source)
 
@@ -423,7 +414,7 @@ class KeptTable:
             is_value = code in (ExtAckResult.VALUE_UNSUPPORTED, ParamErrorCode.TYPE_MISMATCH)
             result = ExtAckResult.VALUE_UNSUPPORTED if is_value else ExtAckResult.FAILED
             for asker in askers:
-                asker.station.say(ParamExtAck(name, raw, number, result), self.source)
+                asker.station.say(messages.ParamExtAck(name, raw, number, result), self.source)
             return
         self._refuse(askers, name, code)
         value = self.known(name)
@@ -436,7 +427,7 @@ class KeptTable:
         name, index = (which, -1) if isinstance(which, str) else ("", which)
         for station, system, component, _ in askers:
             if not (self.session.dialect.has_ack or self.is_lost):
-                station.say(ParamError(system, component, name, index, code), self.source)
+                station.say(messages.ParamError(system, component, name, index, code), self.source)
 
 
 def _code_of(error: ParamClientError) -> int:

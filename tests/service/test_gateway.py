@@ -528,6 +528,20 @@ async def test_rule_6_queues_are_bounded(monkeypatch: pytest.MonkeyPatch) -> Non
         assert len(station.frames) <= 20
 
 
+@in_simulated_time
+async def test_rule_6_telemetry_holds_no_list_up() -> None:
+    vehicle = Puppet(lambda message: ())
+    async with gateway_over(Air([small_px4(), vehicle])) as served:
+        await served.synced()
+        station = served.partner()
+        await station.ask(GCS)
+        frame = frames.build_frame(30, bytes(range(28)), system=1, component=1, sequence=1)
+        for _ in range(2_000):
+            vehicle.say_bytes(frame)
+        await station.ask(LIST, seconds=0.05)
+        assert len(station.of(ParamValue)) == 26
+
+
 # 7: sequence numbers
 
 
@@ -746,8 +760,12 @@ async def test_rule_13_a_readonly_endpoint() -> None:
         )
         assert station.of(ParamError) == [ParamError(255, 190, "PARAM_01", -1, 5)]
         assert by_name(station)["PARAM_01"] == struct.pack("<i", 1)
-        passed = [message for _, frame, message in vehicle.received if frame.system == 255]
-        assert passed == [CommandLong(1, 1, 512, 148.0), GCS]
+        await station.ask_file(Opcode.CREATE_FILE, data=b"a.txt")
+        await station.ask_file(Opcode.LIST_DIRECTORY, data=b"/")
+        commands = [message for _, frame, message in vehicle.received if frame.system == 255]
+        assert commands[:2] == [CommandLong(1, 1, 512, 148.0), GCS]
+        files = [Packet.unpack(each.payload).opcode for each in vehicle.messages(FileTransfer)]
+        assert files == [Opcode.LIST_DIRECTORY]
 
 
 def test_rule_13_names_of_endpoints(tmp_path: Path) -> None:
