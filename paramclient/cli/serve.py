@@ -89,7 +89,7 @@ async def serve(
 
     def started(url: str) -> None:
         for endpoint in hub.gateway.endpoints:
-            print_line(f"ground stations: {endpoint.name}")
+            print_line(f"ground stations: {endpoint.address}")
         print_line(f"serving on {url}")
 
     with on_end_signal(lambda _: stop.set()):

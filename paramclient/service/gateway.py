@@ -40,6 +40,8 @@ __all__ = ["GATEWAY_ADDRESS", "Gateway"]
 GATEWAY_ADDRESS: Final = (254, 191)
 """System and component id of the gateway (MAV_COMP_ID_ONBOARD_COMPUTER): not those of a ground station, so
 that vehicles notice when they lose all of these."""
+GROUND_STATION_ADDRESS: Final = (255, 190)
+"""The ids of a client by default."""
 OWN_TYPE: Final = 18
 """MAV_TYPE_ONBOARD_CONTROLLER, for the same reason."""
 GROUND_STATION_PARAMS: Final = ("SYSID_MYGCS", "MAV_GCS_SYSID")
@@ -97,7 +99,10 @@ class Gateway:
 
     def attach(self, client: ParamClient) -> None:
         """Serve the vehicles of a client, which is not open yet. It is no ground station any more."""
-        client.core.station.own_address, client.core.station.own_type = GATEWAY_ADDRESS, OWN_TYPE
+        station = client.core.station
+        station.own_type = OWN_TYPE
+        if station.own_address == GROUND_STATION_ADDRESS:
+            station.own_address = GATEWAY_ADDRESS
         client.core.add_tap(VehicleLink(self, client))
 
     async def open(self) -> None:

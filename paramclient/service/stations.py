@@ -279,6 +279,14 @@ class MavlinkEndpoint:
             self.signer, self._verifier = Signing(key, SigningPolicy.SIGNED_ONLY, ANSWER_LINK_ID).begin()
         self._listens = self.name.startswith(("udpin:", "tcpin:"))
 
+    @property
+    def address(self) -> str:
+        """The name, with the port that the system has chosen in place of 0."""
+        bound = getattr(self.link, "address", None)
+        if bound is None or not self.name.endswith(":0"):
+            return self.name
+        return f"{self.name.removesuffix('0')}{bound[1]}"
+
     async def open(self) -> None:
         """Open the link.
 
