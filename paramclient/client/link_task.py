@@ -56,6 +56,7 @@ class LinkTask:
         is_disconnected: whether the link is disconnected and being reopened.
         activity: set, and replaced, when data was received, and when the link drops or has failed.
         bytes_received, bytes_sent: on this link.
+        accepts: whether to take received data of a peer; called with each chunk.
         cutter: cuts the received data for the taps.
     """
 
@@ -66,6 +67,7 @@ class LinkTask:
         self.activity = anyio.Event()
         self.bytes_received = self.bytes_sent = 0
         self.cutter = FrameCutter(stream=link.is_stream)
+        self.accepts: Callable[[bytes, Peer], bool] = lambda data, peer: True
         self._link = link
         self._taps = taps
         self._ended = ended
@@ -109,8 +111,9 @@ class LinkTask:
                 return
             for place, (peer, data) in enumerate(chunks, start=1):
                 self.bytes_received += len(data)
-                self.station.receive(data, peer, anyio.current_time())
-                self._show(data, peer)
+                if self.accepts(data, peer):
+                    self.station.receive(data, peer, anyio.current_time())
+                    self._show(data, peer)
                 if not place % CHUNKS_PER_TURN:
                     await anyio.lowlevel.checkpoint()
             self.notify()

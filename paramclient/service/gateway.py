@@ -90,7 +90,7 @@ class Gateway:
         self.copies = _Copies()
         self._warned: set[Source] = set()
         for endpoint in self.endpoints:
-            endpoint.sending = self.copies.sent
+            endpoint.sending = self.copies.sent_down
 
     @property
     def stations(self) -> list[GroundStation]:
@@ -103,7 +103,9 @@ class Gateway:
         station.own_type = OWN_TYPE
         if station.own_address == GROUND_STATION_ADDRESS:
             station.own_address = GATEWAY_ADDRESS
-        client.core.add_tap(VehicleLink(self, client))
+        link = VehicleLink(self, client)
+        client.core.add_tap(link)
+        client.core.link_task.accepts = link.accepts
 
     async def open(self) -> None:
         """Open the endpoints.
@@ -153,7 +155,7 @@ class Gateway:
         is_vehicle = any(link.is_vehicle(source) for link in self.links)
         if bears_key(seen.data) or is_vehicle or self.copies.is_copy(seen.data, station, sees_number=True):
             return
-        self.copies.sent(seen.data)
+        self.copies.sent_down(seen.data)  # no traffic between stations, not even by a vehicle's link
         message = decode(frame) if seen.is_proven else None
         if isinstance(message, Request):
             station.requests[type(message).__name__] += 1
@@ -260,6 +262,15 @@ class VehicleLink(Tap):
         finally:
             self._gateway.links.remove(self)
 
+    def accepts(self, data: bytes, peer: Hashable) -> bool:
+        """Return whether received data is no datagram of the gateway that has come back over another peer."""
+        peers = (node.peer for node in self._client.core.station.nodes.values())
+        return not self._gateway.copies.has(data) or peer in peers
+
+    def sent(self, frame: bytes) -> None:
+        """Take note of a frame to the vehicles."""
+        self._gateway.copies.sent_up(frame)
+
     def send(self, data: bytes) -> None:
         """Send a frame of a station to the vehicles."""
         self._client.core.link_task.forward(data)
@@ -337,10 +348,21 @@ class _Copies:
         self._earlier: dict[int, Hashable] = {}
         self._turned_at = 0.0
 
-    def sent(self, data: bytes) -> None:
-        """Take note of a frame that is sent to a station, or taken from one."""
+    def sent_down(self, data: bytes) -> None:
+        """Take note of a frame, or of a whole datagram, that is sent to a station."""
+        self._note(_key_of(data, sees_number=False))
+        self._note(hash(data))
+
+    def sent_up(self, data: bytes) -> None:
+        """Take note of a frame that is sent to vehicles."""
+        self._note(hash(data))
+
+    def has(self, data: bytes) -> bool:
+        """Return whether these bytes were sent a moment ago."""
+        return hash(data) in self._recent or hash(data) in self._earlier
+
+    def _note(self, key: int) -> None:
         self._turn()
-        key = _key_of(data, sees_number=False)
         self._recent.setdefault(key, self._earlier.get(key))
 
     def is_copy(self, data: bytes, origin: Hashable, *, sees_number: bool) -> bool:

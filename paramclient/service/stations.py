@@ -178,6 +178,8 @@ class GroundStation:
             frames.append(data)
             size += len(data)
             self.endpoint.sending(data)
+        if len(frames) > 1:
+            self.endpoint.sending(b"".join(frames))
         return b"".join(frames)
 
     async def send(self) -> None:
@@ -256,7 +258,7 @@ class MavlinkEndpoint:
         link, name, is_readonly, is_trusted: as given.
         signer: signs the answers; None without a key.
         stations: the connected stations.
-        sending: called with each frame that is about to be sent to a station.
+        sending: called with each frame and each datagram that is about to be sent to a station.
     """
 
     def __init__(

@@ -15,8 +15,10 @@ from typing import Any
 import anyio
 import pytest
 
+from bench.peers import free_port
 from paramclient import ParamType
 from paramclient.errors import LinkError, UsageError
+from paramclient.links import create_link, serve_endpoint
 from paramclient.model.values import Encoding, encode_value
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.param_pck import decode, encode
@@ -708,6 +710,29 @@ async def test_rule_11_a_loop_ends() -> None:
         station.send_bytes(own)  # of a vehicle that is kept
         await anyio.sleep(0.2)
         assert len(station.frames) - before <= 2
+
+
+@pytest.mark.asyncio
+async def test_rule_11_an_endpoint_that_leads_to_the_link_itself() -> None:
+    """As with a link that listens where QGroundControl is expected to."""
+    port = free_port()
+    vehicle = small_px4()
+    endpoints = [parse_endpoint(f"udpout:127.0.0.1:{port}"), parse_endpoint("tcpin:0")]
+    async with anyio.create_task_group() as tasks:
+        async with Hub([f"udpin:127.0.0.1:{port}"], cache=False, mavlink=endpoints) as hub:
+            tasks.start_soon(serve_endpoint, vehicle, create_link(f"udpout:127.0.0.1:{port}"))
+            await until(lambda: hub.targets and hub.targets[0].component.sync_state == "synced")
+            client = hub.links[f"udpin:127.0.0.1:{port}"].client
+            assert client is not None
+            before = client.bytes_received + client.bytes_sent
+            await anyio.sleep(1.0)
+            assert client.bytes_received + client.bytes_sent - before < 50_000
+            tcp = endpoints[1].address.replace("tcpin", "tcp")
+            async with a_client(tcp) as station:
+                component = await station.component()
+                assert (await component.fetch_all()).complete
+                assert (await component.set("PARAM_01", 5)).status == "accepted"
+        tasks.cancel_scope.cancel()
 
 
 @in_simulated_time
