@@ -24,7 +24,8 @@ def simulated() -> Air:
 async def main(link: str | None = None, first: str = "1", second: str = "2") -> None:
     async with ParamClient(link or simulated()) as client:
         one, two = await asyncio.gather(client.component(int(first)), client.component(int(second)))
-        for result in await asyncio.gather(one.fetch_all(), two.fetch_all()):
+        fetched = await client.fetch_all()
+        for result in fetched.results.values():
             print(result)
         for name in sorted(one.params.keys() & two.params.keys()):
             if not one.params[name].same_value(two.params[name]):

@@ -20,6 +20,7 @@ from paramclient.client.client import ParamClient
 from paramclient.client.component import Component, ComponentState
 from paramclient.client.events import Discovered, Event, Events, Found, Lost, Rebooted, Resynced
 from paramclient.client.files import Ftp
+from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.signing import Signing, read_key
 from paramclient.client.streams import Changes
 from paramclient.errors import (
@@ -80,6 +81,7 @@ __all__ = [
     "Event",
     "Events",
     "FetchResult",
+    "FetchedAll",
     "FileError",
     "FileTransferError",
     "Found",

@@ -15,7 +15,7 @@ from unittest import mock
 import anyio
 import anyio.to_thread
 
-from paramclient import CacheError, Component, FetchResult, NoReply, Param, ParamClient, ParamType
+from paramclient import Component, Param, ParamClient, ParamType
 from paramclient.client import cache_writer
 from paramclient.errors import LinkError
 from paramclient.links import Peer, SimLink
@@ -411,23 +411,3 @@ def a_client(link: Any, **options: Any) -> ParamClient:
 
 def _nothing() -> None:
     return
-
-
-async def fetch_everyone(
-    client: ParamClient, *, refresh: bool = False
-) -> tuple[dict[object, FetchResult], dict[object, NoReply | CacheError]]:
-    """Fetch all components that are heard within 1.2 s side by side: the results, and the errors."""
-    await anyio.sleep(1.2)
-    results: dict[object, FetchResult] = {}
-    silent: dict[object, NoReply | CacheError] = {}
-
-    async def fetch(address: object, component: Component) -> None:
-        try:
-            results[address] = await component.fetch_all(refresh=refresh)
-        except (NoReply, CacheError) as error:
-            silent[address] = error
-
-    async with anyio.create_task_group() as tasks:
-        for address, component in client.components.items():
-            tasks.start_soon(fetch, address, component)
-    return results, silent

@@ -309,7 +309,9 @@ class SqliteStore:
         connection.execute("PRAGMA foreign_keys = ON")
         connection.execute("PRAGMA synchronous = NORMAL")
         if writing:
+            connection.execute("BEGIN")  # another process may be creating the tables
             _has_tables(connection)  # nothing is changed in a file that is no cache
+            connection.execute("COMMIT")
             _switch_to_wal(connection)
         return connection
 

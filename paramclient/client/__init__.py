@@ -6,7 +6,7 @@
 - `cache_writer`: loads cached tables, writes new values in batches, and waits for the disk
   if a write is durable.
 - `streams`, `events`: streams of items and of parameter changes; events of components and their stream.
-- `files`: MAVFTP calls.
+- `fleet_fetch`, `files`: fetches of several components, MAVFTP calls.
 - `signing`: keys, options, persistent timestamps.
 - `taps`, `recording`, `forwarding`, `traffic`: the receivers of all frames of a link: the telemetry log, one
   other program, counts.

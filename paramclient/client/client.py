@@ -18,6 +18,7 @@ from paramclient.client.component import Component
 from paramclient.client.core import ClientCore
 from paramclient.client.events import Events
 from paramclient.client.files import Ftp
+from paramclient.client.fleet_fetch import FetchedAll, fetch_components
 from paramclient.client.forwarding import Forwarder
 from paramclient.client.recording import Capture
 from paramclient.client.signing import Signing, refused_in_words
@@ -59,6 +60,8 @@ be lost."""
 PROBE_INTERVAL: Final = 0.5
 """Seconds between two requests to a component that is named in full and was not heard; the first one after
 `LOOK_TIME`, in which a component with heartbeats is heard."""
+LISTENING_TIME: Final = 1.2
+"""Seconds after the client was opened in which components are waited for, by a fetch of all."""
 
 
 class ParamClient:
@@ -397,6 +400,49 @@ class ParamClient:
         if not before.is_same_vehicle(found.identity):
             raise AnotherVehicle(system, found.component, str(before), str(found.identity))
         return found
+
+    async def fetch_all(
+        self,
+        system: int | None = None,
+        *,
+        refresh: bool = False,
+        timeout: float | None = None,
+    ) -> FetchedAll:
+        """Update the tables of all components of one system, or of every system on the link.
+
+        The fetches run in parallel. Components that appear within 1.2 s after the client was opened are
+        included. A component that does not respond is given up; it may have no parameters. Where another
+        component responds, that takes 1.75 s.
+
+        Args:
+            system: fetch only this system; None for all.
+            refresh: as in `Component.fetch_all`.
+            timeout: seconds after which partial results are returned; None: no limit.
+
+        Returns:
+            The results by (system, component), and the errors of the components that did not respond.
+
+        Raises:
+            NoReply: no component was found, or none responded.
+            LinkError: the link failed, or the client was closed.
+        """
+        if refresh:
+            self.core.check_may_send()
+        nodes = self.core.station.nodes
+        deadline = math.inf if timeout is None else anyio.current_time() + timeout
+        await self._wait_for(
+            lambda: (next((each for each in nodes.values() if system in (None, each.system)), None), None),
+            "a component" if system is None else f"a component of system {system}",
+            COMPONENT_TIMEOUT if timeout is None else timeout,
+        )
+        await anyio.sleep_until(self.core.station.listening_since + LISTENING_TIME)
+        chosen = {
+            address: each
+            for address, each in self._components.items()
+            if system in (None, each.system) and each.node.identification.has_parameters
+        }
+        left = None if timeout is None else deadline - anyio.current_time()
+        return await fetch_components(chosen, refresh=refresh, timeout=left)
 
     def traffic_report(self) -> TrafficReport:
         """Return the traffic statistics of the link: components, message rates, packet loss.

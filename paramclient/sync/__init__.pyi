@@ -8,6 +8,7 @@ from typing import Self, TypeAlias
 from paramclient.cache import ParamCache
 from paramclient.client.client import COMPONENT_TIMEOUT
 from paramclient.client.component import REBOOT_TIMEOUT, ComponentState
+from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.signing import Signing
 from paramclient.client.traffic import TrafficReport
 from paramclient.links import Link
@@ -281,6 +282,10 @@ class ParamClient:
         self, component: Component, system: int, *, timeout: float | None = COMPONENT_TIMEOUT
     ) -> Component:
         """Return the component of the same vehicle under its new system id, after its first message there."""
+    def fetch_all(
+        self, system: int | None = None, *, refresh: bool = False, timeout: float | None = None
+    ) -> FetchedAll:
+        """Update the tables of all components of one system, or of every system on the link."""
     def traffic_report(self) -> TrafficReport:
         """Return the traffic statistics of the link: components, message rates, packet loss."""
     def signing_report(self) -> SigningReport | None:

@@ -40,7 +40,6 @@ from tests.shell import (
     Radio,
     Tap,
     bits,
-    fetch_everyone,
     generic,
     in_simulated_time,
     outcome,
@@ -244,10 +243,12 @@ async def test_everyone_on_the_link_starts_from_the_cache(path: Path) -> None:
     camera = generic(system=1, component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
     for source in ("stream", "cache"):
         async with ParamClient(Air([*vehicles, camera]), cache=path) as client:
-            results, silent = await fetch_everyone(client)
-            assert {result.source for result in results.values() if result.component == 1} == {source}
-            assert results.keys() == {(1, 1), (2, 1), (3, 1), (1, 100)}
-            assert not silent
+            everything = await client.fetch_all()
+            assert {result.source for address, result in everything.results.items() if address[1] == 1} == {
+                source
+            }
+            assert everything.results.keys() == {(1, 1), (2, 1), (3, 1), (1, 100)}
+            assert not everything.silent
     assert [vehicle.requests["PARAM_REQUEST_LIST"] for vehicle in vehicles] == [1, 1, 1]
     with ParamCache(path) as cache:
         assert len(cache.components()) == 4
@@ -274,13 +275,13 @@ async def test_a_silent_component_with_a_cached_table_delays_no_other_component(
 ) -> None:
     vehicle, silent = small_px4(), Reticent(system=2, table=VALUES)
     async with ParamClient(Air([vehicle, silent]), cache=path) as client:
-        assert not (await fetch_everyone(client))[1]
+        assert not (await client.fetch_all()).silent
     silent.unanswered = unanswered
     async with ParamClient(Air([vehicle, silent]), cache=path) as client:
-        results, errors = await fetch_everyone(client)
-        assert results[1, 1].elapsed < 0.5
-        assert results.keys() == {(1, 1)}
-        assert errors.keys() == {(2, 1)}
+        everything = await client.fetch_all()
+        assert everything.results[1, 1].elapsed < 0.5
+        assert everything.results.keys() == {(1, 1)}
+        assert everything.silent.keys() == {(2, 1)}
 
 
 # Who it is

@@ -68,6 +68,8 @@ CALLS: dict[str, Call] = {
     "fetch_all anew": lambda client, component: component.fetch_all(refresh=True, timeout=9, progress=seen),
     "changes": first_change,
     "component": lambda client, component: client.component(system=2),
+    "fetch_all of everyone": lambda client, component: client.fetch_all(),
+    "fetch_all of a system": lambda client, component: client.fetch_all(1),
 }
 EVERY_CALL = pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
 

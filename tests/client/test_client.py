@@ -40,7 +40,6 @@ from tests.shell import (
     Tap,
     a_client,
     bits,
-    fetch_everyone,
     generic,
     in_simulated_time,
     outcome,
@@ -61,6 +60,7 @@ CALLS: dict[str, Call] = {
     "fetch_all": lambda client, component: component.fetch_all(),
     "changes": lambda client, component: changes_of(component),
     "client.component": lambda client, component: client.component(system=99, timeout=None),
+    "client.fetch_all": lambda client, component: client.fetch_all(),
 }
 """The public calls that wait."""
 
@@ -144,8 +144,9 @@ def test_a_client_can_be_made_before_the_event_loop() -> None:
 @in_simulated_time
 async def test_calls_on_a_client_that_is_not_open() -> None:
     client = a_client(small_px4())
-    with pytest.raises(ClientClosed, match="not open"):
-        await client.component()
+    for before in (client.component(), client.fetch_all()):
+        with pytest.raises(ClientClosed, match="not open"):
+            await before
     async with client:
         component = await client.component()
         await component.fetch_all()
@@ -442,7 +443,7 @@ async def test_calls_without_a_time_limit_end_by_themselves() -> None:
     async with a_client(tap) as client:
         component = await client.component()
         tap.is_deaf = True
-        for name in ("get", "set", "fetch_all"):
+        for name in ("get", "set", "fetch_all", "client.fetch_all"):
             began = anyio.current_time()
             with pytest.raises(NoReply) as caught:
                 await CALLS[name](client, component)
@@ -467,6 +468,9 @@ async def test_a_fetch_that_times_out_returns_the_received_values() -> None:
         assert list(result.params) == list(VALUES)[: result.received]
         await settled()
         assert not residue(component)
+        both = await client.fetch_all(timeout=1.0)
+        assert not both.complete
+        assert both.results[1, 1].missing
         whole = await component.fetch_all()
         assert whole.complete
         assert dict(whole.params) == slow.params
@@ -500,10 +504,15 @@ async def test_a_fetch_brings_every_parameter() -> None:
 @pytest.mark.parametrize("refresh", [False, True])
 async def test_a_first_fetch_waits_to_hear_whether_there_is_a_file(refresh: bool) -> None:
     """The list of ArduPilot takes several times longer, on a radio ten times."""
-    async with a_client(Air.symmetric([ArduPilotVehicle()], delay=0.2)) as client:
-        component = await client.component()
-        assert component.identity.uid is None  # it has not said who it is yet
-        assert (await component.fetch_all(refresh=refresh)).source == "ftp"
+    for of_all in (False, True):
+        async with a_client(Air.symmetric([ArduPilotVehicle()], delay=0.2)) as client:
+            component = await client.component()
+            assert component.identity.uid is None  # it has not said who it is yet
+            if of_all:
+                results = (await client.fetch_all(refresh=refresh)).results
+                assert [result.source for result in results.values()] == ["ftp"]
+            else:
+                assert (await component.fetch_all(refresh=refresh)).source == "ftp"
 
 
 @in_simulated_time
@@ -539,14 +548,15 @@ async def test_several_vehicles_are_fetched_side_by_side() -> None:
         (3, 1): ArduPilotVehicle(system=3),
     }
     async with a_client(Air(list(vehicles.values()))) as client:
-        results, silent = await fetch_everyone(client)
-        assert not silent
-        assert results.keys() == vehicles.keys()
-        for address, result in results.items():
-            assert isinstance(address, tuple)
-            assert result.complete
+        everything = await client.fetch_all()
+        assert everything.complete
+        assert not everything.silent
+        assert everything.results.keys() == vehicles.keys()
+        for address, result in everything.results.items():
             assert bits(result.params) == bits(vehicles[address].params)
             assert client.components[address].params == result.params
+        one_system = await client.fetch_all(1, refresh=True)
+        assert one_system.results.keys() == {(1, 1), (1, 100)}
 
 
 class Silent(GenericVehicle):
@@ -565,15 +575,34 @@ async def test_a_silent_component_delays_no_other_component(autopilot: int) -> N
         began = anyio.current_time()
         assert (await component.fetch_all()).complete
         assert anyio.current_time() - began < 0.5
-        results, errors = await fetch_everyone(client, refresh=True)
-        assert results[1, 1].complete
-        assert results[1, 1].elapsed < 0.5
-        assert errors.keys() == {(1, 100), (2, 1)}
-        for error in errors.values():
+        began = anyio.current_time()
+        everything = await client.fetch_all(refresh=True)
+        assert anyio.current_time() - began < 3.0
+        assert everything.results.keys() == {(1, 1)}
+        assert everything.silent.keys() == {(1, 100), (2, 1)}
+        for error in everything.silent.values():
             assert isinstance(error, NoReply)
             assert "sends messages" in str(error)
+        assert everything.complete
         assert (await component.get("PARAM_01")).value == 1
         assert not any(residue(each) for each in client.components.values())
+
+
+@in_simulated_time
+async def test_fetch_all_includes_a_vehicle_that_is_heard_late() -> None:
+    late = generic(system=2)
+    late.reboot(1000.0, down=0.9)
+    async with a_client(Air([generic(), late])) as client:
+        assert (await client.fetch_all()).results.keys() == {(1, 1), (2, 1)}
+
+
+@in_simulated_time
+async def test_a_link_without_an_autopilot_can_be_fetched() -> None:
+    async with a_client(generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)) as client:
+        assert (await client.fetch_all()).results.keys() == {(1, 100)}
+        assert (await client.fetch_all(1)).results.keys() == {(1, 100)}
+        with pytest.raises(NoReply, match="system 2"):
+            await client.fetch_all(2)
 
 
 @in_simulated_time
@@ -583,7 +612,7 @@ async def test_a_vehicle_that_answers_nothing_ends_a_fetch_within_7_s() -> None:
             await asyncio.sleep(1.5)
             began = anyio.current_time()
             with pytest.raises(NoReply, match="answers no request"):
-                await next(iter(client.components.values())).fetch_all()
+                await client.fetch_all()
             assert anyio.current_time() - began < 7.0
 
 
@@ -591,10 +620,10 @@ async def test_a_vehicle_that_answers_nothing_ends_a_fetch_within_7_s() -> None:
 async def test_a_lossy_link_to_one_vehicle_is_not_given_up_early() -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:
-        component = await client.component()
+        await client.component()
         tap.is_deaf = True
-        fetch = asyncio.create_task(component.fetch_all())
-        await asyncio.sleep(4.8)
+        fetch = asyncio.create_task(client.fetch_all())
+        await asyncio.sleep(6.0)
         tap.is_deaf = False
         assert (await fetch).complete
 
@@ -724,7 +753,7 @@ async def test_a_link_that_stays_disconnected_fails_the_calls_and_not_the_client
             assert type(error) is LinkError, name
             assert "refused" in str(error)
             assert math.isclose(anyio.current_time() - disconnected_at, link_task.LINK_TIMEOUT, abs_tol=0.1)
-        for call in ("get", "set", "fetch_all", "client.component"):
+        for call in ("get", "set", "fetch_all", "client.component", "client.fetch_all"):
             with pytest.raises(LinkError, match="refused"):
                 await CALLS[call](client, component)
         assert not residue(component)
@@ -858,7 +887,7 @@ async def test_a_busy_link_shortens_the_rests() -> None:
     assert 0.9 * link_task.PAUSE_DATAGRAMS_MAX < largest < 1.1 * link_task.PAUSE_DATAGRAMS_MAX
 
 
-@pytest.mark.parametrize("call", ["get", "set", "fetch_all"])
+@pytest.mark.parametrize("call", ["get", "set", "fetch_all", "client.fetch_all"])
 @in_simulated_time
 async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyPatch) -> None:
     async def seconds(rest: float) -> float:
@@ -898,7 +927,7 @@ async def test_the_autopilots_are_the_vehicles_without_what_they_carry() -> None
     vehicles = [generic(system=3), small_px4(), camera, generic(system=2, component=7)]
     async with a_client(Air(vehicles)) as client:
         assert client.autopilots == []
-        await fetch_everyone(client)
+        await client.fetch_all()
         addresses = [(each.system, each.component) for each in client.autopilots]
         assert addresses == [(1, 1), (2, 7), (3, 1)]
         assert len(client.components) == 4

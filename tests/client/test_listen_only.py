@@ -96,6 +96,8 @@ async def test_the_list_that_another_station_requests_fills_the_table() -> None:
         assert anyio.current_time() - began < 0.01
         assert again.params == result.params
         assert again.hash == vehicle.announced_hash()
+        everyone = await client.fetch_all()
+        assert everyone.results[1, 1].hash == vehicle.announced_hash()
     assert channel.received == []
 
 
@@ -127,6 +129,7 @@ async def test_calls_that_send_are_refused_at_once() -> None:
             lambda: component.set("PARAM_01", 1),
             lambda: client.ftp(component).read("@PARAM/param.pck"),
             lambda: component.fetch_all(refresh=True),
+            lambda: client.fetch_all(refresh=True),
         ]
         began = anyio.current_time()
         for call in calls:
@@ -149,12 +152,13 @@ def test_policy_and_watch_interval_are_refused_with_listen_only() -> None:
 async def test_fetch_all_without_any_request_of_others_ends_with_no_reply(timeout: float | None) -> None:
     async with listener(Channel(generic())) as client:
         component = await client.component()
-        began = anyio.current_time()
-        with pytest.raises(NoReply) as error:
-            await component.fetch_all(timeout=timeout)
-        waited = anyio.current_time() - began
-        assert waited == pytest.approx(timeout or PASSIVE_TIMEOUT, abs=0.1)
-        assert error.value.attempts == 0
+        for fetch_all in (component.fetch_all, client.fetch_all):
+            began = anyio.current_time()
+            with pytest.raises(NoReply) as error:
+                await fetch_all(timeout=timeout)
+            waited = anyio.current_time() - began
+            assert waited == pytest.approx(timeout or PASSIVE_TIMEOUT, abs=0.1)
+            assert error.value.attempts == 0
         assert residue(component) == []
 
 

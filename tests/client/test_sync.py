@@ -41,7 +41,6 @@ from tests.shell import (
     Tap,
     a_client,
     bits,
-    fetch_everyone,
     generic,
     in_simulated_time,
     outcome,
@@ -141,7 +140,7 @@ async def test_by_default_a_hash_is_watched_and_a_list_is_not() -> None:
     px4, ardupilot = Tap(small_px4()), Tap(ArduPilotVehicle(table=VALUES, system=2))
     async with a_client(Air([px4, ardupilot])) as client:
         await client.component(2)
-        await fetch_everyone(client)
+        await client.fetch_all()
         await asyncio.sleep(1.0)
         px4.received.clear()
         await asyncio.sleep(100.0)
@@ -403,7 +402,7 @@ async def test_a_strangers_values_never_reach_the_other_ones_cache(path: Path, a
     berth, camera = Berth(small_px4(uid=1)), Berth(generic(component=100, uid=1))
     async with a_client(Air([berth, camera]), cache=path) as client:
         component = await client.component()
-        await fetch_everyone(client)
+        await client.fetch_all()
         await asyncio.sleep(1.0)
         await asyncio.gather(away(berth, 9.0), away(camera, 9.0))
         stranger = small_px4(uid=2)
@@ -424,7 +423,7 @@ async def test_a_strangers_values_never_reach_the_other_ones_cache(path: Path, a
             assert component.identity.uid == "0000000000000002"
             assert component.params.keys() <= {"PARAM_01"}
             assert eye.params.keys() <= {"PARAM_01"}
-            await fetch_everyone(client)
+            await client.fetch_all()
             await asyncio.sleep(1.0)
     found = {address: values["PARAM_01"] for address, values in kept(path).items()}
     first, second = "uid:0000000000000001", "uid:0000000000000002"
@@ -464,6 +463,8 @@ async def test_cache_only_sends_nothing(path: Path) -> None:
         assert state(component) is SyncState.UNSYNCED
         assert component.state == "cached"
         assert trusts(component) == {Trust.CACHED}
+        everything = await client.fetch_all()
+        assert everything.results[1, 1].source == "cache"
         await asyncio.sleep(100.0)
         assert requested(tap) == 0
         assert (await component.get("PARAM_01")).trust is Trust.LIVE, "a name that is requested is read"
@@ -476,6 +477,8 @@ async def test_cache_only_where_nothing_is_cached(path: Path) -> None:
         component = await client.component()
         with pytest.raises(CacheError, match="1/1"):
             await component.fetch_all()
+        with pytest.raises(CacheError):
+            await client.fetch_all()
         assert requested(tap) == 0
         assert not residue(component)
 
@@ -486,9 +489,9 @@ async def test_a_component_without_a_cached_table_does_not_delay_the_others(path
     await learn(vehicle, path)
     async with a_client(Air([vehicle, generic(component=100)]), cache=path, policy="cache-only") as client:
         await client.component()
-        results, errors = await fetch_everyone(client)
-        assert results.keys() == {(1, 1)}
-        assert isinstance(errors[1, 100], CacheError)
+        everything = await client.fetch_all()
+        assert everything.results.keys() == {(1, 1)}
+        assert isinstance(everything.silent[1, 100], CacheError)
 
 
 @in_simulated_time
@@ -519,8 +522,9 @@ async def test_refresh_is_refused_with_a_policy_that_forbids_downloads(policy: P
     tap = Tap(small_px4())
     async with a_client(tap, policy=policy) as client:
         component = await client.component()
-        with pytest.raises(UsageError, match=f"policy is {policy}"):
-            await component.fetch_all(refresh=True)
+        for call in (component.fetch_all(refresh=True), client.fetch_all(refresh=True)):
+            with pytest.raises(UsageError, match=f"policy is {policy}"):
+                await call
         assert requested(tap) == 0
 
 

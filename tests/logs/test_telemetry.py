@@ -99,6 +99,7 @@ async def test_a_recording_gives_a_complete_table(name: str, crc: int | None, sp
         assert (result.missing, result.hash, result.source) == ((), crc, "stream")
         assert component.sync_state is SyncState.SYNCED
         assert {param.trust for param in result.params.values()} == {Trust.LIVE}
+        assert (await client.fetch_all()).complete
         assert client.bytes_received == sum(len(each.data) for each in read(name))
         assert client.bytes_sent == 0
 
@@ -132,6 +133,8 @@ async def test_missing_parameters_are_reported_at_the_end_of_the_log(tmp_path: P
         for _ in range(2):  # also after its end
             result = await component.fetch_all()
             assert (result.missing, result.count) == ((1,), 3)
+        together = await client.fetch_all()
+        assert together.results[1, 1].missing == (1,)
         await anyio.sleep(60.0)
         # the clock stops at the end of the log, so no component is lost
         assert component.state == "partial"

@@ -44,7 +44,7 @@ from paramclient.provision import (
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, SimParam
 from paramclient.sim.param_table import Entry
 from paramclient.wire import messages
-from tests.shell import FlakyLink, Tap, a_client, fetch_everyone, in_simulated_time, residue
+from tests.shell import FlakyLink, Tap, a_client, in_simulated_time, residue
 
 SETTINGS: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     f"TUNE_{number:02}": number / 4 if number % 3 else number for number in range(30)
@@ -473,7 +473,7 @@ async def test_several_vehicles_are_set_up_concurrently() -> None:
     vehicles = [ardupilot(), px4(system=2), ardupilot(system=3, read_only=["TUNE_01"])]
     base = written(another())
     async with a_client(Air(vehicles)) as client:
-        await fetch_everyone(client)
+        await client.fetch_all()
         components = [client.components[vehicle.system, 1] for vehicle in vehicles]
         over = {
             (1, 1): base,
@@ -504,7 +504,7 @@ async def test_several_vehicles_are_restored_each_to_its_own_state() -> None:
     for vehicle in vehicles:
         vehicle.set_param("TUNE_02", 10.0 + vehicle.system)
     async with a_client(Air(vehicles)) as client:
-        await fetch_everyone(client)
+        await client.fetch_all()
         components = [client.components[vehicle.system, 1] for vehicle in vehicles]
         applied = await apply_all(components, written({"TUNE_02": 42.0}))
         before = {address: result.before for address, result in applied.results.items()}
