@@ -65,7 +65,11 @@ FILE_TRANSFER: Final = message_id(messages.FileTransfer)
 HARMLESS: Final = frozenset({HEARTBEAT, message_id(messages.SystemTime), 4, 66, 111})
 """What passes from the stations of a read-only endpoint, with PING, REQUEST_DATA_STREAM and TIMESYNC."""
 HARMLESS_COMMANDS: Final = (messages.MAV_CMD_REQUEST_MESSAGE, messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
-HARMLESS_OPCODES: Final = frozenset(Opcode) - {Opcode.CREATE_FILE, Opcode.WRITE_FILE}
+HARMLESS_OPCODES: Final = frozenset(Opcode) - {
+    Opcode.CREATE_FILE,
+    Opcode.WRITE_FILE,
+    Opcode.OPEN_FILE_WO,
+}
 """The requests of MAVFTP that write nothing."""
 
 logger = logging.getLogger(__name__)

@@ -157,8 +157,9 @@ class KeptFile:
             case Opcode.READ_FILE | Opcode.BURST_READ_FILE if key in self._open:
                 self._send(asker, request, self._open[key])
                 return True
-            case Opcode.CREATE_FILE if FileQuery.of(_path_of(request)) is not None:
-                self._uploads.add(key)
+            case Opcode.CREATE_FILE | Opcode.OPEN_FILE_WO if FileQuery.of(_path_of(request)) is not None:
+                if len(self._uploads) < OPEN_FILES_MAX:
+                    self._uploads.add(key)
             case Opcode.TERMINATE_SESSION | Opcode.RESET_SESSIONS:
                 if key in self._uploads:
                     self._uploads.remove(key)

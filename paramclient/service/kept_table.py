@@ -342,10 +342,13 @@ class KeptTable:
             del self._reads[which]
 
     async def _find(self, which: Which) -> ReportedValue:
-        """Wait for the value if a fetch may bring it; then ask the vehicle."""
+        """Wait for the value if a fetch may bring it; then ask the vehicle.
+
+        A hash is asked for at once: QGroundControl waits 1 s for it.
+        """
         if self.list_if_current is None:
             loaded = self.load()
-            with anyio.move_on_after(LOADING_WAIT):
+            with anyio.move_on_after(0.0 if which == HASH_CHECK else LOADING_WAIT):
                 while not (loaded.is_set() or self.known(which)):  # noqa: ASYNC110 - no event for one value
                     await anyio.sleep(PROGRESS_INTERVAL)
         known = self.known(which)

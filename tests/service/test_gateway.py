@@ -361,6 +361,17 @@ async def test_rule_3_an_old_proof_is_renewed_behind_the_answer_and_differences_
 
 
 @in_simulated_time
+async def test_rule_3_the_hash_is_answered_in_under_a_second_before_the_table_is() -> None:
+    async with gateway_over(Air.symmetric([PX4Vehicle()], delay=0.1, rate=20_000.0)) as served:
+        station = served.partner()
+        station.send(GCS)
+        await until(lambda: station.frames)
+        await station.ask(ParamRequestRead(1, 1, "_HASH_CHECK", -1), seconds=0.9)
+        assert by_name(station).keys() == {"_HASH_CHECK"}
+        assert not (await served.clients[0].component()).session.table.is_complete
+
+
+@in_simulated_time
 async def test_rule_3_cached_values_are_never_served(tmp_path: Path) -> None:
     cache = tmp_path / "cache.db"
     async with gateway_over(small_px4(), cache=cache) as served:
