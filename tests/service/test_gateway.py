@@ -762,6 +762,26 @@ async def test_rule_11_a_gateway_behind_a_gateway() -> None:
             assert len(requested(vehicle)) == 1
 
 
+@in_simulated_time
+async def test_rule_11_an_ardupilot_behind_two_gateways(tmp_path: Path) -> None:
+    """The outer gateway downloads the file from the inner one, and proves its cached table by checksums."""
+    model = ArduPilotVehicle()
+    vehicle = Tap(model)
+    async with gateway_over(vehicle) as inner:
+        await inner.synced()
+        vehicle.received.clear()
+        for source in ("ftp", "cache"):
+            async with gateway_over(inner.as_vehicles(), cache=tmp_path / "cache.db") as outer:
+                component = await outer.clients[0].component()
+                await component.wait_until_identified(5.0)
+                result = await component.fetch_all()
+                assert (result.source, result.missing) == (source, ())
+                assert bits(result.params) == bits(model.params)
+                assert all(each.default is not None for each in result.params.values())
+        assert not vehicle.messages(FileTransfer)
+        assert not requested(vehicle)
+
+
 # 12: MAVLink 1
 
 
