@@ -376,9 +376,10 @@ class _Copies:
         """
         self._turn()
         key = _key_of(data, sees_number=sees_number)
-        before = self._recent.get(key, self._earlier.get(key, origin))
-        self._recent.setdefault(key, before)
-        return before != origin
+        if self._recent.get(key, self._earlier.get(key, origin)) != origin:
+            return True  # and no note of it: a vehicle that has moved is heard again after a moment
+        self._recent[key] = origin
+        return False
 
     def _turn(self) -> None:
         now = anyio.current_time()

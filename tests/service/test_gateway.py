@@ -723,6 +723,23 @@ async def test_rule_11_a_loop_ends() -> None:
         assert len(station.frames) - before <= 2
 
 
+@in_simulated_time
+async def test_rule_11_a_vehicle_that_moves_is_no_copy_of_itself() -> None:
+    vehicle = small_px4()
+    link = PeersLink({"before": vehicle})
+    async with gateway_over(link) as served:
+        station = served.partner()
+        station.send(GCS)
+        await served.synced()
+        link.endpoints = {"after": vehicle}
+        await anyio.sleep(12.0)
+        station.clear()
+        await anyio.sleep(5.0)
+        assert len(station.of(Heartbeat)) >= 4
+        await station.ask(LIST)
+        assert len(station.of(ParamValue)) == 26
+
+
 @pytest.mark.asyncio
 async def test_rule_11_an_endpoint_that_leads_to_the_link_itself() -> None:
     """As with a link that listens where QGroundControl is expected to."""
