@@ -21,7 +21,7 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import anyio
@@ -161,7 +161,7 @@ def gateway(
     try:
         yield (
             {
-                name: StationCase(case.kind, case.loss, case.by_file, case.rate, port, at)
+                name: StationCase(case.kind, case.loss, way_of(name, case), case.rate, port, at)
                 for name, port, at in zip(stations, ports, asked, strict=True)
             },
             count,
@@ -170,6 +170,11 @@ def gateway(
     finally:
         process.kill()
         process.join()
+
+
+def way_of(station: str, case: Case) -> str:
+    """Return how a station fetches: by file only if it can."""
+    return case.way if case.way in CLIENTS[station].ways else "list"
 
 
 def all_at_once(cases: dict[str, StationCase], seed: int, limit: float) -> dict[str, Outcome]:
@@ -184,7 +189,8 @@ def measure(case: RadioCase, stations: Sequence[str], limit: float, *, direct: b
     seed = 1
     columns: list[dict[str, Outcome]] = []
     if direct:
-        columns.append({name: CLIENTS[name].run(case, seed, limit) for name in stations})
+        runs = {name: replace(case, way=way_of(name, case)) for name in stations}
+        columns.append({name: CLIENTS[name].run(each, seed, limit) for name, each in runs.items()})
     with gateway(case, seed, stations) as (cases, count, ready):
         if not ready.wait(SYNC_TIMEOUT):
             raise SystemExit(f"{case.name}: the gateway's table is not in sync after {SYNC_TIMEOUT:.0f} s")
@@ -210,9 +216,9 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="cases whose names hold one")
     parser.add_argument("--skip-direct", action="store_true", help="no direct downloads")
     arguments = parser.parse_args()
-    kinds = (("PX4", False), ("ArduPilot", False), ("ArduPilot", True))
-    cases = [RadioCase(kind, loss, by_file) for kind, by_file in kinds for loss in (0.0, 0.05, 0.20)]
-    cases += [RadioCase(kind, 0.05, by_file, BAUD_RATE) for kind, by_file in kinds]
+    kinds = (("PX4", "list"), ("ArduPilot", "list"), ("ArduPilot", "file"))
+    cases = [RadioCase(kind, loss, way) for kind, way in kinds for loss in (0.0, 0.05, 0.20)]
+    cases += [RadioCase(kind, 0.05, way, BAUD_RATE) for kind, way in kinds]
     names = choose([case.name for case in cases], arguments.only)
     stations = [name for name, package in STATIONS.items() if installed(package) != "not installed"]
     heads = ["vehicle, link", "station", *([] if arguments.skip_direct else ["direct"]), "in sync"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections import deque
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -23,6 +24,14 @@ from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier
 from tests.shell import a_client
 
 T = TypeVar("T")
+
+
+def free_port() -> int:
+    """A UDP port of this computer that no program uses."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+    return port
 
 
 class StationsLink:

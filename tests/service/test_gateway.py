@@ -15,7 +15,6 @@ from typing import Any
 import anyio
 import pytest
 
-from bench.peers import free_port
 from paramclient import ParamType
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import create_link, serve_endpoint
@@ -42,7 +41,7 @@ from paramclient.wire.messages import (
 )
 from paramclient.wire.signing import SigningKey
 from tests.conversations.virtual import Puppet
-from tests.service.ground_stations import Partner, StationsLink, gateway_over
+from tests.service.ground_stations import Partner, StationsLink, free_port, gateway_over
 from tests.service.hub import service, synced
 from tests.shell import PeersLink, Radio, Tap, a_client, bits, generic, in_simulated_time, small_px4, until
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+import struct
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from functools import partial
 from typing import Any
 
@@ -11,14 +12,55 @@ import anyio
 import anyio.to_process
 import pytest
 
-from bench.peers import fetch_with_mavsdk, fetch_with_pymavlink, free_port
+from paramclient.model.values import Encoding, decode_value
 from paramclient.service import Hub
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.wire.messages import ParamRequestList, ParamRequestRead, ParamSet
+from tests.service.ground_stations import free_port
 from tests.shell import TIMEOUT, Tap, small_px4, until
 
-TIME_LIMIT = 60.0
-"""Seconds for one download."""
+
+def fetch_with_pymavlink(port: int) -> dict[str, float]:
+    """Request the list and, of what has not come after a second of silence, single values."""
+    from pymavlink import mavutil
+
+    master = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}")
+    master.wait_heartbeat(timeout=TIMEOUT)
+    encoding = Encoding.C_CAST if master.messages["HEARTBEAT"].autopilot == 3 else Encoding.BYTEWISE
+    values: dict[str, float] = {}
+    missing: set[int] | None = None
+    master.mav.param_request_list_send(1, 1)
+    while missing is None or missing:
+        message = master.recv_match(type="PARAM_VALUE", blocking=True, timeout=1.0)
+        if message is None:
+            for index in sorted(missing or ())[:10]:
+                master.mav.param_request_read_send(1, 1, b"", index)
+        elif message.param_index < message.param_count:
+            missing = (set(range(message.param_count)) if missing is None else missing) - {
+                message.param_index
+            }
+            raw = struct.pack("<f", message.param_value)
+            values[message.param_id] = float(decode_value(raw, message.param_type, encoding)[0])
+    return values
+
+
+def fetch_with_mavsdk(port: int) -> dict[str, float]:
+    """Download all parameters with MAVSDK."""
+    with mavsdk_params(port) as param:
+        found = param.get_all_params()
+        return {each.name: float(each.value) for each in (*found.int_params, *found.float_params)}
+
+
+@contextmanager
+def mavsdk_params(port: int) -> Iterator[Any]:
+    """MAVSDK's calls for the parameters of the first autopilot that sends to a port."""
+    from mavsdk import ComponentType, Configuration, Mavsdk, log_subscribe
+    from mavsdk.plugins.param import Param
+
+    log_subscribe(lambda *_: True)  # MAVSDK would log on stdout
+    with Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION)) as mavsdk:
+        mavsdk.add_any_connection(f"udpin://127.0.0.1:{port}")
+        yield Param(mavsdk.first_autopilot(timeout_s=TIMEOUT))
 
 
 @asynccontextmanager
@@ -36,10 +78,10 @@ async def stations_of(vehicle: Vehicle, stations: int, **faults: Any) -> AsyncIt
 @pytest.mark.parametrize("kind", [PX4Vehicle, partial(ArduPilotVehicle, live_period=0.0)])
 async def test_stations_get_every_value_and_the_radio_carries_none(kind: Callable[[], Vehicle]) -> None:
     vehicle = kind()
-    found: list[Any] = []
+    found: list[dict[str, float]] = []
 
     async def fetch(way: Any, port: int) -> None:
-        found.append(await anyio.to_process.run_sync(way, port, TIME_LIMIT))
+        found.append(await anyio.to_process.run_sync(way, port))
 
     async with stations_of(vehicle, 2, loss=0.2, delay=0.05) as (radio, ports):
         async with anyio.create_task_group() as tasks:
@@ -48,7 +90,7 @@ async def test_stations_get_every_value_and_the_radio_carries_none(kind: Callabl
         assert not radio.messages(ParamRequestList)
         assert len(radio.messages(ParamRequestRead)) <= 5  # the proof of a table that was proven 5 s before
     truth = {name: float(value) for name, value in vehicle.values.items() if not isinstance(value, bytes)}
-    for _, values in found:
+    for values in found:
         assert {name: values[name] for name in truth} == pytest.approx(truth, rel=1e-6)
 
 
@@ -76,13 +118,7 @@ async def test_pymavlink_counts_no_losses() -> None:
 
 def set_with_mavsdk(port: int) -> tuple[int, str]:
     """Set a parameter, and another one as if it had another type; return what is read, and the error."""
-    from mavsdk import ComponentType, Configuration, Mavsdk, log_subscribe
-    from mavsdk.plugins.param import Param
-
-    log_subscribe(lambda *_: True)
-    with Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION)) as mavsdk:
-        mavsdk.add_any_connection(f"udpin://127.0.0.1:{port}")
-        param = Param(mavsdk.first_autopilot(timeout_s=TIMEOUT))
+    with mavsdk_params(port) as param:
         param.set_param_int("PARAM_01", 77)
         error = ""
         try:
