@@ -210,17 +210,17 @@ def rows() -> Iterator[Row]:
     clean = partial(time_fetch, conditions=CLEAN)
     yield Row("ArduPilot by file, clean, without a pause", "ardupilot", clean, 0.45, 0.6, pause=0.0)
     for refuses, way, bounds in (
-        (False, "file", {0.05: (0.8, 1.3), 0.20: (1.1, 2.0)}),
-        (True, "list", {0.05: (2.3, 3.5), 0.20: (3.8, 6.0)}),
+        (False, "file", {0.05: (1.0, 1.6), 0.20: (1.5, 3.0)}),
+        (True, "list", {0.05: (2.8, 4.0), 0.20: (5.0, 7.0)}),
     ):
         for loss, (median, worst) in bounds.items():
             conditions = Conditions(loss=loss, round_trip=ROUND_TRIP, refuses_files=refuses)
             name = f"ArduPilot by {way}, {loss:.0%} lost"
             yield Row(name, "ardupilot", partial(time_fetch, conditions=conditions), median, worst)
     yield from warm_rows()
-    yield Row(f"ArduPilot, apply {VALUES} values in {GROUPS} groups", "ardupilot", time_apply, 2.5, 3.5)
+    yield Row(f"ArduPilot, apply {VALUES} values in {GROUPS} groups", "ardupilot", time_apply, 3.0, 4.0)
     yield Row("PX4, clean", "px4", clean, 0.95, 1.0, pause=0.0)
-    for loss, median, worst in ((0.05, 1.2, 1.5), (0.20, 1.4, 2.0)):
+    for loss, median, worst in ((0.05, 1.2, 1.5), (0.20, 1.6, 2.8)):
         conditions = Conditions(loss=loss, round_trip=ROUND_TRIP)
         yield Row(
             f"PX4, {loss:.0%} lost", "px4", partial(time_fetch, conditions=conditions), median, worst, 0.0

@@ -115,6 +115,7 @@ def test_live_keeps_the_cache_of_warm_starts_and_counts_their_bytes() -> None:
         text = bench("live", link, "--kind", "ardupilot", "--seeds", "2", *rows)
     found = [line.split(" | ") for line in text.splitlines() if "warm" in line]
     assert len(found) == 6, text
-    assert all(50 < int(row[3].replace(",", "")) < 15_000 for row in found), text
+    proven = [row for row in found if "changed, 100 ms" not in row[0]]  # there a download may be quicker
+    assert all(50 < int(row[3].replace(",", "")) < 15_000 for row in proven), text
     assert "from" not in text, text
     assert {name for name in before if vehicle.values[name] != before[name]} <= {"STAT_RUNTIME"}

@@ -30,8 +30,8 @@ from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.model.identity import version_text
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.fetch import Policy
-from paramclient.protocol.identity import expects_extended, kind_in_words
-from paramclient.protocol.selection import LOOK_TIME, address_in_words, hint_of_link, node_in_words
+from paramclient.protocol.identity import HEARTBEAT_WAIT, expects_extended, kind_in_words
+from paramclient.protocol.selection import address_in_words, hint_of_link, node_in_words
 from paramclient.wire.messages import MAV_AUTOPILOT_INVALID
 
 __all__ = [
@@ -523,7 +523,7 @@ async def _find_by_uid(
                 return found[0]
             if found:
                 has_looked = True
-                await anyio.sleep(LOOK_TIME)
+                await anyio.sleep(HEARTBEAT_WAIT)
                 continue
             client.core.check_open()
             await anyio.sleep(UID_POLL_INTERVAL)
@@ -541,7 +541,7 @@ async def _find_only(client: ParamClient, choice: ChosenVehicle, timeout: float 
     try:
         return await client.only_component(*address, timeout=timeout)
     except AmbiguousVehicle:
-        await anyio.sleep(deadline.left(LOOK_TIME) or 0.0)
+        await anyio.sleep(deadline.left(HEARTBEAT_WAIT) or 0.0)
         with suppress(NoReply):
             await client.only_component(*address, timeout=RECHECK_TIMEOUT)
         raise

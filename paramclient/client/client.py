@@ -31,9 +31,9 @@ from paramclient.model.wording import counted
 from paramclient.protocol import events as protocol
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.fetch import Policy
+from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.protocol.node import Node
 from paramclient.protocol.selection import (
-    LOOK_TIME,
     address_in_words,
     autopilots_of,
     find,
@@ -59,8 +59,8 @@ VEHICLES_LISTENING_TIME: Final = 3.0
 be lost."""
 PROBE_INTERVAL: Final = 0.5
 """Seconds between two requests to a component that is named in full and was not heard; the first one after
-`LOOK_TIME`, in which a component with heartbeats is heard."""
-LISTENING_TIME: Final = 1.2
+`HEARTBEAT_WAIT`, in which a component with heartbeats is heard."""
+LISTENING_TIME: Final = HEARTBEAT_WAIT
 """Seconds after the client was opened in which components are waited for, by a fetch of all."""
 
 
@@ -507,7 +507,7 @@ class ParamClient:
 
     async def _join_vehicle(self, node: Node) -> None:
         """Load the cached tables of a component whose vehicle is identified already, or never was."""
-        await anyio.sleep_until(node.since + LOOK_TIME)  # for the heartbeat of its autopilot
+        await anyio.sleep_until(node.since + HEARTBEAT_WAIT)  # for the heartbeat of its autopilot
         if self.core.cache_writer.may_load(node, vehicle_of(self.core.station.nodes.values(), node)):
             await self._load(node)
 
@@ -515,7 +515,7 @@ class ParamClient:
         """Load the cached tables of a component of an identified vehicle."""
         nodes = self.core.station.nodes.values()
         vehicle = vehicle_of(nodes, node)
-        is_young = anyio.current_time() < node.since + LOOK_TIME
+        is_young = anyio.current_time() < node.since + HEARTBEAT_WAIT
         if vehicle is node and is_young and not node.identification.is_autopilot:
             return  # it may have an autopilot: `_join_vehicle` waits for its heartbeat
         await self.core.cache_writer.load(node, vehicle)
@@ -558,7 +558,7 @@ class ParamClient:
         with anyio.move_on_after(timeout):
             while node is None and not self.core.is_over:
                 now = anyio.current_time()
-                probe_at = max(probe_at, station.listening_since + LOOK_TIME)
+                probe_at = max(probe_at, station.listening_since + HEARTBEAT_WAIT)
                 if system and component and now >= probe_at:
                     station.probe(system, component)
                     probe_at = now + PROBE_INTERVAL
@@ -572,5 +572,5 @@ class ParamClient:
         refused = refused_in_words(self.signing_report())
         hint = "" if refused else hint_of_link(station, self.bytes_received)
         if due is not None:
-            hint, awaited = "", f"{awaited}, then {LOOK_TIME} s without another vehicle"
+            hint, awaited = "", f"{awaited}, then {HEARTBEAT_WAIT} s without another vehicle"
         raise NoReply(f"{awaited}{refused}", attempts=0, waited=anyio.current_time() - began, hint=hint)

@@ -2,9 +2,10 @@
 
 MAVFTP's CalcFileCRC32 returns the CRC-32 of `@PARAM/param.pck`, of all parameters or of a range, in one round
 trip and without opening the file. The same file is encoded from the table. A CRC-32 behind known bytes
-determines the last four: the checksum of one parameter **is** its value. Values that move by themselves are
-read that way, and so are those that were found changed. Nothing is taken over until the checksum of the whole
-file, which covers all names, types, values and the count, agrees.
+determines the last four: the checksum of one parameter shows its exact value, if name and type are known.
+Values that move by themselves are found that way, and so are those that were changed. The checksum is linear:
+such a value can also make up for another name or type, and no other checksum would show it. So each is read
+by its index too. Nothing is taken over until the checksum of the whole file agrees.
 """
 
 from __future__ import annotations
@@ -16,11 +17,12 @@ from typing import Final
 
 import anyio
 
-from paramclient.errors import FileErrorCode, FileTransferError, NoReply
+from paramclient.errors import FileErrorCode, FileTransferError, NoReply, VehicleError
 from paramclient.model.px4_hash import crc32_px4, crc32_px4_before
 from paramclient.model.values import Encoding, ParamType, as_reported, bits_of, bits_of_wire, from_bits
-from paramclient.protocol.ftp import checksum
+from paramclient.protocol.ftp import SILENT_LOST, checksum
 from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode
+from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
 from paramclient.protocol.table import Table
 
@@ -32,15 +34,14 @@ AT_ONCE: Final = 5
 """Requests sent at once: ArduPilot's queue has 5 places, and drops the surplus silently (measured)."""
 INTERVAL: Final = 0.005
 """Seconds between further requests: ArduPilot keeps up with one in 3 ms (measured)."""
-LOST: Final = 1e-3
-"""Probability that all first requests are lost, at which MAVFTP counts as silent."""
 FLOAT32_EXACT: Final = 2**24
 """The largest integer up to which float32 holds all."""
 BOOT_COUNT: Final = "STAT_BOOTCNT"
-MOVING: Final = re.compile(r"STAT_RUNTIME|STAT_BOOTCNT|BARO\d_GND_PRESS")
-"""Names that often have another value at the next connection (measured): the seconds and the number of runs,
-and the air pressure, which is taken again until the vehicle is armed."""
-MEASURED: Final = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|ARSPD\d?_OFFSET|COMPASS_DEC")
+MOVING: Final = re.compile(r"STAT_RUNTIME|STAT_BOOTCNT")
+"""Names that have another value at almost every connection: the seconds and the number of runs."""
+MEASURED: Final = re.compile(
+    r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|ARSPD\d?_OFFSET|COMPASS_DEC|BARO\d_GND_PRESS"
+)
 """Names that each start of the vehicle measures again (measured)."""
 MOVING_MAX: Final = 12
 """Values that are read one by one for their own sake; a table with more of them is downloaded."""
@@ -48,7 +49,10 @@ SEARCHES_MAX: Final = 4
 """Searches for changed values; each finds one at least."""
 PLACES_MAX: Final = 4
 """Ranges that differ, at most, for a search to go on."""
-TOO_MANY: Final = "more has changed than is worth searching for"
+TOO_MANY: Final = "it differs, and a download is quicker than a search for the changes"
+OTHER: Final = "the vehicle has other parameters than the cached table"
+PROOFS_MAX: Final = 2
+"""Proofs: the vehicle may announce a change in the middle of one."""
 PARTS_MAX: Final = 12
 """Parts of a range that one search compares at once."""
 PART_TIME: Final = 0.01
@@ -89,12 +93,15 @@ async def prove(session: Session) -> tuple[str, ...]:
         TableDiffers: its table is too different.
         LinkError: the link is closed for good.
     """
-    table = session.table
-    rows = [_row(table, table.names[index]) for index in range(table.count or 0)]
     async with session.channel.ftp:
-        proof = _Proof(session, rows)
         try:
-            await proof.run()
+            for _ in range(PROOFS_MAX):
+                proof = _Proof(session, _rows(session.table))
+                await proof.run()
+                await proof.confirm()
+                changed = proof.take_over()
+                if changed is not None:
+                    return changed
         except FileTransferError as error:
             if error.code == FileErrorCode.UNKNOWN_COMMAND:
                 session.serves_checksum = False
@@ -102,7 +109,7 @@ async def prove(session: Session) -> tuple[str, ...]:
         except NoReply:
             is_silent = session.serves_checksum is None
             raise ChecksumUnavailable("MAVFTP did not answer", is_silent=is_silent) from None
-    return proof.take_over()
+    raise ChecksumUnavailable("the parameters change all the time")
 
 
 class _Proof:
@@ -130,11 +137,9 @@ class _Proof:
             raise TableDiffers(f"{len(moving)} values of the cached table are not exact")
         whole = range(len(self._rows))
         places = await self._round([whole] if self._round_trip > QUICK_ROUND_TRIP else [], moving)
-        boot_count = next((at for at, row in enumerate(self._rows) if row.name == BOOT_COUNT), None)
-        if boot_count is None or boot_count in self._changed:
-            places = await self._round(
-                [], [at for at, row in enumerate(self._rows) if MEASURED.fullmatch(row.name)]
-            )
+        if all(at in self._changed for at, row in enumerate(self._rows) if row.name == BOOT_COUNT):
+            measured = [at for at, row in enumerate(self._rows) if MEASURED.fullmatch(row.name)]
+            places = await self._round([], measured)
         searches = 0
         while not self._is_equal() and self._last_time <= SEARCH_TIME_MAX and searches < SEARCHES_MAX:
             places = await self._round(places or [whole])
@@ -157,7 +162,7 @@ class _Proof:
         return self._is_equal()
 
     def _is_equal(self) -> bool:
-        return self._checksum == self._computed(range(len(self._rows)))
+        return self._checksum == _checksum_of(self._rows)
 
     async def _round(self, places: list[range], indices: Sequence[int] = ()) -> list[range]:
         """Take over the values at some indices, and ask for the parts of ranges that differ.
@@ -176,7 +181,9 @@ class _Proof:
             self._solve(part.start, found[part], began)
         remaining = []
         for parts in splits:
-            differing = [part for part in parts if part in found and found[part] != self._computed(part)]
+            differing = [
+                part for part in parts if part in found and found[part] != _checksum_of(self._rows, part)
+            ]
             for part in differing or parts[-1:]:  # if no other one does, the last one differs
                 if len(part) == 1 and part in found:
                     self._solve(part.start, found[part], began)
@@ -191,24 +198,24 @@ class _Proof:
 
     def _solve(self, at: int, found: int, requested_at: float) -> None:
         """Take over the one value with which the file of one parameter has this checksum."""
-        row = self._rows[at]
-        difference = crc32_px4_before(found ^ self._computed(range(at, at + 1)), row.type.size)
+        row, known = self._rows[at], _checksum_of(self._rows, range(at, at + 1))
+        difference = crc32_px4_before(found ^ known, row.type.size)
         if difference >> 8 * row.type.size:
-            raise TableDiffers("the vehicle has other parameters than the cached table")
+            raise TableDiffers(OTHER)
         if difference:
             self._rows[at] = row._replace(bits=row.bits ^ difference)
             self._changed[at] = requested_at
 
-    def _computed(self, place: range) -> int:
-        rows = self._rows[place.start : place.stop]
-        return crc32_px4(encode(rows, total=len(self._rows), read_size=CHECKED_READ_SIZE))
-
     async def _request(self, places: Sequence[range | None]) -> list[int]:
         """Return the vehicle's checksums of some ranges, or with None, of all."""
+        if not places:
+            return []
         session, began = self._session, anyio.current_time()
         answers: dict[int, int] = {}
         errors: list[FileTransferError | NoReply] = []
-        attempts = session.channel.timing.attempts_for(LOST) if session.serves_checksum is None else None
+        attempts = (
+            session.channel.timing.attempts_for(SILENT_LOST) if session.serves_checksum is None else None
+        )
 
         async def request(number: int, place: range | None) -> None:
             query = "" if place is None else f"?start={place.start}&count={len(place)}"
@@ -235,22 +242,67 @@ class _Proof:
         self._turn_at = max(self._turn_at, now - AT_ONCE * INTERVAL) + INTERVAL
         await anyio.sleep(max(self._turn_at - now, 0.0))
 
-    def take_over(self) -> tuple[str, ...]:
-        """Put the proven file into the table, and learn which values change; return their names."""
+    async def confirm(self) -> None:
+        """Read the changed values by their indices, and compare names and types.
+
+        Raises:
+            TableDiffers: the vehicle has another parameter at such an index.
+        """
+        other: list[int] = []
+
+        async def read_one(at: int) -> None:
+            try:
+                found = await read(self._session, at)
+            except (NoReply, VehicleError):
+                other.append(at)
+            else:
+                if (found.param_id, found.param_type) != (self._rows[at].name, self._rows[at].type):
+                    other.append(at)
+
+        async with anyio.create_task_group() as tasks:
+            for at in self._changed:
+                tasks.start_soon(read_one, at)
+        if other:
+            raise TableDiffers(OTHER)
+
+    def take_over(self) -> tuple[str, ...] | None:
+        """Put the proven file into the table, and learn which values change.
+
+        Returns:
+            The names of the changed values, without those that move by themselves; None where the table has
+            changed meanwhile.
+        """
         table = self._session.table
         names = [self._rows[at].name for at in self._changed]
-        if names:
-            table.volatile = frozenset(names)
+        if table.count != len(self._rows):
+            return None
         for at, moment in self._changed.items():
             table.store_entry(self._rows[at], at, moment, with_defaults=False)
+        if _checksum_of(_rows(table)) != self._checksum:
+            return None
+        if names:
+            table.volatile = frozenset(names)
         table.prove(self._checksum)
-        return tuple(name for name in names if not (MOVING.fullmatch(name) or MEASURED.fullmatch(name)))
+        return tuple(each for each in names if not (MOVING.fullmatch(each) or MEASURED.fullmatch(each)))
+
+
+def _checksum_of(rows: Sequence[PackedParam], place: range | None = None) -> int:
+    """Return the checksum of the file with these rows, or of a range of it."""
+    part = rows if place is None else rows[place.start : place.stop]
+    return crc32_px4(encode(part, total=len(rows), read_size=CHECKED_READ_SIZE))
+
+
+def _rows(table: Table) -> list[PackedParam]:
+    names = [table.names.get(index, "") for index in range(table.count or 0)]
+    if "" in names or len(set(names)) < len(names):
+        raise ChecksumUnavailable("the list of parameters has a gap, or a name twice")
+    return [_row(table, name) for name in names]
 
 
 def _row(table: Table, name: str) -> PackedParam:
     param = table.params[name]
     if param.is_raw or param.type_number not in PACKABLE:
-        raise ChecksumUnavailable(f"the cached table has {name}, which no parameter file can have")
+        raise ChecksumUnavailable(f"the exact value of {name} is not known")
     default = None if param.default is None else bits_of(param.default, param.type_number)
     return PackedParam(name, ParamType(param.type_number), param.bits, default)
 

@@ -8,7 +8,7 @@ from typing import Final
 import anyio
 
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError, VehicleError
-from paramclient.protocol.ftp import FileCutOff, read_file
+from paramclient.protocol.ftp import SILENT_LOST, FileCutOff, read_file
 from paramclient.protocol.param_pck import PACK_SIZE_MAX, PARAM_FILE, Pack, decode, decode_prefix
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
@@ -20,8 +20,6 @@ WITH_DEFAULTS: Final = "?withdefaults=1"
 ARDUPILOT_WITH_DEFAULTS: Final = 0x04040000
 """flight_sw_version of the first ArduPilot of which every build adds the defaults: 4.4."""
 OPEN_ATTEMPTS_MIN: Final = 3
-OPEN_LOST: Final = 1e-3
-"""Probability that all requests to open the file are lost, at which the list is taken instead."""
 DOWNLOADS_MAX: Final = 2
 """Downloads of the file: one can be a mixture, if the table changes meanwhile."""
 
@@ -70,10 +68,10 @@ async def download_file(session: Session) -> int:
                 session.serves_file = False
             raise FileUnavailable(f"the parameter file was refused: {error.reason}") from None
         except NoReply as error:
-            is_cut_off = isinstance(error, FileCutOff)
             if isinstance(error, FileCutOff):
                 _store_beginning(session, error.prefix, requested_at)
-            raise FileUnavailable("MAVFTP did not answer", is_silent=not is_cut_off) from None
+            is_silent = not isinstance(error, FileCutOff)
+            raise FileUnavailable("MAVFTP did not answer", is_silent=is_silent) from None
         except PackError as error:
             reason = f"the parameter file is not valid: {error}"
             attempts += 1
@@ -113,7 +111,7 @@ async def _read(session: Session, path: str) -> bytes:
         if size and total:
             session.report(min(received * total // size, total), total)
 
-    attempts = max(channel.timing.attempts_for(OPEN_LOST), OPEN_ATTEMPTS_MIN)
+    attempts = max(channel.timing.attempts_for(SILENT_LOST), OPEN_ATTEMPTS_MIN)
     return await read_file(
         channel, path, size_max=PACK_SIZE_MAX, open_attempts=attempts, progress=report, begun=begun
     )

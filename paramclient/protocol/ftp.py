@@ -20,7 +20,16 @@ from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoRe
 from paramclient.protocol.channel import Channel, Inbox
 from paramclient.wire.messages import FileTransfer, Message
 
-__all__ = ["DATA_SIZE_MAX", "DirectoryEntry", "Opcode", "Packet", "checksum", "list_directory", "read_file"]
+__all__ = [
+    "DATA_SIZE_MAX",
+    "SILENT_LOST",
+    "DirectoryEntry",
+    "Opcode",
+    "Packet",
+    "checksum",
+    "list_directory",
+    "read_file",
+]
 
 DATA_SIZE_MAX: Final = 239
 """Bytes of a file in one message, at most."""
@@ -28,6 +37,8 @@ FILE_SIZE_MAX: Final = 64 * 1024 * 1024
 """Bytes of a file, by default: more than any flight log, less than memory."""
 PATH_SIZE_MAX: Final = DATA_SIZE_MAX - 1
 """Bytes of a path, at most: it fills one message, with a NUL."""
+SILENT_LOST: Final = 1e-3
+"""Probability that all requests are lost, at which MAVFTP counts as silent where there is another way."""
 BUSY_TIME: Final = 3.3
 """Seconds after which ArduPilot ends the silent session of another station (measured)."""
 BUSY_ATTEMPTS: Final = 2
@@ -47,6 +58,8 @@ BLOCK_INTERVALS: Final = 8
 """Mean intervals between two blocks after which a burst counts as over."""
 READS_AT_ONCE: Final = 4
 """Reads sent at once: ArduPilot's queue of MAVFTP requests has 5 places, and drops the surplus silently."""
+COPIES_AT_ONCE: Final = 16
+"""Reads sent for the last blocks, in several copies: one round trip of 100 ms has room for as many."""
 BLOCK_INTERVAL: Final = 0.006
 """Seconds in which a vehicle serves one read: ArduPilot sends a block every 5.9 ms (measured)."""
 READS_MAX: Final = 64
@@ -515,7 +528,7 @@ class _FileReader:
                 else:
                     continue
                 del in_flight[at]
-            copies = max(1, min(timing.copies, READS_AT_ONCE // max(len(waiting) + len(in_flight), 1)))
+            copies = max(1, min(timing.copies, COPIES_AT_ONCE // max(len(waiting) + len(in_flight), 1)))
             allowed = int(min((now - paced_at) / BLOCK_INTERVAL, READS_AT_ONCE))
             while waiting and allowed > 0 and len(in_flight) < READS_MAX:
                 at = waiting.popleft()

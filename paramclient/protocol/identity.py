@@ -45,7 +45,7 @@ VERSION_ATTEMPTS_MAX: Final = 12
 VERSION_ATTEMPTS_REFUSED: Final = 4
 """Requests after the first refusal, by both commands in turns: a refusal may concern only one of them."""
 _AUTOPILOTS: Final = {MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot", MAV_AUTOPILOT_PX4: "PX4"}
-_VEHICLES: Final = {1: "plane", MAV_TYPE_GCS: "ground station", 10: "rover", 11: "boat"}
+_VEHICLES: Final = {1: "plane", MAV_TYPE_GCS: "ground station", 10: "rover", 11: "boat", 49: "radio"}
 """Names of MAV_TYPE for users, where they differ from those of the enumeration."""
 _EXTENDED_TYPES: Final = frozenset({26, 30, 42, 44, 48})
 """MAV_TYPE of payloads: GIMBAL, CAMERA, WINCH, ILLUMINATOR, GRIPPER (MAVLink common message set)."""

@@ -1,7 +1,7 @@
 """The only vehicle on a link, for a write without a full address, and what to say where none was heard.
 
 Every autopilot sends a heartbeat once a second (MAVLink's heartbeat protocol). A vehicle is the only one when
-no other was heard for `LOOK_TIME` after it.
+no other was heard for `HEARTBEAT_WAIT` after it.
 """
 
 from __future__ import annotations
@@ -12,13 +12,12 @@ from typing import Final
 from paramclient.errors import AmbiguousVehicle
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.addresses import peer_in_words
-from paramclient.protocol.identity import kind_in_words
+from paramclient.protocol.identity import HEARTBEAT_WAIT, kind_in_words
 from paramclient.protocol.node import Node
 from paramclient.protocol.station import Station
 from paramclient.wire.messages import AUTOPILOT_COMPONENT, MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS
 
 __all__ = [
-    "LOOK_TIME",
     "address_in_words",
     "autopilots_of",
     "find",
@@ -29,13 +28,10 @@ __all__ = [
     "vehicle_of",
 ]
 
-LOOK_TIME: Final = 1.2
-"""Seconds after the first autopilot in which a second one is looked for: the interval of heartbeats, and a
-fifth of it for jitter."""
 LISTED_MAX: Final = 8
 """Components that a hint names, so that it stays readable; it gives the number of further ones."""
-_PERIPHERALS: Final = frozenset({18, 26, 27, *range(30, 35), *range(36, 43), 44, 48})
-"""MAV_TYPE of the parts of a vehicle: onboard computers, gimbals, cameras, batteries, GPS receivers. Some of
+_PERIPHERALS: Final = frozenset({18, 26, 27, *range(30, 35), *range(36, 43), 44, 48, 49})
+"""MAV_TYPE of the parts of a vehicle: computers, gimbals, cameras, batteries, GPS receivers, radios. Some of
 them name an autopilot in their heartbeat, where they should name none."""
 PERIPHERAL_IDS_MIN: Final = 100
 """The first component id that MAVLink gives to parts of a vehicle: MAV_COMP_ID_CAMERA."""
@@ -114,7 +110,7 @@ def only_vehicle(
     if not found:
         return None, None
     is_usual = system is not None and (component is not None or found[0].component == AUTOPILOT_COMPONENT)
-    due = max(min(each.since for each in vehicles), listening_since) + LOOK_TIME
+    due = max(min(each.since for each in vehicles), listening_since) + HEARTBEAT_WAIT
     if now >= due or (is_usual and not found[0].is_split):
         return found[0], None
     return None, due
@@ -160,7 +156,7 @@ def hint_of_node(station: Station, node: Node, now: float) -> str:
     if not station.gate.is_open:
         return f"{station.link} is down at present."
     label, silence = f"{node.system}/{node.component}", now - node.presence.received_at
-    if node.presence.is_lost or silence > LOOK_TIME:
+    if node.presence.is_lost or silence > HEARTBEAT_WAIT:
         return f"Nothing was received of {label} for {silence:.1f} s."
     does = f"{label} sends messages (the last one {silence:.1f} s ago)"
     others = [

@@ -194,10 +194,13 @@ class Session:
             if now <= each.until and param.same_value(each.param):
                 each.was_received = True
                 return
-        if name in self.acknowledging and self.table.encoding is Encoding.BYTEWISE:
-            known = self.table.params.get(name)
-            if known is not None and known.type_number != number:
+        known = self.table.params.get(name)
+        if known is not None and known.type_number != number:
+            if name in self.acknowledging and self.table.encoding is Encoding.BYTEWISE:
                 return
+            if self.identification.is_ardupilot and message.param_index == NO_INDEX and not known.is_raw:
+                # it acknowledges the set of a default as REAL32; the bytes are a float for every type
+                message = message._replace(param_type=known.type_number)
         self.table.store(message, now)
 
     def spelled(self, name: str) -> str:

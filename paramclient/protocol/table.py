@@ -332,17 +332,17 @@ class Table:
 
     def verify(self) -> None:
         """Mark the cached values that the confirmed hash covers as verified."""
-        if not self.volatile_is_known:
-            return
-        for name, param in self.params.items():
-            if param.trust is Trust.CACHED and param.index is not None and name not in self.volatile:
-                self.params[name] = param.with_trust(Trust.VERIFIED)
+        if self.volatile_is_known:
+            self._verify(but=self.volatile)
 
     def prove(self, checksum: int) -> None:
         """Take a checksum that covers the whole table, and mark the cached values as verified."""
         self._hash, self._hash_is_stale = checksum, False
+        self._verify(but=frozenset())
+
+    def _verify(self, *, but: frozenset[str]) -> None:
         for name, param in self.params.items():
-            if param.trust is Trust.CACHED and param.index is not None:
+            if param.trust is Trust.CACHED and param.index is not None and name not in but:
                 self.params[name] = param.with_trust(Trust.VERIFIED)
 
     def unverified(self) -> list[str]:

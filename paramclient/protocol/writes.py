@@ -6,7 +6,7 @@ import math
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext, suppress
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import anyio
 
@@ -176,9 +176,17 @@ async def write_many(
         def sending() -> None:
             outcomes[place] = replace(outcomes[place], status=SetStatus.UNKNOWN)
 
-        options: dict[str, Any] = {"settle": settle, "force": force, "author": author}
         try:
-            result = await write(session, name, value, turn=turn(), sending=sending, **options)
+            result = await write(
+                session,
+                name,
+                value,
+                settle=settle,
+                force=force,
+                author=author,
+                turn=turn(),
+                sending=sending,
+            )
         except (NoReply, LinkError) as error:
             failures.append(error)
             outcomes[place] = replace(outcomes[place], error=error)
@@ -340,9 +348,7 @@ class _Write:
             name=self.name,
         )
 
-    async def _read(
-        self,
-    ) -> Param:
+    async def _read(self) -> Param:
         """Return the parameter as the component reports it now."""
         self.session.acknowledging.discard(self.name)
         await read(self.session, self.name)

@@ -16,7 +16,7 @@ from paramclient.cli import signing as signing_commands
 from paramclient.links import SimLink
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, bits_of
-from paramclient.protocol.selection import LOOK_TIME
+from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, Vehicle
 from paramclient.wire import messages
 from tests.caches import NOW, update
@@ -309,7 +309,7 @@ class Watch:
 @pytest.mark.parametrize(
     ("named", "least", "most"),
     [
-        ([], LOOK_TIME, LOOK_TIME + 0.1),
+        ([], HEARTBEAT_WAIT, HEARTBEAT_WAIT + 0.1),
         (["--vehicle", "1"], 0.0, 0.1),
         (["--vehicle", "1/1"], 0.0, 0.1),
     ],

@@ -36,7 +36,7 @@ from paramclient.client import link_task
 from paramclient.errors import LinkError
 from paramclient.links import Link, create_link, serve_endpoint
 from paramclient.protocol.ftp import Opcode, Packet
-from paramclient.protocol.selection import LOOK_TIME
+from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.provision import apply, prepare, restore, verify
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, Vehicle
 from paramclient.wire import messages
@@ -140,7 +140,7 @@ async def test_a_second_vehicle_is_looked_for() -> None:
         began = anyio.current_time()
         await tasks.start(serve_endpoint, generic(**QUICK), create_link(there))
         assert (await client.only_component()).system == 1
-        assert anyio.current_time() - began >= LOOK_TIME
+        assert anyio.current_time() - began >= HEARTBEAT_WAIT
         await tasks.start(serve_endpoint, generic(system=2, **QUICK), create_link(there))
         await client.component(2)
         with pytest.raises(AmbiguousVehicle, match="2 vehicles"):

@@ -6,7 +6,7 @@ import anyio
 import pytest
 
 from paramclient import AmbiguousVehicle, Component, LinkError, NoReply, UsageError
-from paramclient.protocol.selection import LOOK_TIME
+from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire import frames, messages
 from tests.shell import (
@@ -42,7 +42,7 @@ async def test_the_only_vehicle_is_given_when_it_is_certain_and_at_once_from_the
     async with a_client(Tap(Air([Late(px4(), 0.5)]))) as client:
         found = await client.only_component()
         assert address(found) == (1, 1)
-        assert 0.5 + LOOK_TIME <= simulated_time_loop().now - began < 0.5 + LOOK_TIME + 0.1
+        assert 0.5 + HEARTBEAT_WAIT <= simulated_time_loop().now - began < 0.5 + HEARTBEAT_WAIT + 0.1
         before = simulated_time_loop().now
         for again in (
             await client.only_component(),
@@ -158,7 +158,7 @@ async def test_after_an_absence_of_the_link_a_second_one_is_looked_for_again() -
         await until(lambda: client.core.link_task.is_disconnected)
         began = simulated_time_loop().now
         found = await client.only_component()
-        assert simulated_time_loop().now - began >= LOOK_TIME
+        assert simulated_time_loop().now - began >= HEARTBEAT_WAIT
         assert address(found) == (1, 1)
         assert not tap.messages(messages.ParamSet)
 

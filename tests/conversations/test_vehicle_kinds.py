@@ -30,6 +30,7 @@ from tests.conversations.partial import EVERYTHING, TABLE, Partial
 from tests.conversations.virtual import QUIET, Puppet, Tap, converse, virtual
 
 ARDUPILOT = Heartbeat(2, 3, system_status=4)
+RADIO = Heartbeat(49, 0, system_status=4)
 NO_AUTOPILOT = Heartbeat(2, 8, system_status=4)
 ONBOARD_COMPUTER = Heartbeat(18, 0, system_status=4)
 CAMERA = Heartbeat(30, 0, system_status=4)
@@ -253,8 +254,14 @@ async def test_a_vehicle_with_system_id_0_is_named_as_that() -> None:
 
 @pytest.mark.parametrize(
     ("heartbeat", "component"),
-    [(ONBOARD_COMPUTER, 191), (CAMERA, 100), (Heartbeat(26, 3, system_status=4), 1), (QUIET, 154)],
-    ids=["companion", "camera", "gimbal", "gimbal by its id"],
+    [
+        (ONBOARD_COMPUTER, 191),
+        (CAMERA, 100),
+        (Heartbeat(26, 3, system_status=4), 1),
+        (QUIET, 154),
+        (RADIO, 68),
+    ],
+    ids=["companion", "camera", "gimbal", "gimbal by its id", "radio"],
 )
 @virtual
 async def test_a_part_of_a_vehicle_is_never_the_vehicle(heartbeat: Heartbeat, component: int) -> None:
