@@ -197,7 +197,7 @@ class ClientCore:
                 io.start_soon(self.link_task.send, name="paramclient sender")
                 io.start_soon(self.cache_writer.run, name="paramclient cache writer")
                 for tap in self._taps:
-                    io.start_soon(tap.run, self.link_task.forward)
+                    io.start_soon(tap.run)
                 try:
                     async with anyio.create_task_group() as self._work:
                         self.spawn(self.station.send_heartbeats)

@@ -258,7 +258,7 @@ class VehicleLink(Tap):
         """Whether the client signs what it sends."""
         return self._client.signing_report() is not None
 
-    async def run(self, to_vehicles: object) -> None:
+    async def run(self) -> None:
         """Take part in the gateway while the client is open."""
         self._gateway.links.append(self)
         try:
