@@ -64,8 +64,9 @@ def test_the_oracle_by_file_waits_one_round_trip_for_what_was_lost(
 
 
 def test_gateway_prints_a_table() -> None:
-    row = bench("gateway", "--skip-direct", "--only", "PX4 clean").splitlines()[2]
-    assert re.fullmatch(r"\| PX4 clean \| pymavlink, the usual loop \|( \d+\.\d\d \|){3} 0 \|", row)
+    row, *_, own = bench("gateway", "--skip-direct", "--only", "PX4 clean").split("\n\n")[0].splitlines()[2:]
+    assert re.fullmatch(r"\| PX4 clean \| pymavlink, the usual loop \|( \d+\.\d\d \|){4}  \|", row)
+    assert re.fullmatch(r"\| PX4 clean \| the gateway itself \|  \|  \|( \d+\.\d\d \|){2} \d+ \|", own)
 
 
 def test_peers_prints_a_table_of_a_real_vehicle() -> None:

@@ -40,8 +40,8 @@ __all__ = ["GATEWAY_ADDRESS", "Gateway"]
 GATEWAY_ADDRESS: Final = (254, 191)
 """System and component id of the gateway (MAV_COMP_ID_ONBOARD_COMPUTER): not those of a ground station, so
 that vehicles notice when they lose all of these."""
-GROUND_STATION_ADDRESS: Final = (255, 190)
-"""The ids of a client by default."""
+GROUND_STATION_SYSTEM: Final = 255
+"""The system id of ground stations by default, and of a client."""
 OWN_TYPE: Final = 18
 """MAV_TYPE_ONBOARD_CONTROLLER, for the same reason."""
 GROUND_STATION_PARAMS: Final = ("SYSID_MYGCS", "MAV_GCS_SYSID")
@@ -105,7 +105,7 @@ class Gateway:
         """Serve the vehicles of a client, which is not open yet. It is no ground station any more."""
         station = client.core.station
         station.own_type = OWN_TYPE
-        if station.own_address == GROUND_STATION_ADDRESS:
+        if station.own_address[0] == GROUND_STATION_SYSTEM:
             station.own_address = GATEWAY_ADDRESS
         link = VehicleLink(self, client)
         client.core.add_tap(link)
@@ -135,7 +135,7 @@ class Gateway:
         """Pass a frame of a vehicle to all stations, but for answers to the gateway."""
         table = link.table_of_answer(seen, peer)
         is_answer = table is not None and table.withholds
-        is_copy = not is_answer and self.copies.is_copy(seen.data, (link, peer), sees_number=False)
+        is_copy = not is_answer and self.copies.is_copy(seen.data, (link, peer))
         if bears_key(seen.data) or is_copy:
             return
         for station in self.stations:
@@ -157,16 +157,17 @@ class Gateway:
         frame = seen.frame
         source = (frame.system, frame.component)
         is_vehicle = any(link.is_vehicle(source) for link in self.links)
-        if bears_key(seen.data) or is_vehicle or self.copies.is_copy(seen.data, station, sees_number=True):
+        if bears_key(seen.data) or is_vehicle or self.copies.has(seen.data, but_of=station):
             return
-        self.copies.sent_down(seen.data)  # no traffic between stations, not even by a vehicle's link
+        for link in self.links:
+            link.avoid(frame.system)
         message = decode(frame) if seen.is_proven else None
         if isinstance(message, Request):
             station.requests[type(message).__name__] += 1
             if self._answer(station, source, message, seen):
                 return
         if not station.endpoint.is_readonly or _is_harmless(frame, message):
-            self._route(seen.data, _target_of(frame))
+            self._pass(station, seen)
             if getattr(message, "command", None) == messages.MAV_CMD_PREFLIGHT_STORAGE:
                 for link in self.links:
                     for table in link.tables(_target_of(frame), COMP_ID_ALL, extended=False):
@@ -180,6 +181,9 @@ class Gateway:
         served = [table for table, link in found.items() if self._serves(station, table, link)]
         if not served:
             return False
+        is_list = isinstance(message, ListRequest)
+        if not is_list and len({table.source[0] for table in found}) > 1:
+            return False  # for whichever vehicle: they answer themselves
         present = [table for table in served if not table.is_lost]
         autopilots = [table for table in present if table.source[1] == AUTOPILOT_COMPONENT]
         one = (autopilots or present)[:1]  # that answers a request which all components receive
@@ -190,7 +194,7 @@ class Gateway:
                 for table in present:
                     table.send_list(station)
                 for table, link in found.items():
-                    if table not in served and table.source[1] != AUTOPILOT_COMPONENT:
+                    if table not in served:
                         link.send(_readdressed(message, seen.frame, table.source))
             case messages.ParamRequestRead() | messages.ParamExtRequestRead():
                 which = message.param_id if message.param_index < 0 else message.param_index
@@ -202,11 +206,7 @@ class Gateway:
                         table.set(asker, message)
             case messages.FileTransfer(payload=payload):
                 for table in one:
-                    return (
-                        found[table]
-                        .file(table)
-                        .take(asker, payload, lambda: self._route(seen.data, message.target_system))
-                    )
+                    return found[table].file(table).take(asker, payload, lambda: self._pass(station, seen))
         return True
 
     def _serves(self, station: GroundStation, table: KeptTable, link: VehicleLink) -> bool:
@@ -222,11 +222,14 @@ class Gateway:
             )
         return not is_double
 
-    def _route(self, data: bytes, system: int) -> None:
+    def _pass(self, station: GroundStation, seen: SeenFrame) -> None:
         """Send a frame to the links on which its target was heard; to all for an unknown one, and for all."""
+        self.copies.sent_up(seen.data, station)
+        self.copies.sent_down(seen.data)  # no traffic between stations, not even by a vehicle's link
+        system = _target_of(seen.frame)
         heard = [link for link in self.links if system in link.systems]
         for link in heard if system and heard else self.links:
-            link.send(data)
+            link.send(seen.data)
 
 
 class VehicleLink(Tap):
@@ -291,13 +294,20 @@ class VehicleLink(Tap):
                     self._avoid_watched_id(source)
                 self._gateway.pass_on(self, seen, peer)
 
+    def avoid(self, system: int) -> None:
+        """Take another system id if a ground station has ours, or a vehicle watches it as that of one."""
+        own, component = self._own_address
+        if own == system:
+            systems = {source[0] for each in self._gateway.stations for source in each.sources}
+            free = (each for each in range(own - 1, 0, -1) if each not in systems | self.systems)
+            self._client.core.station.own_address = (next(free, own), component)
+
     def _avoid_watched_id(self, source: Source) -> None:
-        """Take another system id if the vehicle watches ours as that of its ground station."""
-        station, (system, component) = self._client.core.station, self._own_address
-        node = station.nodes.get(source)
+        node = self._client.core.station.nodes.get(source)
         params = {} if node is None else node.plain.table.params
-        if any(name in params and params[name].value == system for name in GROUND_STATION_PARAMS):
-            station.own_address = (system - 1, component)
+        own = self._own_address[0]
+        if any(name in params and params[name].value == own for name in GROUND_STATION_PARAMS):
+            self.avoid(own)
 
     def is_vehicle(self, source: Source) -> bool:
         """Return whether a component with parameters is heard under these ids."""
@@ -344,7 +354,7 @@ class VehicleLink(Tap):
 class _Copies:
     """Recognizes frames that have come back: a link or an endpoint leads to the gateway itself.
 
-    A vehicle sends equal frames too, as its heartbeats: only those of another origin are copies.
+    Vehicles and stations send equal frames too, such as heartbeats: only those of another origin are copies.
     """
 
     def __init__(self) -> None:
@@ -354,43 +364,41 @@ class _Copies:
 
     def sent_down(self, data: bytes) -> None:
         """Take note of a frame, or of a whole datagram, that is sent to a station."""
-        self._note(_key_of(data, sees_number=False))
-        self._note(hash(data))
+        self._note(_key_of(data), self)
+        self._note(hash(data), self)
 
-    def sent_up(self, data: bytes) -> None:
-        """Take note of a frame that is sent to vehicles."""
-        self._note(hash(data))
+    def sent_up(self, data: bytes, origin: Hashable = None) -> None:
+        """Take note of a frame that is sent to vehicles, by a station or by the gateway."""
+        self._note(hash(data), origin or self)
 
-    def has(self, data: bytes) -> bool:
-        """Return whether these bytes were sent a moment ago."""
-        return hash(data) in self._recent or hash(data) in self._earlier
+    def has(self, data: bytes, *, but_of: Hashable = None) -> bool:
+        """Return whether these bytes were sent a moment ago, and not by this station."""
+        return self._origin(hash(data), but_of) != but_of
 
-    def _note(self, key: int) -> None:
-        self._turn()
-        self._recent.setdefault(key, self._earlier.get(key))
-
-    def is_copy(self, data: bytes, origin: Hashable, *, sees_number: bool) -> bool:
-        """Return whether a frame has left the gateway, or came from another origin, a moment ago.
+    def is_copy(self, data: bytes, origin: Hashable) -> bool:
+        """Return whether a frame was sent to a station, or came from another origin, a moment ago.
 
         Vehicles' frames are renumbered for each station, so that their numbers are not compared.
         """
-        self._turn()
-        key = _key_of(data, sees_number=sees_number)
-        if self._recent.get(key, self._earlier.get(key, origin)) != origin:
+        key = _key_of(data)
+        if self._origin(key, origin) != origin:
             return True  # and no note of it: a vehicle that has moved is heard again after a moment
         self._recent[key] = origin
         return False
 
-    def _turn(self) -> None:
+    def _note(self, key: int, origin: Hashable) -> None:
+        self._recent.setdefault(key, self._origin(key, origin))
+
+    def _origin(self, key: int, default: Hashable) -> Hashable:
         now = anyio.current_time()
         if now - self._turned_at > LOOP_TIME:
             self._turned_at = now
             self._recent, self._earlier = {}, self._recent
+        return self._recent.get(key, self._earlier.get(key, default))
 
 
-def _key_of(data: bytes, *, sees_number: bool) -> int:
-    if sees_number:
-        return hash(data)
+def _key_of(data: bytes) -> int:
+    """Return the hash of a frame without its sequence number and checksum."""
     if data[0] == 0xFD:
         return hash(data[:4] + data[5 : 10 + data[1]])
     return hash(data[:2] + data[3 : 6 + data[1]])

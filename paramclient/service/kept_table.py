@@ -259,7 +259,8 @@ class KeptTable:
                 try:
                     await self.component.fetch_all()
                 except ParamClientError:
-                    self._unserved_until = anyio.current_time() + UNSERVED_TIME
+                    if not self.is_lost:
+                        self._unserved_until = anyio.current_time() + UNSERVED_TIME
                 tasks.cancel_scope.cancel()
             self._send_known()
         finally:
@@ -279,20 +280,20 @@ class KeptTable:
 
     def _send_known(self) -> None:
         """Send the values of the list that the stations do not have; another count begins it again."""
-        whole = self.list_if_current
         if self._waiting_count != self.session.table.count:
             self._waiting_count = self.session.table.count
             for sent in self._waiting.values():
                 sent.clear()
+        whole = self.list_if_current
+        values = (whole or listed(self.session)) if self._waiting else []
         for station, sent in self._waiting.items():
-            if whole is not None and not sent:
-                station.stream((self, "list"), self.source, self._current(whole))
-                sent.update(self.session.table.names)
+            new = [value for value in values if value.param_index not in sent]
+            sent.update(value.param_index for value in new)
+            if whole is not None:
+                station.stream((self, "list"), self.source, self._current(new))
                 continue
-            for value in listed(self.session):
-                if value.param_index not in sent:
-                    sent.add(value.param_index)
-                    station.say(value, self.source)
+            for value in new:
+                station.say(value, self.source)
 
     # single values
 
@@ -300,8 +301,7 @@ class KeptTable:
         """Answer a read; the vehicle is asked for what the table does not have."""
         value = self.known(which)
         if value is not None:
-            if which == HASH_CHECK:
-                self.check()
+            self.check()
             asker.station.say(value, self.source)
         elif self._is_unknown(which):
             self._refuse([asker], which, ParamErrorCode.DOES_NOT_EXIST)
@@ -406,9 +406,12 @@ class KeptTable:
             value, _ = decode_value(raw, known, session.table.encoding)
         result = await self.component.set(name, value, author=author)
         done = value_of(session, result.param)
-        answer = messages.ParamExtAck(name, done.raw, number, ExtAckResult.ACCEPTED) if is_extended else done
-        for asker in askers:
-            asker.station.say(answer, self.source)
+        if is_extended:
+            answer = messages.ParamExtAck(name, done.raw, number, ExtAckResult.ACCEPTED)
+            for asker in askers:
+                asker.station.say(answer, self.source)
+        else:
+            self._announce(self, done)
 
     def _reject(self, askers: Iterable[Asker], key: SetKey, code: int) -> None:
         """Refuse a set, and show the value that stays."""

@@ -32,6 +32,7 @@ from paramclient.wire.messages import (
     ParamError,
     ParamExtAck,
     ParamExtRequestList,
+    ParamExtRequestRead,
     ParamExtSet,
     ParamExtValue,
     ParamRequestList,
@@ -96,6 +97,37 @@ async def test_rule_1_a_frame_goes_to_the_link_of_its_target() -> None:
             [each.command for each in vehicle.messages(CommandLong) if each.command in (400, 401, 402)]
             for vehicle in vehicles
         ] == [[401, 402], [400, 401, 402]]
+
+
+@in_simulated_time
+async def test_rule_1_stations_with_equal_ids_send_equal_frames() -> None:
+    """As two programs with pymavlink do, whose first message is a list."""
+    vehicle = Tap(small_px4())
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        stations = [served.partner() for _ in range(3)]
+        vehicle.received.clear()
+        for each in stations:
+            each.send(LIST, ParamRequestRead(1, 1, "NONE", -1), CommandLong(1, 1, 400))
+        await anyio.sleep(3.0)
+        for each in stations:
+            assert len(each.of(ParamValue)) == 26
+            assert len(each.of(ParamError)) == 1
+        assert len(vehicle.messages(CommandLong)) == 1  # the others are equal, and arrive at once
+
+
+@in_simulated_time
+async def test_rule_1_a_request_for_any_vehicle_is_no_request_for_one() -> None:
+    vehicles = [Tap(small_px4(system=number)) for number in (1, 2)]
+    async with gateway_over(*vehicles) as served:
+        await served.synced()
+        station = served.partner()
+        await station.ask(ParamSet(0, 1, "PARAM_01", bytes(4), ParamType.INT32), ParamRequestList(0, 0))
+        for each in vehicles:
+            assert {frame.system for _, frame, message in each.received if isinstance(message, ParamSet)} == {
+                255
+            }
+        assert len(station.of(ParamValue)) >= 2 * 26
 
 
 @in_simulated_time
@@ -197,6 +229,19 @@ async def test_rule_2_an_unknown_name_is_asked_of_the_vehicle_once() -> None:
 
 
 @in_simulated_time
+@pytest.mark.parametrize("seed", range(4))
+async def test_rule_2_an_unknown_name_is_known_to_be_unknown_in_3_seconds_also_with_losses(seed: int) -> None:
+    vehicle = Tap(Air.symmetric([PX4Vehicle()], loss=0.2, delay=0.05, seed=seed))
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        station = served.partner()
+        await station.ask(ParamRequestRead(1, 1, "NONE", -1), seconds=3.0)
+        asked = len(requested(vehicle))
+        await station.ask(ParamRequestRead(1, 1, "NONE", -1), seconds=3.0)
+        assert len(requested(vehicle)) == asked
+
+
+@in_simulated_time
 async def test_rule_2_extended_parameters() -> None:
     camera = Tap(Camera())
     wanted = [
@@ -210,6 +255,9 @@ async def test_rule_2_extended_parameters() -> None:
         camera.received.clear()
         await station.ask(ParamExtRequestList(1, 100))
         assert station.of(ParamExtValue) == wanted
+        one = wanted[2]
+        await station.ask(ParamExtRequestRead(1, 100, one.param_id, -1), ParamExtRequestRead(1, 100, "", 2))
+        assert station.of(ParamExtValue) == [one, one]
         assert not camera.messages(ParamExtRequestList)
         new = ParamExtSet(1, 100, "CAM_NAME", b"Rear".ljust(128, b"\0"), ParamType.CUSTOM)
         await station.ask(new, new, seconds=3.0)
@@ -406,6 +454,24 @@ async def test_rule_3_a_lost_vehicle_is_silent() -> None:
 
 
 @in_simulated_time
+async def test_rule_3_a_vehicle_that_is_lost_during_the_fetch_is_served_when_it_is_back() -> None:
+    vehicle = Tap(Air.symmetric([PX4Vehicle()], rate=20_000.0))
+    async with gateway_over(vehicle) as served:
+        station = served.partner()
+        station.send(GCS)
+        await until(lambda: station.frames)
+        await station.ask(LIST, seconds=0.5)
+        vehicle.is_mute = True
+        await anyio.sleep(30.0)
+        vehicle.is_mute = False
+        await anyio.sleep(3.0)
+        vehicle.received.clear()
+        await station.ask(LIST, seconds=6.0)
+        assert len(by_name(station)) == 904
+        assert askers(vehicle) <= {254}
+
+
+@in_simulated_time
 async def test_rule_3_a_vehicle_that_is_lost_during_an_answer_ends_it() -> None:
     vehicle = Tap(PX4Vehicle())
     async with gateway_over(vehicle) as served:
@@ -459,6 +525,11 @@ async def test_rule_4_a_set_is_a_verified_write_of_its_station() -> None:
         assert by_name(station) == by_name(other) == {"PARAM_01": struct.pack("<i", 33)}
         assert len(vehicle.messages(ParamSet)) == 1
         assert (await anext(changes)).by == "us for station 255/190"
+        other.clear()
+        await station.ask(
+            set_to("PARAM_01", 33), seconds=1.0
+        )  # all others hear of it again, as from a vehicle
+        assert by_name(station) == by_name(other) == {"PARAM_01": struct.pack("<i", 33)}
 
 
 @in_simulated_time
@@ -662,6 +733,21 @@ async def test_rule_9_the_gateway_is_no_ground_station() -> None:
         await anyio.sleep(3.0)
         assert {each.type for each in vehicle.messages(Heartbeat)} == {18}
         assert {frame.system for _, frame, _ in vehicle.received} == {253}
+
+
+@in_simulated_time
+async def test_rule_9_the_gateway_has_the_id_of_no_station() -> None:
+    """Otherwise it would take their answers for its own."""
+    vehicle = Tap(ArduPilotVehicle())
+    async with gateway_over(vehicle, system=255, component=1) as served:
+        await served.synced()
+        station = served.partner(system=254, component=191)
+        await station.ask(GCS, seconds=2.0)
+        vehicle.received.clear()
+        [answer] = await station.ask_file(Opcode.OPEN_FILE_RO, data=b"nothing.txt")
+        assert answer.opcode == Opcode.NAK
+        await anyio.sleep(2.0)
+        assert {frame.system for _, frame, _ in vehicle.received} == {253, 254}
 
 
 # 10: all components, and two vehicles with one id
