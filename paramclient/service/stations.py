@@ -332,7 +332,7 @@ class MavlinkEndpoint:
                 await self._reopen()
                 continue
             for peer, data in chunks:
-                frames = cutter.cut(data, peer)
+                frames = [each for each in cutter.cut(data, peer) if each.is_proven or not each.is_known]
                 if self._verifier is not None:
                     frames = [each for each in frames if self._verifier.accepts(each.data)]
                 for seen in frames:

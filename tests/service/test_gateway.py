@@ -7,21 +7,25 @@ import math
 import random
 import socket
 import struct
+import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import anyio
+import fastcrc
 import pytest
 
 from paramclient import ParamType
 from paramclient.errors import LinkError, UsageError
-from paramclient.links import create_link, serve_endpoint
+from paramclient.links import create_link, serve_endpoint, tcp
 from paramclient.model.values import Encoding, encode_value
 from paramclient.protocol.ftp import Opcode, Packet
-from paramclient.protocol.param_pck import decode, encode
+from paramclient.protocol.param_pck import PackedParam, decode, encode
 from paramclient.service import Hub, stations
+from paramclient.service.kept_file import FileQuery, Rows
 from paramclient.service.stations import MavlinkEndpoint, Numbering, parse_endpoint
 from paramclient.sim import Air, ArduPilotVehicle, Camera, Endpoint, PX4Vehicle
 from paramclient.wire import frames, messages
@@ -314,6 +318,15 @@ async def test_rule_2_the_parameter_file_in_the_requested_pieces(size: int, quer
         [closed] = await station.ask_file(Opcode.TERMINATE_SESSION, session=3)
         assert closed.opcode == Opcode.ACK
         assert not vehicle.messages(FileTransfer)
+
+
+def test_rule_2_a_file_with_defaults_that_are_unknown_is_one_without() -> None:
+    entries = [PackedParam("A", ParamType.INT8, 5), PackedParam("B", ParamType.REAL32, 7)]
+    plain, full = FileQuery(), FileQuery(with_defaults=True)
+    unknown, known = Rows(entries, has_defaults=False), Rows(entries, has_defaults=True)
+    assert unknown.content(full, 80) == unknown.content(plain, 80) == known.content(plain, 80)
+    assert known.content(full, 80)[:2] == b"\x1c\x67"
+    assert unknown.content(full, 80)[:2] == b"\x1b\x67"
 
 
 @in_simulated_time
@@ -659,13 +672,18 @@ def test_rule_7_numbers_of_relayed_inserted_and_withheld_frames() -> None:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_rule_7_renumbered_frames_are_valid(version: int) -> None:
+@pytest.mark.parametrize("extra", [0, 1, 111, 255])
+def test_rule_7_renumbered_frames_are_valid_whatever_their_extra_byte_is(version: int, extra: int) -> None:
     payload = bytes(range(1, 26))
-    options: dict[str, Any] = {"system": 1, "component": 1, "version": version}
-    first = frames.build_frame(22, payload, sequence=17, **options)
+    head = bytes((0xFE, 25)) if version == 1 else bytes((0xFD, 25, 0, 0))
+    tail = bytes((1, 1, 22)) if version == 1 else bytes((1, 1, 22, 0, 0))
+
+    def frame(sequence: int) -> bytes:
+        body = head + bytes((sequence,)) + tail + payload
+        return body + fastcrc.crc16.mcrf4xx(body[1:] + bytes((extra,))).to_bytes(2, "little")
+
     for sequence in range(256):
-        wanted = frames.build_frame(22, payload, sequence=sequence, **options)
-        assert frames.renumber_frame(first, sequence) == wanted
+        assert frames.renumber_frame(frame(17), sequence) == frame(sequence)
 
 
 # 8: signing
@@ -964,6 +982,26 @@ def test_rule_14_a_service_that_only_listens_has_no_stations() -> None:
 
 
 @pytest.mark.asyncio
+async def test_the_command_works_through_the_gateway() -> None:
+    endpoint = parse_endpoint("tcpin:0")
+    vehicle = Tap(small_px4())
+    async with Hub([vehicle], cache=False, mavlink=[endpoint]) as hub:
+        await until(lambda: hub.targets and hub.targets[0].component.sync_state == "synced")
+        vehicle.received.clear()
+        link = endpoint.address.replace("tcpin", "tcp")
+
+        async def command(*arguments: str) -> str:
+            words = [sys.executable, "-m", "paramclient", *arguments, "--no-cache"]
+            return (await anyio.run_process(words)).stdout.decode()
+
+        assert "PARAM_01" in await command("fetch", link)
+        assert "33" in await command("set", link, "PARAM_01", "33")
+        assert "33" in await command("get", link, "PARAM_01")
+        assert len(vehicle.messages(ParamSet)) == 1
+        assert not vehicle.messages(ParamRequestList)
+
+
+@pytest.mark.asyncio
 async def test_stations_on_tcp_and_udp() -> None:
     """`ParamClient` works through a gateway like with a vehicle."""
     endpoints = [parse_endpoint("tcpin:0"), parse_endpoint("udpin:0")]
@@ -1062,6 +1100,36 @@ async def test_a_station_that_floods_and_one_that_sends_garbage() -> None:
         assert len(station.of(ParamValue)) >= 904
         assert len(requested(vehicle)) < 200
         assert station.of(Heartbeat)
+
+
+@pytest.mark.asyncio
+async def test_a_station_that_never_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Others are served meanwhile, and its connection is closed."""
+    monkeypatch.setattr(tcp, "SEND_TIMEOUT", 0.5)
+    endpoint = parse_endpoint("tcpin:0")
+    async with Hub([PX4Vehicle()], cache=False, mavlink=[endpoint]) as hub:
+        await until(lambda: hub.targets and hub.targets[0].component.sync_state == "synced")
+        name = endpoint.address.replace("tcpin", "tcp")
+        with socket.socket() as deaf:
+            deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            deaf.connect(("127.0.0.1", int(name.rpartition(":")[2])))
+            deaf.setblocking(False)
+            await until(lambda: hub.gateway.stations)
+            [station] = hub.gateway.stations
+
+            async def ask() -> None:
+                while True:
+                    with suppress(OSError):
+                        deaf.send(messages.encode(LIST, system=9, component=190, sequence=0))
+                    await anyio.sleep(0.05)
+
+            async with anyio.create_task_group() as tasks, a_client(name) as client:
+                tasks.start_soon(ask)
+                component = await client.component()
+                assert len((await component.fetch_all()).params) == 903
+                await until(lambda: station not in hub.gateway.stations)
+                assert (await component.get(902)).index == 902
+                tasks.cancel_scope.cancel()
 
 
 @in_simulated_time

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import struct
+import subprocess
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import anyio
@@ -114,6 +118,35 @@ def loss_with_pymavlink(port: int) -> float:
 async def test_pymavlink_counts_no_losses() -> None:
     async with stations_of(PX4Vehicle(), 1) as (_, [port]):
         assert await anyio.to_process.run_sync(loss_with_pymavlink, port) == 0.0
+
+
+MAVPROXY = shutil.which("mavproxy.py")
+
+
+@pytest.mark.asyncio
+@pytest.mark.skipif(MAVPROXY is None, reason="MAVProxy is not installed")
+async def test_mavproxy_counts_no_losses(tmp_path: Path) -> None:
+    options: dict[str, Any] = {
+        "cwd": tmp_path,
+        "env": os.environ | {"HOME": str(tmp_path), "PYTHONUNBUFFERED": "1"},
+    }
+    async with stations_of(PX4Vehicle(), 1) as (radio, [port]):
+        command = [str(MAVPROXY), f"--master=udpin:127.0.0.1:{port}", "--default-modules=param,link"]
+        async with await anyio.open_process(
+            [*command, f"--state-basedir={tmp_path}"], stderr=subprocess.STDOUT, **options
+        ) as mavproxy:
+            assert mavproxy.stdin is not None
+            assert mavproxy.stdout is not None
+            lists, text = 0, ""
+            with anyio.fail_after(TIMEOUT):
+                while "% loss" not in text:
+                    text += (await mavproxy.stdout.receive()).decode()
+                    if text.count("Received 903 parameters") > lists:
+                        lists += 1
+                        await mavproxy.stdin.send(b"param fetch\n" if lists < 3 else b"link\n")
+            mavproxy.kill()
+        assert " 0 lost, 0.0% loss" in text
+        assert not radio.messages(ParamRequestList)
 
 
 def set_with_mavsdk(port: int) -> tuple[int, str]:
