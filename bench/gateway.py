@@ -63,6 +63,8 @@ BAUD_RATE = 57600 / 10
 """Bytes per second at 57600 baud."""
 RADIO_DELAY = 0.02
 """Seconds in one direction of a radio at 57600 baud, besides the time that the bytes take."""
+QUIET_TIME = 2.0
+"""Seconds without a datagram about parameters after which a fetch is over: a slow radio has a queue."""
 START_TIME = 5.0
 """Seconds after which all stations wait for a heartbeat, when the gateway is to begin after them."""
 PARAMETERS = frozenset({20, 21, 22, 23, 110, 320, 321, 322, 323, 324, 345})
@@ -257,9 +259,13 @@ class RunningGateway:
     synced: Any
 
     def wait(self) -> None:
-        """Wait for the table in sync."""
+        """Wait for the table in sync, and until nothing of its fetch is on its way any more."""
         if not self.synced.wait(SYNC_TIMEOUT):
             raise SystemExit(f"the gateway's table is not in sync after {SYNC_TIMEOUT:.0f} s")
+        before = -1
+        while self.count.value != before:
+            before = self.count.value
+            time.sleep(QUIET_TIME)
 
     @classmethod
     @contextmanager

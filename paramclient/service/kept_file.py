@@ -23,7 +23,8 @@ __all__ = ["FileQuery", "KeptFile", "Rows", "answers_of", "rows_of"]
 ENTRY_SIZE: Final = 12
 """Bytes of an entry in param.pck, on average: the size in the answer to an open is an estimate."""
 FILE_WAIT: Final = 2.5
-"""Seconds that the opening of the file waits for a fetch; then it passes to the vehicle."""
+"""Seconds that the opening of the file waits for a fetch; then there is no such file, and the station asks
+for the list, which it gets as it is fetched. QGroundControl asks three times, 1 s apart."""
 OPEN_FILES_MAX: Final = 64
 """Files that stations have open of one component, at most; the oldest is closed first."""
 
@@ -206,7 +207,11 @@ class KeptFile:
         with anyio.move_on_after(FILE_WAIT):
             await self._table.load().wait()
         self._opening.discard(opening)
-        if self._table.list_if_current is None or not self._begin(asker, request, route):
+        if self._table.list_if_current is not None and self._begin(asker, request, route):
+            return
+        if self._table.is_loading and request.opcode == Opcode.OPEN_FILE_RO:
+            self._say(asker, reply(request, error=FileErrorCode.FILE_NOT_FOUND))
+        else:
             route()
 
     @property

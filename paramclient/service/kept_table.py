@@ -185,9 +185,14 @@ class KeptTable:
         return is_usable and node.identification.has_parameters and now >= self._unserved_until
 
     @property
+    def is_loading(self) -> bool:
+        """Whether a fetch is in progress."""
+        return self._loaded is not None or self.session.fetching.is_running
+
+    @property
     def withholds(self) -> bool:
         """Whether values of the component are answers to the gateway: it announces changes itself."""
-        return self.session.table.is_complete or self._loaded is not None or self.session.fetching.is_running
+        return self.session.table.is_complete or self.is_loading
 
     @property
     def state_key(self) -> object:

@@ -399,6 +399,22 @@ async def test_rule_3_the_first_value_comes_within_two_seconds_of_a_slow_file() 
 
 
 @in_simulated_time
+async def test_rule_3_a_file_that_is_opened_during_a_long_fetch_is_none() -> None:
+    """So that the station asks for the list, and no second download begins."""
+    vehicle = Tap(ArduPilotVehicle(ftp_rate=2_000.0))
+    async with gateway_over(vehicle) as served:
+        await served.clients[0].component()
+        station = served.partner()
+        [answer] = await station.ask_file(
+            Opcode.OPEN_FILE_RO, data=b"@PARAM/param.pck?withdefaults=1", seconds=2.9
+        )
+        assert (answer.opcode, answer.code) == (Opcode.NAK, 10)
+        await station.ask(LIST, seconds=20.0)
+        assert len(by_name(station)) == 1382
+        assert {frame.system for _, frame, _ in vehicle.received} == {254}
+
+
+@in_simulated_time
 async def test_rule_3_an_old_proof_is_renewed_behind_the_answer_and_differences_are_announced() -> None:
     model = small_px4()
     vehicle = Tap(model)
