@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import math
 import random
 import socket
 import struct
 import sys
+import tracemalloc
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -24,7 +26,7 @@ from paramclient.links import create_link, serve_endpoint, tcp
 from paramclient.model.values import Encoding, encode_value
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.param_pck import PackedParam, decode, encode
-from paramclient.service import Hub, stations
+from paramclient.service import Hub, kept_table, stations
 from paramclient.service.kept_file import FileQuery, Rows
 from paramclient.service.stations import MavlinkEndpoint, Numbering, parse_endpoint
 from paramclient.sim import Air, ArduPilotVehicle, Camera, Endpoint, PX4Vehicle
@@ -1146,6 +1148,27 @@ async def test_a_station_that_never_reads(monkeypatch: pytest.MonkeyPatch) -> No
                 await until(lambda: station not in hub.gateway.stations)
                 assert (await component.get(902)).index == 902
                 tasks.cancel_scope.cancel()
+
+
+@in_simulated_time
+async def test_memory_stays_flat(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept_table, "UNKNOWN_NAMES_MAX", 50)
+    sizes = []
+    async with gateway_over(small_px4()) as served:
+        await served.synced()
+        stations = [served.partner(system=number) for number in range(200, 220)]
+        tracemalloc.start()
+        for number in range(8):
+            for each in stations:
+                each.send(GCS, LIST, set_to("PARAM_01", number), CommandLong(1, 1, 400, number))
+                each.send(*(ParamRequestRead(1, 1, f"N{number}_{name}", -1) for name in range(20)))
+            await anyio.sleep(10.0)
+            for each in stations:
+                each.clear()
+            gc.collect()
+            sizes.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+    assert sizes[-1] - sizes[3] < 50_000, sizes
 
 
 @in_simulated_time
