@@ -19,7 +19,9 @@ from paramclient.links import SimLink
 from paramclient.model.values import ParamType, WireValue
 from paramclient.service import Hub, Listening, Tokens, serve
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, Vehicle
-from paramclient.sim.param_table import Entry
+from paramclient.wire.frames import Frame
+from paramclient.wire.messages import Message
+from tests.simulation import clamped
 
 __all__ = ["BROWSER", "BROWSER_OPTIONS", "HIGHEST", "HOSTILE", "Bench", "at_work"]
 
@@ -47,8 +49,8 @@ class Limited(ArduPilotVehicle):
     def __init__(self) -> None:
         super().__init__(system=2, param_error=True, read_only=["RTL_SPEED"], live_period=0.0)
 
-    def _write(self, entry: Entry, bits: int) -> None:
-        super()._write(entry, min(bits, HIGHEST) if entry.name == "RTL_ALT" else bits)
+    def respond(self, message: Message, sender: Frame) -> None:
+        super().respond(clamped(message, "RTL_ALT", 0, HIGHEST), sender)
 
 
 class Bench:

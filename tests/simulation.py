@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import struct
+from dataclasses import replace
 from functools import partial
 
 from paramclient.model.values import Encoding, Param, ParamType, Trust, WireValue, encode_value
 from paramclient.sim import ArduPilotVehicle
-from paramclient.wire.messages import NO_INDEX, ParamValue
+from paramclient.wire.messages import NO_INDEX, Message, ParamSet, ParamValue
 
-__all__ = ["is_so", "known", "listing_ardupilot", "param_value"]
+__all__ = ["clamped", "is_so", "known", "listing_ardupilot", "param_value"]
 
 listing_ardupilot = partial(ArduPilotVehicle, ftp=False)
 """An ArduPilot without MAVFTP, which gives its table by list alone."""
@@ -25,6 +27,14 @@ def param_value(
 ) -> ParamValue:
     """A PARAM_VALUE as a component would send it."""
     return ParamValue(name, encode_value(value, kind, encoding), kind, count, index)
+
+
+def clamped(message: Message, name: str, low: float, high: float) -> Message:
+    """A set of this parameter of an ArduPilot with its value in this range; any other message as it is."""
+    if not isinstance(message, ParamSet) or message.param_id != name:
+        return message
+    (value,) = struct.unpack("<f", message.raw)
+    return replace(message, raw=struct.pack("<f", min(max(value, low), high)))
 
 
 def known(

@@ -219,22 +219,27 @@ def test_the_core_touches_nothing_outside() -> None:
 
 
 def is_private(name: str) -> bool:
-    return name.startswith("_") and not name.startswith("__")
+    return name.startswith("_") and not name.startswith("__") and name != "_"
+
+
+def private_names_in(tree: ast.AST) -> set[str]:
+    """The private names that a module or a class defines or assigns, also to attributes."""
+    found = set()
+    for node in ast.walk(tree):
+        match node:
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+                found.add(name)
+            case ast.Attribute(attr=name, ctx=ast.Store()) | ast.Name(id=name, ctx=ast.Store()):
+                found.add(name)
+    return set(filter(is_private, found))
 
 
 def test_no_module_uses_the_private_names_of_another() -> None:
     """Those of a base class are its subclasses' too, for themselves: `self._x`."""
     offenders = []
     for module in MODULES:
-        nodes = list(ast.walk(source_of(module)))
-        own = set(NAMEDTUPLE_METHODS)
-        for node in nodes:
-            match node:
-                case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
-                    own.add(name)
-                case ast.Attribute(attr=name, ctx=ast.Store()) | ast.Name(id=name, ctx=ast.Store()):
-                    own.add(name)
-        for node in nodes:
+        own = private_names_in(source_of(module)) | NAMEDTUPLE_METHODS
+        for node in ast.walk(source_of(module)):
             match node:
                 case ast.ImportFrom(names=aliases) if any(is_private(alias.name) for alias in aliases):
                     offenders.append(f"{module}:{node.lineno}")
@@ -243,6 +248,29 @@ def test_no_module_uses_the_private_names_of_another() -> None:
                 case ast.Attribute(attr=name) if is_private(name) and name not in own:
                     offenders.append(f"{module}:{node.lineno} uses {name}")
     assert offenders == []
+
+
+def test_no_test_uses_a_private_name_of_the_package() -> None:
+    """Neither of an object, nor in a class that it derives from one of the package."""
+    private = {name for module in MODULES for name in private_names_in(source_of(module))}
+    used: list[tuple[str, str]] = []
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        bases: set[str] = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            place = f"{path.name}:{getattr(node, 'lineno', 0)}"
+            match node:
+                case ast.ImportFrom(module=str(origin), names=aliases) if origin.startswith("paramclient"):
+                    bases |= {alias.name for alias in aliases}
+                case ast.ClassDef() if bases & {ast.unparse(base) for base in node.bases}:
+                    used += [(place, name) for name in private_names_in(node)]
+                    used += [(place, each.attr) for each in ast.walk(node) if isinstance(each, ast.Attribute)]
+                case ast.Attribute(value=ast.Name(id="self" | "cls")):
+                    continue
+                case ast.Attribute(attr=name) if not ast.unparse(node).startswith("trio."):
+                    used.append((place, name))
+                case ast.Call(args=[_, ast.Constant(value=str(name)), *_]):
+                    used.append((place, name))
+    assert [f"{place} uses {name}" for place, name in used if name in private - NAMEDTUPLE_METHODS] == []
 
 
 def test_one_name_has_one_meaning() -> None:

@@ -27,7 +27,16 @@ from paramclient import (
     Value,
     WrittenParam,
 )
-from paramclient.sync import Component, Discovered, ParamClient, apply, apply_all, restore, verify
+from paramclient.sync import (
+    Component,
+    Discovered,
+    ParamClient,
+    apply,
+    apply_all,
+    metadata_of,
+    restore,
+    verify,
+)
 from tests.sync_stub import STUB, meaning, stub
 
 NAME = "MC_ROLL_P"
@@ -81,7 +90,7 @@ def test_a_whole_session(tmp_path: Path) -> None:
         assert cache.component().params[NAME].value == 7.0
 
 
-def test_a_vehicle_is_set_up_and_restored() -> None:
+def test_a_vehicle_is_set_up_and_restored(tmp_path: Path) -> None:
     wanted = ParamSet({NAME: WrittenParam(NAME, 6.5)})
     asked: list[Value] = []
     with ParamClient("sim:px4", cache=False) as client:
@@ -91,8 +100,17 @@ def test_a_vehicle_is_set_up_and_restored() -> None:
         assert verify(vehicle, wanted).is_met
         assert restore(vehicle, result.before).complete
         seen: list[Component] = []
-        done = apply_all([vehicle], lambda each: wanted, progress=lambda each, _: seen.append(each))
+        done = apply_all(
+            [vehicle],
+            lambda each: wanted,
+            info=lambda each: metadata_of(each),
+            backup=lambda each: tmp_path / f"{each.get(NAME).index}.params",
+            progress=lambda each, _: seen.append(each),
+            before_writing=lambda each: asked.append(each.get(NAME).value),
+        )
         assert done.results[1, 1].complete
+        assert (tmp_path / f"{vehicle.get(NAME).index}.params").exists()
+        assert asked == [4.0, 4.0]
         assert set(seen) == {vehicle}
     assert not apply_all([], wanted).results
 

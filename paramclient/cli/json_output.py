@@ -364,8 +364,8 @@ class FetchJson(Json):
     received: int
     source: str
     hash: str | None
-    missing: list[int]
-    cached: list[str]
+    missing: tuple[int, ...]
+    cached: tuple[str, ...]
     changed: tuple[str, ...]
     lost: int
     repeated: int
@@ -382,8 +382,6 @@ class FetchJson(Json):
         result: FetchResult,
         params: Iterable[Param],
         *,
-        missing: list[int],
-        cached: list[str],
         bytes_received: int,
         bytes_sent: int,
         described: Mapping[str, int | float],
@@ -395,10 +393,7 @@ class FetchJson(Json):
             component=component.component,
             autopilot=component.autopilot,
             uid=component.identity.uid,
-            received=result.count - len(missing),
             hash=hash_text(result.hash),
-            missing=missing,
-            cached=cached,
             round_trip_s=rounded(result.round_trip),
             elapsed_s=round(result.elapsed, 4),
             bytes_received=bytes_received,

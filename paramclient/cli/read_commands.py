@@ -156,15 +156,13 @@ async def fetch_table(session: CommandSession, *, refresh: bool = False) -> Fetc
 class _Fetched:
     """The parameters that were received or confirmed in this session.
 
-    A value that is only cached is left out, and its index counts as missing. If the policy prevents its
-    request, it is included and named in `cached`. `described` has defaults of the metadata, by name.
+    A value that is only cached is left out. If the policy prevents its request, it is included and named in
+    `cached` of the result. `described` has defaults of the metadata, by name.
     """
 
     session: CommandSession
     result: FetchResult
     params: list[Param]
-    missing: list[int]
-    cached: list[str]
     bytes_received: int
     bytes_sent: int
     described: Mapping[str, int | float] = field(default_factory=dict)
@@ -172,19 +170,11 @@ class _Fetched:
     @classmethod
     def of(cls, session: CommandSession, result: FetchResult, policy: Policy) -> _Fetched:
         """Select the parameters of a fetch under a policy."""
-        params = by_index(session.component.params.values())
-        cached = [param for param in params if param.trust is Trust.CACHED]
-        missing = set(result.missing)
-        if policy is Policy.AUTO:
-            missing |= {param.index for param in cached if param.index is not None}
-            params = [param for param in params if param.trust is not Trust.CACHED]
-            cached = []
+        left_out = set(result.cached) if policy is Policy.AUTO else set()
         return cls(
             session,
-            result,
-            params=params,
-            missing=sorted(missing),
-            cached=[param.name for param in cached],
+            replace(result, cached=()) if left_out else result,
+            params=by_index(each for name, each in result.params.items() if name not in left_out),
             bytes_received=session.client.bytes_received,
             bytes_sent=session.client.bytes_sent,
         )
@@ -208,9 +198,10 @@ class _Fetched:
     @property
     def incomplete(self) -> str:
         """The line about missing parameters."""
-        indices = f"{'index' if len(self.missing) == 1 else 'indices'} "
-        indices += first_of(self.missing, INDICES_SHOWN_MAX)
-        number = "was" if len(self.missing) == 1 else "were"
+        missing = self.result.missing
+        indices = f"{'index' if len(missing) == 1 else 'indices'} "
+        indices += first_of(missing, INDICES_SHOWN_MAX)
+        number = "was" if len(missing) == 1 else "were"
         return (
             f"incomplete: {indices} of {self.session.label} {number} not received; run the command again to "
             "request what is missing"
@@ -220,7 +211,7 @@ class _Fetched:
     def summary(self) -> str:
         """The line about the fetch: parameters, source, seconds, losses, bytes, hash."""
         result = self.result
-        of = f" of {result.count}" if self.missing else ""
+        of = f" of {result.count}" if result.missing else ""
         crc = "" if result.hash is None else f"; hash {hash_text(result.hash)}"
         lost = "" if result.source == "cache" else f"{result.lost} lost, {result.repeated} repeated, "
         trip = "" if result.round_trip is None else f"round trip {milliseconds(result.round_trip)}, "
@@ -228,7 +219,7 @@ class _Fetched:
         if len(self.session.client.components) > 1:  # the counters are those of the link
             transferred = f"{transferred} on the whole link"
         return (
-            f"{result.count - len(self.missing)}{of} {self.session.noun}s of {self.session.label} from "
+            f"{result.received}{of} {self.session.noun}s of {self.session.label} from "
             f"{result.source} in {result.elapsed:.2f} s, {lost}{trip}{transferred}{crc}"
         )
 
@@ -238,8 +229,6 @@ class _Fetched:
             self.session.component,
             self.result,
             self.params,
-            missing=self.missing,
-            cached=self.cached,
             bytes_received=self.bytes_received,
             bytes_sent=self.bytes_sent,
             described=self.described,
@@ -282,7 +271,7 @@ def _show_fetched(
             say(printable(each.summary))
     code = report_failures(done)
     for each in found:
-        if each.missing:
+        if each.result.missing:
             report(each.incomplete)
             code = max(code, ExitCode.INCOMPLETE)
     if changed and not has_defaults:

@@ -524,7 +524,7 @@ async def _find_by_uid(
                 has_looked = True
                 await anyio.sleep(HEARTBEAT_WAIT)
                 continue
-            client.core.check_open()
+            client.core.station.gate.check()
             await anyio.sleep(UID_POLL_INTERVAL)
     waited = anyio.current_time() - began
     raise NoReply(awaited, attempts=0, waited=waited, hint=received_in_words(client))

@@ -41,19 +41,27 @@ T = TypeVar("T")
 
 
 @dataclass(eq=False)
-class _Pending:
-    """What is to be written of one table.
+class _Record:
+    """What the cache has of one table, and what is to be written of it.
 
     Attributes:
-        generation: of the component, when the first of it was received.
+        generation: of the component, when the first change was received.
         changes: changed parameters in order, each with the time by the clock of the event loop, as the
             computer's clock may be wrong.
         is_whole: whether the whole table is to be written, as it is.
+        synced_at: when the table was last proven, in unix time, as the cache has it, or None.
+        fetched_at: likewise in this session, by the clock of the event loop.
     """
 
     generation: int
     changes: list[tuple[Change, float]] = field(default_factory=list)
     is_whole: bool = False
+    synced_at: float | None = None
+    fetched_at: float | None = None
+
+    @property
+    def is_unwritten(self) -> bool:
+        return self.is_whole or bool(self.changes)
 
 
 class CacheWriter:
@@ -78,9 +86,7 @@ class CacheWriter:
         self._thread = anyio.CapacityLimiter(1)
         self._identities: dict[Node, Identity] = {}  # of the vehicle, under which tables are written
         self._vehicles: dict[Node, Node] = {}  # the autopilot with this identity
-        self._synced_at: dict[Session, float] = {}  # when each table was last proven, as the cache knows
-        self._fetched_at: dict[Session, float] = {}  # and in this session, by the event loop's clock
-        self._pending: dict[Session, _Pending] = {}
+        self._records: dict[Session, _Record] = {}
         self._writing = anyio.Lock()
         self._is_closing = False
         self._is_synced = True  # what was written is safe from power loss
@@ -124,7 +130,7 @@ class CacheWriter:
 
     def _warn_of_lost(self) -> None:
         for node, identity in self._identities.items():
-            if any(self._waits(session) for session in node.sessions):
+            if any(self._record(node, session).is_unwritten for session in node.sessions):
                 logger.warning(
                     "the last values of %d/%d (%s) are not in the cache, and lost: %s",
                     *(node.system, node.component, identity.key, self.failure or "timeout"),
@@ -167,23 +173,22 @@ class CacheWriter:
             if identity.uid is not None:
                 session.table.forget_doubtful()
             if kept is not None and session.table.params:  # received before it was known which vehicle it is
-                self._pending_of(node, session).is_whole = True
+                self._record(node, session).is_whole = True
             if cached is None:
                 continue
             if vehicle.identification.autopilot is None:  # no heartbeat yet
                 known = cached.identity
                 identity = replace(identity, autopilot=known.autopilot, vehicle_type=known.vehicle_type)
-            if cached.synced_at is not None:
-                self._synced_at[session] = cached.synced_at
+            self._records.setdefault(session, _Record(node.generation)).synced_at = cached.synced_at
             is_same_firmware = _firmware(cached.identity) == _firmware(identity)
-            params, ahead = cached.params.values(), self._seconds_ahead()
+            params, ahead, now = cached.params.values(), self._seconds_ahead(), anyio.current_time()
             session.table.load(
                 params if is_same_firmware else [replace(each, default=None) for each in params],
                 count=cached.count if cached.complete and is_same_firmware else None,
                 hash=cached.hash,
                 volatile=cached.volatile,
                 volatile_is_known=cached.volatile_known,
-                moments={name: at - ahead for name, at in cached.heard_at.items()},
+                moments={name: min(at - ahead, now) for name, at in cached.heard_at.items()},
             )
             if is_same_firmware and session.serves_file is None:
                 session.serves_file = cached.file_works
@@ -194,38 +199,37 @@ class CacheWriter:
         """Drop what waits: another vehicle uses the ids of the component."""
         self._identities.pop(node, None)
         for session in node.sessions:
-            for each in (self._pending, self._synced_at, self._fetched_at):
-                each.pop(session, None)
+            self._records.pop(session, None)
 
     def changed(self, node: Node, session: Session, change: Change) -> None:
         """Take a change of a parameter."""
         if self.cache is None:
             return
-        pending = self._pending_of(node, session)
-        if len(pending.changes) < PENDING_MAX:
+        record = self._record(node, session)
+        if len(record.changes) < PENDING_MAX:
             at = min(session.table.moments.get(change.name, math.inf), anyio.current_time())
-            pending.changes.append((change, at))
+            record.changes.append((change, at))
         else:
-            pending.is_whole = True
+            record.is_whole = True
         self._wake()
 
     def fetched(self, node: Node, session: Session, *, is_whole: bool) -> None:
         """Take note of a complete fetch; `is_whole`: indices may have changed without values."""
-        pending = self._pending_of(node, session)
-        self._fetched_at[session] = anyio.current_time()
-        pending.is_whole = pending.is_whole or is_whole
+        record = self._record(node, session)
+        record.fetched_at = anyio.current_time()
+        record.is_whole |= is_whole
         self._wake()
 
-    def _pending_of(self, node: Node, session: Session) -> _Pending:
-        """Return what is to be written of a table.
+    def _record(self, node: Node, session: Session) -> _Record:
+        """Return the record of a table.
 
         What was received of an unidentified component before it was lost may be of another vehicle.
         """
-        pending = self._pending.get(session)
-        is_doubtful = pending is not None and pending.generation != node.generation
-        if pending is None or (is_doubtful and node not in self._identities):
-            pending = self._pending[session] = _Pending(node.generation)
-        return pending
+        record = self._records.get(session)
+        is_doubtful = record is not None and record.generation != node.generation
+        if record is None or (is_doubtful and node not in self._identities):
+            record = self._records[session] = _Record(node.generation)
+        return record
 
     async def run(self) -> None:
         """Write new values in batches, until cancelled."""
@@ -253,35 +257,30 @@ class CacheWriter:
             return
         async with self._writing:
             certain = [node for node in self._identities if self._is_certain(node)]
-            taken = [
-                (node, session, self._pending[session])
-                for node in certain
-                for session in node.sessions
-                if self._waits(session)
-            ]
+            records = [(node, each, self._record(node, each)) for node in certain for each in node.sessions]
+            taken = [each for each in records if each[2].is_unwritten]
             if durable and self._is_synced and not taken:
                 return
             updates = [self._update(*each) for each in taken]
-            before = [(pending, len(pending.changes), pending.is_whole) for _, _, pending in taken]
-            for _, _, pending in taken:
-                pending.is_whole = False
+            before = [(record, len(record.changes), record.is_whole) for _, _, record in taken]
+            for _, _, record in taken:
+                record.is_whole = False
             is_saved = self._is_synced = False
             try:
                 await self._call(partial(cache.save, updates, durable=durable))
                 is_saved = True
             finally:
-                for pending, count, was_whole in before:
+                for record, count, was_whole in before:
                     if is_saved:
-                        del pending.changes[:count]
+                        del record.changes[:count]
                     else:
-                        pending.is_whole |= was_whole
+                        record.is_whole |= was_whole
             self._is_synced = durable
             self.failure = None
             if cache.replacements != self._replacements:  # a new file, without the earlier values
                 self._replacements = cache.replacements
-                for node in certain:
-                    for session in node.sessions:
-                        self._pending_of(node, session).is_whole = True
+                for _, _, record in records:
+                    record.is_whole = True
                 self._wake()
 
     async def write_durably(self, node: Node) -> None:
@@ -309,23 +308,22 @@ class CacheWriter:
         """Return whether the vehicle and the component are still those that were identified."""
         return node.identification.is_confirmed and self._vehicles[node].identification.is_confirmed
 
-    def _update(self, node: Node, session: Session, pending: _Pending) -> TableUpdate:
+    def _update(self, node: Node, session: Session, record: _Record) -> TableUpdate:
         table, vehicle = session.table, self._vehicles[node]
         identity, heard = self._identities[node], vehicle.identification
         if heard.autopilot is not None:
             identity = replace(identity, autopilot=heard.autopilot, vehicle_type=heard.vehicle_type or 0)
-        observations = [(each.new, at, each.by) for each, at in pending.changes if each.new is not None]
-        if pending.is_whole:
+        observations = [(each.new, at, each.by) for each, at in record.changes if each.new is not None]
+        if record.is_whole:
             observations += [(param, table.moments[name], BY_VEHICLE) for name, param in table.params.items()]
         ahead = self._seconds_ahead()
-        fetched_at = self._fetched_at.get(session)
         is_extended = session is node.extended
         state = TableState(
             hash=table.hash if table.is_complete else None,
             count=table.count,
             complete=table.is_complete,
             volatile_known=table.volatile_is_known,
-            synced_at=self._synced_at.get(session) if fetched_at is None else fetched_at + ahead,
+            synced_at=record.synced_at if record.fetched_at is None else record.fetched_at + ahead,
             file_works=session.serves_file,
         )
         return TableUpdate(
@@ -343,15 +341,10 @@ class CacheWriter:
                 )
                 for param, at, by in observations
             ],
-            removed={each.name: at + ahead for each, at in pending.changes if each.new is None},
-            replace=pending.is_whole and table.is_complete,
+            removed={each.name: at + ahead for each, at in record.changes if each.new is None},
+            replace=record.is_whole and table.is_complete,
             extended=is_extended,
         )
-
-    def _waits(self, session: Session) -> bool:
-        """Return whether something of a table is to be written."""
-        pending = self._pending.get(session)
-        return pending is not None and (pending.is_whole or bool(pending.changes))
 
     def _seconds_ahead(self) -> float:
         """Return the seconds from the event loop's clock to unix time, always the same.

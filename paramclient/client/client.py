@@ -23,25 +23,16 @@ from paramclient.client.recording import Capture
 from paramclient.client.signing import Signing, refused_in_words
 from paramclient.client.streams import Subscribers
 from paramclient.client.traffic import Traffic, TrafficReport
-from paramclient.errors import AnotherVehicle, NoReply, ParamClientError, UsageError
+from paramclient.errors import AnotherVehicle, ClientClosed, NoReply, ParamClientError, UsageError
 from paramclient.links import Link, ReplayLink, SimLink, create_link
 from paramclient.model.values import Encoding
 from paramclient.model.wording import counted
 from paramclient.protocol import events as protocol
+from paramclient.protocol import selection
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.fetch import Policy
 from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.protocol.node import Node
-from paramclient.protocol.selection import (
-    address_in_words,
-    autopilots_of,
-    find,
-    hint_of_link,
-    node_in_words,
-    only_vehicle,
-    vehicle_of,
-)
-from paramclient.protocol.session import Session
 from paramclient.protocol.station import Station
 from paramclient.protocol.watch import INTERVAL_MIN
 from paramclient.wire.signing import SigningKey, SigningReport
@@ -97,7 +88,9 @@ class ParamClient:
             for vehicles that share a system id.
 
     Attributes:
+        link: the link object.
         cache: cache of the tables, or None.
+        listens_only: whether the client sends nothing: by `listen_only`, or because the link is a log.
 
     Raises:
         UsageError: the link name, an id, the interval or the policy is not valid, or one of the latter two is
@@ -133,34 +126,36 @@ class ParamClient:
             raise UsageError(f"policy must be one of {', '.join(Policy)}, not {policy!r}") from None
         if listen_only and (watch_interval or self.policy is not Policy.AUTO):
             raise UsageError("the client only listens: it takes no policy, and no watch_interval but 0")
-        opened = create_link(link)
+        self.link = opened = create_link(link)
         is_log = isinstance(opened, ReplayLink)
+        self.listens_only = listen_only or is_log
         self.cache = choose_cache(cache, is_log=is_log)
         self.watch_interval = watch_interval
         self._components: dict[Address, Component] = {}
-        self._by_session: dict[Session, Component] = {}
         self._events: Subscribers[events.Event] = Subscribers()
         capture = None if tlog is None else Capture(tlog)
         self._traffic = Traffic() if traffic else None
-        self.core = ClientCore(
+        self.core = core = ClientCore(
             opened,
             CacheWriter(self.cache, owned=self.cache is not cache),
             [tap for tap in (capture, self._traffic) if tap is not None],
             Signing(signing) if isinstance(signing, SigningKey) else signing,
-            partial(
-                Station,
-                link=opened.name,
-                is_stream=opened.is_stream,
-                system=system,
-                component=component,
-                encoding=encoding,
-                listens_only=listen_only or is_log,
-                split_peers=split_peers,
-                discovered=self._meet,
-                emit=self.emit,
-                changed=self._changed,
-            ),
             self._end_streams,
+        )
+        core.station = core.link_task.station = Station(
+            link=opened.name,
+            is_stream=opened.is_stream,
+            send=core.link_task.queue,
+            spawn=core.spawn,
+            system=system,
+            component=component,
+            encoding=encoding,
+            listens_only=self.listens_only,
+            split_peers=split_peers,
+            discovered=self._meet,
+        )
+        core.station.gate.fail(
+            ClientClosed("the client is not open; use `async with` or `open`", link=opened.name)
         )
 
     def __repr__(self) -> str:
@@ -204,18 +199,8 @@ class ParamClient:
     @property
     def autopilots(self) -> list[Component]:
         """The autopilot of each system, sorted by system id, without cameras, gimbals and the like."""
-        found = autopilots_of(self.core.station.nodes.values())
-        return [self._by_session[each.plain] for each in sorted(found, key=lambda node: node.system)]
-
-    @property
-    def link(self) -> Link:
-        """The link object of the client."""
-        return self.core.link
-
-    @property
-    def listens_only(self) -> bool:
-        """Whether the client sends nothing: because of `listen_only`, or because the link is a log."""
-        return self.core.station.listens_only
+        found = selection.autopilots_of(self.core.station.nodes.values())
+        return [self._components[each.address] for each in sorted(found, key=lambda node: node.system)]
 
     @property
     def bytes_received(self) -> int:
@@ -277,8 +262,8 @@ class ParamClient:
         """
         nodes = self.core.station.nodes
         return await self._wait_for(
-            lambda: (find(nodes.values(), system, component, peer), None),
-            address_in_words(system, component, peer),
+            lambda: selection.find(nodes.values(), system, component, peer),
+            selection.address_in_words(system, component, peer),
             timeout,
             asked=(system, component),
         )
@@ -306,14 +291,13 @@ class ParamClient:
             raise UsageError(f"expect must be a number of vehicles from 1 up, not {expect}")
         began = anyio.current_time()
         await self.component(timeout=timeout)
-        wait = VEHICLES_LISTENING_TIME
-        if expect is not None:
-            wait = math.inf if timeout is None else began + timeout - anyio.current_time()
-        with anyio.move_on_after(wait):
+        if expect is None:
+            timeout = anyio.current_time() - began + VEHICLES_LISTENING_TIME
+        with anyio.CancelScope(deadline=math.inf if timeout is None else began + timeout):
             while expect is None or len(self.autopilots) < expect:
-                await self._activity()
+                await self.core.link_task.wait_for_activity()
         if expect is not None and len(self.autopilots) < expect:
-            heard = ", ".join(node_in_words(each.node) for each in self.autopilots)
+            heard = ", ".join(selection.node_in_words(each.node) for each in self.autopilots)
             waited = anyio.current_time() - began
             raise NoReply(f"{expect} vehicles; heard only {heard}", attempts=0, waited=waited)
         for each in self.autopilots:
@@ -352,14 +336,14 @@ class ParamClient:
             return await self.component(system, component, peer=peer, timeout=timeout)
         station = self.core.station
         return await self._wait_for(
-            lambda: only_vehicle(
+            lambda: selection.only_vehicle(
                 station.nodes.values(),
                 system,
                 component,
                 anyio.current_time(),
                 listening_since=station.listening_since,
             ),
-            address_in_words(system, component),
+            selection.address_in_words(system, component),
             timeout,
             asked=(system, component),
         )
@@ -385,11 +369,11 @@ class ParamClient:
         """
         before, began = component.identity, anyio.current_time()
 
-        def choose() -> tuple[Node | None, None]:
-            node = find(self.core.station.nodes.values(), system, component.component, None)
-            return node if node is not None and node.presence.received_at > began else None, None
+        def choose() -> Node | None:
+            node = selection.find(self.core.station.nodes.values(), system, component.component, None)
+            return node if node is not None and node.presence.received_at > began else None
 
-        found = await self._wait_for(choose, address_in_words(system, component.component), timeout)
+        found = await self._wait_for(choose, selection.address_in_words(system, component.component), timeout)
         with anyio.move_on_after(timeout), self.core.station.gate.until_closed():
             await found.node.identification.settled()
         if not before.is_same_vehicle(found.identity):
@@ -397,11 +381,7 @@ class ParamClient:
         return found
 
     async def fetch_all(
-        self,
-        system: int | None = None,
-        *,
-        refresh: bool = False,
-        timeout: float | None = None,
+        self, system: int | None = None, *, refresh: bool = False, timeout: float | None = None
     ) -> FetchedAll:
         """Update the tables of all components of one system, or of every system on the link.
 
@@ -422,11 +402,11 @@ class ParamClient:
             LinkError: the link failed, or the client was closed.
         """
         if refresh:
-            self.core.check_may_send()
+            self.core.station.check_may_send()
         nodes = self.core.station.nodes
         deadline = math.inf if timeout is None else anyio.current_time() + timeout
         await self._wait_for(
-            lambda: (next((each for each in nodes.values() if system in (None, each.system)), None), None),
+            lambda: next((each for each in nodes.values() if system in (None, each.system)), None),
             "a component" if system is None else f"a component of system {system}",
             COMPONENT_TIMEOUT if timeout is None else timeout,
         )
@@ -448,7 +428,7 @@ class ParamClient:
         """
         if self._traffic is None:
             raise UsageError("this client does not count traffic; use ParamClient(..., traffic=True)")
-        self.core.check_open()
+        self.core.station.gate.check()
         return self._traffic.report(anyio.current_time(), self.core.link_task.cutter)
 
     def signing_report(self) -> SigningReport | None:
@@ -463,25 +443,21 @@ class ParamClient:
 
     def _meet(self, node: Node) -> None:
         """Follow a new component."""
-        ext = Component(self, node, node.extended, None)
-        component = Component(self, node, node.plain, ext)
-        self._by_session |= {node.extended: ext, node.plain: component}
-        self._components[component.address] = component
+        component = self._components[node.address] = Component(self, node, node.plain)
+        node.emit = partial(self._emit, component)
         self._events.push(events.Discovered(component))
-        self.core.spawn(self._join_vehicle, node)
+        self.core.spawn(component.join_vehicle)
 
-    def emit(self, node: Node, event: protocol.ComponentEvent) -> None:
+    def _emit(self, component: Component, event: protocol.ComponentEvent) -> None:
         """Tell the subscribers and the cache what has happened to a component."""
-        component = self._by_session[node.plain]
         match event:
             case protocol.Identified():
-                nodes = self.core.station.nodes.values()
-                for each in nodes:
-                    if vehicle_of(nodes, each) is node:
-                        self.core.spawn(self._load, each)
+                for each in self._components.values():
+                    if each.vehicle is component.node:
+                        self.core.spawn(each.load)
                 return
             case protocol.Replaced():
-                self.core.cache_writer.forget(node)
+                self.core.cache_writer.forget(component.node)
                 return
             case protocol.Lost(silence=silence):
                 self._events.push(events.Lost(component, silence))
@@ -492,45 +468,21 @@ class ParamClient:
             case protocol.Resynced(changed=changed, hash=confirmed):
                 self._events.push(events.Resynced(component, changed, confirmed))
         if isinstance(event, protocol.Found | protocol.Rebooted):
-            for session in node.sessions:
-                self._by_session[session].watch.doubt()
+            component.watch.doubt()
+            component.ext.watch.doubt()
         self.core.link_task.notify()
-
-    def _changed(self, node: Node, session: Session, change: protocol.Change) -> None:
-        self._by_session[session].subscribers.push(change)
-        self.core.cache_writer.changed(node, session, change)
-
-    async def _join_vehicle(self, node: Node) -> None:
-        """Load the cached tables of a component whose vehicle is identified already, or never was."""
-        await anyio.sleep_until(node.since + HEARTBEAT_WAIT)  # for the heartbeat of its autopilot
-        if self.core.cache_writer.may_load(node, vehicle_of(self.core.station.nodes.values(), node)):
-            await self._load(node)
-
-    async def _load(self, node: Node) -> None:
-        """Load the cached tables of a component of an identified vehicle."""
-        nodes = self.core.station.nodes.values()
-        vehicle = vehicle_of(nodes, node)
-        is_young = anyio.current_time() < node.since + HEARTBEAT_WAIT
-        if vehicle is node and is_young and not node.identification.is_autopilot:
-            return  # it may have an autopilot: `_join_vehicle` waits for its heartbeat
-        await self.core.cache_writer.load(node, vehicle)
-        for session in node.sessions:
-            self._by_session[session].cache_is_read.set()
 
     def _end_streams(self) -> None:
         error: ParamClientError | None = None if self.core.is_over else self.core.station.gate.error
-        for component in self._by_session.values():
-            component.subscribers.end(error)
-            component.cache_is_read.set()
+        for component in self._components.values():
+            for each in (component, component.ext):
+                each.subscribers.end(error)
+                each.cache_is_read.set()
         self._events.end(error)
-
-    async def _activity(self) -> None:
-        await self.core.link_task.activity.wait()
-        self.core.check_open()
 
     async def _wait_for(
         self,
-        choose: Callable[[], tuple[Node | None, float | None]],
+        choose: Callable[[], Node | float | None],
         awaited: str,
         timeout: float | None,
         *,
@@ -539,33 +491,33 @@ class ParamClient:
         """Wait until a choice is made, and its cached table is loaded.
 
         Args:
-            choose: called after each message; returns the choice, or when it may change without a message.
+            choose: called after each message; returns the choice, or when one may be made without a message.
             awaited: for the error.
             timeout: seconds; None waits without limit.
             asked: system and component to which requests are sent; nothing is, without both.
         """
-        self.core.check_open()
+        self.core.station.gate.check()
         began = anyio.current_time()
         station = self.core.station
         system, component = asked
         probe_at = 0.0 if system and component else math.inf
-        node, due = choose()
+        found = choose()
         with anyio.move_on_after(timeout):
-            while node is None and not self.core.is_over:
+            while not (isinstance(found, Node) or self.core.is_over):
                 now = anyio.current_time()
                 probe_at = max(probe_at, station.listening_since + HEARTBEAT_WAIT)
                 if system and component and now >= probe_at:
                     station.probe(system, component)
                     probe_at = now + PROBE_INTERVAL
-                with anyio.move_on_after(min(probe_at, math.inf if due is None else due) - now):
-                    await self._activity()
-                node, due = choose()
-            if node is not None:
-                await self._by_session[node.plain].wait_for_cache()
-        if node is not None:
-            return self._by_session[node.plain]
+                with anyio.move_on_after(min(probe_at, math.inf if found is None else found) - now):
+                    await self.core.link_task.wait_for_activity()
+                found = choose()
+            if isinstance(found, Node):
+                await self._components[found.address].wait_for_cache()
+        if isinstance(found, Node):
+            return self._components[found.address]
         refused = refused_in_words(self.signing_report())
-        hint = "" if refused else hint_of_link(station, self.bytes_received)
-        if due is not None:
+        hint = "" if refused else selection.hint_of_link(station, self.bytes_received)
+        if found is not None:
             hint, awaited = "", f"{awaited}, then {HEARTBEAT_WAIT} s without another vehicle"
         raise NoReply(f"{awaited}{refused}", attempts=0, waited=anyio.current_time() - began, hint=hint)

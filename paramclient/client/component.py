@@ -15,14 +15,7 @@ from paramclient.cache import check_author
 from paramclient.client.core import ClientCore
 from paramclient.client.signing import timestamp_now
 from paramclient.client.streams import Changes, Subscribers
-from paramclient.errors import (
-    AmbiguousVehicle,
-    CacheError,
-    NoReply,
-    NotDurable,
-    ParamClientError,
-    UsageError,
-)
+from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, NotDurable, ParamClientError, UsageError
 from paramclient.links.replay import ReplayLink
 from paramclient.model.ext_values import check_ext_value
 from paramclient.model.identity import Identity, autopilot_name
@@ -37,9 +30,10 @@ from paramclient.model.values import (
     check_value,
 )
 from paramclient.protocol import commands
-from paramclient.protocol.addresses import Address, PeerAddress, peer_in_words
+from paramclient.protocol.addresses import Address, peer_in_words
 from paramclient.protocol.events import Change, Resynced
-from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all, result_of
+from paramclient.protocol.fetch import FetchResult, FetchSource, Policy, Progress, fetch_all, result_of
+from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.protocol.node import Node
 from paramclient.protocol.reads import read_param
 from paramclient.protocol.selection import hint_of_node, node_in_words, vehicle_of
@@ -91,12 +85,7 @@ class Owner(Protocol):
     watch_interval: float | None
 
     @property
-    def listens_only(self) -> bool: ...
-
-    @property
     def components(self) -> Mapping[Address, Component]: ...
-
-    def emit(self, node: Node, event: Resynced) -> None: ...
 
     async def successor(
         self, component: Component, system: int, *, timeout: float | None = ...
@@ -113,28 +102,32 @@ class Component:
 
     Attributes:
         system, component: MAVLink ids of the component.
+        is_extended: whether these are the extended parameters: the `ext` of another component.
         params: the known parameters by name: live, verified or cached, see `Trust`. The mapping is read-only
             and follows the received messages.
     """
 
-    def __init__(self, client: Owner, node: Node, session: Session, ext: Component | None) -> None:
+    def __init__(self, client: Owner, node: Node, session: Session) -> None:
         self.client = client
         self.core = client.core
         self.node = node
         self.session = session
         self.system = node.system
         self.component = node.component
+        self.is_extended = session.dialect.has_ack
         self.params = ParamMap(session.table.params)
         self.subscribers: Subscribers[Change] = Subscribers()
-        self.policy = Policy.CACHE_ONLY if client.listens_only else client.policy
+        listens_only = self.core.station.listens_only
+        self.policy = Policy.CACHE_ONLY if listens_only else client.policy
         self.watch = Watch(
             session, node.presence, self._resynced, interval=client.watch_interval, policy=self.policy
         )
         self.cache_is_read = anyio.Event()
-        self._ext = ext
+        self._ext = Component(client, node, node.extended) if session is node.plain else None
         self._last: FetchResult | None = None
+        session.table.changed = self._changed
         session.table.recounted = self.watch.doubt
-        if client.listens_only:
+        if listens_only:
             session.contradicted = self.watch.doubt
         else:
             self.core.spawn(self.watch.run)
@@ -147,11 +140,6 @@ class Component:
         return self._ext
 
     @property
-    def is_extended(self) -> bool:
-        """Whether these are the extended parameters: whether the component is the `ext` of another one."""
-        return self.session.dialect.has_ack
-
-    @property
     def autopilot(self) -> str:
         """Autopilot of its heartbeat: px4, ardupilot, generic, …; "unknown" before the first heartbeat."""
         number = self.node.identification.autopilot
@@ -160,10 +148,11 @@ class Component:
     @property
     def identity(self) -> Identity:
         """Identity of the vehicle from AUTOPILOT_VERSION: hardware id, firmware, capabilities, if known."""
-        return self._vehicle.identification.identity
+        return self.vehicle.identification.identity
 
     @property
-    def _vehicle(self) -> Node:
+    def vehicle(self) -> Node:
+        """The autopilot of its vehicle, whose identity is the vehicle's; without one, its own node."""
         return vehicle_of(self.core.station.nodes.values(), self.node)
 
     @property
@@ -208,9 +197,7 @@ class Component:
     @property
     def address(self) -> Address:
         """Its key in `ParamClient.components`: (system, component), with `split_peers` also the peer."""
-        if self.node.is_split:
-            return PeerAddress(self.system, self.component, self.node.peer)
-        return (self.system, self.component)
+        return self.node.address
 
     @property
     def peer(self) -> str:
@@ -268,7 +255,7 @@ class Component:
             check_portable_name(name)
         elif not isinstance(name, int) or not 0 <= name < PARAMETERS_MAX:
             raise UsageError(f"parameter index {name}: indices are 0 to {PARAMETERS_MAX - 1}")
-        self.core.check_may_send()
+        self.core.station.check_may_send()
         with self.limited(timeout, f"parameter {name} of {self.system}/{self.component}"):
             return await read_param(self.session, name)
 
@@ -314,6 +301,7 @@ class Component:
             TypeMismatch: the parameter has another type on the vehicle.
             ValueNotApplied: the vehicle keeps its previous value and reports no reason.
             NoReply: the vehicle did not respond. It is unknown whether it has the value.
+            AnotherVehicle: another vehicle has taken its place meanwhile. Nothing was written to it.
             AmbiguousVehicle: another vehicle uses the same ids. Nothing was written.
             NotDurable: the vehicle has accepted the value, but it could not be written to the disk.
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
@@ -342,8 +330,8 @@ class Component:
 
         Several writes are in flight at a time. A parameter that reveals or hides others, such as `*_ENABLE`,
         is written alone: all writes before it end first, and those after it begin afterwards. A value that is
-        refused does not stop the others. If the vehicle does not respond any more, the link fails or the
-        timeout expires, the call returns the outcomes so far.
+        refused does not stop the others. If the vehicle does not respond any more, another vehicle takes its
+        place, the link fails or the timeout expires, the call returns the outcomes so far.
 
         Args:
             values: values by name, or pairs of name and value. Values are as in `set`.
@@ -413,12 +401,12 @@ class Component:
             NoReply: no response arrived.
             LinkError: the link failed, or the client was closed.
         """
-        self.core.check_open()
+        self.core.station.gate.check()
         if refresh:
-            self.core.check_may_send()
+            self.core.station.check_may_send()
             if self.policy is not Policy.AUTO:
                 raise UsageError(f"refresh needs a download, and the policy is {self.policy}")
-        began = anyio.current_time()
+        began, generation = anyio.current_time(), self.node.generation
         if timeout is None and self._waits_for_others:
             timeout = PASSIVE_TIMEOUT
         with self.limited(None, "all parameters"):
@@ -431,24 +419,25 @@ class Component:
                     result = await fetch_all(
                         self.session, refresh=refresh, policy=self.policy, progress=progress
                     )
-                return self._fetched(replace(result, elapsed=anyio.current_time() - began))
+                return self._fetched(replace(result, elapsed=anyio.current_time() - began), generation)
             if self.session.table.count is None:
                 raise self._nothing(began)
         is_confirmed = _has(self.params, Trust.VERIFIED)
-        return result_of(self.session, "cache" if is_confirmed else "stream", began, [TIMEOUT_NOTE])
+        source: FetchSource = "cache" if is_confirmed else "stream"
+        return result_of(self.session, source, began, [TIMEOUT_NOTE], policy=self.policy)
 
     async def _listen(self, began: float) -> FetchResult:
         """Wait until the table is complete by what other stations request, or until a log has ended."""
         table = self.session.table
         while not self.core.is_over and not (self._waits_for_others and self._is_heard()):
-            await self.core.link_task.activity.wait()
-            self.core.check_open()
+            await self.core.link_task.wait_for_activity()
         if not table.params:
             raise self._nothing(began)
         is_cached = self._is_heard() and _has(table.params, Trust.CACHED)
         if not is_cached:
             self.session.confirm_announced()
-        return result_of(self.session, "cache" if is_cached else "stream", began, [])
+        source: FetchSource = "cache" if is_cached else "stream"
+        return result_of(self.session, source, began, [], policy=self.policy)
 
     def _is_heard(self) -> bool:
         """Return whether all values were received, or the hash of the cached ones was."""
@@ -469,7 +458,7 @@ class Component:
             what += ", which no other station has requested"
         return NoReply(what, attempts=0, waited=anyio.current_time() - began)
 
-    def _fetched(self, result: FetchResult) -> FetchResult:
+    def _fetched(self, result: FetchResult, generation: int) -> FetchResult:
         self._last = result
         logger.debug("%s: %r", self.core.link.name, result)
         if not result.params and self.policy is not Policy.AUTO:
@@ -480,12 +469,19 @@ class Component:
             self.watch.unconfirmed()
         elif result.complete:
             self.watch.fetched()
-            self.core.cache_writer.fetched(self.node, self.session, is_whole=result.source != "cache")
+            if self.node.generation != generation:
+                self.watch.doubt()
+            else:
+                self.core.cache_writer.fetched(self.node, self.session, is_whole=result.source != "cache")
         return result
+
+    def _changed(self, change: Change) -> None:
+        self.subscribers.push(change)
+        self.core.cache_writer.changed(self.node, self.session, change)
 
     def _resynced(self, event: Resynced) -> None:
         self.core.cache_writer.fetched(self.node, self.session, is_whole=True)
-        self.client.emit(self.node, event)
+        self.node.emit(event)
 
     async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
         """Give the vehicle a signing key with SETUP_SIGNING, or with None, disable its signing.
@@ -508,7 +504,7 @@ class Component:
             )
         if self.node.version == 1:
             raise UsageError(f"{self.system}/{self.component} uses MAVLink 1, which has no signing")
-        self.core.check_may_send()
+        self.core.station.check_may_send()
         await self.core.station.set_up_signing(self.node, key, 0 if key is None else timestamp_now())
 
     async def reboot(self, *, system: int | None = None, timeout: float | None = REBOOT_TIMEOUT) -> Component:
@@ -527,7 +523,7 @@ class Component:
             NoReply: it did not answer, or did not come back in time.
             LinkError: the link failed, or the client was closed.
         """
-        self.core.check_may_send()
+        self.core.station.check_may_send()
         moves = system is not None and system != self.system
         with self.limited(timeout, f"{self.system}/{self.component} to be back after its reboot"):
             await commands.reboot(self.node, returns=not moves)
@@ -549,10 +545,26 @@ class Component:
         self.subscribers.add(changes := Changes())
         return changes
 
+    async def join_vehicle(self) -> None:
+        """Load the cached tables of a component whose vehicle is identified already, or never was."""
+        await anyio.sleep_until(self.node.since + HEARTBEAT_WAIT)  # for the heartbeat of its autopilot
+        if self.core.cache_writer.may_load(self.node, self.vehicle):
+            await self.load()
+
+    async def load(self) -> None:
+        """Load the cached tables of a component of an identified vehicle."""
+        node, vehicle = self.node, self.vehicle
+        is_young = anyio.current_time() < node.since + HEARTBEAT_WAIT
+        if vehicle is node and is_young and not node.identification.is_autopilot:
+            return  # it may have an autopilot: `join_vehicle` waits for its heartbeat
+        await self.core.cache_writer.load(node, vehicle)
+        self.cache_is_read.set()
+        self.ext.cache_is_read.set()
+
     async def wait_until_identified(self, timeout: float) -> None:
         """Wait at most `timeout` seconds until the vehicle is identified, as its cache key requires."""
         with anyio.move_on_after(timeout):
-            await self._vehicle.identification.settled()
+            await self.vehicle.identification.settled()
 
     async def wait_for_cache(self) -> None:
         """Wait until the cached table, if there is one, is in the table; 1.5 s at most.
@@ -563,14 +575,10 @@ class Component:
         if self.core.cache_writer.may_have(self.node):
             with anyio.CancelScope(deadline=self.node.since + CACHE_TIMEOUT):
                 await self.cache_is_read.wait()
-            self.core.check_open()
+            self.core.station.gate.check()
 
     async def _check_writes(
-        self,
-        values: Mapping[str, Settable] | Iterable[tuple[str, Settable]],
-        settle: float,
-        *,
-        durable: bool,
+        self, values: Mapping[str, Settable] | Iterable[tuple[str, Settable]], settle: float, *, durable: bool
     ) -> list[tuple[str, WireValue]]:
         """Check that values may be written, and return them with their names.
 
@@ -584,7 +592,7 @@ class Component:
             raise UsageError(f"{HASH_CHECK} is read-only: it is the hash of the parameters, not a parameter")
         if not 0.0 <= settle <= SETTLE_MAX:
             raise UsageError(f"settle must be 0 to {SETTLE_MAX:g} seconds, not {settle}")
-        self.core.check_may_send()
+        self.core.station.check_may_send()
         if self.node.has_rival(anyio.current_time()):
             words = node_in_words(self.node)
             raise AmbiguousVehicle(
@@ -605,12 +613,12 @@ class Component:
             raise NotDurable(f"{address} has accepted {what}, but it is not on the disk: {error}") from error
 
     @contextmanager
-    def limited(self, timeout: float | None, what: str) -> Iterator[None]:
-        """Raise NoReply at a timeout, and add to each NoReply what was received meanwhile."""
+    def limited(self, timeout: float | None, what: str) -> Iterator[anyio.CancelScope]:
+        """Raise NoReply at a timeout, or when the scope is cancelled; add to each what was received."""
         began = anyio.current_time()
         try:
             with anyio.move_on_after(timeout) as scope:
-                yield
+                yield scope
             if scope.cancelled_caught:
                 raise NoReply(what, attempts=0, waited=anyio.current_time() - began)
         except NoReply as error:

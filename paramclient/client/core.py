@@ -43,14 +43,16 @@ class ClientCore:
         cache_writer: writes tables to the cache.
         taps: receivers of all frames of the link.
         signing: the key and its options, or None.
-        new_station: makes the station, of functions that queue bytes and start background work.
         ended: called when the streams end: with a log, with a link that has failed for good, or at closing.
 
     Attributes:
-        link_task, station, cache_writer: the parts.
+        link_task, cache_writer: the parts.
+        station: set before `open`.
         cache: the cache of the tables, or None.
         is_over: whether a log has ended.
     """
+
+    station: Station
 
     def __init__(
         self,
@@ -58,7 +60,6 @@ class ClientCore:
         cache_writer: CacheWriter,
         taps: Sequence[Tap],
         signing: Signing | None,
-        new_station: Callable[..., Station],
         ended: Callable[[], None],
     ) -> None:
         self.link = link
@@ -67,7 +68,6 @@ class ClientCore:
         self.is_over = False
         self._taps = list(taps)
         self.link_task = LinkTask(link, taps=self._taps, ended=self._link_ended)
-        self.station = self.link_task.station = new_station(send=self.link_task.queue, spawn=self.spawn)
         self._signing = signing
         self._ended = ended
         self._work: anyio.abc.TaskGroup | None = None
@@ -83,26 +83,6 @@ class ClientCore:
         if self._work is None or self.station.gate.is_closed:
             return "closed"
         return "reconnecting" if self.link_task.is_disconnected else "open"
-
-    def check_open(self) -> None:
-        """Check that requests can be sent.
-
-        Raises:
-            LinkError: the link failed, or the client is not open.
-        """
-        self.station.gate.check()
-        if self._work is None:
-            raise ClientClosed("the client is not open; use `async with` or `open`", link=self.link.name)
-
-    def check_may_send(self) -> None:
-        """Check that the client is open, and does not only listen.
-
-        Raises:
-            UsageError, LinkError.
-        """
-        self.check_open()
-        if self.station.listens_only:
-            raise UsageError("the client only listens, and sends no requests")
 
     def add_tap(self, tap: Tap) -> None:
         """Pass all frames of the link also to this receiver; before `open`."""
@@ -201,6 +181,7 @@ class ClientCore:
                 try:
                     async with anyio.create_task_group() as self._work:
                         self.spawn(self.station.send_heartbeats)
+                        self.station.gate.open()
                         self._is_opened.set()
                         await self._is_to_close.wait()
                         logger.debug("%s: closing", self.link.name)

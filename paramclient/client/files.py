@@ -74,6 +74,6 @@ class Ftp:
     def _channel(self, path: str, timeout: float | None) -> Iterator[Channel]:
         """Raise NoReply at the timeout."""
         component = self._component
-        component.core.check_may_send()
+        component.core.station.check_may_send()
         with component.limited(timeout, f"{path} of {component.system}/{component.component}"):
             yield component.node.channel

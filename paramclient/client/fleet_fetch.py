@@ -12,7 +12,6 @@ from paramclient.client.component import Component
 from paramclient.errors import CacheError, NoReply, ParamClientError
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.fetch import FetchResult
-from paramclient.protocol.selection import hint_of_node
 
 __all__ = ["FetchedAll", "fetch_components"]
 
@@ -41,10 +40,7 @@ class FetchedAll:
 
 
 async def fetch_components(
-    components: Mapping[Address, Component],
-    *,
-    refresh: bool,
-    timeout: float | None,
+    components: Mapping[Address, Component], *, refresh: bool, timeout: float | None
 ) -> FetchedAll:
     """Fetch the tables of components in parallel; see `ParamClient.fetch_all`.
 
@@ -56,16 +52,13 @@ async def fetch_components(
     results: dict[Address, FetchResult] = {}
     silent: dict[Address, NoReply | CacheError] = {}
     failures: list[ParamClientError] = []
-    scopes = {address: anyio.CancelScope() for address in components}
+    scopes: dict[Address, anyio.CancelScope] = {}
 
     async def fetch(address: Address, component: Component) -> None:
         try:
-            with scopes[address]:
+            what = f"the parameters of {component.system}/{component.component}"
+            with component.limited(None, what) as scopes[address]:
                 results[address] = await component.fetch_all(refresh=refresh, timeout=timeout)
-            if scopes[address].cancelled_caught:
-                what = f"the parameters of {component.system}/{component.component}"
-                hint = hint_of_node(component.core.station, component.node, anyio.current_time())
-                raise NoReply(what, attempts=0, waited=SILENT_TIME, hint=hint)
         except (NoReply, CacheError) as error:
             silent[address] = error
         except ParamClientError as error:

@@ -39,7 +39,7 @@ if sys.platform != "win32":
 if TYPE_CHECKING:
     import serialx
 
-__all__ = ["SerialDevice", "SerialLink"]
+__all__ = ["SerialDevice", "SerialLink", "open_port"]
 
 T = TypeVar("T")
 
@@ -110,7 +110,7 @@ class SerialLink:
         opening = self._openings
         try:
             with anyio.fail_after(OPEN_TIMEOUT):
-                port = await _open_port(self.device, self.baud)
+                port = await open_port(self.device, self.baud)
         except OSError as error:
             self._check(opening)
             if isinstance(error, TimeoutError):
@@ -200,7 +200,12 @@ class _Port(Protocol):
         """Wake waiting tasks, drop unsent bytes, close. Not cancellable; takes at most `CLOSE_TIMEOUT`."""
 
 
-async def _open_port(device: str, baud: int) -> _Port:
+async def open_port(device: str, baud: int) -> _Port:
+    """Open a port, as this system does.
+
+    Raises:
+        OSError, UsageError: it cannot be opened.
+    """
     if sys.platform == "win32":
         from paramclient.links.serial_transport import Transport  # imported here because it imports asyncio
 

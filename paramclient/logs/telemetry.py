@@ -92,7 +92,6 @@ class _Import:
             spawn=_ignore,
             listens_only=True,
             discovered=self._introduce,
-            changed=self._take_change,
         )
 
     async def read(self, records: Iterator[Record]) -> tuple[ImportedTable, ...]:
@@ -112,11 +111,13 @@ class _Import:
 
     def _introduce(self, node: Node) -> None:
         """Take the first HEARTBEAT and AUTOPILOT_VERSION: frames before them are of the same vehicle."""
+        for session in node.sessions:
+            session.table.changed = partial(self._take_change, session)
         for introductions in self._introductions.values():
             if (frame := introductions.get((node.system, node.component))) is not None:
                 self._station.receive(frame, LOG_PEER, self._at)
 
-    def _take_change(self, node: Node, session: Session, change: Change) -> None:
+    def _take_change(self, session: Session, change: Change) -> None:
         if session.table.is_complete:
             self._complete_at.setdefault(session, self._at)
         if change.new is None:

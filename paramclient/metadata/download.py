@@ -168,7 +168,7 @@ async def announced_metadata(component: Component, timeout: float | None) -> Com
         NoReply: no response in time.
         LinkError: the link failed, or the client was closed.
     """
-    component.core.check_open()
+    component.core.station.gate.check()
     found = None
     with anyio.move_on_after(timeout) as scope:
         found = await request_message(component.node.channel, ComponentMetadata)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from typing import Final, Protocol, TypeAlias, TypeVar
 
@@ -46,6 +46,8 @@ LATE_GRACE: Final = 0.02
 """Seconds for which a stalled program looks once more for the answer."""
 WINDOW: Final = 12
 """Requests in flight: ArduPilot's queue of reads has 20 places, and its overflow is dropped silently."""
+WINDOW_PX4: Final = 60
+"""Requests in flight to a PX4, which answers each at once."""
 FTP_SEQUENCES_PER_SECOND: Final = 1000
 """Sequence numbers of MAVFTP that a second skips, more than a program uses in it."""
 
@@ -297,8 +299,8 @@ def keys_of(message: Message) -> tuple[Key, ...]:
             return ((ParamExtAck, name),)
         case CommandAck(command=command):
             return ((CommandAck, command),)
-        case FileTransfer():
-            return (FileTransfer,)
+        case FileTransfer(payload=payload):
+            return (FileTransfer, int.from_bytes(payload[:2], "little")), FileTransfer
         case _:
             return (type(message),)
 
@@ -344,7 +346,7 @@ class Channel:
         self._transmit = transmit
         self._presence = presence
         self.inboxes: dict[Key, list[Inbox]] = {}
-        self._waits: dict[anyio.CancelScope, tuple[float, int]] = {}
+        self._waits: dict[anyio.CancelScope, tuple[float, int, float] | None] = {}
         self.window = anyio.Semaphore(WINDOW)
         self.window_size = WINDOW
 
@@ -401,33 +403,54 @@ class Channel:
                 if not self.inboxes[key]:
                     del self.inboxes[key]
 
-    def silence_since(self, began: float, now: float) -> float:
-        """Return the seconds since the component was heard, but at most those since `began`."""
-        return now - max(began, self._presence.received_at)
+    def is_lost(self, now: float) -> bool:
+        """Return whether the component sends heartbeats, and was silent for longer than these explain."""
+        return now - self._presence.received_at >= self._presence.timeout
 
-    @property
-    def silence_max(self) -> float:
-        """Seconds of silence after which requests are given up."""
-        return min(self._presence.timeout, SILENCE_MAX)
+    def is_silent(self, began: float) -> bool:
+        """Return whether a conversation ends that began then: the component is silent for too long.
 
-    def is_hopeless(self, attempts: int, began: float, now: float, attempts_max: int | None = None) -> bool:
+        One that begins in such a silence has as much time of its own.
+        """
+        now, heard = anyio.current_time(), self._presence.received_at
+        silence_max = min(self._presence.timeout, SILENCE_MAX)
+        since = heard if began - heard < silence_max else began
+        return now - since >= silence_max
+
+    def is_hopeless(self, attempts: int, began: float, attempts_max: int | None = None) -> bool:
         """Return whether to give up a request that was sent so often since `began`.
 
         Without `attempts_max`, loss must not explain the silence, and the component must have had time.
         """
-        silence = now - self._presence.received_at
-        was_silent = silence - (now - began) >= self.silence_max
-        if silence >= self.silence_max and (not was_silent or now - began >= self.silence_max):
-            return True
-        if not self.answered.is_set() and now - began >= UNANSWERED_MAX:
+        elapsed = anyio.current_time() - began
+        if self.is_silent(began) or (not self.answered.is_set() and elapsed >= UNANSWERED_MAX):
             return True
         if attempts_max is not None:
             return attempts >= attempts_max
-        return attempts >= self.timing.attempts_max and now - began >= PATIENCE_MIN
+        return attempts >= self.timing.attempts_max and elapsed >= PATIENCE_MIN
 
-    def is_lost(self, now: float) -> bool:
-        """Return whether the component sends heartbeats, and was silent for longer than these explain."""
-        return now - self._presence.received_at >= self._presence.timeout
+    @contextmanager
+    def waiting_until(
+        self, deadline: float, attempt: tuple[float, int, float] | None = None
+    ) -> Iterator[anyio.CancelScope]:
+        """Run a block that waits for a message, until the deadline or until the component is lost.
+
+        Args:
+            deadline: on the clock of the event loop.
+            attempt: when a request was sent, how often before, and the seconds to wait at least: a shorter
+                round trip that is measured meanwhile shortens the wait.
+        """
+        with anyio.CancelScope(deadline=deadline) as scope:
+            self._waits[scope] = attempt
+            try:
+                yield scope
+            finally:
+                del self._waits[scope]
+
+    def lose(self) -> None:
+        """End the waits for messages: the component is lost."""
+        for scope in self._waits:
+            scope.deadline = -math.inf
 
     async def exchange(
         self,
@@ -437,8 +460,9 @@ class Channel:
         *,
         what: str,
         attempts: int | Callable[[], int] | None = None,
-        copies: int = 1,
+        copies: Callable[[int], int] = lambda attempt: 1,
         timeout_min: float = 0.0,
+        ready: Callable[[], Awaitable[None]] | None = None,
     ) -> T:
         """Send a request until it is answered. Cancellation leaves nothing behind.
 
@@ -449,8 +473,9 @@ class Channel:
                 error that the message tells.
             what: names the request in the error.
             attempts: at most, or a function that returns them; None for as many as loss explains.
-            copies: of the request in each attempt after the first.
+            copies: returns how often an attempt, counted from 0, is sent at once.
             timeout_min: seconds to wait in each attempt, at least.
+            ready: awaited before each attempt, in place of the open link.
 
         Raises:
             NoReply: loss no longer explains the silence, or nothing at all was heard of the component.
@@ -459,10 +484,10 @@ class Channel:
         began = anyio.current_time()
         attempt = 0
         while True:
-            await self.gate.wait()
+            await (self.gate.wait if ready is None else ready)()
             sent = anyio.current_time()
             message = request(attempt) if callable(request) else request
-            for _ in range(copies if attempt else 1):
+            for _ in range(copies(attempt)):
                 self.send(message)
             answer = await self.wait_for(inbox, accept, sent, attempt, timeout_min)
             attempt += 1
@@ -470,7 +495,7 @@ class Channel:
             if answer is not None:
                 self._measure(attempt, now - sent, now - began)
                 return answer
-            if self.is_hopeless(attempt, began, now, attempts() if callable(attempts) else attempts):
+            if self.is_hopeless(attempt, began, attempts() if callable(attempts) else attempts):
                 raise NoReply(what, attempts=attempt, waited=now - began)
 
     async def wait_for(
@@ -481,42 +506,38 @@ class Channel:
         attempt: int,
         timeout_min: float = 0.0,
     ) -> T | None:
-        """Wait for the answer to an attempt that was sent; return None at its timeout.
+        """Wait for the answer to an attempt that was sent; return None at its timeout, or in a loss.
 
         A program that wakes up late, as it was stalled, looks once more.
         """
+        answer: T | None = None
         deadline = sent + max(self.timing.timeout(attempt), timeout_min)
-        with anyio.CancelScope(deadline=deadline) as scope:
-            if self.timing.round_trip is None:
-                self._waits[scope] = (sent, attempt)
-            try:
-                while True:
-                    answer = accept(await inbox.next())
-                    if answer is not None:
-                        return answer
-            finally:
-                self._waits.pop(scope, None)
-        if anyio.current_time() > scope.deadline + LATE_WAKE_UP:
+        with self.waiting_until(deadline, (sent, attempt, timeout_min)) as scope:
+            answer = await _accepted(inbox, accept)
+        if answer is None and anyio.current_time() > scope.deadline + LATE_WAKE_UP:
             with anyio.move_on_after(LATE_GRACE):
-                while True:
-                    answer = accept(await inbox.next())
-                    if answer is not None:
-                        return answer
-        return None
+                answer = await _accepted(inbox, accept)
+        return answer
 
     def _measure(self, attempts: int, last: float, whole: float) -> None:
-        """Take the times of an answered exchange; the first round trip shortens the waits that are open."""
+        """Take the times of an answered exchange; it shortens the waits that are open."""
         timing = self.timing
         self.answered.set()
         if self.is_streaming:
             return
         timing.answered(attempts)
-        is_first = timing.round_trip is None
         if attempts == 1:
             timing.measure(last)
         else:
             timing.bound(whole)
-        if is_first:
-            for scope, (sent, attempt) in self._waits.items():
-                scope.deadline = min(scope.deadline, sent + timing.timeout(attempt))
-            self._waits.clear()
+        for scope, request in self._waits.items():
+            if request is not None:
+                sent, attempt, timeout_min = request
+                scope.deadline = min(scope.deadline, sent + max(timing.timeout(attempt), timeout_min))
+
+
+async def _accepted(inbox: Inbox, accept: Callable[[Message], T | None]) -> T:
+    while True:
+        answer = accept(await inbox.next())
+        if answer is not None:
+            return answer

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from paramclient.errors import NoReply, UnknownParameter
+from paramclient.errors import NoReply, VehicleError
 from paramclient.protocol.checksum import ChecksumUnavailable, TableDiffers, prove
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.reads import read
@@ -73,7 +73,7 @@ async def request_digest(session: Session) -> Digest | None:
         return None
     try:
         answer = await read(session, HASH_CHECK)
-    except (NoReply, UnknownParameter):  # MAV_HASH_CHK_EN is 0
+    except (NoReply, VehicleError):  # MAV_HASH_CHK_EN is 0
         return None
     return Digest.of(answer)
 

@@ -12,6 +12,7 @@ import anyio
 from paramclient.errors import NoReply
 from paramclient.model.params import ParamMap
 from paramclient.model.values import Param
+from paramclient.model.wording import first_of
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.digest import Answer, ask, request_digest
 from paramclient.protocol.file_download import FileUnavailable, download_file
@@ -31,6 +32,9 @@ REPAIRS_MAX: Final = 2
 CHANGED_MEANWHILE: Final = "The parameters changed during the download: the table may be a mixture."
 NOT_REFRESHED: Final = "The values outside the hash were not read again, because the policy is hash-only."
 LEFT_OUT: Final = "Skipped {}: no parameter file can contain this name."
+NOT_READ: Final = "Values outside the vehicle's hash could not be read: {}."
+NOT_READ_SHOWN_MAX: Final = 5
+"""Names of such values that the note has, so that it stays readable."""
 UNCONFIRMED: Final = "The cached table was not confirmed: {}."
 UNPROVEN: Final = "The vehicle's hash could not be computed from the table; it was equal before and after."
 
@@ -81,7 +85,9 @@ class FetchResult:
         source: "cache" when the vehicle confirmed the cached table, or the policy allows only the cache;
             "ftp" for the packed file, "stream" for the list.
         count: parameters that the component says it has.
-        missing: indices that were not received, rising. Empty when the fetch is complete.
+        missing: indices that were neither received in this fetch nor confirmed, rising. Empty when it is
+            complete. A policy other than AUTO counts cached values as there.
+        cached: names whose values were neither received in this fetch nor confirmed.
         hash: the PX4 hash, or ArduPilot's checksum, by which the vehicle confirmed the table, or None.
         elapsed: seconds from the call to the end.
         notes: further sentences for the user.
@@ -105,15 +111,16 @@ class FetchResult:
     repeated: int = 0
     round_trip: float | None = None
     changed: tuple[str, ...] = ()
+    cached: tuple[str, ...] = ()
 
     @property
     def received(self) -> int:
-        """Parameters of the list that are known."""
+        """Parameters of the list that are not missing."""
         return self.count - len(self.missing)
 
     @property
     def complete(self) -> bool:
-        """Whether every parameter of the list is known."""
+        """Whether no parameter of the list is missing."""
         return self.count > 0 and not self.missing
 
     def __repr__(self) -> str:
@@ -201,6 +208,12 @@ class _Fetch:
             self.notes.append(UNCONFIRMED.format(answer.reason))
         if self.policy is Policy.HASH_ONLY:
             return self._unconfirmed()
+        channel = self.session.channel
+        if channel.is_silent(self._began):
+            waited = anyio.current_time() - self._began
+            raise NoReply(
+                f"the parameters of {channel.system}/{channel.component}", attempts=0, waited=waited
+            )
         self._is_silent = answer.is_silent
         digest = answer.digest
         source = await self._download()
@@ -223,7 +236,7 @@ class _Fetch:
                     self.table.complete()
                     return "ftp"
                 except FileUnavailable as error:
-                    if self._is_lost():
+                    if session.channel.is_silent(self._began):
                         self.notes.append(f"The component was lost: {error.reason}.")
                         return "ftp"
                     self.notes.append(f"Downloaded as a list: {error.reason}.")
@@ -233,12 +246,9 @@ class _Fetch:
             session.serves_file = False
         with session.channel.gate.until_closed(or_failed=True):
             await session.identification.encoding_certain()
-        self.table.complete()
+        if not self.listed.missing:
+            self.table.complete()
         return "stream"
-
-    def _is_lost(self) -> bool:
-        channel = self.session.channel
-        return channel.silence_since(self._began, anyio.current_time()) >= channel.silence_max
 
     async def _settle(self, before: Digest | None) -> bool:
         """Compare the table with the digest after the download; return whether the fetch is done."""
@@ -260,11 +270,10 @@ class _Fetch:
         return False
 
     async def _read_unverified(self) -> None:
-        """Read the values that the digest does not cover, and learn which names are volatile."""
-        try:
-            await read_many(self.session, self.table.unverified(), lambda name, result: None)
-        except* NoReply:
-            self.notes.append("Some values outside the vehicle's hash could not be read.")
+        """Read the values that the digest does not cover."""
+        await read_many(self.session, self.table.unverified(), lambda name, result: None)
+        if left := self.table.unverified(self._began):
+            self.notes.append(NOT_READ.format(first_of(left, NOT_READ_SHOWN_MAX)))
 
     def _unconfirmed(self) -> FetchResult:
         """Return the table as it is cached."""
@@ -272,11 +281,12 @@ class _Fetch:
         return replace(self._result("cache"), hash=None)
 
     def _result(self, source: FetchSource) -> FetchResult:
-        lost, repeated = self.listed.lost, self.listed.repeated
         self.notes += [LEFT_OUT.format(repr(name)) for name in self.table.left_out]
         if doubt := self.session.encoding_doubt:
             self.notes.append(doubt)
-        result = result_of(self.session, source, self._began, self.notes, lost=lost, repeated=repeated)
+        result = result_of(
+            self.session, source, self._began, self.notes, policy=self.policy, listed=self.listed
+        )
         return replace(result, changed=self._changed)
 
 
@@ -286,22 +296,28 @@ def result_of(
     began: float,
     notes: Iterable[str],
     *,
-    lost: int = 0,
-    repeated: int = 0,
+    policy: Policy,
+    listed: ListResult | None = None,
 ) -> FetchResult:
     """Return the result of a fetch with the table as it is; of a partial one where it was ended."""
-    channel, table = session.channel, session.table
+    channel, table, listed = session.channel, session.table, listed or ListResult()
+    cached, missing = table.unverified(began), {*table.missing(), *listed.missing}
+    if policy is Policy.AUTO:
+        indices = (table.params[name].index for name in cached)
+        missing |= {index for index in indices if index is not None}
+    is_confirmed = table.is_complete and (source == "cache" or not missing)
     return FetchResult(
         channel.system,
         channel.component,
         ParamMap(table.view()),
         source,
         table.count or 0,
-        tuple(table.missing()),
-        table.hash if table.is_complete else None,
+        tuple(sorted(missing)),
+        table.hash if is_confirmed else None,
         anyio.current_time() - began,
         tuple(dict.fromkeys(notes)),
-        lost,
-        repeated,
+        listed.lost,
+        listed.repeated,
         channel.timing.round_trip,
+        cached=tuple(cached),
     )

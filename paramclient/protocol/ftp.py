@@ -8,7 +8,6 @@ from __future__ import annotations
 import errno
 import math
 import struct
-from collections import deque
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from enum import IntEnum
@@ -46,9 +45,6 @@ BUSY_ATTEMPTS: Final = 2
 CLOSE_TIMEOUT: Final = 2.0
 """Seconds for the closing of a session, also when its reader is cancelled. ArduPilot has one session for all
 links: an open one blocks the file access of all stations for 3 s."""
-CLOSE_COPIES: Final = 4
-"""Copies of each request that closes a session: the time for it is short, and packets are lost in bursts.
-ArduPilot's queue of requests holds 5."""
 BURST_PAUSE_MIN: Final = 0.15
 """Seconds before the first block after which a burst counts as lost: at 57600 baud, ArduPilot begins one
 95 ms after the request."""
@@ -56,8 +52,6 @@ BLOCK_PAUSE_MIN: Final = 0.05
 """Seconds without a further block after which a burst counts as over."""
 BLOCK_INTERVALS: Final = 8
 """Mean intervals between two blocks after which a burst counts as over."""
-READS_AT_ONCE: Final = 4
-"""Reads sent at once: ArduPilot's queue of MAVFTP requests has 5 places, and drops the surplus silently."""
 COPIES_AT_ONCE: Final = 16
 """Reads sent for the last blocks, in several copies: one round trip of 100 ms has room for as many."""
 BLOCK_INTERVAL: Final = 0.006
@@ -177,8 +171,8 @@ async def read_file(
         NoReply: it does not answer; `FileCutOff` in the middle of the file.
         LinkError: the link is closed for good.
     """
-    async with channel.ftp, _opened(channel, path, open_attempts) as (session, size, inbox):
-        reader = _FileReader(channel, inbox, session, path, read_size, size_max)
+    async with channel.ftp, _opened(channel, path, open_attempts) as (session, size):
+        reader = _FileReader(channel, session, path, read_size, size_max)
         reader.progress = None if progress is None else (lambda received: progress(received, size))
         reader.begun = begun
         try:
@@ -200,9 +194,7 @@ async def checksum(channel: Channel, path: str, *, attempts: int | None = None) 
         NoReply: it does not answer.
         LinkError: the link is closed for good.
     """
-    with channel.inbox(FileTransfer) as inbox:
-        data = path_bytes(path)
-        answer = await _request(channel, inbox, Opcode.CALC_FILE_CRC32, path, data, attempts=attempts)
+    answer = await _request(channel, Opcode.CALC_FILE_CRC32, path, path_bytes(path), attempts=attempts)
     if len(answer.data) < 4:
         raise _error(channel, path, FileErrorCode.INVALID_DATA_SIZE)
     return int.from_bytes(answer.data[:4], "little")
@@ -219,21 +211,18 @@ async def list_directory(channel: Channel, path: str) -> list[DirectoryEntry]:
     entries: list[DirectoryEntry] = []
     passed = 0
     async with channel.ftp:
-        with channel.inbox(FileTransfer) as inbox:
-            while True:
-                try:
-                    answer = await _request(
-                        channel, inbox, Opcode.LIST_DIRECTORY, path, path_bytes(path), offset=passed
-                    )
-                except FileTransferError as error:
-                    if error.code == FileErrorCode.EOF:
-                        return entries
-                    raise
-                found = [each.decode("utf-8", "replace") for each in answer.data.split(b"\0") if each]
-                if not found:
+        while True:
+            try:
+                answer = await _request(channel, Opcode.LIST_DIRECTORY, path, path_bytes(path), offset=passed)
+            except FileTransferError as error:
+                if error.code == FileErrorCode.EOF:
                     return entries
-                passed += len(found)
-                entries += [entry for text in found if (entry := _entry(text)) is not None]
+                raise
+            found = [each.decode("utf-8", "replace") for each in answer.data.split(b"\0") if each]
+            if not found:
+                return entries
+            passed += len(found)
+            entries += [entry for text in found if (entry := _entry(text)) is not None]
 
 
 def _entry(text: str) -> DirectoryEntry | None:
@@ -259,7 +248,6 @@ def path_bytes(path: str) -> bytes:
 
 async def _request(
     channel: Channel,
-    inbox: Inbox,
     opcode: Opcode,
     path: str,
     data: bytes = b"",
@@ -268,10 +256,10 @@ async def _request(
     offset: int = 0,
     size: int = 0,
     attempts: int | None = None,
-    copies: int = 1,
+    copies: Callable[[int], int] | None = None,
     sequence: int | None = None,
 ) -> Packet:
-    """Send one request until its ACK arrives.
+    """Send one request until its ACK arrives; several copies at once from the second attempt on.
 
     All attempts have one sequence number, so the server repeats its response and does not act twice.
     """
@@ -281,69 +269,62 @@ async def _request(
 
     def accept(message: Message) -> Packet | None:
         answer = _answer(message)
-        if answer is None or answer.sequence != (sequence + 1) & 0xFFFF or answer.requested != opcode:
+        if answer is None or answer.requested != opcode:
             return None
         if answer.opcode == Opcode.NAK:
             raise _error(channel, path, answer.code)
         return answer
 
-    return await channel.exchange(
-        FileTransfer(0, *channel.target, packet.pack()),
-        inbox,
-        accept,
-        what=f"MAVFTP {opcode.name} {path} of {channel.system}/{channel.component}",
-        attempts=attempts,
-        copies=copies,
-    )
+    with channel.inbox((FileTransfer, (sequence + 1) & 0xFFFF)) as inbox:
+        return await channel.exchange(
+            FileTransfer(0, *channel.target, packet.pack()),
+            inbox,
+            accept,
+            what=f"MAVFTP {opcode.name} {path} of {channel.system}/{channel.component}",
+            attempts=attempts,
+            copies=copies or (lambda attempt: channel.timing.copies if attempt else 1),
+        )
 
 
 @asynccontextmanager
-async def _opened(
-    channel: Channel, path: str, attempts: int | None
-) -> AsyncIterator[tuple[int, int | None, Inbox]]:
+async def _opened(channel: Channel, path: str, attempts: int | None) -> AsyncIterator[tuple[int, int | None]]:
     """Open a file, and close its session at the end, also if opening is cancelled half-way."""
     data = path_bytes(path)
-    with channel.inbox(FileTransfer) as inbox:
-        session: int | None = None
-        sequence = 0
-        is_requested = False  # and not answered: it may be open
-        try:
-            for attempt in range(BUSY_ATTEMPTS):
-                try:
-                    is_requested, sequence = True, channel.next_ftp_sequence()
-                    answer = await _request(
-                        channel,
-                        inbox,
-                        Opcode.OPEN_FILE_RO,
-                        path,
-                        data,
-                        attempts=attempts,
-                        sequence=sequence,
-                    )
-                    break
-                except NoReply:
-                    is_requested = False
+    session: int | None = None
+    sequence = 0
+    is_requested = False  # and not answered: it may be open
+    try:
+        for attempt in range(BUSY_ATTEMPTS):
+            try:
+                is_requested, sequence = True, channel.next_ftp_sequence()
+                answer = await _request(
+                    channel, Opcode.OPEN_FILE_RO, path, data, attempts=attempts, sequence=sequence
+                )
+                break
+            except NoReply:
+                is_requested = False
+                raise
+            except FileTransferError as error:
+                is_requested = False
+                if error.code != FileErrorCode.INVALID_SESSION or attempt + 1 == BUSY_ATTEMPTS:
                     raise
-                except FileTransferError as error:
-                    is_requested = False
-                    if error.code != FileErrorCode.INVALID_SESSION or attempt + 1 == BUSY_ATTEMPTS:
-                        raise
-                    await anyio.sleep(BUSY_TIME)
-            session = answer.session
-            size = int.from_bytes(answer.data[:4], "little") if len(answer.data) >= 4 else None
-            yield session, size, inbox
-        finally:
-            if session is not None or is_requested:
-                is_closed = False
-                with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT), suppress(LinkError):
-                    await _close(channel, inbox, path, session, sequence)
-                    is_closed = True
-                if not is_closed:  # the opening may just have been repeated, or nothing is received any more
-                    last = Packet(channel.next_ftp_sequence(), session or 0, Opcode.TERMINATE_SESSION)
-                    channel.send(FileTransfer(0, *channel.target, last.pack()))
+                await anyio.sleep(BUSY_TIME)
+        session = answer.session
+        size = int.from_bytes(answer.data[:4], "little") if len(answer.data) >= 4 else None
+        yield session, size
+    finally:
+        if session is not None or is_requested:
+            is_closed = False
+            seconds = 0.0 if channel.is_lost(anyio.current_time()) else CLOSE_TIMEOUT
+            with anyio.CancelScope(shield=True), anyio.move_on_after(seconds), suppress(LinkError):
+                await _close(channel, path, session, sequence)
+                is_closed = True
+            if not is_closed:  # the opening may just have been repeated, or nothing is received any more
+                last = Packet(channel.next_ftp_sequence(), session or 0, Opcode.TERMINATE_SESSION)
+                channel.send(FileTransfer(0, *channel.target, last.pack()))
 
 
-async def _close(channel: Channel, inbox: Inbox, path: str, session: int | None, opening: int) -> None:
+async def _close(channel: Channel, path: str, session: int | None, opening: int) -> None:
     """Close a session.
 
     One whose number never arrived is requested once more, with the sequence number of its opening. ArduPilot
@@ -353,13 +334,9 @@ async def _close(channel: Channel, inbox: Inbox, path: str, session: int | None,
         if session is None:
             with suppress(FileTransferError):
                 data = path_bytes(path)
-                answer = await _request(
-                    channel, inbox, Opcode.OPEN_FILE_RO, path, data, copies=CLOSE_COPIES, sequence=opening
-                )
+                answer = await _request(channel, Opcode.OPEN_FILE_RO, path, data, sequence=opening)
                 session = answer.session
-        await _request(
-            channel, inbox, Opcode.TERMINATE_SESSION, path, session=session or 0, copies=CLOSE_COPIES
-        )
+        await _request(channel, Opcode.TERMINATE_SESSION, path, session=session or 0)
 
 
 class FileCutOff(NoReply):
@@ -402,10 +379,6 @@ class _Pieces:
             found.append((at, self.end))
         return found
 
-    def has(self, offset: int) -> bool:
-        """Return whether a piece begins there, or the file ends before."""
-        return offset in self._pieces or (self.end is not None and offset >= self.end)
-
     def content(self) -> bytes:
         """Return the whole file."""
         data = bytearray()
@@ -418,22 +391,19 @@ class _Pieces:
 class _FileReader:
     """The read of one open file: a burst from beginning to end, and single reads of lost blocks."""
 
-    def __init__(
-        self, channel: Channel, inbox: Inbox, session: int, path: str, read_size: int, size_max: int
-    ) -> None:
+    def __init__(self, channel: Channel, session: int, path: str, read_size: int, size_max: int) -> None:
         self.progress: Callable[[int], None] | None = None
         self.begun: Callable[[bytes], None] = lambda head: None
         self._channel = channel
-        self._inbox = inbox
         self._session = session
         self._path = path
         self._read_size = read_size
         self._size_max = size_max
         self._pieces = _Pieces()
-        self._reads: dict[int, int] = {}  # offset by the sequence number of its response
         self._has_bursts = True
         self._began = self._last = 0.0
         self._blocks = 0
+        self._reads = 0  # in progress
 
     async def read(self) -> bytes:
         """Return the content of the file."""
@@ -455,127 +425,105 @@ class _FileReader:
     async def _burst(self, offset: int) -> None:
         """Request the rest of the file from an offset, and take its blocks until they end or pause."""
         channel = self._channel
-        for attempt in range(channel.timing.attempts_max):
-            await channel.gate.wait()
-            sequence = channel.next_ftp_sequence()
-            request = Packet(
-                sequence, self._session, Opcode.BURST_READ_FILE, size=self._read_size, offset=offset
-            )
-            channel.send(FileTransfer(0, *channel.target, request.pack()))
-            sent = self._last = anyio.current_time()
-            pause = max(channel.timing.timeout(attempt), BURST_PAUSE_MIN)
-            first = math.inf
-            while True:
-                packet = None
-                with anyio.move_on_after(max(self._last + pause - anyio.current_time(), 0.001)):
-                    packet = _answer(await self._inbox.next())
-                if packet is None:
-                    break
-                if packet.requested != Opcode.BURST_READ_FILE or packet.session != self._session:
-                    continue
-                if packet.opcode == Opcode.NAK:
-                    self._end_of_burst(packet)
+        with channel.inbox(FileTransfer) as inbox:
+            for attempt in range(channel.timing.attempts_max):
+                await channel.gate.wait()
+                sequence = channel.next_ftp_sequence()
+                request = Packet(
+                    sequence, self._session, Opcode.BURST_READ_FILE, size=self._read_size, offset=offset
+                )
+                channel.send(FileTransfer(0, *channel.target, request.pack()))
+                if await self._take_burst(inbox, max(channel.timing.timeout(attempt), BURST_PAUSE_MIN)):
                     return
-                self._take(packet)
-                first = min(first, self._last)
-                interval = (self._last - first) / max(self._blocks, 1)
-                pause = max(BLOCK_PAUSE_MIN, BLOCK_INTERVALS * interval)
-                if packet.burst_complete:
+                if self._pieces.reached > offset:
                     return
-            if self._pieces.reached > offset:
-                return
-            if channel.silence_since(sent, anyio.current_time()) >= channel.silence_max:
-                return
+                if channel.is_silent(self._began):
+                    what = f"{self._path} of {channel.system}/{channel.component} at byte {offset}"
+                    waited = anyio.current_time() - self._began
+                    raise NoReply(what, attempts=attempt + 1, waited=waited)
+
+    async def _take_burst(self, inbox: Inbox, pause: float) -> bool:
+        """Take the blocks of a burst until it is over; return False at a pause."""
+        self._last = anyio.current_time()
+        first = math.inf
+        while True:
+            packet = None
+            with self._channel.waiting_until(self._last + pause):
+                packet = _answer(await inbox.next())
+            if packet is None:
+                return False
+            if packet.requested != Opcode.BURST_READ_FILE or packet.session != self._session:
+                continue
+            if packet.opcode == Opcode.NAK:
+                self._end_of_burst(packet)
+                return True
+            self._take(packet.offset, packet.data)
+            first = min(first, self._last)
+            interval = (self._last - first) / max(self._blocks, 1)
+            pause = max(BLOCK_PAUSE_MIN, BLOCK_INTERVALS * interval)
+            if packet.burst_complete:
+                return True
 
     def _end_of_burst(self, packet: Packet) -> None:
         if packet.code == FileErrorCode.EOF:
             if packet.offset >= self._pieces.reached:  # otherwise the end is unknown, and a read shows it
                 self._pieces.end = packet.offset
-        elif packet.code == FileErrorCode.UNKNOWN_COMMAND:
-            self._has_bursts = False
-        else:
+        elif packet.code != FileErrorCode.UNKNOWN_COMMAND:
             raise _error(self._channel, self._path, packet.code)
         self._has_bursts = False
 
     async def _read_gaps(self) -> None:
         """Read what is missing, and the end while it is unknown, block by block."""
-        pieces = self._pieces
+        pieces, window = self._pieces, anyio.Semaphore(READS_MAX)
         while True:
             wanted = [at for first, end in pieces.gaps() for at in range(first, end, self._read_size)]
             if pieces.end is None:
                 wanted.append(pieces.reached)
             if not wanted:
                 return
-            await self._read_blocks(wanted)
+            try:
+                async with anyio.create_task_group() as tasks:
+                    self._reads = len(wanted)
+                    for at in wanted:
+                        await window.acquire()
+                        tasks.start_soon(self._read_block, at, window)
+                        await anyio.sleep(BLOCK_INTERVAL)
+            except ExceptionGroup as group:
+                raise group.exceptions[0] from None
 
-    async def _read_blocks(self, wanted: list[int]) -> None:
-        """Read these offsets, each again when its time is over; several copies of the last ones."""
-        channel, timing = self._channel, self._channel.timing
-        began = anyio.current_time()
-        in_flight: dict[int, tuple[float, float]] = {}  # when each was sent, and when it counts as lost
-        attempts: dict[int, int] = {}
-        waiting = deque(wanted)
-        paced_at = -math.inf
-        while waiting or in_flight:
-            now = anyio.current_time()
-            for at, (sent, due) in list(in_flight.items()):
-                if self._pieces.has(at):
-                    timing.answered(attempts[at])
-                    if attempts[at] == 1:
-                        timing.measure(now - sent)
-                elif due <= now:
-                    waiting.appendleft(at)
-                else:
-                    continue
-                del in_flight[at]
-            copies = max(1, min(timing.copies, COPIES_AT_ONCE // max(len(waiting) + len(in_flight), 1)))
-            allowed = int(min((now - paced_at) / BLOCK_INTERVAL, READS_AT_ONCE))
-            while waiting and allowed > 0 and len(in_flight) < READS_MAX:
-                at = waiting.popleft()
-                if self._pieces.has(at):
-                    continue
-                paced_at = now
-                allowed -= copies
-                tried = attempts.get(at, 0)
-                if channel.is_hopeless(tried, began, now):
-                    what = f"{self._path} of {channel.system}/{channel.component} at byte {at}"
-                    raise NoReply(what, attempts=tried, waited=now - began)
-                await channel.gate.wait()
-                for _ in range(copies):
-                    self._send_read(at)
-                attempts[at] = tried + 1
-                in_flight[at] = (now, now + timing.timeout(tried))
-            if in_flight or waiting:
-                due = min((due for _, due in in_flight.values()), default=math.inf)
-                if waiting:
-                    due = min(due, now + BLOCK_INTERVAL * READS_AT_ONCE)
-                with anyio.move_on_after(max(due - now, 0.001)):
-                    self._take_read(_answer(await self._inbox.next()))
+    async def _read_block(self, offset: int, window: anyio.Semaphore) -> None:
+        """Read one block, or find the end of the file there."""
+        channel, pieces = self._channel, self._pieces
 
-    def _send_read(self, offset: int) -> None:
-        sequence = self._channel.next_ftp_sequence()
-        self._reads[(sequence + 1) & 0xFFFF] = offset
-        request = Packet(sequence, self._session, Opcode.READ_FILE, size=self._read_size, offset=offset)
-        self._channel.send(FileTransfer(0, *self._channel.target, request.pack()))
+        def copies(attempt: int) -> int:
+            return max(1, min(channel.timing.copies, COPIES_AT_ONCE // self._reads))
 
-    def _take_read(self, packet: Packet | None) -> None:
-        if packet is None or packet.session != self._session:
-            return
-        if packet.requested == Opcode.BURST_READ_FILE and packet.opcode == Opcode.ACK:
-            self._take(packet)
-        offset = self._reads.get(packet.sequence)
-        if packet.requested != Opcode.READ_FILE or offset is None:
-            return
-        if packet.opcode == Opcode.ACK and packet.data:
-            self._take(packet._replace(offset=offset))
-        elif packet.opcode == Opcode.ACK or packet.code == FileErrorCode.EOF:
-            end = self._pieces.end
-            self._pieces.end = offset if end is None else min(end, offset)
+        try:
+            answer = await _request(
+                channel,
+                Opcode.READ_FILE,
+                self._path,
+                session=self._session,
+                offset=offset,
+                size=self._read_size,
+                copies=copies,
+            )
+        except FileTransferError as error:
+            if error.code != FileErrorCode.EOF:
+                raise
+            data = b""
         else:
-            raise _error(self._channel, self._path, packet.code)
+            data = answer.data
+        finally:
+            self._reads -= 1
+            window.release()
+        if data:
+            self._take(offset, data)
+        else:
+            pieces.end = offset if pieces.end is None else min(pieces.end, offset)
 
-    def _take(self, packet: Packet) -> None:
-        if packet.offset + len(packet.data) > self._size_max:
+    def _take(self, offset: int, data: bytes) -> None:
+        if offset + len(data) > self._size_max:
             system, component = self._channel.target
             raise FileTransferError(
                 f"{self._path} of {system}/{component} is longer than {self._size_max} bytes",
@@ -584,9 +532,9 @@ class _FileReader:
                 path=self._path,
                 code=FileErrorCode.INVALID_DATA_SIZE,
             )
-        if packet.offset == 0:
-            self.begun(packet.data)
-        self._pieces.take(packet.offset, packet.data)
+        if offset == 0:
+            self.begun(data)
+        self._pieces.take(offset, data)
         self._blocks += 1
         self._last = anyio.current_time()
         if self.progress is not None:

@@ -207,11 +207,14 @@ class Identification:
             product_id=message.product_id,
             capabilities=message.capabilities,
         )
-        is_another = before.uid is not None and before.key != self.identity.key
         self.capabilities = message.capabilities
         self.is_confirmed = True
         self.settle()
-        return is_another
+        return self.is_another(before)
+
+    def is_another(self, before: Identity) -> bool:
+        """Return whether the vehicle is another one than it was."""
+        return before.uid is not None and before.key != self.identity.key
 
     def settle(self) -> None:
         """Take the identity as it is: no more of it will be received."""

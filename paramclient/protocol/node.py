@@ -9,11 +9,10 @@ import anyio
 
 from paramclient.model.identity import hardware_id
 from paramclient.model.values import Encoding
-from paramclient.protocol.addresses import Peer
-from paramclient.protocol.channel import Channel, Gate
+from paramclient.protocol.addresses import Address, Peer, PeerAddress
+from paramclient.protocol.channel import WINDOW_PX4, Channel, Gate
 from paramclient.protocol.dialect import EXTENDED, PLAIN, Digest
 from paramclient.protocol.events import (
-    Change,
     ComponentEvent,
     Found,
     Identified,
@@ -50,8 +49,6 @@ CLOCK_REQUESTS: Final = 2
 """Requests for it: one may be lost, and nothing waits for the answer."""
 CLOCK_INTERVAL: Final = 1.0
 """Seconds between them."""
-WINDOW_PX4: Final = 60
-"""Requests in flight to a PX4, which answers each at once."""
 ACCEPTED: Final = 0
 """PARAM_ACK_ACCEPTED in PARAM_EXT_ACK."""
 
@@ -60,23 +57,22 @@ class Node:
     """One component on the link, as its messages show it.
 
     Args:
-        system, component: its address.
+        address: its address, with the peer where equal ids at other peers are other components.
         link: the link's name, part of an identity without a hardware id.
         peer: from which its messages arrive.
         since: when it was heard first.
-        is_split: whether components with equal ids at other peers are other components.
         transmit: queues a message for the component.
         gate: whether the link carries messages.
         encoding: chosen by the user, or None.
         listens_only: whether nothing is requested.
         spawn: starts an async function in the background.
-        emit: called with each event.
-        changed: called with each change of a parameter, and its session.
 
     Attributes:
         channel, presence, identification: the parts.
         plain, extended: the parameters.
-        peer, since, is_split: as given; a vehicle may move to another peer.
+        emit: called with each event.
+        address, peer, since: as given; a vehicle may move to another peer.
+        system, component, is_split: what the address has.
         rival: another live peer that uses the same ids, and when it was heard; None without one.
         told_rival: the one of which the user was warned.
         version: of MAVLink, 1 or 2, by its last message.
@@ -86,42 +82,34 @@ class Node:
 
     def __init__(
         self,
-        system: int,
-        component: int,
+        address: Address,
         *,
         link: str,
         peer: Peer,
         since: float,
-        is_split: bool,
         transmit: Callable[[Message], None],
         gate: Gate,
         encoding: Encoding | None,
         listens_only: bool,
         spawn: Spawn,
-        emit: Callable[[ComponentEvent], None],
-        changed: Callable[[Session, Change], None],
     ) -> None:
-        self.system = system
-        self.component = component
+        self.address = address
+        self.system, self.component = system, component = address
         self.peer = peer
         self.since = since
-        self.is_split = is_split
+        self.is_split = isinstance(address, PeerAddress)
         self.rival: tuple[Peer, float] | None = None
         self.told_rival: Peer | None = None
         self.presence = Presence()
         self.channel = Channel(system, component, transmit, gate, self.presence)
         self.identification = Identification(system, link, encoding, listens_only=listens_only)
-        self.plain = Session(
-            self.channel, self.identification, PLAIN, spawn, lambda change: changed(self.plain, change)
-        )
-        self.extended = Session(
-            self.channel, self.identification, EXTENDED, spawn, lambda change: changed(self.extended, change)
-        )
+        self.plain = Session(self.channel, self.identification, PLAIN, spawn, self.identified)
+        self.extended = Session(self.channel, self.identification, EXTENDED, spawn, self.identified)
         self.sessions = (self.plain, self.extended)
+        self.emit: Callable[[ComponentEvent], None] = lambda event: None
         self.version = 2
         self.generation = 0
         self._spawn = spawn
-        self._emit = emit
         self._identifying: Shared[None] = Shared(spawn, gate)
 
     def receive(self, message: Message, now: float, version: int = 2) -> None:
@@ -131,7 +119,7 @@ class Node:
         self.version = version
         if presence.is_lost:
             presence.is_lost = False
-            self._emit(Found(silence))
+            self.emit(Found(silence))
             self._spawn(self.identify)
         elif silence > REBOOT_SILENCE_MIN and self.identification.is_settled:
             self._spawn(self._request_clock)
@@ -164,7 +152,7 @@ class Node:
                 if self.identification.version(message):
                     self._replace()
                 self._settle_encoding()
-                self._emit(Identified())
+                self.emit(Identified())
         self.channel.dispatch(message)
 
     async def identified(self) -> None:
@@ -180,7 +168,7 @@ class Node:
         """Doubt all values: the vehicle has rebooted, and may have measured or loaded others."""
         self.presence.rebooted(now)
         self._doubt()
-        self._emit(Rebooted())
+        self.emit(Rebooted())
         self._spawn(self.identify)
 
     def resumed(self) -> None:
@@ -218,7 +206,7 @@ class Node:
         self.generation += 1
         for session in self.sessions:
             session.table.clear()
-        self._emit(Replaced())
+        self.emit(Replaced())
 
     async def identify(self) -> None:
         """Request the identity, unless that is in progress."""
@@ -229,7 +217,7 @@ class Node:
         await self.identified()
         self._settle_encoding()
         if not was_settled and self.identification.capabilities is None:
-            self._emit(Identified())
+            self.emit(Identified())
         if not self.identification.is_encoding_certain:
             await anyio.sleep(HEARTBEAT_WAIT)
             self.identification.miss_heartbeat()
@@ -258,5 +246,7 @@ class Node:
             if not presence.is_lost and silence >= timeout:
                 presence.is_lost = True
                 self._doubt()
-                self._emit(Lost(silence))
+                self.emit(Lost(silence))
+                if self.channel.gate.is_open:
+                    self.channel.lose()
             await anyio.sleep(min(max(timeout - silence, 0.001), 1.0) if not presence.is_lost else 1.0)

@@ -26,7 +26,7 @@ from paramclient.protocol.list_download import download_list
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK, Message, ParamError
 
-__all__ = ["read", "read_many", "read_param", "refusal"]
+__all__ = ["queue_time", "read", "read_many", "read_param", "refusal"]
 
 CONTROL_LOST: Final = 1e-4
 """Probability that all attempts of the control read are lost, which decides whether a component answers
@@ -114,7 +114,7 @@ async def _ask(
     def attempts_max() -> int:
         return channel.timing.attempts_max  # of this moment: the loss is better known with each answer
 
-    wait = _queue_time(session)
+    wait = queue_time(session)
     if is_served is False:
         attempts = 1
     elif is_served is None and (channel.timing.round_trip is None) != (which == HASH_CHECK):
@@ -172,11 +172,11 @@ async def read_many(
 
     async def read_one(name: str) -> None:
         try:
-            message = await read(session, name)
+            param = await read_param(session, name)
         except ParamClientError as error:
             done(name, error)
         else:
-            done(name, session.table.params[message.param_id])
+            done(name, param)
 
     async with anyio.create_task_group() as tasks:
         for name in names:
@@ -202,15 +202,15 @@ def refusal(session: Session, which: str | int, code: int) -> UnknownParameter |
     )
 
 
-def _queue_time(session: Session) -> float:
-    """Return the seconds that an ArduPilot takes to answer the reads in flight; 0 for others.
+def queue_time(session: Session, more: int = 0) -> float:
+    """Return the seconds that an ArduPilot takes to answer the reads in flight, and `more`; 0 for others.
 
     Without it, sets, which are answered at once, would measure a round trip at which all reads are repeated.
     """
     if not session.identification.is_ardupilot:
         return 0.0
     channel = session.channel
-    slots = 1 + (channel.window_size - channel.window.value) // READS_PER_SLOT_ARDUPILOT
+    slots = 1 + (channel.window_size - channel.window.value + more) // READS_PER_SLOT_ARDUPILOT
     return slots * SLOT_ARDUPILOT + (channel.timing.round_trip or 0.0)
 
 

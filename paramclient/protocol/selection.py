@@ -82,8 +82,8 @@ def only_vehicle(
     now: float,
     *,
     listening_since: float,
-) -> tuple[Node | None, float | None]:
-    """Return the only component that an address fits, or None before that is certain, and when it may be.
+) -> Node | float | None:
+    """Return the only component that an address fits, or when that may be certain; None before one is heard.
 
     Lost components do not count. With a system id, component 1 is the autopilot if it is one. With both ids,
     the component is certain after its first message.
@@ -108,12 +108,12 @@ def only_vehicle(
     if len(vehicles) > 1 or len(found) > 1:
         raise _ambiguous(vehicles if len(vehicles) > 1 else found)
     if not found:
-        return None, None
+        return None
     is_usual = system is not None and (component is not None or found[0].component == AUTOPILOT_COMPONENT)
     due = max(min(each.since for each in vehicles), listening_since) + HEARTBEAT_WAIT
     if now >= due or (is_usual and not found[0].is_split):
-        return found[0], None
-    return None, due
+        return found[0]
+    return due
 
 
 def node_in_words(node: Node) -> str:

@@ -10,10 +10,11 @@ from typing import Any, Final, Generic, TypeVar
 
 import anyio
 
-from paramclient.model.values import Encoding, Param
+from paramclient.errors import AnotherVehicle, NoReply
+from paramclient.model.identity import Identity
+from paramclient.model.values import Encoding, Param, ParamType
 from paramclient.protocol.channel import Channel, Gate
 from paramclient.protocol.dialect import Dialect, Digest, ReportedValue
-from paramclient.protocol.events import Change
 from paramclient.protocol.identity import Identification
 from paramclient.protocol.table import Table
 from paramclient.wire.messages import NO_INDEX
@@ -36,7 +37,7 @@ class Shared(Generic[T]):
 
     Args:
         spawn: starts the work in the background.
-        gate: fails after the work was cancelled with all background work.
+        gate: fails after all background work was cancelled.
     """
 
     def __init__(self, spawn: Spawn, gate: Gate) -> None:
@@ -63,9 +64,9 @@ class Shared(Generic[T]):
             self._spawn(self._execute, run)
         run.waiters += 1
         try:
-            await run.done.wait()
-            if run.was_cancelled:
-                with self._gate.until_closed():
+            with self._gate.until_closed():  # a client that is being closed starts no work
+                await run.done.wait()
+                if run.was_cancelled:
                     await anyio.sleep_forever()
         finally:
             run.waiters -= 1
@@ -133,7 +134,7 @@ class Session:
         channel, identification: the component's.
         dialect: plain or extended.
         spawn: starts an async function in the background.
-        changed: called with each change of a parameter.
+        identified: requests the identity and waits for it.
 
     Attributes:
         table: the current values.
@@ -148,6 +149,7 @@ class Session:
         contradicted: called when a hash is received that is not the table's.
         reads_names, reads_indices: whether reads by name, and by index, are answered; None while unknown.
         listing: the list that is downloaded in place of reads that are not answered.
+        seeking: the reads for evidence of the encoding.
         acknowledging: names whose next value may acknowledge a set, in another type than the parameter's.
         observers: called with the parameters received and their number, while a fetch runs.
     """
@@ -158,13 +160,13 @@ class Session:
         identification: Identification,
         dialect: Dialect,
         spawn: Spawn,
-        changed: Callable[[Change], None],
+        identified: Callable[[], Awaitable[None]],
     ) -> None:
         self.channel = channel
         self.identification = identification
         self.dialect = dialect
         self.spawn = spawn
-        self.table = Table(dialect, changed)
+        self.table = Table(dialect)
         self.table.author_of = self._author_of
         self.fetching: Shared[Any] = Shared(spawn, channel.gate)
         self.reading: set[str | int] = set()
@@ -178,8 +180,10 @@ class Session:
         self.reads_names: bool | None = None
         self.reads_indices: bool | None = None
         self.listing: Shared[Any] = Shared(spawn, channel.gate)
+        self.seeking: Shared[None] = Shared(spawn, channel.gate)
         self.acknowledging: set[str] = set()
         self.observers: set[Callable[[int, int | None], None]] = set()
+        self._identified = identified
         self._locks: dict[str, anyio.Lock] = {}
         self._foreign_sets: dict[str, tuple[str, float]] = {}
 
@@ -194,14 +198,23 @@ class Session:
             if now <= each.until and param.same_value(each.param):
                 each.was_received = True
                 return
-        known = self.table.params.get(name)
-        if known is not None and known.type_number != number:
-            if name in self.acknowledging and self.table.encoding is Encoding.BYTEWISE:
+        if name in self.acknowledging and self.table.encoding is Encoding.BYTEWISE:
+            known = self.table.params.get(name)
+            if known is not None and known.type_number != number:
                 return
-            if self.identification.is_ardupilot and message.param_index == NO_INDEX and not known.is_raw:
-                # it acknowledges the set of a default as REAL32; the bytes are a float for every type
-                message = message._replace(param_type=known.type_number)
-        self.table.store(message, now)
+        self.table.store(self.typed(message), now)
+
+    def typed(self, message: ReportedValue) -> ReportedValue:
+        """Return a value in the known type of its parameter, where it acknowledges an ArduPilot's default.
+
+        ArduPilot acknowledges the set of a default that was never stored as REAL32, whatever the type is
+        (measured on 4.6-dev); the bytes are a float for every type.
+        """
+        known = self.table.params.get(message.param_id)
+        is_ack = self.identification.is_ardupilot and message.param_index == NO_INDEX
+        if known is None or not is_ack or known.is_raw or message.param_type != ParamType.REAL32:
+            return message
+        return message._replace(param_type=known.type_number)
 
     def spelled(self, name: str) -> str:
         """Return a name as the vehicle spells it.
@@ -211,6 +224,26 @@ class Session:
         """
         is_open = self.identification.is_ardupilot and name.isascii() and name not in self.table.params
         return name.upper() if is_open else name
+
+    async def confirm(self, vehicle: Identity) -> None:
+        """Wait until the link is open, and until it is certain that this vehicle still uses the address.
+
+        Raises:
+            AnotherVehicle: another one does.
+            NoReply: the vehicle was lost, has rebooted or its link was interrupted, and it does not say again
+                which one it is.
+            LinkError: the link has failed.
+        """
+        began, (system, component) = anyio.current_time(), self.channel.target
+        await self.channel.gate.wait()
+        if not self.identification.is_confirmed:
+            await self._identified()
+            await self.channel.gate.wait()
+            if not self.identification.is_confirmed:
+                waited = anyio.current_time() - began
+                raise NoReply(f"the identity of {system}/{component}", attempts=0, waited=waited)
+        if self.identification.is_another(vehicle):
+            raise AnotherVehicle(system, component, str(vehicle), str(self.identification.identity))
 
     def lock(self, name: str) -> anyio.Lock:
         """Return the lock of the writes to one name: they run one after the other."""

@@ -10,14 +10,13 @@ from typing import Final
 
 import anyio
 
-from paramclient.errors import LinkError
+from paramclient.errors import LinkError, UsageError
 from paramclient.model.values import Encoding
 from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_words
 from paramclient.protocol.channel import Gate
 from paramclient.protocol.dialect import EXTENDED, PLAIN
-from paramclient.protocol.events import Change, ComponentEvent
 from paramclient.protocol.node import Node
-from paramclient.protocol.session import Session, Spawn
+from paramclient.protocol.session import Spawn
 from paramclient.wire.frames import BOOT_CLOCK_OFFSETS, Frame, Framer, sign_frame
 from paramclient.wire.messages import (
     AUTOPILOT_COMPONENT,
@@ -85,8 +84,6 @@ class Station:
         listens_only: whether nothing is ever sent.
         split_peers: whether equal ids at different peers are different components.
         discovered: called with a new component, before its first message is taken.
-        emit: called with each event of a component.
-        changed: called with each change of a parameter.
 
     Attributes:
         nodes: every known component, by (system, component).
@@ -110,8 +107,6 @@ class Station:
         listens_only: bool = False,
         split_peers: bool = False,
         discovered: Callable[[Node], None] = lambda node: None,
-        emit: Callable[[Node, ComponentEvent], None] = lambda node, event: None,
-        changed: Callable[[Node, Session, Change], None] = lambda node, session, change: None,
     ) -> None:
         self.link = link
         self.nodes: dict[Address, Node] = {}
@@ -128,8 +123,6 @@ class Station:
         self._encoding = encoding
         self._splits_peers = split_peers
         self._discovered = discovered
-        self._emit = emit
-        self._changed = changed
         self._datagrams = self._new_framer(stream=False)
         self._framers: dict[Peer, Framer] = {}
         self._ended_peers: set[Peer] = set()  # of components: another connection may take their ids
@@ -153,6 +146,17 @@ class Station:
             sum(framer.skipped for framer in framers),
             sum(framer.damaged for framer in framers),
         )
+
+    def check_may_send(self) -> None:
+        """Check that requests can be sent.
+
+        Raises:
+            UsageError: the client only listens.
+            LinkError: the link failed, or the client is not open.
+        """
+        self.gate.check()
+        if self.listens_only:
+            raise UsageError("the client only listens, and sends no requests")
 
     def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
         """Sign what is sent, and accept what the verifier accepts; call it before `receive`."""
@@ -321,6 +325,8 @@ class Station:
         if is_gone or node.peer in self._ended_peers or node.is_same_vehicle(message):
             node.peer = peer
             node.rival = None
+            if not node.is_same_vehicle(message):
+                node.resumed()
             return True
         node.rival = (peer, now)
         return False
@@ -343,19 +349,15 @@ class Station:
             self.transmit(message, None if is_reopened else node.peer, node.version)
 
         node = Node(
-            address[0],
-            address[1],
+            address,
             link=f"{self.link}#{peer_in_words(peer)}" if self._splits_peers else self.link,
             peer=peer,
             since=now,
-            is_split=self._splits_peers,
             transmit=transmit,
             gate=self.gate,
             encoding=self._encoding,
             listens_only=self.listens_only,
             spawn=self._spawn,
-            emit=lambda event: self._emit(node, event),
-            changed=lambda session, change: self._changed(node, session, change),
         )
         if self._asked.get((node.system, node.component), 0) > 2:
             node.channel.reads_from = (node.system, COMP_ID_ALL)

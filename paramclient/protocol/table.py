@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Final
@@ -37,7 +38,6 @@ class Table:
 
     Args:
         dialect: decodes the values.
-        changed: called with each change, after it is stored.
 
     Attributes:
         params: by name, in the order of first reception. Shared with readers; never replaced.
@@ -51,12 +51,11 @@ class Table:
         evidence: for each encoding, a value that shows it: name, bytes and type.
         is_growing: whether each value so far was the last one by its own param_count: a component that counts
             what it has sent, and whose list ends by a pause.
+        changed: called with each change, after it is stored.
         recounted: called when the count of a complete table changes, or may have changed.
     """
 
-    def __init__(
-        self, dialect: Dialect = PLAIN, changed: Callable[[Change], None] = lambda change: None
-    ) -> None:
+    def __init__(self, dialect: Dialect = PLAIN) -> None:
         self.dialect = dialect
         self.params: dict[str, Param] = {}
         self.count: int | None = None
@@ -67,8 +66,8 @@ class Table:
         self.left_out: set[str] = set()
         self.is_growing = True
         self.author_of: Callable[[str], str] = lambda name: "vehicle"
+        self.changed: Callable[[Change], None] = lambda change: None
         self.recounted: Callable[[], None] = lambda: None
-        self._changed = changed
         self._held: dict[str, Change] | None = {} if dialect is PLAIN else None
         self._encoding = Encoding.BYTEWISE
         self._wire: dict[str, tuple[bytes, int]] = {}  # as received, until the encoding is certain
@@ -159,16 +158,15 @@ class Table:
         elif place is not None:
             self._take_place(name, place)
         self.moments[name] = now
+        self._take_evidence(name, raw, number)
         if old is None:
             if len(self.params) >= NAMES_MAX:
                 return None
             new = self.dialect.param(name, raw, number, place, self._encoding)
-            self._take_evidence(name, raw, number)
         elif not is_exact and self._is_reported(old, raw, number):
             new = self._placed(old, place)
         else:
             new = self.dialect.param(name, raw, number, place, self._encoding)
-            self._take_evidence(name, raw, number)
             if new.type_number == old.type_number:
                 new = replace(new, default=old.default)
         if self._held is not None:
@@ -305,7 +303,7 @@ class Table:
 
     def _report(self, change: Change) -> None:
         if self._held is None:
-            self._changed(change)
+            self.changed(change)
         else:
             self._held.setdefault(change.name, change)
 
@@ -315,7 +313,7 @@ class Table:
         self._wire.clear()
         for name, change in held.items():
             if change.new is not None and name in self.params:
-                self._changed(replace(change, new=self.params[name]))
+                self.changed(replace(change, new=self.params[name]))
 
     def with_default(self, param: Param) -> Param:
         """Return a parameter that was received earlier with the default that is known by now."""
@@ -345,9 +343,14 @@ class Table:
             if param.trust is Trust.CACHED and param.index is not None and name not in but:
                 self.params[name] = param.with_trust(Trust.VERIFIED)
 
-    def unverified(self) -> list[str]:
-        """Return the names whose values are neither received on this link nor covered by the hash."""
-        return [name for name, param in self.params.items() if param.trust is Trust.CACHED]
+    def unverified(self, since: float = math.inf) -> list[str]:
+        """Return the names whose values are cached; with `since`, without those that were received since then
+        from a component that was lost afterwards."""
+        return [
+            name
+            for name, param in self.params.items()
+            if param.trust is Trust.CACHED and self.moments[name] < since
+        ]
 
     def clear(self) -> None:
         """Forget everything: another vehicle uses the address."""

@@ -10,7 +10,7 @@ from typing import Final
 
 import anyio
 
-from paramclient.errors import NoReply
+from paramclient.errors import LinkError, NoReply
 from paramclient.model.values import Param, Trust
 from paramclient.protocol.digest import ask, may_confirm
 from paramclient.protocol.events import Resynced
@@ -129,7 +129,11 @@ class Watch:
             self._signal.set()
 
     async def run(self) -> None:
-        """Check until cancelled."""
+        """Check until cancelled.
+
+        Raises:
+            LinkError: the link is closed for good.
+        """
         while True:
             self._signal = anyio.Event()
             if self._is_due:
@@ -145,8 +149,9 @@ class Watch:
             self._is_due = False
             try:
                 await self._check()
-            except NoReply:
-                await anyio.sleep(RETRY_INTERVAL)
+            except (NoReply, LinkError):
+                with self._session.channel.gate.until_closed():
+                    await anyio.sleep(RETRY_INTERVAL)
                 self._is_due = True
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext, suppress
 from dataclasses import replace
@@ -11,7 +12,9 @@ from typing import Final
 import anyio
 
 from paramclient.errors import (
+    AnotherVehicle,
     ExtAckResult,
+    ExtSetRefused,
     LinkError,
     NoReply,
     ParamClientError,
@@ -22,10 +25,9 @@ from paramclient.errors import (
     ValueNotApplied,
     ValueUnsupported,
 )
-from paramclient.model.identity import autopilot_name, reason_against_non_finite
+from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite
 from paramclient.model.names import is_group_switch
 from paramclient.model.values import (
-    Encoding,
     Param,
     ParamType,
     Trust,
@@ -34,20 +36,19 @@ from paramclient.model.values import (
     type_name,
 )
 from paramclient.protocol.channel import Inbox
-from paramclient.protocol.reads import read, refusal
+from paramclient.protocol.reads import queue_time, read, read_param, refusal
 from paramclient.protocol.session import ReplacedValue, Session
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
 from paramclient.wire.messages import Message, ParamError, ParamExtAck, StatusText
 
 __all__ = ["write", "write_many"]
 
-UNCHANGED_MAX: Final = 5
-"""Sets that leave the old value, after which the vehicle has not applied it: a PARAM_SET can be lost."""
 SILENT_SETS_MAX: Final = 3
 """Sets without an acknowledgement, after which a read shows the value: some firmware acknowledges none."""
+SETS_MIN: Final = 5
 SETS_MAX: Final = 12
 SETS_LOST: Final = 1e-4
-"""Probability that sets without an acknowledgement, which leave the old value, are lost."""
+"""Probability that all sets are lost, at which a vehicle that keeps the old value has not applied them."""
 EVIDENCE_READS: Final = 8
 """Indices that are read for evidence of the encoding: few components begin with more zeros and floats."""
 EXT_PROGRESS_TIMEOUT: Final = 60.0
@@ -71,6 +72,7 @@ async def write(
     author: str = "us",
     turn: AbstractAsyncContextManager[object] | None = None,
     sending: Callable[[], None] = lambda: None,
+    vehicle: Identity | None = None,
 ) -> SetResult:
     """Set one parameter, and prove its value by what the component reports.
 
@@ -88,7 +90,8 @@ async def write(
         force: also send NaN and infinity to a vehicle that cannot store them.
         author: of the change, for the history.
         turn: entered while requests are sent, but not while the value is watched.
-        sending: called before the first set is sent.
+        sending: called before each set is sent.
+        vehicle: to which it is sent; None for the present one.
 
     Raises:
         UsageError: the value does not fit the type, or must not be sent.
@@ -96,10 +99,11 @@ async def write(
         Refused: it gave another reason.
         TypeMismatch: the type changed during the write.
         ValueNotApplied: it kept another value, and gave no reason.
+        AnotherVehicle: another vehicle has answered meanwhile; nothing was written to it.
         NoReply: it did not answer. The value may have been set.
         LinkError: the link is closed for good.
     """
-    gate = session.channel.gate
+    vehicle = vehicle or session.identification.identity
     _check_finite(session, name, value, force=force)
     if session.spelled(name) != name:
         name = (await read(session, name)).param_id
@@ -107,13 +111,9 @@ async def write(
         session.writing[name] = author
         try:
             async with turn or nullcontext():
-                await _learn_type(session, name)
-                await _check_encoding(session, name)
-                before = session.table.params[name]
-                await gate.wait()
-                sending()
+                before = await _read_writable(session, name)
                 try:
-                    result = await _Write(session, name, value).run()
+                    result = await _Write(session, vehicle, before, value, sending).run()
                 except (NoReply, LinkError, anyio.get_cancelled_exc_class()):
                     session.foreign_set(name, author, anyio.current_time())  # it may be acknowledged yet
                     raise
@@ -122,10 +122,10 @@ async def write(
                 session.replaced[name].append(late)
                 session.spawn(_ignore_late_answers, session, late)
             if settle > 0:
-                with gate.until_closed():
+                with session.channel.gate.until_closed():
                     await anyio.sleep(settle)
-                await read(session, name)
-                now = session.table.params[name]
+                now = await read_param(session, name)
+                await session.confirm(vehicle)
                 if not now.same_value(result.param):
                     result = replace(result, status="adjusted", param=now)
             return result
@@ -147,9 +147,9 @@ async def write_many(
 ) -> SetManyResult:
     """Set several parameters, as many at once as the component serves.
 
-    A parameter that shows or hides others (`*_ENABLE`) is set alone, after those before it. When the link
-    fails, the component does not answer any more, or the timeout expires, the other parameters are not tried,
-    and the result has the error.
+    Values of one parameter are set in order. A parameter that shows or hides others (`*_ENABLE`) is set
+    alone, after those before it. When the link fails, the component does not answer any more, another vehicle
+    takes its place, or the timeout expires, the other parameters are not tried, and the result has the error.
 
     Args:
         session, settle, force, author: as for `write`.
@@ -158,6 +158,7 @@ async def write_many(
         timeout: seconds; None for no limit.
     """
     began, system, component = anyio.current_time(), *session.channel.target
+    vehicle = session.identification.identity
     done = progress or (lambda outcome: None)
     outcomes = [SetOutcome(name, value, SetStatus.NOT_TRIED) for name, value in pairs]
     limiter = anyio.CapacityLimiter(BATCH_SIZE)
@@ -186,8 +187,9 @@ async def write_many(
                 author=author,
                 turn=turn(),
                 sending=sending,
+                vehicle=vehicle,
             )
-        except (NoReply, LinkError) as error:
+        except (NoReply, LinkError, AnotherVehicle) as error:
             failures.append(error)
             outcomes[place] = replace(outcomes[place], error=error)
         except ParamClientError as error:
@@ -196,16 +198,23 @@ async def write_many(
             outcomes[place] = SetOutcome(name, value, SetStatus(result.status), result)
         done(outcomes[place])
 
+    async def write_in_order(places: Sequence[int]) -> None:
+        for place in places:
+            await write_one(place)
+
     autopilot = autopilot_name(session.identification.autopilot or 0)
     places = list(range(len(pairs)))
     with anyio.move_on_after(timeout) as scope:
         while places and not failures:
             switches = (at for at, place in enumerate(places) if is_group_switch(pairs[place][0], autopilot))
             together = max(next(switches, len(places)), 1)
+            by_name: defaultdict[str, list[int]] = defaultdict(list)
+            for place in places[:together]:
+                by_name[session.spelled(pairs[place][0])].append(place)
             try:
                 async with anyio.create_task_group() as tasks:
-                    for place in places[:together]:
-                        tasks.start_soon(write_one, place)
+                    for same_name in by_name.values():
+                        tasks.start_soon(write_in_order, same_name)
             except ExceptionGroup as group:  # of `done`
                 raise group.exceptions[0] from None
             del places[:together]
@@ -230,67 +239,128 @@ class _Write:
     Attributes:
         before: the parameter before the first set.
         wanted: the value that proves success.
+        attempts: sets that were sent.
     """
 
-    def __init__(self, session: Session, name: str, value: WireValue) -> None:
+    def __init__(
+        self,
+        session: Session,
+        vehicle: Identity,
+        before: Param,
+        value: WireValue,
+        sending: Callable[[], None],
+    ) -> None:
         self.session = session
         self.channel = session.channel
-        self.name = name
+        self.name = before.name
+        self.before = self.wanted = before
         self.value = value
-        self.before = session.table.params[name]
-        self.wanted = self.before
         self.attempts = 0
+        self._began = anyio.current_time()
+        self._vehicle = vehicle
+        self._sending = sending
         self._raw = b""
+        self._has_other_value = False
         self._has_new_type = False
 
     async def run(self) -> SetResult:
-        """Send the set until its outcome is proven."""
-        channel = self.channel
-        key = self.session.dialect.value
-        keys = [(key, self.name), StatusText]
-        if self.session.dialect.has_ack:
-            keys = [(ParamExtAck, self.name)]
-        began = anyio.current_time()
+        """Send the set until its outcome is proven: by the wanted value, or by the same other one twice."""
+        self._encode()
+        for each in list(self.session.replaced.get(self.name, ())):
+            if self._is_wanted(each.param):  # its acknowledgement would be ignored
+                await anyio.sleep_until(each.until + 0.001)
+        dialect = self.session.dialect
+        keys = [(ParamExtAck, self.name)] if dialect.has_ack else [(dialect.value, self.name), StatusText]
         adjusted: Param | None = None
-        unanswered = unchanged = 0
-        with channel.inbox(*keys) as inbox:
-            self._encode()
-            for each in list(self.session.replaced.get(self.name, ())):
-                if self._is_wanted(each.param):  # its acknowledgement would be ignored
-                    await anyio.sleep_until(each.until + 0.001)
+        with self.channel.inbox(*keys) as inbox:
             while True:
-                await channel.gate.wait()
-                sent = anyio.current_time()
-                number = self.before.type_number
-                self.session.acknowledging.add(self.name)
-                channel.send(self.session.dialect.request_set(channel.target, self.name, self._raw, number))
-                self.attempts += 1
-                answer = await self._answer(inbox, sent)
-                is_silent = answer is None
-                if answer is None:
-                    unanswered += 1
-                    if unanswered < SILENT_SETS_MAX:
-                        continue
-                    try:
-                        answer = await self._read()
-                    except NoReply:
-                        what = f"the acknowledgement of {self.name} by {channel.system}/{channel.component}"
-                        waited = anyio.current_time() - began
-                        raise NoReply(what, attempts=self.attempts, waited=waited) from None
-                if answer.type_number != number:
+                answer = await self._set(inbox)
+                await self._confirm()
+                if answer.type_number != self.before.type_number:
                     self._retype(answer)
-                    continue
-                if self._is_wanted(answer) or self._is_converted(answer):
+                elif self._is_wanted(answer) or self._is_converted(answer):
                     return self._result(answer)
-                if adjusted is not None and (adjusted.same_value(answer) or self.attempts >= SETS_MAX):
+                elif answer.same_value(self.before):
+                    sets_max = min(max(self.channel.timing.attempts_for(SETS_LOST), SETS_MIN), SETS_MAX)
+                    if self.attempts >= sets_max:
+                        raise self._not_applied(answer)
+                elif adjusted is not None and (adjusted.same_value(answer) or self.attempts >= SETS_MAX):
                     return self._result(answer)
-                if not answer.same_value(self.before):
+                else:
                     adjusted = answer
-                    continue
-                unchanged += not is_silent
-                sets_max = min(max(channel.timing.attempts_for(SETS_LOST), UNCHANGED_MAX), SETS_MAX)
-                if unchanged >= UNCHANGED_MAX or self.attempts >= sets_max:
-                    raise self._not_applied(answer)
+
+    async def _set(self, inbox: Inbox) -> Param:
+        """Send the set until it is acknowledged; return the wanted value, or what a read shows.
+
+        Silence may be that of a firmware that acknowledges nothing, and another value may be an older one.
+        """
+        channel = self.channel
+        what = f"the acknowledgement of {self.name} by {channel.system}/{channel.component}"
+        answer: Param | ParamExtAck | None = None
+        self._has_other_value = False
+        with suppress(NoReply):
+            answer = await channel.exchange(
+                self._request,
+                inbox,
+                self._accept,
+                what=what,
+                attempts=lambda: 0 if self._has_other_value else SILENT_SETS_MAX,
+                ready=self._confirm,
+            )
+        while isinstance(answer, ParamExtAck) and answer.param_result == ExtAckResult.IN_PROGRESS:
+            until = anyio.current_time() + EXT_PROGRESS_TIMEOUT
+            answer = await channel.wait_for(inbox, self._accept, until, 0)
+        if isinstance(answer, Param) and answer.type_number == self.before.type_number:
+            return answer
+        if answer is not None:  # only a read shows a changed type, and the value of an extended parameter
+            return await self._read(inbox)
+        if not channel.is_silent(self._began):
+            with suppress(NoReply):
+                return await self._read(inbox)
+        raise NoReply(what, attempts=self.attempts, waited=anyio.current_time() - self._began)
+
+    async def _confirm(self) -> None:
+        await self.session.confirm(self._vehicle)
+
+    def _request(self, attempt: int) -> Message:
+        """Return the set, and count it as sent."""
+        self.attempts += 1
+        self._sending()
+        self.session.acknowledging.add(self.name)
+        dialect, number = self.session.dialect, self.before.type_number
+        return dialect.request_set(self.channel.target, self.name, self._raw, number)
+
+    def _accept(self, message: Message) -> Param | ParamExtAck | None:
+        """Return an acknowledgement: PARAM_EXT_ACK, the wanted value, or any in another type."""
+        session, encoding = self.session, self.session.table.encoding
+        if isinstance(message, ParamExtAck):
+            if message.param_result in (ExtAckResult.ACCEPTED, ExtAckResult.IN_PROGRESS):
+                return message
+            raise self._ext_refusal(message.param_result)
+        if isinstance(message, ParamError):
+            raise refusal(session, self.name, message.error)
+        if isinstance(message, StatusText):
+            if message.text.startswith(f"{DENIED}{self.name})"):
+                raise refusal(session, self.name, ParamErrorCode.READ_ONLY)
+            return None
+        assert isinstance(message, session.dialect.value)
+        _, raw, number, _, _ = message = session.typed(message)
+        if (number, raw) == (self.before.type_number, self._raw):
+            # this value, and not the rounded form of the one before
+            session.table.store(message, anyio.current_time(), is_exact=True)
+        param = session.dialect.param(self.name, raw, number, None, encoding)
+        if self._is_wanted(param) or number != self.before.type_number:
+            return param
+        self._has_other_value = True
+        return None
+
+    async def _read(self, inbox: Inbox) -> Param:
+        """Return the parameter as the component reports it now."""
+        self.session.acknowledging.discard(self.name)
+        param = await read_param(self.session, self.name)
+        while inbox:
+            self._accept(await inbox.next())  # a refusal that came behind the value
+        return param
 
     def _encode(self) -> None:
         """Set the bytes to send, and the value that proves success."""
@@ -298,93 +368,6 @@ class _Write:
         encoding = session.table.encoding
         self._raw = session.dialect.encode(self.value, number, encoding)
         self.wanted = session.dialect.param(self.name, self._raw, number, None, encoding)
-
-    async def _answer(self, inbox: Inbox, sent: float) -> Param | None:
-        """Wait for the parameter after a set: the wanted value, or what a read shows; None in silence."""
-        if self.session.dialect.has_ack:
-            return await self._ext_answer(inbox, sent)
-        other: list[Param] = []
-
-        def accept(message: Message) -> Param | None:
-            param = self._take(message)
-            if param is None or self._is_wanted(param) or param.type_number != self.before.type_number:
-                return param
-            other.append(param)
-            return None
-
-        answer = await self.channel.wait_for(inbox, accept, sent, min(self.attempts - 1, 3))
-        if answer is not None:
-            if self.attempts == 1 and not self.channel.is_streaming:
-                self.channel.timing.measure(anyio.current_time() - sent)
-            is_typed = answer.type_number == self.before.type_number
-            return answer if is_typed else await self._read()  # only a read shows that the type has changed
-        if not other:
-            return None
-        param = await self._read()
-        while inbox:
-            self._take(await inbox.next())  # a refusal that came behind the value
-        return param
-
-    async def _ext_answer(self, inbox: Inbox, sent: float) -> Param | None:
-        """Wait for PARAM_EXT_ACK, as long as the component reports progress; then read the value."""
-        attempt = min(self.attempts - 1, 3)
-        while True:
-            ack = await self.channel.wait_for(inbox, _ext_ack, sent, attempt)
-            if ack is None or ack.param_result != ExtAckResult.IN_PROGRESS:
-                break
-            sent, attempt = anyio.current_time() + EXT_PROGRESS_TIMEOUT, 0
-        if ack is None:
-            return None
-        if ack.param_result == ExtAckResult.ACCEPTED:
-            return await self._read()
-        system, component = self.channel.target
-        kind = ValueUnsupported if ack.param_result == ExtAckResult.VALUE_UNSUPPORTED else SetFailed
-        reason = ExtAckResult.name_of(ack.param_result)
-        raise kind(
-            f"{system}/{component} refused {self.name}: {reason}",
-            system=system,
-            component=component,
-            code=ack.param_result,
-            name=self.name,
-        )
-
-    async def _read(self) -> Param:
-        """Return the parameter as the component reports it now."""
-        self.session.acknowledging.discard(self.name)
-        await read(self.session, self.name)
-        return self.session.table.params[self.name]
-
-    def _take(self, message: Message) -> Param | None:
-        """Return the parameter in a value, and raise the error in a refusal."""
-        if isinstance(message, ParamError):
-            raise refusal(self.session, self.name, message.error)
-        if isinstance(message, StatusText):
-            if message.text.startswith(f"{DENIED}{self.name})"):
-                raise refusal(self.session, self.name, ParamErrorCode.READ_ONLY)
-            return None
-        assert isinstance(message, self.session.dialect.value)
-        encoding = self.session.table.encoding
-        number = message.param_type
-        if number == ParamType.REAL32 and self.before.type_number != number:
-            number = self._known_type(message.raw)
-        elif (number, message.raw) == (self.before.type_number, self._raw):
-            # this value, and not the rounded form of the one before
-            self.session.table.store(message, anyio.current_time(), is_exact=True)
-        return self.session.dialect.param(self.name, message.raw, number, None, encoding)
-
-    def _known_type(self, raw: bytes) -> int:
-        """Return the known integer type for a value in REAL32, if it holds the value.
-
-        ArduPilot answers a PARAM_SET with REAL32, whatever the parameter's type is, if the value is the
-        default and was never stored (measured on 4.6-dev).
-        """
-        known = self.before.type
-        encoding = self.session.table.encoding
-        if encoding is Encoding.C_CAST and isinstance(known, ParamType) and known.is_integer:
-            param = self.session.dialect.param(self.name, raw, known, None, encoding)
-            if not param.is_raw:
-                return known
-        return ParamType.REAL32
 
     def _is_wanted(self, param: Param) -> bool:
         return self.wanted.same_value(param)
@@ -425,6 +408,17 @@ class _Write:
                 name=self.name,
             ) from None
 
+    def _ext_refusal(self, result: int) -> ExtSetRefused:
+        system, component = self.channel.target
+        kind = ValueUnsupported if result == ExtAckResult.VALUE_UNSUPPORTED else SetFailed
+        return kind(
+            f"{system}/{component} refused {self.name}: {ExtAckResult.name_of(result)}",
+            system=system,
+            component=component,
+            code=result,
+            name=self.name,
+        )
+
     def _not_applied(self, actual: Param) -> ValueNotApplied:
         system, component = self.channel.target
         number = actual.type_number
@@ -439,32 +433,39 @@ class _Write:
         )
 
 
-async def _learn_type(session: Session, name: str) -> None:
-    """Read a parameter whose type was neither received nor verified on this link."""
-    known = session.table.params.get(name)
-    if known is None or known.trust is Trust.CACHED:
-        await read(session, name)
+async def _read_writable(session: Session, name: str) -> Param:
+    """Return a parameter, as soon as its type and the encoding are certain.
 
-
-async def _check_encoding(session: Session, name: str) -> None:
-    """Wait until the encoding of an integer is certain, and raise UsageError if the values contradict it.
-
-    Where neither the component nor the user names the encoding, and 0 shows none, other values are read.
+    Raises:
+        UsageError: the parameter is an integer, and the values contradict the encoding.
     """
-    channel, identification, table = session.channel, session.identification, session.table
-    with channel.gate.until_closed(or_failed=True):
-        await identification.encoding_certain()
-    kind = table.params[name].type
-    if session.dialect.has_ack or not (isinstance(kind, ParamType) and kind.is_integer):
-        return
-    if not (identification.is_encoding_known or table.evidence):
-        with channel.inbox(session.dialect.value) as inbox, anyio.move_on_after(channel.timing.timeout(0)):
-            for index in range(EVIDENCE_READS):
-                channel.send(session.dialect.request_read(channel.reads_from, index))
-            while not table.evidence:
-                await inbox.next()
-    if doubt := session.encoding_doubt:
-        raise UsageError(f"{name} was not written. {doubt}")
+    await _known(session, name)
+    with session.channel.gate.until_closed(or_failed=True):
+        await session.identification.encoding_certain()
+    param = await _known(session, name)
+    is_integer = isinstance(param.type, ParamType) and param.type.is_integer
+    if is_integer and not session.dialect.has_ack and session.identification.chosen is None:
+        if not session.table.evidence:  # 0 is the same in both, and files have no encoding
+            await session.seeking.join(lambda: _seek_evidence(session))
+        if doubt := session.encoding_doubt:
+            raise UsageError(f"{name} was not written. {doubt}")
+    return param
+
+
+async def _known(session: Session, name: str) -> Param:
+    """Return a parameter that was received or verified on this link; read it if it was not."""
+    known = session.table.params.get(name)
+    return await read_param(session, name) if known is None or known.trust is Trust.CACHED else known
+
+
+async def _seek_evidence(session: Session) -> None:
+    """Read the first values of the list, until one shows the encoding or all had time to be answered."""
+    channel, evidence = session.channel, session.table.evidence
+    with channel.inbox(session.dialect.value) as inbox:
+        sent, seconds = anyio.current_time(), queue_time(session, EVIDENCE_READS)
+        for index in range(EVIDENCE_READS):
+            channel.send(session.dialect.request_read(channel.reads_from, index))
+        await channel.wait_for(inbox, lambda message: evidence or None, sent, 0, seconds)
 
 
 async def _ignore_late_answers(session: Session, late: ReplacedValue) -> None:
@@ -488,7 +489,3 @@ def _check_finite(session: Session, name: str, value: WireValue, *, force: bool)
         raise UsageError(
             f"{name} = {value} was not sent to {system}/{component}: {why}. Force it to send it all the same."
         )
-
-
-def _ext_ack(message: Message) -> ParamExtAck | None:
-    return message if isinstance(message, ParamExtAck) else None

@@ -369,6 +369,7 @@ class ApplyRun:
         Raises:
             ParamClientError: not all values were tried.
         """
+        self._check_same_vehicle()
         self._is_verified = False
         by_name = {step.name: step for step in steps}
         before = frozenset(self.sent)

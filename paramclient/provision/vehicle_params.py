@@ -12,7 +12,7 @@ from paramclient.errors import NotInCache, UsageError, VehicleError
 from paramclient.model.comparison import defaults_of, non_defaults
 from paramclient.model.defaults import add_defaults
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param, Trust
+from paramclient.model.values import Param
 from paramclient.model.wording import first_of
 
 if TYPE_CHECKING:
@@ -88,10 +88,7 @@ async def collect_set(
     *,
     source: str,
 ) -> FetchedSet:
-    """Return the parameters of a fetched table as a set.
-
-    Parameters that the vehicle does not list
-    and that are only cached cannot be confirmed; they are left out.
+    """Return the parameters of a fetched table as a set, without values that are only cached.
 
     Args:
         component: the component.
@@ -101,11 +98,10 @@ async def collect_set(
     Raises:
         LinkError: the link failed.
     """
-    params = list(component.params.values())
-    known = [param for param in params if param.trust is not Trust.CACHED]
-    stale = {
-        param.index: param.name for param in params if param.trust is Trust.CACHED and param.index is not None
-    }
+    cached = set(result.cached)
+    known = [param for name, param in result.params.items() if name not in cached]
+    indices = {name: result.params[name].index for name in cached}
+    stale = {index: name for name, index in indices.items() if index is not None}
     missing = [stale.get(index, f"index {index}") for index in sorted({*result.missing, *stale})]
     return FetchedSet(set_maker(component, source)(known), known, missing)
 

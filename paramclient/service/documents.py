@@ -19,7 +19,7 @@ from paramclient.cli.json_output import (
 )
 from paramclient.cli.json_setup import ApplyJson, PlanJson
 from paramclient.model.notation import bits_text, hash_text, rounded
-from paramclient.model.values import ParamType, Trust
+from paramclient.model.values import ParamType
 from paramclient.protocol.identity import expects_extended
 
 if TYPE_CHECKING:
@@ -179,8 +179,6 @@ def fetch_result(result: FetchResult, target: Target) -> dict[str, Any]:
             component,
             result,
             (),
-            missing=list(result.missing),
-            cached=[name for name, each in component.params.items() if each.trust is Trust.CACHED],
             bytes_received=0 if client is None else client.bytes_received,
             bytes_sent=0 if client is None else client.bytes_sent,
             described={},

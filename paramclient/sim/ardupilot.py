@@ -224,7 +224,7 @@ class ArduPilotVehicle(Vehicle):
             self._refuse(ParamErrorCode.VALUE_OUT_OF_RANGE, request, sender)
         elif entry.name in self._read_only:
             self._send_value(entry, index=messages.NO_INDEX)
-            self._send(messages.StatusText(_WARNING, f"Param write denied ({entry.name})"))
+            self.send(messages.StatusText(_WARNING, f"Param write denied ({entry.name})"))
             self._refuse(ParamErrorCode.READ_ONLY, request, sender)
         else:
             bits = _converted(value, entry.type)
@@ -397,7 +397,7 @@ class ArduPilotVehicle(Vehicle):
     def _answer_reads(self) -> None:
         """Send the completed responses, and look up those for the next slot."""
         for answer in self._ready:
-            self._send(answer)
+            self.send(answer)
         self._ready.clear()
         self._look_up()
 
@@ -411,7 +411,7 @@ class ArduPilotVehicle(Vehicle):
         if is_held:
             return
         for answer, sender in self._file_answers:
-            self._send(messages.FileTransfer(0, *sender, answer.pack()))
+            self.send(messages.FileTransfer(0, *sender, answer.pack()))
             is_opened = answer.requested == Opcode.OPEN_FILE_RO and answer.opcode == Opcode.ACK
             if is_opened and any(path.startswith(PARAM_FILE) for path in self.open_files):
                 self._send_banner()
@@ -423,7 +423,7 @@ class ArduPilotVehicle(Vehicle):
 
     def _send_banner(self) -> None:
         for text in _BANNER:
-            self._send(messages.StatusText(_INFO, text))
+            self.send(messages.StatusText(_INFO, text))
 
     def _next(self, period: float, *, after: float | None = None) -> float:
         """Return the start of the next period; periods are counted from switching on."""

@@ -171,7 +171,8 @@ class Camera(BytewiseVehicle):
         del self._ext[self.ext_param(name).name]
         self._ext = {each.name: replace(each, index=index) for index, each in enumerate(self._ext.values())}
 
-    def _on_request(self, message: messages.Message, sender: frames.Frame) -> None:
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        """See `Device.respond`."""
         if isinstance(message, messages.ParamExtRequestRead):
             self._on_ext_read(message)
         elif isinstance(message, messages.ParamExtRequestList):
@@ -181,7 +182,7 @@ class Camera(BytewiseVehicle):
         elif isinstance(message, messages.ParamExtSet):
             self._on_ext_set(message)
         else:
-            super()._on_request(message, sender)
+            super().respond(message, sender)
 
     def _on_ext_read(self, request: messages.ParamExtRequestRead) -> None:
         found = self._ext.get(request.param_id)
@@ -209,7 +210,7 @@ class Camera(BytewiseVehicle):
             self._acknowledge(self._store(known.name, ext_bytes(wanted)), ExtAckResult.ACCEPTED)
 
     def _acknowledge(self, param: Param, result: ExtAckResult) -> None:
-        self._send(messages.ParamExtAck(param.name, ext_bytes(param), param.type_number, result))
+        self.send(messages.ParamExtAck(param.name, ext_bytes(param), param.type_number, result))
 
     def _store(self, name: str, raw: bytes) -> Param:
         known = self._ext[name]
@@ -225,7 +226,7 @@ class Camera(BytewiseVehicle):
 
     def _send_ext(self, param: Param) -> None:
         index = 0 if param.index is None else param.index
-        self._send(
+        self.send(
             messages.ParamExtValue(param.name, ext_bytes(param), param.type_number, len(self._ext), index)
         )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import struct
-from abc import ABC, abstractmethod
 from collections import Counter
 from dataclasses import replace
 from typing import Final, TypedDict
@@ -32,7 +31,7 @@ class DeviceOptions(TypedDict, total=False):
     reboot_down: float
 
 
-class Device(ABC):
+class Device:
     """A simulated component that is switched on and off, sends heartbeats, and executes commands.
 
     `Vehicle` adds the parameters, and documents the arguments and attributes.
@@ -181,11 +180,26 @@ class Device(ABC):
         out, self._out = self._out, []
         return out
 
-    # Implemented by subclasses
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        """Respond to a message for this component. A subclass may ignore some, or respond otherwise."""
+        if isinstance(message, messages.CommandLong):
+            self._on_command(message, sender)
+        elif isinstance(message, messages.SetupSigning) and not self.armed:
+            self._take_key(message.key, message.initial_timestamp)
 
-    @abstractmethod
-    def _on_request(self, message: messages.Message, sender: frames.Frame) -> None:
-        """Handle a request for this component that is not a command."""
+    def send(self, message: messages.Message) -> None:
+        """Send a message. A subclass may drop some, or send others instead."""
+        self._queue(
+            messages.encode(
+                message,
+                system=self.system,
+                component=self.component,
+                sequence=self._sequence,
+                version=self._mavlink_version,
+            )
+        )
+
+    # Implemented by subclasses
 
     def _answers_system(self, target: int) -> bool:
         return target in (0, self.system)
@@ -244,19 +258,6 @@ class Device(ABC):
             if self._next_telemetry <= now:
                 self._next_telemetry = now + self._telemetry_period
 
-    # Helpers for subclasses
-
-    def _send(self, message: messages.Message) -> None:
-        self._queue(
-            messages.encode(
-                message,
-                system=self.system,
-                component=self.component,
-                sequence=self._sequence,
-                version=self._mavlink_version,
-            )
-        )
-
     # Internal
 
     def _take_key(self, key: signing.SigningKey | None, timestamp: int) -> None:
@@ -274,9 +275,9 @@ class Device(ABC):
 
     def _send_heartbeat(self, now: float) -> None:
         if self._high_latency:
-            self._send(messages.HighLatency2(self._heartbeat.type, self._heartbeat.autopilot))
+            self.send(messages.HighLatency2(self._heartbeat.type, self._heartbeat.autopilot))
             return
-        self._send(self._beat)
+        self.send(self._beat)
         self._send_clock(now)
 
     def _send_clock(self, now: float) -> None:
@@ -284,7 +285,7 @@ class Device(ABC):
         self._send_system_time(now)
 
     def _send_system_time(self, now: float) -> None:
-        self._send(messages.SystemTime(0, self._time_boot_ms(now)))
+        self.send(messages.SystemTime(0, self._time_boot_ms(now)))
 
     def _time_boot_ms(self, now: float) -> int:
         """Return the time since switching on in milliseconds, in 32 bits."""
@@ -346,13 +347,7 @@ class Device(ABC):
         if message.target_component not in (messages.COMP_ID_ALL, self.component):
             return
         self.requests[_NAMES[type(message)]] += 1
-        if isinstance(message, messages.CommandLong):
-            self._on_command(message, frame)
-        elif isinstance(message, messages.SetupSigning):
-            if not self.armed:
-                self._take_key(message.key, message.initial_timestamp)
-        else:
-            self._on_request(message, frame)
+        self.respond(message, frame)
 
     def _on_command(self, request: messages.CommandLong, sender: frames.Frame) -> None:
         if request.command == messages.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN:
@@ -374,12 +369,12 @@ class Device(ABC):
         ack = messages.CommandAck(request.command, result, sender.system, sender.component)
         answers: list[messages.Message] = [ack] if requested is None else [ack, requested]
         for answer in answers if self._ack_first else reversed(answers):
-            self._send(answer)
+            self.send(answer)
 
     def _on_clock_request(self, sender: frames.Frame) -> None:
         """Acknowledge a request for SYSTEM_TIME, and send the message as soon as the main loop runs."""
         number, result = messages.MAV_CMD_REQUEST_MESSAGE, CommandResult.ACCEPTED
-        self._send(messages.CommandAck(number, result, sender.system, sender.component))
+        self.send(messages.CommandAck(number, result, sender.system, sender.component))
         self._clock_due = max(self._now, self._on_at + self._clock_delay)
 
     def _on_restart_command(self, mode: int, sender: frames.Frame) -> None:
@@ -389,7 +384,7 @@ class Device(ABC):
             self._restart_at = min(self._restart_at, self._now + self._restart_delay)
         if self._reboot_ack or not is_obeyed:
             command = messages.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
-            self._send(messages.CommandAck(command, result, sender.system, sender.component))
+            self.send(messages.CommandAck(command, result, sender.system, sender.component))
 
 
 _NAMES = {

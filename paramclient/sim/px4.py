@@ -263,7 +263,7 @@ class PX4Vehicle(BytewiseVehicle):
     def _on_command(self, request: messages.CommandLong, sender: frames.Frame) -> None:
         if request.command == messages.MAV_CMD_PREFLIGHT_STORAGE and request.param1 == _RESET_ALL:
             self._load_bits(self._first_bits)
-            self._send(
+            self.send(
                 messages.CommandAck(request.command, CommandResult.ACCEPTED, sender.system, sender.component)
             )
             return
@@ -276,8 +276,8 @@ class PX4Vehicle(BytewiseVehicle):
         ):
             super()._on_command(request, sender)
             return
-        self._send(messages.ComponentMetadata(f"mftp://{GENERAL_FILE}", crc32_px4(general)))
-        self._send(
+        self.send(messages.ComponentMetadata(f"mftp://{GENERAL_FILE}", crc32_px4(general)))
+        self.send(
             messages.CommandAck(request.command, CommandResult.ACCEPTED, sender.system, sender.component)
         )
 
@@ -414,7 +414,7 @@ class PX4Vehicle(BytewiseVehicle):
         value = self.announced_hash()
         if value is not None:
             raw = value.to_bytes(4, "little")
-            self._send(
+            self.send(
                 messages.ParamValue(
                     messages.HASH_CHECK, raw, ParamType.UINT32, len(self._listed), messages.NO_INDEX
                 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from typing import Final, Unpack
 
@@ -33,7 +33,7 @@ class VehicleOptions(DeviceOptions, total=False):
     list_stops: float
 
 
-class Vehicle(Device):
+class Vehicle(Device, ABC):
     """A simulated component with the parameter protocol in bytes; an `Endpoint`.
 
     Sans-I/O, without a clock. Requests at `now` are answered with the delays of a real vehicle;
@@ -205,6 +205,19 @@ class Vehicle(Device):
         entry = self._entry(name)
         self._write(entry, bits_of(value, entry.type))
 
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        """See `Device.respond`."""
+        if isinstance(message, messages.ParamRequestRead):
+            self._on_read(message, sender)
+        elif isinstance(message, messages.ParamRequestList):
+            self._on_list()
+        elif isinstance(message, messages.ParamSet):
+            self._on_set(message, sender)
+        elif isinstance(message, messages.FileTransfer) and self.file_server is not None:
+            self.file_server.receive(message.payload, (sender.system, sender.component), self._now)
+        else:
+            super().respond(message, sender)
+
     # Implemented by subclasses
 
     @abstractmethod
@@ -266,16 +279,6 @@ class Vehicle(Device):
     def _is_dead(self, entry: Entry) -> bool:
         return bool(self.dead) and (entry.index in self.dead or entry.name in self.dead)
 
-    def _on_request(self, message: messages.Message, sender: frames.Frame) -> None:
-        if isinstance(message, messages.ParamRequestRead):
-            self._on_read(message, sender)
-        elif isinstance(message, messages.ParamRequestList):
-            self._on_list()
-        elif isinstance(message, messages.ParamSet):
-            self._on_set(message, sender)
-        elif isinstance(message, messages.FileTransfer) and self.file_server is not None:
-            self.file_server.receive(message.payload, (sender.system, sender.component), self._now)
-
     def _next_transmission(self) -> float:
         return min(super()._next_transmission(), self._next_burst, self._next_file_work())
 
@@ -316,7 +319,7 @@ class Vehicle(Device):
         """Send the due MAVFTP responses."""
         if self.file_server is not None:
             for answer, sender in self.file_server.work(now):
-                self._send(messages.FileTransfer(0, *sender, answer.pack()))
+                self.send(messages.FileTransfer(0, *sender, answer.pack()))
 
     # Helpers for subclasses
 
@@ -365,7 +368,7 @@ class Vehicle(Device):
             index = messages.NO_INDEX if entry.index is None else entry.index
         if count is None:
             count = len(self._listed)
-        self._send(
+        self.send(
             messages.ParamValue(entry.name, entry.raw, entry.type if kind is None else kind, count, index)
         )
 
@@ -379,7 +382,7 @@ class Vehicle(Device):
         if self._param_error:
             index = request.param_index if isinstance(request, messages.ParamRequestRead) else -1
             name = request.param_id if index < 0 else ""
-            self._send(messages.ParamError(sender.system, sender.component, name, index, code))
+            self.send(messages.ParamError(sender.system, sender.component, name, index, code))
 
 
 _TABLE_SIZE_MAX = 65535

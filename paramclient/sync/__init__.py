@@ -20,14 +20,7 @@ from __future__ import annotations
 from paramclient import metadata, provision
 from paramclient.client.events import Discovered, Event, Found, Lost, Rebooted, Resynced
 from paramclient.provision.fleet import Wanted
-from paramclient.sync.proxy import (
-    Changes,
-    Component,
-    Events,
-    Ftp,
-    ParamClient,
-    blocking,
-)
+from paramclient.sync.proxy import Changes, Component, Events, Ftp, ParamClient, blocking
 
 __all__ = [
     "Changes",

@@ -74,13 +74,11 @@ class Component:
 
     system: int
     component: int
+    is_extended: bool
     params: ParamMap
     @property
     def ext(self) -> Component:
         """The extended parameters of the component (PARAM_EXT_*), whose values are also text and bytes."""
-    @property
-    def is_extended(self) -> bool:
-        """Whether these are the extended parameters: whether the component is the `ext` of another one."""
     @property
     def autopilot(self) -> str:
         """Autopilot of its heartbeat: px4, ardupilot, generic, …; "unknown" before the first heartbeat."""
@@ -212,7 +210,9 @@ class Events(Iterator[Event]):
 class ParamClient:
     "A ground station for the MAVLink parameter protocol on one link, as an async context manager."
 
+    link: Link
     cache: ParamCache | None
+    listens_only: bool
     def __enter__(self) -> Self: ...
     def __exit__(self, *error: object) -> None: ...
     def open(self) -> Self: ...
@@ -239,12 +239,6 @@ class ParamClient:
     @property
     def autopilots(self) -> list[Component]:
         """The autopilot of each system, sorted by system id, without cameras, gimbals and the like."""
-    @property
-    def link(self) -> Link:
-        """The link object of the client."""
-    @property
-    def listens_only(self) -> bool:
-        """Whether the client sends nothing: because of `listen_only`, or because the link is a log."""
     @property
     def bytes_received(self) -> int:
         """Bytes received over the link."""

@@ -15,7 +15,7 @@ from dataclasses import replace
 from functools import partial, wraps
 from queue import Empty, SimpleQueue
 from types import MappingProxyType
-from typing import Any, Final, Self
+from typing import Any, ClassVar, Final, Self
 
 import anyio
 from anyio.from_thread import BlockingPortal, start_blocking_portal
@@ -30,6 +30,9 @@ THREAD_NAME: Final = "paramclient blocking client"
 """Name of the thread of a client, in debuggers."""
 WAIT_INTERVAL: Final = 0.1
 """Seconds after which a waiting thread wakes up: Windows delivers Ctrl-C only then."""
+
+CALLBACKS: Final = ("progress", "before_writing")
+"""Arguments that are called while a call runs, in the thread of the caller."""
 
 
 class _Session:
@@ -104,7 +107,7 @@ class _Session:
 
     def shown(self, value: Any) -> Any:
         """Return a value of the client as the caller is to see it."""
-        kind = _PROXIES.get(type(value))
+        kind = Proxy._kinds.get(type(value))
         if kind is not None:
             found = self.proxies.get(value)
             if found is None:
@@ -122,9 +125,10 @@ class _Session:
     def _argument(self, calls: SimpleQueue[Callable[[], object] | None], name: str, value: Any) -> Any:
         """Return an argument of a call as the client is to see it."""
 
-        async def ask() -> None:
+        async def ask(*items: Any) -> None:
             answered = anyio.Event()
-            calls.put(lambda: (value(), self._portal.start_task_soon(answered.set)))
+            call = partial(value, *map(self.shown, items))
+            calls.put(lambda: (call(), self._portal.start_task_soon(answered.set)))
             await answered.wait()
 
         if name == "progress" and value is not None:
@@ -142,8 +146,12 @@ _sessions: weakref.WeakSet[_Session] = weakref.WeakSet()
 class Proxy:
     """An object of the client. Its methods block, and its attributes are those of the object."""
 
+    _kinds: ClassVar[dict[type | None, type[Proxy]]] = {}  # by the class of the client's objects
     _session: _Session
     _target: Any
+
+    def __init_subclass__(cls, of: type | None = None) -> None:
+        cls._kinds[of] = cls
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
@@ -165,7 +173,7 @@ class Proxy:
         return shown
 
 
-class ParamClient(Proxy):
+class ParamClient(Proxy, of=asynchronous.ParamClient):
     """See `paramclient.ParamClient`: the same arguments and calls, without `await`."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -194,19 +202,16 @@ class ParamClient(Proxy):
         self.close()
 
 
-class Component(Proxy):
+class Component(Proxy, of=component.Component):
     """See `paramclient.Component`."""
 
 
-class Ftp(Proxy):
+class Ftp(Proxy, of=files.Ftp):
     """See `paramclient.Ftp`."""
 
 
-class Stream(Proxy):
+class Stream(Proxy, Iterator[Any]):
     """Items as they arrive: a `for` loop waits for each. Ctrl-C loses none."""
-
-    def __iter__(self) -> Self:
-        return self
 
     def __next__(self) -> Any:
         return self.next()
@@ -236,41 +241,37 @@ class Stream(Proxy):
             taken.append(await anext(self._target))
 
 
-class Changes(Stream):
+class Changes(Stream, of=streams.Changes):
     """See `paramclient.Changes`."""
 
 
-class Events(Stream):
+class Events(Stream, of=events.Events):
     """See `paramclient.Events`."""
-
-
-_PROXIES: dict[type, type[Proxy]] = {
-    asynchronous.ParamClient: ParamClient,
-    component.Component: Component,
-    files.Ftp: Ftp,
-    streams.Changes: Changes,
-    events.Events: Events,
-}
 
 
 def blocking(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that takes a client or components with calls that block."""
 
     @wraps(function)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        if isinstance(args[0], Proxy):
-            return args[0]._session.run(function, *args, **kwargs)
-        vehicles, *rest = [list(args[0]), *args[1:]]
+    def call(first: Any, *args: Any, **kwargs: Any) -> Any:
+        if isinstance(first, Proxy):
+            return first._session.run(function, first, *args, **kwargs)
+        vehicles = list(first)
         sessions = {each._session for each in vehicles}
         if len(sessions) > 1:
             raise UsageError(
                 f"the vehicles belong to {len(sessions)} clients; make one call for those of each client"
             )
+
+        def answered(value: Any) -> Any:
+            """Return a function of a vehicle with its results, as it may make calls that block."""
+            return {each._target: value(each) for each in vehicles}.__getitem__ if callable(value) else value
+
+        args = tuple(map(answered, args))
+        kwargs = {name: each if name in CALLBACKS else answered(each) for name, each in kwargs.items()}
         if not sessions:
-            return anyio.run(partial(function, vehicles, *rest, **kwargs))
-        if callable(rest[0]):  # one result for each vehicle
-            rest[0] = {each._target: rest[0](each) for each in vehicles}.__getitem__
-        return sessions.pop().run(function, vehicles, *rest, **kwargs)
+            return anyio.run(partial(function, vehicles, *args, **kwargs))
+        return sessions.pop().run(function, vehicles, *args, **kwargs)
 
     return call
 

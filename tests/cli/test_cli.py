@@ -31,9 +31,9 @@ from paramclient.cli.options import LinkOptions
 from paramclient.errors import ClientClosed, ParamClientError, ParamErrorCode
 from paramclient.links import Peer, SimLink
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
-from paramclient.sim.param_table import Entry
 from paramclient.wire import frames, messages
 from tests.commands import Command, Outcome, Put, behind, in_process, leaping, strict
+from tests.conversations.virtual import Tap
 from tests.shell import in_simulated_time
 
 ROOT = Path(__file__).parents[2]
@@ -190,16 +190,8 @@ def test_fetch_prints_a_table_and_a_summary(command: Command, warm: Path) -> Non
     )
 
 
-class Gappy(GenericVehicle):
-    """A vehicle that never sends one of its parameters."""
-
-    def _send_value(self, entry: Entry, **where: Any) -> None:
-        if entry.name != "B":
-            super()._send_value(entry, **where)
-
-
 def test_missing_parameters_are_named(command: Command, put: Callable[[Endpoint], str]) -> None:
-    url = put(Gappy({"A": 1, "B": 2, "C": 3}))
+    url = put(GenericVehicle({"A": 1, "B": 2, "C": 3}, dead=["B"]))
     fetched = command("fetch", url, "--json", "--no-cache", "--timeout", 5)
     assert fetched.code == 1
     assert fetched.json["missing"] == [1]
@@ -213,9 +205,12 @@ class ListOnlyValues(PX4Vehicle):
 
     secret = next(row.name for row in px4_table() if row.volatile)
 
-    def _send_value(self, entry: Entry, **where: Any) -> None:
-        if entry.name != self.secret or self._position is not None:
-            super()._send_value(entry, **where)
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        secret = self.params[self.secret]
+        if not isinstance(message, messages.ParamRequestRead) or (
+            message.param_id != secret.name and message.param_index != secret.index
+        ):
+            super().respond(message, sender)
 
 
 def test_a_value_that_is_only_cached_is_missing(
@@ -230,6 +225,21 @@ def test_a_value_that_is_only_cached_is_missing(
     assert fetched.json["missing"] == [known["params"][ListOnlyValues.secret]["index"]]
     assert fetched.json["received"] == len(fetched.json["params"]) == 902
     assert ListOnlyValues.secret not in fetched.json["params"]
+
+
+def test_what_came_of_a_refresh_until_the_vehicle_was_lost_is_printed(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    known = command("fetch", put(PX4Vehicle()), "--json", "--cache", cache).json
+    messages_left = iter(range(300))
+    dying = Tap(PX4Vehicle(), down=lambda message: next(messages_left, None) is not None)
+    fetched = command("fetch", put(dying), "--refresh", "--json", "--cache", cache)
+    assert fetched.code == 1
+    found = fetched.json
+    assert 200 < found["received"] == len(found["params"]) == 903 - len(found["missing"]) < 300
+    assert found["params"].items() <= known["params"].items()
+    assert "paramclient: incomplete: " in fetched.err
 
 
 def test_the_system_and_the_component_can_be_chosen(command: Command) -> None:
@@ -300,24 +310,32 @@ def test_nan_can_be_forced(command: Command) -> None:
 class Unchanging(GenericVehicle):
     """A vehicle that keeps its values without a reason."""
 
-    def _write(self, entry: Entry, bits: int) -> None:
-        pass
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        if isinstance(message, messages.ParamSet):
+            message = messages.ParamRequestRead(self.system, self.component, message.param_id, -1)
+        super().respond(message, sender)
 
 
 class Mistyped(GenericVehicle):
     """A vehicle that reports a wrong type for every set."""
 
-    def _on_set(self, request: messages.ParamSet, sender: frames.Frame) -> None:
-        self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        if isinstance(message, messages.ParamSet):
+            self.send(
+                messages.ParamError(
+                    *(sender.system, sender.component, message.param_id, -1), ParamErrorCode.TYPE_MISMATCH
+                )
+            )
+        else:
+            super().respond(message, sender)
 
 
 class SilentOnParams(GenericVehicle):
     """A vehicle with heartbeats that answers no parameter requests."""
 
-    def _on_read(self, request: messages.ParamRequestRead, sender: frames.Frame) -> None:
-        pass
-
-    _on_set = _on_read  # type: ignore[assignment]  # the message is ignored
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        if not isinstance(message, messages.ParamRequestRead | messages.ParamSet):
+            super().respond(message, sender)
 
 
 @pytest.mark.parametrize(
@@ -521,15 +539,21 @@ def vehicle_lost_and_found() -> PX4Vehicle:
 
     class Restless(PX4Vehicle):
         begun_at: float | None = None
+        is_changed = False
 
         def tick(self, now: float) -> None:
             if self.begun_at is None:
                 self.begun_at = now
-            elif now > self.begun_at + 1.5 and self._heartbeat.base_mode:
-                self._heartbeat = replace(self._heartbeat, base_mode=0)
+            elif now > self.begun_at + 1.5 and not self.is_changed:
+                self.is_changed = True
                 self.set_param("B", 3)
                 self.reboot(now, down=8.0)
             super().tick(now)
+
+        def send(self, message: messages.Message) -> None:
+            if isinstance(message, messages.Heartbeat) and self.is_changed:
+                message = replace(message, base_mode=0)
+            super().send(message)
 
     return Restless(table={"A": 1, "B": 2})
 

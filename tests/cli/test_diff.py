@@ -18,7 +18,6 @@ from paramclient.links import SimLink
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, WireValue, bits_of
 from paramclient.sim import GenericVehicle, Vehicle
-from paramclient.sim.param_table import Entry
 from tests.caches import NOW, PX4, update
 from tests.commands import Command, in_process
 
@@ -272,14 +271,6 @@ def test_show_prints_a_file(command: Command, write: Callable[..., str]) -> None
 # Links
 
 
-class Gappy(GenericVehicle):
-    """A vehicle that never sends one of its parameters."""
-
-    def _send_value(self, entry: Entry, **where: Any) -> None:
-        if entry.name != "B":
-            super()._send_value(entry, **where)
-
-
 @pytest.fixture
 def vehicles(monkeypatch: pytest.MonkeyPatch) -> dict[str, Vehicle]:
     """Return the vehicles by URL; all other URLs have none."""
@@ -306,7 +297,7 @@ def test_two_links_are_fetched_concurrently(command: Command, vehicles: dict[str
 
 
 def test_parameters_missing_from_a_link_are_named(command: Command, vehicles: dict[str, Vehicle]) -> None:
-    vehicles["tcp:one:1"] = Gappy({"A": 1, "B": 2})
+    vehicles["tcp:one:1"] = GenericVehicle({"A": 1, "B": 2}, dead=["B"])
     vehicles["tcp:two:1"] = GenericVehicle({"A": 1, "B": 2})
     outcome = command("diff", "tcp:one:1", "tcp:two:1", "--timeout", 1)
     assert (outcome.code, outcome.out) == (1, "")

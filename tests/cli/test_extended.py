@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from paramclient.sim import Air, Camera, PX4Vehicle
+from paramclient.wire import messages
 from tests.commands import Command, Put, behind, in_process, leaping
 
 URL = "udpin:0.0.0.0:14550"
@@ -265,8 +266,7 @@ def test_the_history_of_extended_parameters(command: Command, put: Put) -> None:
 
 
 class Changing(Camera):
-    """A camera that sets one of its parameters itself after 5 s, removes another, and reports only the
-    first."""
+    """A camera that changes two of its parameters itself after 5 s, which another station then reads."""
 
     def tick(self, now: float) -> None:
         super().tick(now)
@@ -275,7 +275,8 @@ class Changing(Camera):
             self.set_ext_param("CAM_NAME", "Rear")
             self.set_ext_param("CAM_KEY", b"\xff")
             for name in ("CAM_NAME", "CAM_KEY"):
-                self._send_ext(self.ext_param(name))
+                request = messages.ParamExtRequestRead(self.system, self.component, name, -1)
+                self.receive(messages.encode(request, system=254, component=190, sequence=0), now)
 
 
 def changing() -> Camera:

@@ -12,7 +12,7 @@ import pytest
 
 from paramclient import ParamType
 from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
-from paramclient.wire import messages
+from paramclient.wire import frames, messages
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import Tap
 
@@ -220,17 +220,9 @@ def test_a_vehicle_that_falls_silent_has_an_outcome_for_each_value(command: Comm
     class Ending(ArduPilotVehicle):
         """A vehicle that answers nothing after its first set."""
 
-        def _on_set(self, request: Any, sender: Any) -> None:
-            if self.requests["PARAM_SET"] <= 1:
-                super()._on_set(request, sender)
-
-        def _on_read(self, request: Any, sender: Any) -> None:
-            if not self.requests["PARAM_SET"]:
-                super()._on_read(request, sender)
-
-        def _on_list(self) -> None:
-            if not self.requests["PARAM_SET"]:
-                super()._on_list()
+        def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+            if self.requests["PARAM_SET"] <= isinstance(message, messages.ParamSet):
+                super().respond(message, sender)
 
     table = [SimParam(f"P_{number}", ParamType.INT16, 3, default=1) for number in range(6)]
     done = command("reset", put(Ending(table=table, live=())), "P_*", "--json")

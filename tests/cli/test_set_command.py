@@ -10,6 +10,7 @@ import pytest
 
 from paramclient import ParamType
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
+from paramclient.wire import frames, messages
 from tests.commands import Command, Outcome, Put, behind, in_process, leaping
 
 NAMES = [f"P_{number:02}" for number in range(60)]
@@ -34,22 +35,14 @@ def put(monkeypatch: pytest.MonkeyPatch) -> Put:
 class Ending(GenericVehicle):
     """A vehicle that does something else instead of its 41st set, and sets nothing from then on."""
 
-    def _on_set(self, request: Any, sender: Any) -> None:
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
         if self.requests["PARAM_SET"] <= 40:
-            super()._on_set(request, sender)
-        elif self.requests["PARAM_SET"] == 41:
+            super().respond(message, sender)
+        elif isinstance(message, messages.ParamSet) and self.requests["PARAM_SET"] == 41:
             self.end()
 
-    def _on_read(self, request: Any, sender: Any) -> None:
-        if self.requests["PARAM_SET"] <= 40:
-            super()._on_read(request, sender)
-
-    def _on_list(self) -> None:
-        if self.requests["PARAM_SET"] <= 40:
-            super()._on_list()
-
     def end(self) -> None:
-        """Keep silent from now on, also about reads and lists."""
+        """Keep silent from now on."""
 
 
 class Interrupting(Ending):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import pty
 import re
@@ -19,6 +20,7 @@ import pytest
 from paramclient import ParamCache, ParamType, read_file
 from paramclient.model.values import WireValue
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle
+from paramclient.wire import frames, messages
 from tests.commands import Command, Put, behind, in_process, leaping
 
 TABLE: dict[str, WireValue | tuple[ParamType, WireValue]] = {
@@ -490,11 +492,11 @@ def test_a_restore_of_all_vehicles_must_be_confirmed(
 class Interrupting(GenericVehicle):
     """A vehicle during whose twelfth PARAM_SET the user presses Ctrl-C."""
 
-    def _on_set(self, request: Any, sender: Any) -> None:
-        if self.requests["PARAM_SET"] == 12:
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        if isinstance(message, messages.ParamSet) and self.requests["PARAM_SET"] == 12:
             signal.raise_signal(signal.SIGINT)
         else:
-            super()._on_set(request, sender)
+            super().respond(message, sender)
 
 
 @pytest.mark.parametrize("as_json", [False, True])
@@ -525,10 +527,10 @@ def test_ctrl_c_prints_the_outcomes_so_far(
 class Dying(GenericVehicle):
     """Says nothing any more after 12 writes."""
 
-    def _on_set(self, request: Any, sender: Any) -> None:
-        super()._on_set(request, sender)
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        super().respond(message, sender)
         if self.requests["PARAM_SET"] == 12:
-            self._switch_on(float("inf"))
+            self.reboot(down=math.inf)
 
 
 @pytest.mark.parametrize("options", [[], ["--vehicle", "1"]])

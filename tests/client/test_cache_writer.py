@@ -260,9 +260,9 @@ class Reticent(PX4Vehicle):
 
     unanswered: tuple[type[messages.Message], ...] = ()
 
-    def _take(self, frame: frames.Frame) -> None:
-        if not isinstance(messages.decode(frame), self.unanswered):
-            super()._take(frame)
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        if not isinstance(message, self.unanswered):
+            super().respond(message, sender)
 
 
 PARAMETER_REQUESTS = (messages.ParamRequestRead, messages.ParamRequestList)

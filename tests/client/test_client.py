@@ -361,9 +361,12 @@ async def test_a_write_that_the_vehicle_adjusts() -> None:
 class Retyping(GenericVehicle):
     """It calls its parameters REAL32 when they are read, and INT32 when they are written."""
 
-    def _on_set(self, request: messages.ParamSet, sender: frames.Frame) -> None:
-        kind = ParamType.REAL32 if request.param_type == ParamType.INT32 else ParamType.INT32
-        self._send(messages.ParamValue(request.param_id, request.raw, kind, 24, 1))
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        if isinstance(message, messages.ParamSet):
+            kind = ParamType.REAL32 if message.param_type == ParamType.INT32 else ParamType.INT32
+            self.send(messages.ParamValue(message.param_id, message.raw, kind, 24, 1))
+        else:
+            super().respond(message, sender)
 
 
 @in_simulated_time
@@ -562,7 +565,7 @@ async def test_several_vehicles_are_fetched_side_by_side() -> None:
 class Silent(GenericVehicle):
     """A component that sends heartbeats and nothing else."""
 
-    def _take(self, frame: frames.Frame) -> None:
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
         return
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import anyio
 import pytest
 
-from paramclient import Component, ParamCache, ParamClient, SetStatus
+from paramclient import Component, ParamCache, ParamClient, SetStatus, SyncState
 from paramclient.cli.json_output import FetchJson, WriteJson, as_json
 from paramclient.cli.json_setup import ApplyJson
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -20,15 +20,16 @@ from tests.conversations.virtual import Silence
 from tests.shell import in_simulated_time
 
 KINDS = pytest.mark.parametrize("kind", ["px4", "ardupilot", "list", "generic"])
+DELAYS = pytest.mark.parametrize("delay", [0.05, 0.4, 1.25], ids=lambda delay: f"{2 * delay}s")
 TIME_MAX = 7.0
 
 
 class World:
-    """A vehicle on a link with a round trip of 100 ms, which goes silent when a condition holds."""
+    """A vehicle on a link with a delay each way, which goes silent when a condition holds."""
 
-    def __init__(self, kind: str) -> None:
+    def __init__(self, kind: str, delay: float = 0.05) -> None:
         self.vehicle: Vehicle = new_vehicle(kind)
-        self.endpoint = Silence(Air.symmetric([self.vehicle], delay=0.05), at=1e9)
+        self.endpoint = Silence(Air.symmetric([self.vehicle], delay=delay), at=1e9)
         floats = [each.name for each in self.vehicle.listed if each.type is ParamType.REAL32]
         self.wanted = {name: 0.25 + number for number, name in enumerate(plain(floats)[:150])}
 
@@ -56,9 +57,10 @@ def plain(names: list[str]) -> list[str]:
 
 
 @KINDS
+@DELAYS
 @in_simulated_time
-async def test_fetch(kind: str) -> None:
-    world = World(kind)
+async def test_fetch(kind: str, delay: float) -> None:
+    world = World(kind, delay)
     received = [0]
     async with ParamClient(world.endpoint, cache=False) as client:
         component = await client.component()
@@ -74,22 +76,64 @@ async def test_fetch(kind: str) -> None:
                 component,
                 result,
                 result.params.values(),
-                missing=[*result.missing],
-                cached=[],
                 bytes_received=0,
                 bytes_sent=0,
                 described={},
             )
             assert as_json(shown)["params"].keys() == result.params.keys()
 
-        began = anyio.current_time()  # a file has no progress before the number of parameters is known
+        began = anyio.current_time()
+        cut_off_after = 6 * delay if kind == "ardupilot" else 1e9  # its file shows no progress before the end
+        await world.until_silent(
+            lambda: received[-1] > 120 or anyio.current_time() > began + cut_off_after, call
+        )
+
+
+@pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
+@in_simulated_time
+async def test_a_refresh_of_a_cached_table(kind: str, tmp_path: Path) -> None:
+    world = World(kind)
+    cache = tmp_path / "cache.sqlite3"
+    async with ParamClient(world.endpoint, cache=cache) as client:
+        count = (await (await client.component()).fetch_all()).count
+    with ParamCache(cache) as opened:
+        synced_at = opened.component(system=1).synced_at
+    received = [0]
+    world.vehicle.load(world.wanted)
+    async with ParamClient(world.endpoint, cache=cache) as client:
+        component = await client.component()
+        await anyio.sleep(2.0)
+
+        async def call() -> None:
+            result = await component.fetch_all(
+                refresh=True, progress=lambda each: received.append(each.received)
+            )
+            assert not result.complete
+            assert result.hash is None
+            assert (result.count, len(result.params)) == (count, count)
+            assert {result.params[name].index for name in result.cached} == set(result.missing)
+            assert 50 < result.received == count - len(result.cached)
+            wrong = {
+                name
+                for name, param in result.params.items()
+                if not param.same_value(world.vehicle.param(name))
+            }
+            assert wrong <= set(result.cached)
+
+        began = anyio.current_time()
         await world.until_silent(lambda: received[-1] > 120 or anyio.current_time() > began + 0.3, call)
+        world.endpoint.at = 1e9
+        await anyio.sleep(2.0)
+        assert (component.state, component.sync_state) == ("cached", SyncState.UNSYNCED)
+    with ParamCache(cache) as opened:
+        assert opened.component(system=1).synced_at == synced_at
 
 
 @KINDS
+@DELAYS
 @in_simulated_time
-async def test_set_many(kind: str, tmp_path: Path) -> None:
-    world = World(kind)
+async def test_set_many(kind: str, delay: float, tmp_path: Path) -> None:
+    world = World(kind, delay)
     cache = tmp_path / "cache.sqlite3"
     async with ParamClient(world.endpoint, cache=cache) as client:
         component = await client.component()

@@ -30,6 +30,7 @@ from paramclient.client import signing
 from paramclient.client.signing import key_from_environment
 from paramclient.links import SimLink
 from paramclient.sim import ArduPilotVehicle, Vehicle
+from paramclient.wire import frames, messages
 from paramclient.wire.signing import UNITS_PER_SECOND, Refusal
 from tests.shell import VALUES, in_simulated_time, simulated_time_loop, small_px4
 
@@ -388,6 +389,17 @@ def test_a_key_is_changed_with_the_one_before(
     assert vehicle.signing_key == OTHER_KEY
 
 
+def ignore_keys(monkeypatch: pytest.MonkeyPatch, vehicle: Vehicle) -> None:
+    """Let a vehicle ignore SETUP_SIGNING."""
+    respond = vehicle.respond
+
+    def ignore(message: messages.Message, sender: frames.Frame) -> None:
+        if not isinstance(message, messages.SetupSigning):
+            respond(message, sender)
+
+    monkeypatch.setattr(vehicle, "respond", ignore)
+
+
 def test_a_vehicle_that_does_not_obey_is_found_out(
     put: Callable[[Vehicle], str],
     key_file: Path,
@@ -396,12 +408,12 @@ def test_a_vehicle_that_does_not_obey_is_found_out(
 ) -> None:
     """Firmware without signing, and one that takes no orders over this link."""
     deaf = small_px4()
-    monkeypatch.setattr(deaf, "_take_key", lambda *_: None)
+    ignore_keys(monkeypatch, deaf)
     code, out, err = command("signing", "setup", put(deaf), "--signing-key", key_file, "--link-is-safe")
     assert (code, out) == (1, "")
     assert "1/1 answers, but does not sign with the key" in err
     stubborn = signed_vehicle(usb=True)
-    monkeypatch.setattr(stubborn, "_take_key", lambda *_: None)
+    ignore_keys(monkeypatch, stubborn)
     code, out, err = command("signing", "disable", put(stubborn), "--link-is-safe")
     assert (code, out) == (1, "")
     assert "1/1 still signs" in err

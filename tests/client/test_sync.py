@@ -336,6 +336,29 @@ async def test_a_reboot_is_reported() -> None:
 
 
 @in_simulated_time
+async def test_a_table_is_checked_after_a_fetch_during_which_the_vehicle_rebooted() -> None:
+    vehicle = small_px4(burst=1, period=0.1, hash_check=False)
+    tap = Tap(vehicle)
+    async with a_client(tap) as client:
+        component = await client.component()
+        events = client.events()
+        await asyncio.sleep(5.0)
+        async with asyncio.timeout(20.0), asyncio.TaskGroup() as tasks:
+            fetching = tasks.create_task(component.fetch_all())
+            await until(lambda: len(component.params) > 8, pause=0.01)
+            vehicle.reboot(anyio.current_time(), down=1.5)
+            vehicle.load({"PARAM_01": 1001})
+            tap.is_deaf = True
+            assert isinstance(await anext(events), Rebooted)
+            tap.is_deaf = False
+        assert fetching.result().params["PARAM_01"].value == 1
+        assert state(component) is SyncState.CHECKING
+        await asyncio.sleep(10.0)
+        assert state(component) is SyncState.SYNCED
+        assert bits(component.params) == bits(vehicle.params)
+
+
+@in_simulated_time
 async def test_a_write_waits_until_it_is_known_who_it_is() -> None:
     vehicle = small_px4()
     tap = Tap(vehicle)
@@ -373,6 +396,27 @@ async def test_a_link_that_was_disconnected_is_checked_like_a_loss(seconds: floa
         assert resynced == Resynced(component, ("PARAM_01",), vehicle.announced_hash())
         assert [type(event) for event in lost] == ([Lost, Found] if seconds > 5 else [])
         assert bits(component.params) == bits(vehicle.params)
+
+
+@in_simulated_time
+async def test_a_watch_survives_a_link_that_drops_during_a_check() -> None:
+    vehicle = small_px4()
+    tap = Tap(vehicle)
+    link = FlakyLink(tap)
+    async with a_client(link, watch_interval=5.0) as client:
+        component = await client.component()
+        await component.fetch_all()
+        tap.received.clear()
+        tap.is_deaf = True
+        await until(lambda: hashes(tap), pause=0.01)
+        await link.drop(stays_offline=True)
+        await asyncio.sleep(15.0)  # requests fail after 10 s
+        tap.is_deaf = link.is_offline = False
+        await asyncio.sleep(15.0)
+        assert state(component) is SyncState.SYNCED
+        await change_silently(tap, vehicle, PARAM_01=1001)
+        await asyncio.sleep(6.0)
+        assert component.params["PARAM_01"].value == 1001
 
 
 # another vehicle in its place, and the cache

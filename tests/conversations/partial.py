@@ -9,6 +9,7 @@ from paramclient import Encoding, ParamType
 from paramclient.model.values import encode_value
 from paramclient.wire.messages import (
     COMP_ID_ALL,
+    AutopilotVersion,
     CommandAck,
     CommandLong,
     Message,
@@ -38,6 +39,7 @@ class Partial(Puppet):
         count: returns the param_count of an index.
         encoding: of the values.
         ack_type: the type in acknowledgements; None for the parameter's.
+        version: answers requests for it; None for a refusal.
         asked_as: the component id under which it is asked, if that is not its own.
         options: as of `Puppet`.
     """
@@ -51,6 +53,7 @@ class Partial(Puppet):
         count: Callable[[int], int] | None = None,
         encoding: Encoding = Encoding.BYTEWISE,
         ack_type: ParamType | None = None,
+        version: AutopilotVersion | None = None,
         asked_as: int | None = None,
         **options: Any,
     ) -> None:
@@ -61,6 +64,7 @@ class Partial(Puppet):
         self._first = first
         self._count = count or (lambda index: len(table))
         self._ack_type = ack_type
+        self._version = version
         self._target = options.get("component", 1) if asked_as is None else asked_as
 
     def number_of(self, kind: type[Message]) -> int:
@@ -89,4 +93,4 @@ class Partial(Puppet):
                 if "acks" in self._serves:
                     yield self._value(name, self._ack_type)
             case CommandLong(command=command) if "commands" in self._serves:
-                yield CommandAck(command, 3)
+                yield CommandAck(command, 3) if self._version is None else self._version

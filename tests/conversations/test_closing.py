@@ -8,7 +8,7 @@ import anyio
 import pytest
 
 from paramclient import ClientClosed, Component, LinkError, ParamClient
-from paramclient.sim import PX4Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.conversations.virtual import run
 from tests.shell import FlakyLink
 
@@ -42,6 +42,31 @@ def test_closing_ends_a_call_of_another_task_at_once(call: str, backend: str) ->
             closed_at = anyio.current_time()
         assert anyio.current_time() - closed_at < 0.1
         assert [type(error) for error in errors] == [ClientClosed]
+
+    run(test, backend=backend)
+
+
+@BACKENDS
+def test_a_call_that_begins_while_a_file_is_closed_on_board_ends_too(backend: str) -> None:
+    async def test() -> None:
+        vehicle = ArduPilotVehicle()
+        client = ParamClient(Air.symmetric([vehicle], delay=0.3), cache=False)
+        errors: list[LinkError] = []
+
+        async def fetch(component: Component) -> None:
+            with pytest.raises(LinkError) as caught:
+                await component.fetch_all()
+            errors.append(caught.value)
+
+        async with anyio.create_task_group() as tasks:
+            await client.open()
+            component = await client.component()
+            tasks.start_soon(fetch, component)
+            await anyio.sleep(1.3)
+            tasks.start_soon(client.aclose)
+            await anyio.sleep(0.01)
+            tasks.start_soon(fetch, component.ext)
+        assert [type(error) for error in errors] == [ClientClosed] * 2
 
     run(test, backend=backend)
 

@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from paramclient.model.values import ParamType
 from paramclient.protocol.events import Change
+from paramclient.protocol.node import Node
 from paramclient.protocol.station import Station
 from paramclient.wire import messages
 from paramclient.wire.frames import Framer
@@ -19,14 +20,17 @@ from tests.conversations.virtual import run
 def test_a_value_before_the_first_heartbeat_is_reported_as_the_vehicle_means_it() -> None:
     async def session() -> None:
         changes: list[Change] = []
+
+        def discovered(node: Node) -> None:
+            node.plain.table.changed = changes.append
+
         async with anyio.create_task_group() as tasks:
             station = Station(
                 link="sim:test",
                 is_stream=False,
                 send=lambda data, peer: None,
                 spawn=tasks.start_soon,
-                emit=lambda node, event: None,
-                changed=lambda node, session, change: changes.append(change),
+                discovered=discovered,
             )
             said = partial(messages.encode, system=1, component=1)
 
@@ -54,8 +58,6 @@ def test_the_heartbeat_of_a_vehicle_that_sends_other_messages_is_requested() -> 
                 is_stream=False,
                 send=lambda data, peer: sent.append(data),
                 spawn=tasks.start_soon,
-                emit=lambda node, event: None,
-                changed=lambda node, session, change: None,
             )
             attitude = mavlink.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0)
             for number in range(5):

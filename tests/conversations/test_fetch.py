@@ -8,11 +8,12 @@ from dataclasses import replace
 import anyio
 import pytest
 
-from paramclient.errors import NoReply
+from paramclient.errors import NoReply, ParamErrorCode
 from paramclient.model.values import Trust
 from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle, px4_table
-from tests.conversations.virtual import Silence, converse, run
+from paramclient.wire.messages import HASH_CHECK, Message, ParamError, ParamRequestRead
+from tests.conversations.virtual import Silence, Tap, converse, run
 
 BACKENDS = pytest.mark.parametrize("backend", ["trio", "asyncio"])
 
@@ -192,6 +193,46 @@ def test_silent_mavftp_costs_at_most_one_and_a_half_seconds() -> None:
             return (await fetch_all(node.plain)).elapsed
 
     assert run(lambda: elapsed(0.0, asks=True)) - run(lambda: elapsed(0.0, asks=False)) < 1.5
+
+
+@pytest.mark.parametrize("code", ParamErrorCode)
+def test_a_hash_that_is_refused_for_any_reason_is_no_hash(code: ParamErrorCode) -> None:
+    async def main() -> None:
+        def up(message: Message) -> bool:
+            is_hash = isinstance(message, ParamRequestRead) and message.param_id == HASH_CHECK
+            if is_hash:
+                conversation.hear(ParamError(255, 190, HASH_CHECK, -1, code))
+            return not is_hash
+
+        vehicle = PX4Vehicle(hash_check=False)
+        async with converse(Tap(vehicle, up=up)) as conversation:
+            node = await conversation.node()
+            for _ in range(2):
+                check_right(vehicle, await fetch_all(node.plain))
+
+    run(main)
+
+
+def test_a_value_outside_the_hash_that_is_not_received_is_missing() -> None:
+    async def main() -> None:
+        vehicle = PX4Vehicle()
+        secret = vehicle.param(next(row.name for row in px4_table() if row.volatile))
+
+        def up(message: Message) -> bool:
+            return not (isinstance(message, ParamRequestRead) and message.param_id == secret.name)
+
+        async with converse(Tap(vehicle, up=up)) as conversation:
+            node = await conversation.node()
+            await fetch_all(node.plain)
+            node.plain.table.doubt()
+            vehicle.load({secret.name: 9.5})
+            result = await fetch_all(node.plain)
+            assert (result.source, result.complete) == ("cache", False)
+            assert (result.missing, result.cached) == ((secret.index,), (secret.name,))
+            assert result.params[secret.name].trust is Trust.CACHED
+            assert any(secret.name in note for note in result.notes)
+
+    run(main)
 
 
 def test_policies_limit_what_is_sent() -> None:

@@ -17,7 +17,7 @@ from paramclient.errors import (
     NoReply,
     VehicleArmed,
 )
-from paramclient.model.values import Encoding, ParamType, encode_value
+from paramclient.model.values import Encoding, ParamType, Trust, encode_value
 from paramclient.protocol.commands import reboot, request_message, send_command
 from paramclient.protocol.events import Found, Identified, Lost, Rebooted, Replaced
 from paramclient.protocol.fetch import fetch_all
@@ -451,6 +451,23 @@ async def test_the_same_hardware_id_proves_that_a_vehicle_has_moved() -> None:
 
 
 @virtual
+async def test_a_vehicle_at_another_peer_may_be_another_one_until_it_is_identified() -> None:
+    async with converse(Nothing()) as conversation:
+        conversation.hear(HighLatency2(2, 12), peer="a")  # it counts as lost only after a minute
+        conversation.hear(AutopilotVersion(0, uid=7), peer="a")
+        conversation.hear(ParamValue("A", b"\1\0\0\0", 6, 10, 0), peer="a")
+        node = conversation.station.nodes[1, 1]
+        await anyio.sleep(5.5)
+        asked = len(conversation.sent_of(CommandLong))
+        conversation.hear(HighLatency2(2, 12), peer="b")
+        await anyio.sleep(0.1)
+        assert node.plain.table.params["A"].trust is Trust.CACHED
+        assert len(conversation.sent_of(CommandLong)) > asked
+        conversation.hear(AutopilotVersion(0, uid=8), peer="b")
+        assert (node.peer, len(conversation.of(Replaced))) == ("b", 1)
+
+
+@virtual
 async def test_split_peers_are_components_of_their_own() -> None:
     async with converse(Nothing(), split_peers=True) as conversation:
         for peer in (("10.0.0.1", 1), ("10.0.0.2", 1)):
@@ -581,13 +598,12 @@ async def test_the_only_autopilot_is_chosen_and_peripherals_and_stations_do_not_
         conversation.hear(CAMERA, component=100)
         conversation.hear(GCS, system=254, component=190)
         conversation.hear(Heartbeat(18, 0, system_status=4), system=2, component=191)  # a companion computer
-        assert choose(None, None, 5.0)[0] is None
+        assert choose(None, None, 5.0) is None
         conversation.hear(PX4)
-        found, due = choose(None, None, 5.0)
-        assert (found, due) == (None, 6.2)
-        assert choose(None, None, 6.2)[0] is nodes[1, 1]
-        assert choose(1, None, 5.0)[0] is nodes[1, 1]
-        assert choose(1, 100, 5.0)[0] is nodes[1, 100]
+        assert choose(None, None, 5.0) == 6.2
+        assert choose(None, None, 6.2) is nodes[1, 1]
+        assert choose(1, None, 5.0) is nodes[1, 1]
+        assert choose(1, 100, 5.0) is nodes[1, 100]
         assert find(nodes.values(), None, None, None) is nodes[1, 1]
         conversation.hear(ARDUPILOT, system=3)
         with pytest.raises(AmbiguousVehicle, match="1/1 PX4 quadrotor, 3/1 ArduPilot rover"):

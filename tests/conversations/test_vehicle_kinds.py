@@ -20,16 +20,24 @@ from paramclient import (
 )
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read
-from paramclient.protocol.writes import write
-from paramclient.sim import Air, GenericVehicle
+from paramclient.protocol.set_results import SetStatus
+from paramclient.protocol.writes import write, write_many
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from paramclient.wire.messages import (
+    CAPABILITY_FTP,
+    CAPABILITY_PARAM_ENCODE_BYTEWISE,
+    AutopilotVersion,
     Heartbeat,
+    ParamRequestList,
+    ParamRequestRead,
     ParamSet,
+    ParamValue,
 )
 from tests.conversations.partial import EVERYTHING, TABLE, Partial
 from tests.conversations.virtual import QUIET, Puppet, Tap, converse, virtual
 
 ARDUPILOT = Heartbeat(2, 3, system_status=4)
+PX4 = Heartbeat(2, 12, system_status=4)
 RADIO = Heartbeat(49, 0, system_status=4)
 NO_AUTOPILOT = Heartbeat(2, 8, system_status=4)
 ONBOARD_COMPUTER = Heartbeat(18, 0, system_status=4)
@@ -123,6 +131,42 @@ async def test_odd_indices_and_counts_make_a_complete_table(options: dict[str, A
         }
 
 
+@pytest.mark.parametrize("serves", [EVERYTHING, ("list",)], ids=["reads", "list only"])
+@pytest.mark.parametrize("loss", [0.1, 0.2])
+@virtual
+async def test_a_list_whose_count_grows_is_never_complete_without_its_end(
+    loss: float, serves: tuple[str, ...]
+) -> None:
+    table = {f"P{number:02}": (number, ParamType.INT32) for number in range(40)}
+    for seed in range(12):
+        vehicle = Partial(table, serves=serves, count=lambda index: index + 1)
+        async with converse(Air.symmetric([vehicle], loss=loss, seed=seed)) as conversation:
+            result = await fetch_all((await conversation.node()).plain)
+            assert not result.complete or len(result.params) == 40
+
+
+@pytest.mark.parametrize("interval", [0.3, 0.7, 1.0])
+@pytest.mark.parametrize("heartbeat", [QUIET, PX4], ids=["generic", "PX4"])
+@virtual
+async def test_a_slow_list_whose_count_grows_is_received_to_its_end(
+    interval: float, heartbeat: Heartbeat
+) -> None:
+    async with converse(Puppet(lambda message: (), heartbeat=heartbeat)) as conversation:
+        node = await conversation.node()
+
+        async def send_list() -> None:
+            while not conversation.sent_of(ParamRequestList):  # noqa: ASYNC110 - in virtual time
+                await anyio.sleep(0.01)
+            for index in range(12):
+                conversation.hear(ParamValue(f"P{index}", bytes(4), ParamType.REAL32, index + 1, index))
+                await anyio.sleep(interval)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(send_list)
+            result = await fetch_all(node.plain)
+            assert (result.complete, len(result.params)) == (True, 12)
+
+
 @pytest.mark.parametrize("too_many", [1, 3_000])
 @virtual
 async def test_a_count_that_is_too_large_costs_seconds_and_no_value(too_many: int) -> None:
@@ -160,17 +204,23 @@ async def test_a_name_that_no_file_can_hold_is_noted_and_not_missed(name: str) -
 
 
 @pytest.mark.parametrize(
-    ("heartbeat", "encoding"),
-    [(ARDUPILOT, Encoding.BYTEWISE), (QUIET, Encoding.C_CAST)],
-    ids=["AP", "generic"],
+    ("heartbeat", "capabilities", "encoding"),
+    [
+        (ARDUPILOT, None, Encoding.BYTEWISE),
+        (ARDUPILOT, CAPABILITY_FTP, Encoding.BYTEWISE),
+        (QUIET, None, Encoding.C_CAST),
+        (PX4, CAPABILITY_PARAM_ENCODE_BYTEWISE, Encoding.C_CAST),
+    ],
+    ids=["AP", "AP with version", "generic", "PX4 with version"],
 )
 @pytest.mark.parametrize("name", ["MODE", "OFFSET", "ZERO"])
 @virtual
 async def test_integers_in_another_encoding_are_told_and_not_written(
-    heartbeat: Heartbeat, encoding: Encoding, name: str
+    heartbeat: Heartbeat, capabilities: int | None, encoding: Encoding, name: str
 ) -> None:
     table = {"ZERO": (0, ParamType.INT32), **TABLE}
-    vehicle = Partial(table, heartbeat=heartbeat, encoding=encoding)
+    version = None if capabilities is None else AutopilotVersion(capabilities, uid=7)
+    vehicle = Partial(table, heartbeat=heartbeat, encoding=encoding, version=version)
     async with converse(vehicle) as conversation:
         session = (await conversation.node()).plain
         with pytest.raises(UsageError, match=rf"was not written.*--encoding {encoding}"):
@@ -180,7 +230,9 @@ async def test_integers_in_another_encoding_are_told_and_not_written(
         assert any(f"--encoding {encoding}" in note for note in (await fetch_all(session)).notes)
     async with converse(vehicle, encoding=encoding) as conversation:
         session = (await conversation.node()).plain
+        asked = vehicle.number_of(ParamRequestRead)
         assert (await write(session, name, 9)).status == "accepted"
+        assert vehicle.number_of(ParamRequestRead) == asked + 1
         assert (await fetch_all(session)).params["NODE_ID"].value == 3
         assert not session.encoding_doubt
 
@@ -198,6 +250,22 @@ async def test_right_encodings_are_not_doubted() -> None:
             session = (await conversation.node()).plain
             await fetch_all(session)
             assert not session.encoding_doubt
+
+
+@pytest.mark.parametrize("maker", [PX4Vehicle, ArduPilotVehicle])
+@virtual
+async def test_the_encoding_is_looked_for_once_and_within_a_round_trip(maker: type[PX4Vehicle]) -> None:
+    vehicle = maker()
+    zeros = [each.name for each in vehicle.listed if each.type is ParamType.INT32 and not each.value][:20]
+    async with converse(Air.symmetric([vehicle], delay=0.1)) as conversation:
+        session = (await conversation.node()).plain
+        await anyio.sleep(1.0)
+        outcomes = (await write_many(session, [(name, 1) for name in zeros])).outcomes
+        assert {each.status for each in outcomes} <= {SetStatus.ACCEPTED, SetStatus.REFUSED}
+        asked = vehicle.requests["PARAM_REQUEST_READ"]
+        assert len(zeros) < asked <= len(zeros) + 8
+        await write(session, zeros[0], 0)
+        assert vehicle.requests["PARAM_REQUEST_READ"] == asked
 
 
 # addresses

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable
+from collections.abc import Awaitable, Callable, Iterable
+from dataclasses import replace
 
 import anyio
 import pytest
 
 from paramclient.errors import (
+    AnotherVehicle,
     LinkError,
     NoReply,
     ParamClientError,
@@ -22,12 +24,13 @@ from paramclient.errors import (
 )
 from paramclient.model.values import ParamType, Trust, WireValue
 from paramclient.protocol.fetch import fetch_all
-from paramclient.protocol.reads import read
+from paramclient.protocol.reads import read, read_many, read_param
 from paramclient.protocol.session import Session
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetStatus
 from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, OtherStation, PX4Vehicle, SimParam
 from paramclient.wire.messages import (
+    NO_INDEX,
     AutopilotVersion,
     CommandLong,
     Message,
@@ -397,6 +400,134 @@ async def test_writes_to_one_name_follow_each_other() -> None:
                 await anyio.sleep(0.001)
         assert vehicle.param("MC_ROLL_P").value == 3.0
         assert [each.new.value for each in conversation.changes if each.new][-3:] == [1.0, 2.0, 3.0]
+
+
+@virtual
+async def test_values_of_one_parameter_are_set_in_the_order_of_the_call() -> None:
+    vehicle = ArduPilotVehicle()
+    names = ["RTL_ALT", "rtl_alt"]
+    async with converse(Air.symmetric([vehicle], delay=0.01)) as conversation:
+        session = (await conversation.node()).plain
+        values = [1000.0 + number for number in range(12)]
+        await many(session, [(names[number % 2], value) for number, value in enumerate(values)])
+        sent = [struct.unpack("<f", each.raw)[0] for each in conversation.sent_of(ParamSet)]
+        assert sent == values
+        assert vehicle.param("RTL_ALT").value == values[-1]
+
+
+@virtual
+async def test_an_acknowledgement_to_another_station_changes_no_type() -> None:
+    """ArduPilot acknowledges the set of a default as REAL32, whatever the type is."""
+    vehicle = ArduPilotVehicle(live_period=0.0)
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        await fetch_all(session)
+        before = session.table.params["RTL_ALT"]
+        acknowledgement = struct.pack("<f", 1500.0), ParamType.REAL32, session.table.count or 0, NO_INDEX
+        conversation.hear(ParamValue("RTL_ALT", *acknowledgement))
+        assert session.table.params["RTL_ALT"] == replace(before, value=1500, bits=1500)
+        result = await write(session, "RTL_ALT", 1600)
+        assert (result.status, result.param.type, result.attempts) == ("accepted", before.type, 1)
+        assert [each.param_type for each in conversation.sent_of(ParamSet)] == [before.type]
+        assert vehicle.param("RTL_ALT").value == 1600
+
+
+# another vehicle
+
+
+@virtual_on_both
+@pytest.mark.parametrize("doubt", ["its clock", "an interrupted link"])
+@pytest.mark.parametrize("is_same", [False, True], ids=["another", "the same"])
+async def test_no_set_is_sent_to_another_vehicle_and_a_rebooted_one_gets_the_others(
+    doubt: str, is_same: bool
+) -> None:
+    first, other = PX4Vehicle(uid=1), PX4Vehicle(uid=2)
+    async with converse(place := Tap(Air.symmetric([first], delay=0.05))) as conversation:
+        session = (await conversation.node()).plain
+        await fetch_all(session)
+        await anyio.sleep(30.0)
+        floats = [each.name for each in first.listed if each.type is ParamType.REAL32]
+        names = [name for name in floats if not name.startswith(("MPC", "LNDMC"))][:150]
+        results: list[SetManyResult] = []
+
+        async def set_all() -> None:
+            results.append(await write_many(session, [(name, 0.125) for name in names]))
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(set_all)
+            await anyio.sleep(0.25)
+            if doubt == "an interrupted link":
+                conversation.station.interrupt()
+            if is_same:
+                first.reboot(anyio.current_time(), down=1.0)
+            place.up = place.down = lambda message: False
+            await anyio.sleep(1.0)
+            place.up = place.down = lambda message: True
+            if not is_same:
+                place.endpoint = Air.symmetric([other], delay=0.05)
+            if doubt == "an interrupted link":
+                conversation.station.resume(anyio.current_time())
+        (result,) = results
+        if is_same:
+            assert {each.status for each in result.outcomes} == {SetStatus.ACCEPTED}
+            assert all(first.param(name).value == 0.125 for name in names)
+            return
+        assert not other.requests["PARAM_SET"]
+        assert isinstance(result.error, AnotherVehicle)
+        assert result.counts[SetStatus.ACCEPTED] + result.counts[SetStatus.UNKNOWN] <= 80
+        assert result.counts[SetStatus.NOT_TRIED] >= 70
+        assert all(each.is_set or each.error is not None for each in result.outcomes)
+        assert (await write(session, names[-1], 0.5)).status == "accepted"
+        assert other.param(names[-1]).value == 0.5
+
+
+@virtual
+async def test_no_set_is_sent_to_a_vehicle_that_does_not_say_again_which_one_it_is() -> None:
+    async with converse(endpoint := Tap(PX4Vehicle())) as conversation:
+        session = (await conversation.node()).plain
+        await read(session, "MC_ROLL_P")
+        await anyio.sleep(1.0)
+        endpoint.up = lambda message: not isinstance(message, CommandLong)
+        conversation.station.interrupt()
+        conversation.station.resume(anyio.current_time())
+        began = anyio.current_time()
+        with pytest.raises(NoReply, match="the identity of 1/1"):
+            await write(session, "MC_ROLL_P", 3.5)
+        assert anyio.current_time() - began < 10.0
+        assert not conversation.sent_of(ParamSet)
+        endpoint.up = lambda message: True
+        assert (await write(session, "MC_ROLL_P", 3.5)).status == "accepted"
+
+
+@virtual_on_both
+async def test_another_vehicle_behind_a_value_ends_a_write_and_no_read() -> None:
+    params = {"A": (struct.pack("<f", 5.0), 9), "B": (struct.pack("<f", 6.0), 9)}
+    vehicle = table_puppet(params)
+    calls: list[tuple[str, Callable[[Session], Awaitable[object]]]] = [
+        ("AnotherVehicle", lambda session: write(session, "A", 1.0)),
+        ("Param", lambda session: read_param(session, "A")),
+        ("NoneType", lambda session: read_many(session, ["A", "B"], lambda name, result: None)),
+    ]
+    async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
+        session = (await conversation.node()).plain
+        await anyio.sleep(3.0)
+        outcomes: list[str] = []
+
+        async def run_call(call: Callable[[Session], Awaitable[object]]) -> None:
+            try:
+                outcomes.append(type(await call(session)).__name__)
+            except ParamClientError as error:
+                outcomes.append(type(error).__name__)
+
+        for uid, (_, call) in enumerate(calls, start=20):
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(run_call, call)
+                await anyio.sleep(0.05)
+                conversation.hear(ParamValue("A", *params["A"], 2, 0))
+                conversation.hear(ParamValue("B", *params["B"], 2, 1))
+                conversation.hear(AutopilotVersion(16, uid=uid))
+        assert outcomes == [outcome for outcome, _ in calls]
+        assert not any(isinstance(each, ParamSet) for each in vehicle.received)
 
 
 # authors

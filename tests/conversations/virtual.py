@@ -7,7 +7,7 @@ import inspect
 import random
 import selectors
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from functools import wraps
 from typing import Any, TypeVar
 
@@ -17,10 +17,10 @@ import sniffio
 import trio
 from trio.testing import MockClock
 
+from paramclient.errors import ParamClientError
 from paramclient.links.sim import SimLink
 from paramclient.protocol.events import Change, ComponentEvent
 from paramclient.protocol.node import Node
-from paramclient.protocol.session import Session
 from paramclient.protocol.station import Station
 from paramclient.sim import Endpoint
 from paramclient.wire.frames import Framer
@@ -159,11 +159,14 @@ async def converse(endpoint: Endpoint, **options: Any) -> AsyncIterator[Conversa
         conversation.sent.append(data)
         wake[0].set()
 
-    def emit(node: Node, event: ComponentEvent) -> None:
-        conversation.events.append(event)
+    def discovered(node: Node) -> None:
+        node.emit = conversation.events.append
+        for session in node.sessions:
+            session.table.changed = conversation.changes.append
 
-    def changed(node: Node, session: Session, change: Change) -> None:
-        conversation.changes.append(change)
+    async def supervise(work: Callable[..., Awaitable[object]], *arguments: object) -> None:
+        with suppress(ParamClientError):
+            await work(*arguments)
 
     async def read() -> None:
         while True:
@@ -183,9 +186,8 @@ async def converse(endpoint: Endpoint, **options: Any) -> AsyncIterator[Conversa
                 link="sim:test",
                 is_stream=False,
                 send=send,
-                spawn=tasks.start_soon,
-                emit=emit,
-                changed=changed,
+                spawn=lambda *work: tasks.start_soon(supervise, *work),
+                discovered=discovered,
                 **options,
             )
         )
@@ -207,7 +209,7 @@ class Tap:
     """An endpoint behind a filter: messages to it and from it are passed on where a function says so.
 
     Args:
-        endpoint: the vehicle.
+        endpoint: the vehicle; another one may take its place.
         up, down: return whether a message to the vehicle, or from it, arrives.
     """
 
@@ -220,24 +222,24 @@ class Tap:
     ) -> None:
         self.up = up
         self.down = down
-        self._endpoint = endpoint
+        self.endpoint = endpoint
 
     def receive(self, data: bytes, now: float) -> None:
         """Pass a datagram on to the vehicle."""
         if all(map(self.up, messages_in(data))):
-            self._endpoint.receive(data, now)
+            self.endpoint.receive(data, now)
 
     def tick(self, now: float) -> None:
         """Pass the time on."""
-        self._endpoint.tick(now)
+        self.endpoint.tick(now)
 
     def next_deadline(self) -> float | None:
         """Return the vehicle's deadline."""
-        return self._endpoint.next_deadline()
+        return self.endpoint.next_deadline()
 
     def data_to_send(self) -> list[bytes]:
         """Return what arrives of the vehicle's frames."""
-        return [data for data in self._endpoint.data_to_send() if all(map(self.down, messages_in(data)))]
+        return [data for data in self.endpoint.data_to_send() if all(map(self.down, messages_in(data)))]
 
 
 QUIET = Heartbeat(2, 0, system_status=4)

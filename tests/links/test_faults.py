@@ -7,7 +7,6 @@ import errno
 import os
 import selectors
 import socket
-from collections.abc import Callable
 from typing import Any
 
 import anyio
@@ -27,26 +26,29 @@ GONE = [errno.ENETDOWN, errno.ENETUNREACH, errno.EADDRNOTAVAIL, errno.EINVAL]
 class Net:
     """A network that can be disconnected; then sending a datagram fails with the given error."""
 
-    def __init__(self, patch: pytest.MonkeyPatch) -> None:
-        self.reason: int | None = None
-        transmit = udp.UdpLink._transmit
-        connected = udp.UdpOut._transmit
+    reason: int | None = None
 
-        def sent_by(original: Callable[..., None]) -> Callable[..., None]:
-            def send(link: udp.UdpLink, sock: socket.socket, data: bytes, address: Any) -> None:
-                if self.reason is not None and not getattr(link, "is_the_vehicles", False):
-                    raise OSError(self.reason, os.strerror(self.reason))
-                original(link, sock, data, address)
-
-            return send
-
-        patch.setattr(udp.UdpLink, "_transmit", sent_by(transmit))
-        patch.setattr(udp.UdpOut, "_transmit", sent_by(connected))
+    def check(self) -> None:
+        if self.reason is not None:
+            raise OSError(self.reason, os.strerror(self.reason))
 
 
 @pytest.fixture
 def net(monkeypatch: pytest.MonkeyPatch) -> Net:
-    return Net(monkeypatch)
+    """The network of all sockets."""
+    net = Net()
+
+    class Socket(socket.socket):
+        def send(self, *arguments: Any) -> int:
+            net.check()
+            return super().send(*arguments)
+
+        def sendto(self, *arguments: Any) -> int:
+            net.check()
+            return super().sendto(*arguments)
+
+    monkeypatch.setattr(socket, "socket", Socket)
+    return net
 
 
 @pytest.fixture

@@ -45,7 +45,7 @@ def cable(tmp_path: Path) -> Iterator[Cable]:
 def port(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Both implementations; the second is that of Windows, which also works here."""
     if request.param == "transport":
-        monkeypatch.setattr(serial, "_open_port", Transport.opened)
+        monkeypatch.setattr(serial, "open_port", Transport.opened)
     return str(request.param)
 
 
@@ -248,13 +248,13 @@ async def test_an_unsupported_baud_rate(cable: Cable, port: str, monkeypatch: py
 
 
 class Stuck:
-    """A driver that delays opening or closing of a port: the next one, or the given one."""
+    """A driver that delays opening or closing of the next port."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, call: str, port: object = None) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, call: str) -> None:
         self.is_in_it = threading.Event()
         self.may_go_on = threading.Event()
         self.is_closed = threading.Event()
-        self._port = None if port is None else id(port)  # keeping the port itself would keep it open
+        self._port: int | None = None  # its id: keeping the port itself would keep it open
         self._slow = call
         self._real = {name: getattr(serialx.Serial, name) for name in ("open", "close")}
         monkeypatch.setattr(serialx.Serial, "open", lambda port: self._call("open", port))
@@ -295,8 +295,8 @@ async def test_opening_a_stalled_driver_times_out(cable: Cable, monkeypatch: pyt
 @pytest.mark.asyncio
 async def test_closing_a_stalled_driver_times_out(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serial, "CLOSE_TIMEOUT", 0.01)
+    stuck = Stuck(monkeypatch, "close")
     async with opened(cable) as link:
-        stuck = Stuck(monkeypatch, "close", link._port._serial)
         await link.close()
         assert stuck.is_in_it.is_set()
         stuck.may_go_on.set()

@@ -24,9 +24,8 @@ from paramclient.errors import (
     UsageError,
     VehicleArmed,
 )
-from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, WireValue, bits_of, from_bits
+from paramclient.model.values import ParamType, WireValue
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.provision import (
     MISSING,
@@ -42,9 +41,9 @@ from paramclient.provision import (
     verify_all,
 )
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, SimParam
-from paramclient.sim.param_table import Entry
-from paramclient.wire import messages
+from paramclient.wire import frames, messages
 from tests.shell import FlakyLink, Tap, a_client, in_simulated_time, residue
+from tests.simulation import clamped
 
 SETTINGS: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     f"TUNE_{number:02}": number / 4 if number % 3 else number for number in range(30)
@@ -72,19 +71,17 @@ GROUP: dict[str, WireValue | tuple[ParamType, WireValue]] = {
 class HidingGroup(ArduPilotVehicle):
     """An ArduPilot that answers no reads by name for the parameters of a hidden group."""
 
-    def _find(self, name: str) -> Entry | None:
-        entry = super()._find(name)
-        return entry if entry is not None and (not self._listed or self._is_listed(entry)) else None
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        name = getattr(message, "param_id", "")
+        if not name or name in self.params:
+            super().respond(message, sender)
 
 
 class ClampingVehicle(ArduPilotVehicle):
     """An ArduPilot that keeps TUNE_01 within 0 to 10."""
 
-    def _write(self, entry: Entry, bits: int) -> None:
-        value = from_bits(bits, entry.type)
-        if entry.name == "TUNE_01" and not isinstance(value, bytes):
-            bits = bits_of(min(max(value, 0.0), 10.0), entry.type)
-        super()._write(entry, bits)
+    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+        super().respond(clamped(message, "TUNE_01", 0.0, 10.0), sender)
 
 
 CLAMPED: dict[str, WireValue | tuple[ParamType, WireValue]] = {
@@ -662,17 +659,35 @@ async def test_a_system_id_of_another_vehicle_is_not_set() -> None:
     assert [vehicle.system for vehicle in vehicles] == [1, 7]
 
 
+@pytest.mark.parametrize("sent", [0, len(SETTINGS)])
 @in_simulated_time
-async def test_another_vehicle_at_the_same_address_ends_the_run() -> None:
-    vehicle = ardupilot()
+async def test_another_vehicle_at_the_same_address_ends_the_run(sent: int) -> None:
+    """Before the first value, or before the values are read again."""
+    vehicle, other = ardupilot(), ardupilot(uid2=b"another")
     tap = Tap(vehicle)
+
+    async def exchange() -> None:
+        while vehicle.requests["PARAM_SET"] < sent:  # noqa: ASYNC110 - in simulated time
+            await anyio.sleep(0.1)
+        tap.is_deaf = tap.is_mute = True
+        tap.endpoint = other
+        await anyio.sleep(1.5)
+        tap.is_deaf = tap.is_mute = False
+        await anyio.sleep(1.0)
+
     async with a_client(tap) as client:
         component = await client.component()
-        with mock.patch.object(Identity, "is_same_vehicle", return_value=False):
-            result = await apply(component, written(another()))
-    assert isinstance(result.error, AnotherVehicle)
-    assert not result.complete
-    assert len(tap.messages(messages.ParamSet)) == len(SETTINGS)
+        await anyio.sleep(30.0)
+        if sent:
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(exchange)
+                result = await apply(component, written(another()))
+            assert isinstance(result.error, AnotherVehicle)
+            assert not result.complete
+        else:
+            with pytest.raises(AnotherVehicle):
+                await apply(component, written(another()), before_writing=exchange)
+    assert (vehicle.requests["PARAM_SET"], other.requests["PARAM_SET"]) == (sent, 0)
 
 
 class EndpointWithEvent(Tap):
