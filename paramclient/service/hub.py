@@ -22,6 +22,7 @@ from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata import Metadata, MetadataStore, metadata_of
 from paramclient.protocol.fetch import FetchResult, Progress
+from paramclient.protocol.watch import SyncState
 from paramclient.service import documents
 from paramclient.service.event_feed import EventFeed
 from paramclient.service.gateway import Gateway
@@ -38,6 +39,9 @@ CHECK_INTERVAL: Final = 0.2
 """Seconds between two checks for changes of states, and between two progress events."""
 REOPEN_DELAYS: Final = (0.25, 0.5, 1.0, 2.0, 5.0)
 """Seconds before each attempt to reopen a failed link; the last one repeats."""
+
+REFETCH_DELAYS: Final = (5.0, 15.0, 60.0)
+"""Seconds before each further fetch of a table that is not complete: some components have no parameters."""
 
 Result = TypeVar("Result")
 LinkChoice: TypeAlias = "str | Link | Endpoint"
@@ -245,11 +249,13 @@ class Hub:
             tasks.start_soon(self._load, target)
 
     async def _load(self, target: Target) -> None:
-        """Fetch the table of a component that was heard."""
-        if not self._fetches:
-            return
-        with suppress(ParamClientError):
-            await self.fetch(target)
+        """Fetch the table of a component that was heard, again if that ends without all of it."""
+        for delay in (0.0, *REFETCH_DELAYS) if self._fetches else ():
+            await anyio.sleep(delay)
+            if delay and target.component.sync_state in (SyncState.SYNCED, SyncState.LOST):
+                return
+            with suppress(ParamClientError):
+                await self.fetch(target)
 
     async def _load_known_metadata(self, target: Target) -> None:
         """Load the metadata of the firmware of a component that this computer has, if any."""

@@ -999,6 +999,18 @@ def test_rule_14_a_service_that_only_listens_has_no_stations() -> None:
         Hub([small_px4()], cache=False, mavlink=["tcpin:0"], listen_only=True)
 
 
+@in_simulated_time
+async def test_a_table_that_could_not_be_fetched_is_fetched_later() -> None:
+    vehicle = Tap(small_px4())
+    vehicle.is_deaf = True
+    async with Hub([vehicle], cache=False) as hub:
+        await anyio.sleep(30.0)
+        assert hub.targets[0].component.sync_state == "unsynced"
+        vehicle.is_deaf = False
+        await anyio.sleep(90.0)
+        assert hub.targets[0].component.sync_state == "synced"
+
+
 @pytest.mark.asyncio
 async def test_the_command_works_through_the_gateway() -> None:
     endpoint = parse_endpoint("tcpin:0")
