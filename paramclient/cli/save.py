@@ -41,8 +41,13 @@ from paramclient.metadata import Metadata
 from paramclient.model.defaults import default_of
 from paramclient.model.names import NameChoice
 from paramclient.model.paramset import ParamSet
-from paramclient.model.wording import counted
-from paramclient.provision.vehicle_params import NO_DEFAULTS, cached_param_set, select_non_defaults
+from paramclient.model.wording import counted, first_of
+from paramclient.provision.vehicle_params import (
+    NAMES_SHOWN_MAX,
+    NO_DEFAULTS,
+    cached_param_set,
+    select_non_defaults,
+)
 
 __all__ = ["save"]
 
@@ -108,6 +113,8 @@ async def save(
     for fault in selection.faults:
         report(fault)
     sets = _chosen(selection.sets, only) if only else selection.sets
+    if written is not FileFormat.JSON:
+        sets = [each if each.is_extended else _numbers(each) for each in sets]
     files = _by_file(str(file), sets) if is_pattern_name(str(file)) else {file: sets}
     if sets:
         for path, each in files.items():
@@ -236,6 +243,17 @@ def _chosen(sets: Sequence[ParamSet], only: Sequence[str]) -> list[ParamSet]:
         raise UsageError(f"no parameter is called {unmatched}")
     parts = [replace(each, params={n: param for n, param in each.items() if n in names}) for each in sets]
     return [each for each in parts if each]
+
+
+def _numbers(params: ParamSet) -> ParamSet:
+    """Return the set without values that are no numbers, as 64 bits in a PARAM_VALUE or an unknown type."""
+    raw = [name for name, param in params.items() if param.is_raw]
+    if not raw:
+        return params
+    names = first_of(raw, NAMES_SHOWN_MAX)
+    report(f"{address(params)}: left out, as only a .json file can hold them: {names}")
+    numbers = {name: param for name, param in params.items() if not param.is_raw}
+    return replace(params, params=numbers, source=f"{params.source}, without {names}")
 
 
 def _by_file(pattern: str, sets: Sequence[ParamSet]) -> dict[Path, list[ParamSet]]:

@@ -38,6 +38,9 @@ PASS_OVERHEAD: Final = 0.15
 """Seconds that another pass of the list takes beside its values."""
 FRUITLESS_PASSES_MAX: Final = 5
 """Passes in a row without a new value, after which the count may be false: a request can be lost."""
+QUEUE_TIME: Final = 1.0
+"""Seconds without a missing value after which no answer to a read waits behind others in the queue of a slow
+radio: PX4 fills that with its list within a second, at 57600 baud for 6 s, and answers reads behind it."""
 GAPS_INTERVAL: Final = 0.02
 """Seconds after which gaps are looked at again without a new value."""
 
@@ -96,10 +99,13 @@ class _Download:
         self._count: int | None = None
         self._began = self._last = 0.0
         self._reached = -1  # the highest index
+        self._listed = 0  # values of this pass
+        self._rate_before = 0.0  # values per second of the quickest pass before it
         self._listed_at = 0.0  # when the last value arrived that no read had asked for
         self._skipped: set[int] = set()  # missing indices below the highest one
         self._reading: set[int] = set()  # indices whose reads are in flight
         self._tried: dict[int, int] = {}  # attempts in vain by index that was ever read
+        self._gained_at = 0.0  # when the last value arrived that was missing
         self._has_answer = False  # to a read
 
     async def begin(self) -> None:
@@ -141,29 +147,34 @@ class _Download:
             while (missing := self._missing()) and not self._is_silent():
                 seconds_left = len(self.table.names) / self._rate() + PASS_OVERHEAD
                 is_slower = len(missing) / READS_PER_SECOND_ARDUPILOT > seconds_left
-                if not is_slower or fruitless >= FRUITLESS_PASSES_MAX:
+                has_begun = len(self._received) > self.channel.window_size  # others may answer earlier reads
+                if (
+                    (has_begun and not is_slower)
+                    or len(missing) < self.channel.window_size
+                    or fruitless >= FRUITLESS_PASSES_MAX
+                ):
                     await self._read_gaps()
                     is_short = self._missing() and self._count != 1  # a count of one may be right
                     if is_short and not self._has_answer and not self._is_silent():
-                        await self._next_pass(seconds_left)  # some firmware serves no reads
+                        await self._next_pass()  # some firmware serves no reads
                     break
                 self.result.lost += len(missing)
-                await self._next_pass(seconds_left)
+                await self._next_pass()
                 fruitless = fruitless + 1 if self._missing() == missing else 0
         self.result.missing = missing = self._missing()
         if self.table.is_growing and not self._is_silent():
             missing.pop()  # it has no more
 
-    async def _next_pass(self, seconds: float) -> None:
+    async def _next_pass(self) -> None:
         """Request the list once more, where that is quicker than reads, and receive it."""
         await self.channel.gate.wait()
         self.channel.send(self.session.dialect.request_list(self.channel.reads_from))
         before, self._reached = self._reached, -1
         self._skipped.clear()
-        self._listed_at = anyio.current_time()
-        with anyio.move_on_after(seconds + self.channel.timing.timeout(0)):
-            while self._missing() and not self._is_over():
-                await self._take_for(GAPS_INTERVAL)
+        self._rate_before, self._listed = self._rate(), 0
+        self._began = self._listed_at = anyio.current_time()
+        while self._missing() and not self._is_over():
+            await self._take_for(GAPS_INTERVAL)
         self._reached = max(self._reached, before)
 
     async def _read_gaps(self) -> None:
@@ -196,6 +207,8 @@ class _Download:
         if not self._is_over() or (self.table.is_growing and now - self._listed_at < PAUSE_GROWING):
             return False
         missing = self._missing()
+        if missing and now - self._gained_at < QUEUE_TIME:
+            return False
         given_up = sum(map(self._is_given_up, missing))
         is_fruitless = now - self._last >= UNANSWERED_MAX and given_up >= self.channel.window_size
         return is_fruitless or given_up == len(missing)
@@ -255,8 +268,7 @@ class _Download:
         pause = PAUSE_PX4 if self.reads_beside else PAUSE_OTHERS
         if count is not None and self._reached >= count - TAIL:
             pause = PAUSE_TAIL
-        if self._received:
-            pause = max(pause, PAUSE_INTERVALS / self._rate())
+        pause = max(pause, PAUSE_INTERVALS / self._rate() if self._listed else self.channel.timing.timeout(0))
         return anyio.current_time() - self._listed_at > pause or self._is_silent()
 
     def _is_silent(self) -> bool:
@@ -264,8 +276,8 @@ class _Download:
         return self.channel.is_silent(self._began)
 
     def _rate(self) -> float:
-        """Return the values per second of the list so far."""
-        return len(self._received) / max(self._listed_at - self._began, 0.01)
+        """Return the values per second of this list so far, or of an earlier pass."""
+        return max(self._rate_before, self._listed / max(self._listed_at - self._began, 0.01))
 
     async def _take_for(self, seconds: float) -> None:
         """Take the values that arrive, at most for some seconds without one."""
@@ -299,7 +311,11 @@ class _Download:
             self._reached = -1
         if index > self._reached or index not in self._tried:
             self._listed_at = self._last
-        self.result.repeated += index in self._received
+            self._listed += 1
+        if index in self._received:
+            self.result.repeated += 1
+        else:
+            self._gained_at = self._last
         self._received.add(index)
         self._skipped.discard(index)
         if index > self._reached:

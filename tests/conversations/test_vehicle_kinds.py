@@ -200,6 +200,37 @@ async def test_a_name_that_no_file_can_hold_is_noted_and_not_missed(name: str) -
         assert any(repr(name) in note for note in result.notes)
 
 
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("too_many", [0, 2])
+@virtual
+async def test_a_name_that_is_not_in_the_list_of_an_ardupilot_without_reads_is_unknown(
+    first: int, too_many: int
+) -> None:
+    table = {"abc_def": (5.0, ParamType.REAL32), "ghi": (1.0, ParamType.REAL32)}
+    vehicle = Partial(
+        table, serves=("list",), first=first, count=lambda index: 2 + too_many, heartbeat=ARDUPILOT
+    )
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        with pytest.raises(UnknownParameter, match=r"1/1 has no ABC_DEF.*Did you mean abc_def"):
+            await read(session, "ABC_DEF")
+        assert (await read(session, "abc_def")).param_id == "abc_def"
+        assert anyio.current_time() < 20.0
+
+
+@pytest.mark.parametrize("serves", [EVERYTHING, ("list", "indices")], ids=["all reads", "by index"])
+@virtual
+async def test_an_unknown_name_of_a_px4_without_hash_is_told_as_what_it_is(serves: tuple[str, ...]) -> None:
+    vehicle = Partial(serves=serves, heartbeat=PX4, count=lambda index: len(TABLE) + 2)
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        with pytest.raises(UnknownParameter) as caught:
+            await read(session, "NOPE")
+        assert "answers no reads" not in str(caught.value)
+        assert vehicle.number_of(ParamRequestList) == (serves is not EVERYTHING)
+        assert anyio.current_time() < 15.0
+
+
 # the encoding
 
 
