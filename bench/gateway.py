@@ -8,8 +8,8 @@ parameters: directly; through a gateway whose table is in sync, one after the ot
 once through a gateway that has just heard the vehicle; and through one that is fetching the table. The values
 are compared with those of the vehicle. Stations reach the gateway over real UDP, each in its own process.
 
-With `--live`, the vehicle is the one on this link, behind the relay of `tests/live/relay.py`; 57600 baud is
-left out, and values that it changes itself are not compared. Nothing is changed on the vehicle.
+With `--live`, the vehicle is the one on this link, behind the relay of `tests/live/relay.py`, which at 57600
+baud leaves telemetry out; values that it changes itself are not compared. Nothing is changed on the vehicle.
 
 Prints a Markdown table: seconds from the first request to the last value, and the datagrams about parameters
 on the vehicle's link while the stations downloaded from the table in sync.
@@ -113,7 +113,10 @@ class Radio:
     @property
     def conditions(self) -> Conditions:
         delay = RADIO_DELAY if self.rate else ROUND_TRIP / 2 if self.loss else 0.0
-        return Conditions(loss=self.loss, round_trip=2 * delay, rate=self.rate, seed=1)
+        is_slow = self.rate is not None  # and the vehicle is set to send little telemetry
+        return Conditions(
+            loss=self.loss, round_trip=2 * delay, rate=self.rate, seed=1, drops_telemetry=is_slow
+        )
 
     def case(self, way: str) -> Case:
         """Return the case in which a station is connected to the vehicle."""
@@ -386,9 +389,7 @@ def main() -> None:
             relay = stack.enter_context(Relay(arguments.live, listeners=[port]))
             field = LiveField(relay, port, Path(stack.enter_context(tempfile.TemporaryDirectory())))
             fields, vehicle = {field.kind: field}, f" {field.vehicle}."
-        links: list[tuple[float, float | None]] = [(loss, None) for loss in LOSSES]
-        if arguments.live is None:  # the queue of the relay has no end, which no real radio has
-            links.append((0.05, BAUD_RATE))
+        links: list[tuple[float, float | None]] = [*((loss, None) for loss in LOSSES), (0.05, BAUD_RATE)]
         radios = [Radio(kind, *link, field) for kind, field in fields.items() for link in links]
         names = choose([radio.name for radio in radios], arguments.only)
         heads = ["vehicle, loss", "station", *([] if arguments.skip_direct else ["direct"]), "in sync"]
