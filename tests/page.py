@@ -94,7 +94,7 @@ class Bench:
         found = self.ask("GET", "/vehicles")["vehicles"]
         px4 = next((each for each in found if each["link"] == "px4" and each["state"] == "synced"), None)
         if px4 is not None and not px4["has_metadata"]:
-            self.ask("POST", "/vehicles/1/1/metadata?link=px4", {})
+            self.ask("POST", "/vehicles/1/1/fetch?link=px4", {"metadata": True})
         is_described = px4 is not None and px4["has_metadata"]
         return is_described and sum(each["state"] == "synced" for each in found) == len(self.vehicles)
 
