@@ -17,7 +17,7 @@ from paramclient.errors import UsageError
 
 __all__ = ["serve", "token"]
 
-SERVICE_LIBRARIES: Final = ("fastapi", "prometheus_client", "uvicorn")
+SERVICE_LIBRARIES: Final = ("fastapi", "uvicorn")
 """Libraries that the extra `service` installs."""
 _UNSIGNED: Final = SigningOptions()
 
@@ -31,10 +31,6 @@ async def serve(
     fetch: Annotated[bool, Parameter(negative="--no-fetch")] = True,
     listen_only: bool = False,
     tokens: Path | None = None,
-    host: tuple[str, ...] = (),
-    allow_origin: tuple[str, ...] = (),
-    tls_cert: Path | None = None,
-    tls_key: Path | None = None,
     verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False,
     options: SigningOptions = _UNSIGNED,
 ) -> int:
@@ -60,12 +56,6 @@ async def serve(
             request.
         tokens: A file with access tokens, made by `paramclient token`. Without it, only this computer can
             connect.
-        host: A name of this service for browsers and programs, such as companion.local; may be given several
-            times.
-        allow_origin: Origin of a web page of another site that may use the service with a token, such as
-            https://station.example; may be given several times.
-        tls_cert: A certificate file (PEM), to serve over TLS.
-        tls_key: The key file of the certificate (PEM).
         verbose: Log each step on stderr.
     """
     if missing := [name for name in SERVICE_LIBRARIES if find_spec(name) is None]:
@@ -95,10 +85,8 @@ async def serve(
     with on_end_signal(lambda _: stop.set()):
         await service.serve(
             hub,
-            listening=service.Listening.at(listen, tls_cert=tls_cert, tls_key=tls_key),
+            listening=service.Listening.at(listen),
             tokens=None if tokens is None else service.Tokens.read(tokens),
-            hosts=host,
-            origins=allow_origin,
             stop=stop,
             listens=started,
         )

@@ -16,11 +16,12 @@ import anyio.abc
 import anyio.to_thread
 
 from paramclient.cache import ParamCache
+from paramclient.client.cache_writer import choose_cache
 from paramclient.client.client import ParamClient
 from paramclient.client.events import Discovered, Event, Found, Rebooted, Resynced
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.links import Link, create_link
-from paramclient.metadata import Metadata, MetadataStore, metadata_of
+from paramclient.metadata import MetadataStore, metadata_of
 from paramclient.protocol.fetch import FetchResult, Progress
 from paramclient.protocol.watch import SyncState
 from paramclient.service import documents
@@ -82,7 +83,7 @@ class Hub:
         mavlink: Iterable[str | MavlinkEndpoint] = (),
         **options: Any,
     ) -> None:
-        self.cache = _open_cache(cache)
+        self.cache = choose_cache(cache, is_log=False)
         self._owns_cache = self.cache is not cache
         self._fetches = fetches
         self.feed = EventFeed()
@@ -132,21 +133,21 @@ class Hub:
 
     @property
     def targets(self) -> list[Target]:
-        """All components, the lowest ids first."""
-        found = [target for link in self.links.values() for target in link.targets.values()]
-        return sorted(found, key=lambda each: (each.component.system, each.component.component))
+        """All parameters of components, the lowest ids first."""
+        pairs = [pair for link in self.links.values() for pair in link.targets.items() if pair[1].is_listed]
+        return [target for _, target in sorted(pairs, key=lambda pair: pair[0])]
 
-    def target(self, system: int, component: int, link: str | None = None) -> Target:
-        """Return the component with this address.
+    def target(
+        self, system: int, component: int, link: str | None = None, *, extended: bool = False
+    ) -> Target:
+        """Return the parameters of the component with this address.
 
         Raises:
             ServiceError: the component is unknown, or on several links and none is given.
         """
-        found = [
-            target
-            for each in self.links.values()
-            if link in (None, each.name) and (target := each.targets.get((system, component))) is not None
-        ]
+        key = system, component, extended
+        links = [each for each in self.links.values() if link in (None, each.name)]
+        found = [each.targets[key] for each in links if key in each.targets]
         if not found:
             on = "any link" if link is None else link
             detail = f"No message of {system}/{component} was received on {on}."
@@ -160,7 +161,7 @@ class Hub:
     async def fetch(
         self, target: Target, *, refresh: bool = False, timeout: float | None = None
     ) -> FetchResult:
-        """Fetch the table of a component; see `Component.fetch_all`. The progress is published."""
+        """Fetch the parameters of a component; see `Component.fetch_all`. The progress is published."""
 
         def note(progress: Progress) -> None:
             target.progress = progress
@@ -174,7 +175,7 @@ class Hub:
         await self._load_known_metadata(target)
         return result
 
-    async def load_metadata(self, target: Target, *, timeout: float | None = None) -> Metadata:
+    async def load_metadata(self, target: Target, *, timeout: float | None = None) -> None:
         """Load the metadata of a component from the vehicle; see `metadata_of`.
 
         Raises:
@@ -187,7 +188,6 @@ class Hub:
             raise ServiceError(404, "no-metadata", detail)
         target.metadata, target.described = found, identity
         self._check(target)
-        return found
 
     async def read_cache(self, work: Callable[[ParamCache], Result]) -> Result:
         """Run a function of the cache in a thread.
@@ -218,8 +218,9 @@ class Hub:
                 self._set_state(link, "failed", str(_first(group)))
             finally:
                 link.client = None
-                for target in list(link.targets.values()):
-                    self._forget(target)
+                for target in link.targets.values():
+                    self.feed.publish("vehicle", **target.address, vehicle=None)
+                link.targets.clear()
             await anyio.sleep(REOPEN_DELAYS[min(attempts, len(REOPEN_DELAYS) - 1)])
             attempts += 1
 
@@ -236,11 +237,14 @@ class Hub:
     def _take(self, link: ServiceLink, event: Event, tasks: anyio.abc.TaskGroup) -> None:
         """Handle an event of a client."""
         component = event.component
-        target = link.targets.get((component.system, component.component))
-        if target is None or target.component is not component:
-            target = link.targets[component.system, component.component] = Target.of(link, component)
-            for each in filter(None, (target, target.extended)):
-                tasks.start_soon(self._publish_changes, each)
+        key = component.system, component.component, False
+        if key not in link.targets or link.targets[key].component is not component:
+            setup = anyio.Lock()
+            for each in (component, component.ext):
+                target = Target(link, each, setup)
+                link.targets[component.system, component.component, each.is_extended] = target
+                tasks.start_soon(self._publish_changes, target)
+        target = link.targets[key]
         if isinstance(event, Resynced):
             target.fetches += 1
         self._check(target)
@@ -259,11 +263,11 @@ class Hub:
 
     async def _load_known_metadata(self, target: Target) -> None:
         """Load the metadata of the firmware of a component that this computer has, if any."""
-        identity, store = target.component.identity, self.metadata_store
-        if store is None or target.described == identity:
+        component, store = target.component, self.metadata_store
+        identity = component.identity
+        if store is None or target.described == identity or component.is_extended:
             return
-        component = target.component.component
-        target.metadata = await anyio.to_thread.run_sync(store.known, identity, component)
+        target.metadata = await anyio.to_thread.run_sync(store.known, identity, component.component)
         target.described = identity
 
     async def _publish_changes(self, target: Target) -> None:
@@ -274,7 +278,8 @@ class Hub:
         with suppress(ParamClientError):
             async for change in target.component.changes():
                 if change.kind != "first":
-                    self.feed.publish("change", **target.address, **documents.change(change, target))
+                    members = documents.change(change, target.info(change.name))
+                    self.feed.publish("change", **target.address, **members)
 
     async def _check_regularly(self, link: ServiceLink) -> None:
         while True:
@@ -286,17 +291,11 @@ class Hub:
         """Publish the state of a component if it has changed, or the progress of its fetch."""
         if target.progress is not None:
             self.feed.publish("progress", **target.address, **documents.progress(target.progress))
-        vehicle = documents.vehicle(target)
+        vehicle = documents.vehicle(target) if target.is_listed else {}
         state = documents.lasting_members(vehicle)
-        if state != target.published:
+        if state != target.published and vehicle:
             target.published = state
             self.feed.publish("vehicle", **target.address, vehicle=vehicle)
-
-    def _forget(self, target: Target) -> None:
-        component, targets = target.component, target.link.targets
-        if targets.get((component.system, component.component)) is target:
-            del targets[component.system, component.component]
-            self.feed.publish("vehicle", **target.address, vehicle=None)
 
     def _set_state(self, link: ServiceLink, state: str, error: str | None = None) -> None:
         if (state, error) == (link.state, link.error):
@@ -305,14 +304,6 @@ class Hub:
         logger.log(level, "%s: %s%s", link.name, state, "" if error is None else f": {error}")
         link.state, link.error = state, error
         self.feed.publish("link", link=link.name, state=state, error=error)
-
-
-def _open_cache(cache: ParamCache | str | os.PathLike[str] | bool | None) -> ParamCache | None:
-    if isinstance(cache, ParamCache):
-        return cache
-    if cache is False:
-        return None
-    return ParamCache(None if cache is None or cache is True else cache)
 
 
 def _first(group: BaseExceptionGroup[BaseException]) -> BaseException:

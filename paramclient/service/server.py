@@ -1,21 +1,19 @@
-"""The HTTP server of the service: address, uvicorn with its limits and TLS, start and shutdown."""
+"""The HTTP server of the service: address, uvicorn with its limits, start and shutdown."""
 
 from __future__ import annotations
 
 import contextlib
 import socket
-import ssl
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from ipaddress import ip_address
-from pathlib import Path
 from typing import Final
 
 import anyio
 import uvicorn
 
 from paramclient.errors import LinkError, UsageError
-from paramclient.service.app import LOOPBACK_NAMES, create_app
+from paramclient.service.app import create_app
 from paramclient.service.hub import Hub
 from paramclient.service.tokens import Tokens
 
@@ -38,17 +36,13 @@ class Listening:
     Attributes:
         host: host name or IP address.
         port: TCP port; 0 for any free port.
-        tls_cert: path of the certificate in PEM, or None.
-        tls_key: path of its private key in PEM, or None.
     """
 
     host: str = "127.0.0.1"
     port: int = 8765
-    tls_cert: Path | None = None
-    tls_key: Path | None = None
 
     @classmethod
-    def at(cls, text: str, *, tls_cert: Path | None = None, tls_key: Path | None = None) -> Listening:
+    def at(cls, text: str) -> Listening:
         """Parse `HOST:PORT`; an IPv6 address is in brackets.
 
         Raises:
@@ -60,7 +54,7 @@ class Listening:
         if not (colon and bare and is_number) or (":" in bare and bare == host):
             what = "is not a listening address HOST:PORT such as 127.0.0.1:8765 or [::1]:0"
             raise UsageError(f"{text!r} {what}")
-        return cls(bare, int(port), tls_cert, tls_key)
+        return cls(bare, int(port))
 
     @property
     def name(self) -> str:
@@ -89,8 +83,6 @@ async def serve(
     *,
     listening: Listening | None = None,
     tokens: Tokens | None = None,
-    hosts: Sequence[str] = (),
-    origins: Sequence[str] = (),
     stop: anyio.Event | None = None,
     listens: Callable[[str], None] | None = None,
 ) -> None:
@@ -100,15 +92,12 @@ async def serve(
         hub: links and cache, not yet open.
         listening: listening address.
         tokens: the valid tokens; None only for a loopback address.
-        hosts: names of the service for clients, besides the address; with tokens and none, all are accepted,
-            because only the token gives authority.
-        origins: origins of other sites whose pages may use the service with a token.
         stop: ends the call when set; None for no end but cancellation.
         listens: called with the URL as soon as the service accepts connections.
 
     Raises:
         LinkError: the address cannot be listened on.
-        UsageError: the certificate is invalid, or other computers could connect without tokens.
+        UsageError: other computers could connect without tokens.
     """
     listening = Listening() if listening is None else listening
     stop = anyio.Event() if stop is None else stop
@@ -116,10 +105,8 @@ async def serve(
         raise UsageError(
             f"{listening.host} is not a loopback address: a service for other computers needs --tokens FILE"
         )
-    names = [*LOOPBACK_NAMES, listening.name, *hosts] if hosts or tokens is None else ["*"]
-    app = create_app(hub, tokens=tokens, hosts=names, origins=origins)
     config = uvicorn.Config(
-        app,
+        create_app(hub, tokens=tokens),
         lifespan="off",
         ws="none",
         log_config=None,
@@ -130,17 +117,10 @@ async def serve(
         timeout_keep_alive=IDLE_TIMEOUT,
         timeout_graceful_shutdown=SHUTDOWN_TIMEOUT,
         h11_max_incomplete_event_size=HEADER_BYTES_MAX,
-        ssl_certfile=listening.tls_cert,
-        ssl_keyfile=listening.tls_key,
     )
-    try:
-        config.load()
-    except (OSError, ssl.SSLError) as error:
-        raise UsageError(f"the certificate cannot be used: {error}") from error
     server = _Server(config)
     with _open(listening) as opened:
-        scheme = "http" if listening.tls_cert is None else "https"
-        url = f"{scheme}://{listening.name}:{opened.getsockname()[1]}"
+        url = f"http://{listening.name}:{opened.getsockname()[1]}"
         async with anyio.create_task_group() as tasks:
             try:
                 async with hub:

@@ -44,7 +44,7 @@ export async function roleOf(token = sessionStorage.getItem(TOKEN)) {
 
 /** Returns the path of a component's resource, on its link or in the cache (`is_kept`). */
 export function at(component, what = "", query = {}) {
-  const place = component.is_kept ? { key: component.key } : { link: component.link };
+  const place = component.is_kept ? { key: component.key } : { link: component.link, ext: component.extended };
   return `/api/vehicles/${component.system}/${component.component}${what}?${new URLSearchParams({ ...place, ...query })}`;
 }
 

@@ -6,9 +6,9 @@ import { Details } from "./details.js";
 import { showKeys } from "./dialogs.js";
 import { announce, button, byId, el, isNarrow, onceAFrame, setText } from "./dom.js";
 import { CellEditor } from "./editor.js";
-import { hasExtended } from "./extended.js";
 import { Grid } from "./grid.js";
 import { nameOf, outcomesText, review, undo, undoButton } from "./review.js";
+import { showStations } from "./stations.js";
 import { HIGHLIGHT_TIME, OTHERS, store } from "./store.js";
 import { defaultOf, many, parse } from "./values.js";
 import { drawActions, drawVehicles, offerDescriptions, showError } from "./vehicles.js";
@@ -29,7 +29,7 @@ const grid = new Grid({
   show: (row) => details.open(row, true),
   moved: (row) => details.follow(row),
 });
-const editor = new CellEditor({ grid, stage: (name, text, send) => store.stage(name, text, send) });
+const editor = new CellEditor({ grid, stage: (name, text) => store.stage(name, text) });
 const details = new Details({ leave: () => grid.root.focus({ preventScroll: true }) });
 
 function edit(row) {
@@ -183,9 +183,7 @@ function emptyText(count, total, component, table) {
     return component.fetch
       ? "Loading the parameters."
       : table.isLoaded
-        ? `No parameters are known${component.is_kept ? "." : " yet. Fetch requests them from the vehicle."}${
-            hasExtended(component) ? " Extended shows the extended ones." : ""
-          }`
+        ? `No parameters are known${component.is_kept ? "." : " yet. Fetch requests them from the vehicle."}`
         : "Loading …";
   if (shown.filter === "changed" && !shown.words.length)
     return table.sorted.some((row) => row.isChanged !== null)
@@ -232,6 +230,7 @@ function choose(change) {
 // events of the service
 
 store.on("all", () => {
+  byId("rail").hidden = byId("main").hidden = false; // hidden until a valid token is there
   editor.close(false);
   details.forget();
   shown.group = "";
@@ -334,19 +333,9 @@ byId("search").addEventListener("keydown", (event) => {
 byId("group-choice").addEventListener("change", () => choose({ group: byId("group-choice").value }));
 byId("vehicle-choice").addEventListener("change", () => store.select(byId("vehicle-choice").value).catch(showError));
 byId("tools").append(
+  button("", () => showStations().catch(showError), { kind: "quiet only", drawing: "station", label: "Ground stations" }),
   button("", showKeys, { kind: "quiet only", drawing: "help", label: "Keys" }),
-  button("", turnTheme, { kind: "quiet only", drawing: "theme", label: "Dark or light" }),
 );
-
-function turnTheme() {
-  const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
-  document.documentElement.dataset.theme = theme;
-  try {
-    localStorage.setItem("theme", theme);
-  } catch {
-    // without storage the choice lasts until the page is closed
-  }
-}
 
 const KEYS = {
   "/": () => {
@@ -371,7 +360,7 @@ function take(valueOf) {
   const text = row && store.mayWrite ? valueOf(row) : null;
   if (text === null) return;
   const read = parse(text, row.type);
-  if (!read.error) store.stage(row.name, read.text, read.send);
+  if (!read.error) store.stage(row.name, read.text);
 }
 
 document.addEventListener("keydown", (event) => {
@@ -412,5 +401,4 @@ addEventListener("beforeunload", (event) => {
   if ([...store.tables.values()].some((table) => table.pending.size)) event.preventDefault();
 });
 
-drawActions();
 stream.open();

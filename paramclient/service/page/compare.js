@@ -6,7 +6,7 @@ import { closeDialog, openDialog } from "./dialogs.js";
 import { valueText } from "./details.js";
 import { Caution, OUTCOMES, nameOf, outcomesText } from "./review.js";
 import { keyOf, store } from "./store.js";
-import { isWhole, many, moment, numberText, textOf } from "./values.js";
+import { many, moment, numberText, textOf } from "./values.js";
 
 /** Maximum size of a parameter file in bytes, as in the service. */
 const FILE_BYTES_MAX = 2 * 2 ** 20;
@@ -81,8 +81,8 @@ async function fillSnapshots(component, list, attempt) {
       `${each.reason}, ${many(each.size, "parameter")}`,
       () =>
         attempt(async () => {
-          const state = await get(at(component, "/params", { snapshot: each.id }));
-          return otherOf(`state of ${moment(each.time)}`, state.params, { snapshot: each.id }, false);
+          const state = await get(at(component, "/params", { at: each.id }));
+          return otherOf(`state of ${moment(each.time)}`, state.params, { at: each.id }, false);
         }),
     ]);
   } catch (error) {
@@ -98,14 +98,11 @@ function fillVehicles(component, list, attempt) {
     () =>
       attempt(async () => {
         const { params } = await get(at(each, "/params"));
-        const values = Object.entries(params).map(([name, param]) => [name, sendable(param)]);
+        const values = Object.entries(params).map(([name, param]) => [name, textOf(param)]);
         return otherOf(nameOf(each), params, { values: Object.fromEntries(values) }, false);
       }),
   ]);
 }
-
-/** Returns a value as it is sent: digits of an integer that a JavaScript number cannot represent. */
-const sendable = (param) => (Number.isSafeInteger(param.value) || !isWhole(param.type) ? param.value : textOf(param));
 
 function fill(list, items, remark, parts) {
   const made = items.map((item) => choice(...parts(item)));
@@ -233,14 +230,12 @@ export async function takeOver() {
         el("b", { class: `outcome ${word.kind}`, text: word.text }),
         ` ${made}${row.reason ?? ""}`,
       );
-      const known = table.rows.get(line.name)?.document;
       const isTaken = ["set", "adjusted", "unproven"].includes(row.status);
       outcomes.push({
         name: line.name,
         status: row.status,
         isTaken,
         before: line.before,
-        restore: line.restore ?? known?.value,
       });
     }
     table.sent = { names: new Set(chosen.map((line) => line.name)), outcomes, at: Date.now() };
@@ -341,9 +336,7 @@ function linesOf(plan, table, other, refresh) {
       );
       const line = { name, status, box, remark, element };
       line.follow = () => {
-        const { text, document } = table.rows.get(name) ?? {};
-        line.before = text ?? "";
-        line.restore = document?.bits ? { bits: document.bits } : document?.value;
+        line.before = table.rows.get(name)?.text ?? "";
         setText(now, line.before);
       };
       line.follow();

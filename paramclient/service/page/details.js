@@ -66,7 +66,7 @@ export class Details {
     this.key = store.selected;
     this.form = store.mayWrite
       ? editorOf(row, store.table.pending.get(row.name), {
-          stage: (text, send) => store.stage(row.name, text, send),
+          stage: (text) => store.stage(row.name, text),
           leave: () => this.close(),
           isCompact: false,
         })
@@ -150,8 +150,8 @@ export class Details {
     const old = valueText(entry.old, row.type);
     const now = entry.new === null ? "gone" : valueText(entry.new, row.type);
     const take = () => {
-      const { error, text, send } = parse(old, row.type);
-      if (!error) store.stage(row.name, text, send);
+      const { error, text } = parse(old, row.type);
+      if (!error) store.stage(row.name, text);
     };
     return el(
       "li",

@@ -1,12 +1,12 @@
 /** Editors of a value: a number with its range, a list of named values, or check boxes for bits. */
 
 import { button, byId, el, faultText, isNarrow } from "./dom.js";
-import { defaultOf, isFloat, maskOf, parse, rangeOf, sameText, textOf, textOfMask, warningOf } from "./values.js";
+import { defaultOf, isFloat, isWhole, maskOf, parse, rangeOf, sameText, textOf, textOfMask, warningOf } from "./values.js";
 
 const OTHER = "other";
 
 /**
- * Creates the form for one parameter. Calls `stage(text, send)` with a valid value, and `leave()` at the end.
+ * Creates the form for one parameter. Calls `stage(text)` with a valid value, and `leave()` at the end.
  * `first` receives the focus, and `refresh(row)` handles a changed value.
  */
 export function editorOf(row, pending, { stage, leave, isCompact = true }) {
@@ -35,7 +35,7 @@ export function editorOf(row, pending, { stage, leave, isCompact = true }) {
           report(read);
           if (read.error) input.first.focus();
           else {
-            stage(read.text, read.send);
+            stage(read.text);
             leave();
           }
         },
@@ -87,7 +87,7 @@ export class CellEditor {
   open(row, pending) {
     this.row = row;
     this.form = editorOf(row, pending, {
-      stage: (text, send) => this.stage(row.name, text, send),
+      stage: (text) => this.stage(row.name, text),
       leave: () => this.close(true),
     });
     this.box.replaceChildren(this.form);
@@ -133,7 +133,7 @@ function number(row, value, hintId, report) {
   const first = el("input", {
     class: "number",
     value,
-    inputmode: isFloat(type) ? "decimal" : "numeric",
+    inputmode: isFloat(type) ? "decimal" : isWhole(type) ? "numeric" : "text",
     autocomplete: "off",
     spellcheck: "false",
     enterkeyhint: "done",
@@ -142,7 +142,7 @@ function number(row, value, hintId, report) {
     on: {
       input: () => report(parse(first.value, type)),
       keydown: (event) => {
-        if (event.key !== "ArrowUp" && event.key !== "ArrowDown") return;
+        if (!["ArrowUp", "ArrowDown"].includes(event.key) || !(isFloat(type) || isWhole(type))) return;
         event.preventDefault();
         const read = parse(first.value, type);
         if (read.error || !Number.isFinite(Number(read.text))) return;

@@ -14,7 +14,8 @@ export const OTHERS = "Others";
 /** Prefix of the keys of cached vehicles; no link name starts with it. */
 const CACHED_PREFIX = "kept:";
 
-export const keyOf = (component) => `${component.link} ${component.system}/${component.component}`;
+export const keyOf = ({ link, system, component, extended }) =>
+  `${link} ${system}/${component}${extended ? " extended" : ""}`;
 
 /** One parameter: the document of the service, and derived values. */
 class Row {
@@ -213,7 +214,6 @@ class Store {
     for (const event of early) this.take(event);
     if (!this.component) this.selected = first(this.components);
     this.emit("all");
-    this.emit("extended", null);
     if (this.selected) await this.loadTable(this.selected);
   }
 
@@ -290,7 +290,6 @@ class Store {
     }
     const key = keyOf(event);
     if (event.type === "vehicle") this.takeComponent(key, event);
-    else if (event.type === "change" && event.extended) this.emit("extended", event);
     else if (event.type === "change") this.takeChange(key, event);
     else if (event.type === "progress") {
       const component = this.components.get(key);
@@ -350,11 +349,11 @@ class Store {
   }
 
   /** Stages a value; one equal to the vehicle's is removed. */
-  stage(name, text, send) {
+  stage(name, text) {
     const row = this.table.rows.get(name);
     if (!row) return;
     if (sameText(text, row.text, row.type)) this.table.pending.delete(name);
-    else this.table.pending.set(name, { name, text, send, before: row.text });
+    else this.table.pending.set(name, { name, text, before: row.text });
     this.emit("pending");
   }
 
@@ -393,7 +392,7 @@ export function authorOf(by) {
 /** Returns the key of the lowest autopilot, else of the lowest component: they are sorted. */
 function first(components) {
   const all = [...components.values()].sort((a, b) => a.system - b.system || a.component - b.component);
-  const chosen = all.find((each) => each.component === 1) ?? all[0];
+  const chosen = all.find((each) => each.component === 1) ?? all.find((each) => each.params) ?? all[0];
   return chosen ? keyOf(chosen) : null;
 }
 

@@ -4,7 +4,6 @@ import { at, download, request } from "./api.js";
 import { announce, button, byId, choice, el, faultText, nothing, setText } from "./dom.js";
 import { chooseOther } from "./compare.js";
 import { closeDialog, openDialog } from "./dialogs.js";
-import { offerExtended, showExtended } from "./extended.js";
 import { nameOf } from "./review.js";
 import { keyOf, store } from "./store.js";
 import { many, moment, span } from "./values.js";
@@ -156,7 +155,6 @@ function drawVehicle(component) {
   const parts = [TYPES[type], versionOf(identity?.firmware), place, count && many(count, "parameter")];
   setText(byId("subtitle"), parts.filter(Boolean).join(" · "));
   drawFetch(component);
-  offerExtended();
 }
 
 /** Formats a version of AUTOPILOT_VERSION: three bytes, then its type. */
@@ -180,12 +178,6 @@ export function drawActions() {
     button("Compare", () => chooseOther(), { drawing: "compare" }),
     button("Save", shown(save), { drawing: "save" }),
     isHeard && button("Load descriptions", shown(describe), { drawing: "help", id: "describe", hidden: true }),
-    button("Extended", shown(showExtended), {
-      drawing: "extended",
-      label: "Extended parameters of the component: text and 64-bit numbers",
-      id: "extended",
-      hidden: true,
-    }),
     store.mayWrite &&
       button("Snapshot", shown(keepState), { drawing: "keep", label: "Snapshot: record the current values for a later restore" }),
     isHeard && button("Fetch", shown(fetchAll), { drawing: "refresh", label: "Fetch all parameters from the vehicle" }),
@@ -193,7 +185,6 @@ export function drawActions() {
   byId("actions").replaceChildren(...actions.filter(Boolean));
   byId("meter-cancel").replaceChildren(button("Stop", stopFetch, { kind: "quiet" }));
   setText(byId("role"), store.mayWrite ? "" : "read-only");
-  offerExtended();
   offerDescriptions();
 }
 
@@ -208,8 +199,8 @@ async function describe() {
   announce("Loading the descriptions.");
   byId("describe").disabled = true;
   try {
-    const { count } = await request("POST", at(store.component, "/metadata"), {}, { timeout: DESCRIPTION_TIMEOUT });
-    announce(`${many(count, "parameter")} described.`);
+    await request("POST", at(store.component, "/fetch"), { metadata: true }, { timeout: DESCRIPTION_TIMEOUT });
+    announce("The descriptions are loaded.");
   } finally {
     byId("describe").disabled = false;
   }
