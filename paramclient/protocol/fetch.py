@@ -313,7 +313,7 @@ def result_of(
         channel.component,
         ParamMap(table.view()),
         source,
-        table.count or 0,
+        table.count or len(table.params) + len(missing),  # none where it cannot be one
         tuple(sorted(missing)),
         table.hash if is_confirmed else None,
         anyio.current_time() - began,

@@ -11,7 +11,7 @@ from paramclient.errors import NoReply, ParamErrorCode
 from paramclient.protocol.channel import ATTEMPTS_MAX, LATE_GRACE, LATE_WAKE_UP, UNANSWERED_MAX, Inbox
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.session import Session
-from paramclient.wire.messages import HASH_CHECK, Message, ParamError
+from paramclient.wire.messages import HASH_CHECK, PARAMETERS_MAX, Message, ParamError
 
 __all__ = ["ListResult", "download_list"]
 
@@ -295,7 +295,7 @@ class _Download:
     def _take(self, message: Message) -> None:
         """Take one value."""
         assert isinstance(message, self.session.dialect.value)
-        count, index = message.param_count, message.param_index
+        count, index = min(message.param_count, PARAMETERS_MAX), message.param_index
         self._last = anyio.current_time()
         if message.param_id == HASH_CHECK:
             self.result.digest = Digest.of(message)

@@ -34,7 +34,7 @@ from paramclient.wire.messages import (
     ParamValue,
 )
 from tests.conversations.partial import EVERYTHING, TABLE, Partial
-from tests.conversations.virtual import QUIET, Puppet, Tap, converse, virtual
+from tests.conversations.virtual import QUIET, Puppet, Tap, converse, virtual, virtual_on_both
 
 ARDUPILOT = Heartbeat(2, 3, system_status=4)
 PX4 = Heartbeat(2, 12, system_status=4)
@@ -167,6 +167,13 @@ async def test_a_slow_list_whose_count_grows_is_received_to_its_end(
             assert (result.complete, len(result.params)) == (True, 12)
 
 
+@virtual
+async def test_a_count_of_more_than_can_be_requested_is_told_as_what_can() -> None:
+    async with converse(Partial(count=lambda index: 65_535)) as conversation:
+        result = await fetch_all((await conversation.node()).plain)
+        assert (set(result.params), result.received, result.count) == (set(TABLE), len(TABLE), 32_768)
+
+
 @pytest.mark.parametrize("too_many", [1, 3_000])
 @virtual
 async def test_a_count_that_is_too_large_costs_seconds_and_no_value(too_many: int) -> None:
@@ -229,6 +236,24 @@ async def test_an_unknown_name_of_a_px4_without_hash_is_told_as_what_it_is(serve
         assert "answers no reads" not in str(caught.value)
         assert vehicle.number_of(ParamRequestList) == (serves is not EVERYTHING)
         assert anyio.current_time() < 15.0
+
+
+@pytest.mark.parametrize("heartbeat", [ARDUPILOT, QUIET, PX4], ids=["AP", "generic", "PX4"])
+@pytest.mark.parametrize("parts", [("list", "sets"), ("list", "sets", "acks")], ids="+".join)
+@virtual_on_both
+async def test_a_value_of_a_list_is_taken_without_its_end(
+    heartbeat: Heartbeat, parts: tuple[str, ...]
+) -> None:
+    count = len(TABLE) + 3_000
+    table = {name: (value, ParamType.REAL32) for name, (value, _) in TABLE.items()}
+    vehicle = Partial(table, serves=parts, heartbeat=heartbeat, count=lambda index: count)
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        await read(session, "OFFSET")
+        assert anyio.current_time() < 8.5
+        assert (await write(session, "MODE", 4)).status == "accepted"
+        assert anyio.current_time() < 12.0
+        assert not session.listing.is_running
 
 
 # the encoding
