@@ -47,7 +47,7 @@ FIRST_VALUE_TIME: Final = 1.0
 """Seconds without a value of a running fetch, after which one is read beside it: MAVSDK repeats its list
 after 2 s and gives up at the sixth."""
 LOADING_WAIT: Final = 1.0
-"""Seconds that a read waits for the fetch to bring the value before the vehicle is asked."""
+"""Seconds that a read by name waits for a fetch to bring the value before the vehicle is asked."""
 READ_TIMEOUT: Final = 3.0
 """Seconds for a value or a name that the table does not have."""
 SET_TIMEOUT: Final = 2.9
@@ -349,13 +349,13 @@ class KeptTable:
     async def _find(self, which: Which) -> ReportedValue:
         """Wait for the value if a fetch may bring it; then ask the vehicle.
 
-        A hash is asked for at once: QGroundControl waits 1 s for it.
+        An index is a gap in a station's list, which the fetch closes. A hash is asked for at once:
+        QGroundControl waits 1 s for it.
         """
-        if self.list_if_current is None:
-            loaded = self.load()
-            with anyio.move_on_after(0.0 if which == HASH_CHECK else LOADING_WAIT):
-                while not (loaded.is_set() or self.known(which)):  # noqa: ASYNC110 - no event for one value
-                    await anyio.sleep(PROGRESS_INTERVAL)
+        by_name = 0.0 if which == HASH_CHECK else LOADING_WAIT
+        with anyio.move_on_after(READ_TIMEOUT if isinstance(which, int) else by_name):
+            while self.is_loading and not self.known(which):  # noqa: ASYNC110 - no event for one value
+                await anyio.sleep(PROGRESS_INTERVAL)
         known = self.known(which)
         if known is not None:
             return known

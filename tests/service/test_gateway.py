@@ -401,6 +401,21 @@ async def test_rule_3_the_first_value_comes_within_two_seconds_of_a_slow_file() 
 
 
 @in_simulated_time
+async def test_rule_3_reads_of_gaps_wait_for_the_fetch() -> None:
+    vehicle = Tap(ArduPilotVehicle(ftp_rate=4_000.0))
+    async with gateway_over(vehicle) as served:
+        await served.clients[0].component()
+        station = served.partner()
+        station.send(LIST)
+        await anyio.sleep(2.5)
+        vehicle.received.clear()
+        for _ in range(3):
+            await station.ask(*(ParamRequestRead(1, 1, "", index) for index in range(700, 710)), seconds=2.0)
+        assert {each.param_index for each in station.of(ParamValue)} >= set(range(700, 710))
+        assert not requested(vehicle)
+
+
+@in_simulated_time
 async def test_rule_3_a_file_that_is_opened_during_a_long_fetch_is_none() -> None:
     """So that the station asks for the list, and no second download begins."""
     vehicle = Tap(ArduPilotVehicle(ftp_rate=2_000.0))
