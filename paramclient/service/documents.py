@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
-from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson, SummaryJson
 from paramclient.cli.json_output import (
-    IdentityJson,
     InfoJson,
     Json,
     ParamJson,
@@ -22,7 +20,6 @@ from paramclient.model.notation import hash_text, rounded
 from paramclient.model.values import ParamType
 
 if TYPE_CHECKING:
-    from paramclient.cache import CachedSummary, CachedVehicle
     from paramclient.files import ParamFile
     from paramclient.metadata import ParamInfo
     from paramclient.model.values import Param
@@ -79,20 +76,6 @@ class WritesJson(Json):
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HistoryJson(Json):
-    """Changes of values, the newest last."""
-
-    history: list[HistoryLineJson]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SnapshotsJson(Json):
-    """Snapshots, the newest last."""
-
-    snapshots: list[SnapshotJson]
-
-
 def param(known: Param, info: ParamInfo | None, *, whole: bool = True) -> ParamJson:
     """Return a parameter of a table, with its metadata, or if not `whole`, with the meaning of its value."""
     shown = ParamJson.of_table(known, info)
@@ -110,17 +93,13 @@ def vehicle(target: Target) -> dict[str, Any]:
     """Return the state of the parameters of a component on a link.
 
     `params` is the number of known parameters, `count` the number that the component announces, `fetch` the
-    progress of a running fetch, `fetches` the number of ended ones, `key` the key of its table in the cache.
+    progress of a running fetch, `fetches` the number of ended ones.
     """
-    component, identity = target.component, target.component.identity
+    component = target.component
     return {
         **target.address,
+        **as_json(VehicleJson.of(component)),
         "link_state": target.link.state,
-        "autopilot": component.autopilot,
-        "vehicle_type": identity.vehicle_type,
-        "key": identity.key,
-        "uid": identity.uid,
-        "identity": as_json(IdentityJson.of(identity)),
         "encoding": component.encoding.value,
         "count": component.count,
         "params": len(component.params),
@@ -140,15 +119,6 @@ def vehicle(target: Target) -> dict[str, Any]:
 def lasting_members(found: dict[str, Any]) -> dict[str, Any]:
     """Return the members of a vehicle whose changes are events."""
     return {name: value for name, value in found.items() if name not in CHANGING_MEMBERS}
-
-
-def cached_vehicles(
-    vehicles: Iterable[CachedVehicle], tables: Iterable[CachedSummary]
-) -> list[dict[str, Any]]:
-    """Return the tables of the cache, the last heard first, each with the time when its vehicle was heard."""
-    seen = {each.key: each.last_seen for each in vehicles}
-    found = [{**as_json(SummaryJson.of(each)), "last_seen": seen.get(each.key, 0.0)} for each in tables]
-    return sorted(found, key=lambda each: each["last_seen"], reverse=True)
 
 
 def progress(now: Progress) -> dict[str, Any]:
