@@ -40,7 +40,9 @@ if TYPE_CHECKING:
 __all__ = ["Hub"]
 
 CHECK_INTERVAL: Final = 0.2
-"""Seconds between two checks for changes of states, and between two progress events."""
+"""Seconds between two checks for changes of states, among them the progress of a fetch."""
+CHANGING_MEMBERS: Final = ("silence_s", "round_trip_s", "params")
+"""Members of a vehicle that change all the time: they cause no event."""
 REOPEN_DELAYS: Final = (0.25, 0.5, 1.0, 2.0, 5.0)
 """Seconds before each attempt to reopen a failed link; the last one repeats."""
 
@@ -305,12 +307,10 @@ class Hub:
                 self._check(target)
 
     def _check(self, target: Target) -> None:
-        """Publish the state of a component if it has changed, or the progress of its fetch."""
-        if target.progress is not None:
-            self.feed.publish("progress", **target.address, **documents.progress(target.progress))
-        vehicle = documents.vehicle(target) if target.is_listed else {}
-        state = documents.lasting_members(vehicle)
-        if state != target.published and vehicle:
+        """Publish the state of a component if it has changed."""
+        vehicle = documents.vehicle(target)
+        state = {**vehicle, **dict.fromkeys(CHANGING_MEMBERS)}
+        if target.is_listed and state != target.published:
             target.published = state
             self.feed.publish("vehicle", **target.address, vehicle=vehicle)
 

@@ -187,10 +187,9 @@ class ApplyRequest(SetupOptions, PlanRequest):
 
 
 class RestoreRequest(SetupOptions):
-    """The state to restore; without `at`, the state before the last apply. `dry_run` writes nothing."""
+    """The state to restore; without `at`, the state before the last apply."""
 
     at: Moment | None = None
-    dry_run: bool = False
 
 
 class SnapshotRequest(Body):

@@ -14,12 +14,12 @@ from fastapi import APIRouter, Depends, Header, Path, Query, Request
 from fastapi.responses import PlainTextResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from paramclient.cli.json_output import FetchJson, ParamJson, WriteJson, WrittenJson
+from paramclient.cli.json_output import FetchJson, ParamJson, VehicleJson, WriteJson, WrittenJson, as_json
 from paramclient.model.names import NameChoice
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.service import documents
 from paramclient.service.access import author_of, require_write
-from paramclient.service.documents import ParamsJson, WritesJson
+from paramclient.service.documents import ParamsJson
 from paramclient.service.hub import Hub
 from paramclient.service.metrics import METRICS_MEDIA_TYPE, metrics_text
 from paramclient.service.request_bodies import (
@@ -159,7 +159,7 @@ async def set_param(request: Request, target: TargetArgument, name: str, body: W
 
 
 @writing.patch(f"{VEHICLE}/params")
-async def set_params(request: Request, target: TargetArgument, body: WriteManyRequest) -> WritesJson:
+async def set_params(request: Request, target: TargetArgument, body: WriteManyRequest) -> dict[str, Any]:
     """Write several parameters in order, many at a time, and verify each.
 
     If a value is invalid or out of range, nothing is written. A value that the vehicle refuses does not stop
@@ -168,7 +168,8 @@ async def set_params(request: Request, target: TargetArgument, body: WriteManyRe
     values = await values_in_range(body.values, target, force=body.force)
     options = body.model_dump(exclude={"values"})
     result = await target.component.set_many(values, **options, author=author_of(request))
-    return WritesJson.of(result, target)
+    found = {"vehicle": VehicleJson.of(target.component), "error": result.error and str(result.error)}
+    return dict(as_json(found | {"results": [documents.write(each, target) for each in result.outcomes]}))
 
 
 @reading.post(f"{VEHICLE}/fetch")

@@ -17,7 +17,7 @@ from pydantic import AwareDatetime
 
 from paramclient.cache import ParamCache, SnapshotSummary
 from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson
-from paramclient.cli.json_output import VehicleJson
+from paramclient.cli.json_output import SetJson, VehicleJson, as_json
 from paramclient.cli.json_setup import ApplyJson, PlanJson
 from paramclient.errors import UsageError
 from paramclient.files import FileFormat, dumps
@@ -25,11 +25,9 @@ from paramclient.files.formats import ENDINGS
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
 from paramclient.provision import ApplyProgress, ApplyResult, apply, prepare, restore
-from paramclient.provision.apply_restore import restore_categories
 from paramclient.provision.restore_point import load_state_before_apply
 from paramclient.provision.vehicle_params import fetch_set, select_non_defaults, set_maker
 from paramclient.service.access import author_of, require_write
-from paramclient.service.documents import FileJson
 from paramclient.service.hub import Hub
 from paramclient.service.problems import ServiceError
 from paramclient.service.request_bodies import (
@@ -59,9 +57,11 @@ ROUTERS: Final = (reading, writing)
 
 
 @reading.post("/api/files")
-async def read_file(body: UploadedFile) -> FileJson:
+async def read_file(body: UploadedFile) -> dict[str, Any]:
     """Parse a parameter file of any format. It is not stored."""
-    return await anyio.to_thread.run_sync(lambda: FileJson.of(body.read()))
+    file = await anyio.to_thread.run_sync(body.read)
+    sets = as_json([SetJson.with_sources(each, {}) for each in file.sets])
+    return {"file": file.source, "format": file.file_format, "notes": file.notes, "components": sets}
 
 
 @reading.get(f"{VEHICLE}/file", response_class=Response)
@@ -114,7 +114,9 @@ async def _only_setup(target: TargetArgument) -> AsyncIterator[None]:
 @reading.post(f"{VEHICLE}/plan")
 async def plan(hub: HubArgument, target: TargetArgument, body: PlanRequest) -> PlanJson:
     """Return which values an apply would write, in which order, and which it would skip, and why."""
-    return await _plan(target, await _wanted(hub, target, body), body.include, force=body.force)
+    component, wanted = target.component, await _wanted(hub, target, body)
+    found = await prepare(component, wanted, include=body.include, info=target.metadata, force=body.force)
+    return PlanJson.of(found, system=component.system, component=component.component)
 
 
 @writing.post(f"{VEHICLE}/apply", dependencies=[Depends(_only_setup)])
@@ -124,28 +126,21 @@ async def apply_(request: Request, hub: HubArgument, target: TargetArgument, bod
     The progress is in the events. If the client disconnects, the apply ends; written values stay.
     """
     wanted = await _wanted(hub, target, body)
-    options = body.model_dump(exclude={"values", "file", "at", "only"})
-    return _applied(
-        target, await apply(target.component, wanted, **options, **_context(request, hub, target))
-    )
+    options = body.model_dump(exclude={"values", "file", "at", "only"}) | _context(request, hub, target)
+    return _applied(target, await apply(target.component, wanted, **options))
 
 
 @writing.post(f"{VEHICLE}/restore", dependencies=[Depends(_only_setup)])
 async def restore_(
     request: Request, hub: HubArgument, target: TargetArgument, body: RestoreRequest
-) -> ApplyJson | PlanJson:
-    """Restore an earlier state, with the vehicle's own identity and calibration; `dry_run` writes nothing."""
+) -> ApplyJson:
+    """Restore an earlier state, with the vehicle's own identity and calibration."""
     if body.at is None:
         state = await hub.read_cache(load_state_before_apply, target)
     else:
         state = await hub.state_at(target, body.at)
-    if body.dry_run:
-        categories = await restore_categories(target.component, state)
-        return await _plan(target, state, (*categories, *body.include), force=body.force)
-    options = body.model_dump(exclude={"at", "dry_run"})
-    return _applied(
-        target, await restore(target.component, state, **options, **_context(request, hub, target))
-    )
+    options = body.model_dump(exclude={"at"}) | _context(request, hub, target)
+    return _applied(target, await restore(target.component, state, **options))
 
 
 async def _wanted(hub: Hub, target: Target, body: PlanRequest) -> ParamSet:
@@ -157,12 +152,6 @@ async def _wanted(hub: Hub, target: Target, body: PlanRequest) -> ParamSet:
     else:
         found = await values_set(body.values or {}, target)
     return found if body.only is None else found.only(body.only)
-
-
-async def _plan(target: Target, wanted: ParamSet, include: tuple[str, ...], *, force: bool) -> PlanJson:
-    component = target.component
-    found = await prepare(component, wanted, include=include, info=target.metadata, force=force)
-    return PlanJson.of(found, system=component.system, component=component.component)
 
 
 def _applied(target: Target, result: ApplyResult) -> ApplyJson:

@@ -274,11 +274,7 @@ class Store {
     const key = keyOf(event);
     if (event.type === "vehicle") this.takeComponent(key, event);
     else if (event.type === "change") this.takeChange(key, event);
-    else if (event.type === "progress") {
-      const component = this.components.get(key);
-      if (component) component.fetch = event;
-      this.emit("components");
-    } else if (event.type === "setup") this.emit("setup", event);
+    else if (event.type === "setup") this.emit("setup", event);
   }
 
   takeComponent(key, event) {
