@@ -13,7 +13,7 @@ from starlette.staticfiles import StaticFiles
 from paramclient.service import routes, setup_routes
 from paramclient.service.access import AccessMiddleware, cancel_on_disconnect
 from paramclient.service.hub import Hub
-from paramclient.service.problems import RESPONSES, install_handlers
+from paramclient.service.problems import ERRORS, RESPONSES, respond
 from paramclient.service.tokens import Tokens
 from paramclient.version import __version__
 
@@ -40,9 +40,9 @@ def create_app(hub: Hub, *, tokens: Tokens | None = None) -> FastAPI:
         docs_url=None,  # its scripts would come from another site
         redoc_url=None,
         responses=RESPONSES,
+        exception_handlers=dict.fromkeys(ERRORS, respond),
     )
     app.state.hub = hub
-    install_handlers(app)
     app.add_middleware(RequestBodyLimitMiddleware, max_body_size=BODY_BYTES_MAX)
     app.add_middleware(cancel_on_disconnect)
     app.add_middleware(AccessMiddleware, tokens=tokens)

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
 
-from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson, SummaryJson
 from paramclient.cli.json_output import (
-    IdentityJson,
     InfoJson,
     Json,
     ParamJson,
-    SetJson,
     VehicleJson,
     WriteJson,
     WrittenJson,
@@ -22,18 +19,12 @@ from paramclient.model.notation import hash_text, rounded
 from paramclient.model.values import ParamType
 
 if TYPE_CHECKING:
-    from paramclient.cache import CachedSummary, CachedVehicle
-    from paramclient.files import ParamFile
     from paramclient.metadata import ParamInfo
     from paramclient.model.values import Param
     from paramclient.protocol.events import Change
-    from paramclient.protocol.fetch import Progress
-    from paramclient.protocol.set_results import SetManyResult, SetOutcome
+    from paramclient.protocol.set_results import SetOutcome
     from paramclient.service.stations import GroundStation
     from paramclient.service.targets import Target
-
-CHANGING_MEMBERS: Final = frozenset({"silence_s", "round_trip_s", "params", "fetch"})
-"""Members of a vehicle that change all the time: they cause no event."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,54 +34,6 @@ class ParamsJson(Json):
     run: str
     seq: int
     params: Mapping[str, ParamJson | WrittenJson]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FileJson(Json):
-    """The content of a parameter file: a set for each component."""
-
-    file: str
-    format: str
-    notes: list[str]
-    components: list[SetJson]
-
-    @classmethod
-    def of(cls, file: ParamFile) -> FileJson:
-        """Return the content of a file."""
-        sets = [SetJson.with_sources(each, {}) for each in file.sets]
-        return cls(file=file.source, format=file.file_format, notes=list(file.notes), components=sets)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WritesJson(Json):
-    """The outcomes of several writes in order; `error` says why not all were tried."""
-
-    vehicle: VehicleJson
-    results: list[WriteJson]
-    error: str | None
-
-    @classmethod
-    def of(cls, result: SetManyResult, target: Target) -> WritesJson:
-        """Return the outcomes of writes to a component."""
-        return cls(
-            vehicle=VehicleJson.of(target.component),
-            results=[write(outcome, target) for outcome in result.outcomes],
-            error=None if result.error is None else str(result.error),
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HistoryJson(Json):
-    """Changes of values, the newest last."""
-
-    history: list[HistoryLineJson]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SnapshotsJson(Json):
-    """Snapshots, the newest last."""
-
-    snapshots: list[SnapshotJson]
 
 
 def param(known: Param, info: ParamInfo | None, *, whole: bool = True) -> ParamJson:
@@ -110,17 +53,13 @@ def vehicle(target: Target) -> dict[str, Any]:
     """Return the state of the parameters of a component on a link.
 
     `params` is the number of known parameters, `count` the number that the component announces, `fetch` the
-    progress of a running fetch, `fetches` the number of ended ones, `key` the key of its table in the cache.
+    progress of a running fetch, `fetches` the number of ended ones.
     """
-    component, identity = target.component, target.component.identity
+    component, now = target.component, target.progress
     return {
         **target.address,
+        **as_json(VehicleJson.of(component)),
         "link_state": target.link.state,
-        "autopilot": component.autopilot,
-        "vehicle_type": identity.vehicle_type,
-        "key": identity.key,
-        "uid": identity.uid,
-        "identity": as_json(IdentityJson.of(identity)),
         "encoding": component.encoding.value,
         "count": component.count,
         "params": len(component.params),
@@ -131,33 +70,9 @@ def vehicle(target: Target) -> dict[str, Any]:
         "is_lost": component.sync_state == "lost",
         "silence_s": round(component.silence, 3),
         "round_trip_s": rounded(component.round_trip),
-        "fetch": None if target.progress is None else progress(target.progress),
+        "fetch": None if now is None else {**asdict(now), "rate": round(now.rate, 1)},
         "fetches": target.fetches,
         "has_metadata": target.metadata is not None,
-    }
-
-
-def lasting_members(found: dict[str, Any]) -> dict[str, Any]:
-    """Return the members of a vehicle whose changes are events."""
-    return {name: value for name, value in found.items() if name not in CHANGING_MEMBERS}
-
-
-def cached_vehicles(
-    vehicles: Iterable[CachedVehicle], tables: Iterable[CachedSummary]
-) -> list[dict[str, Any]]:
-    """Return the tables of the cache, the last heard first, each with the time when its vehicle was heard."""
-    seen = {each.key: each.last_seen for each in vehicles}
-    found = [{**as_json(SummaryJson.of(each)), "last_seen": seen.get(each.key, 0.0)} for each in tables]
-    return sorted(found, key=lambda each: each["last_seen"], reverse=True)
-
-
-def progress(now: Progress) -> dict[str, Any]:
-    """Return the progress of a fetch: received parameters, their total, rate per second, seconds left."""
-    return {
-        "received": now.received,
-        "total": now.total,
-        "rate": round(now.rate, 1),
-        "seconds_left": rounded(now.seconds_left),
     }
 
 

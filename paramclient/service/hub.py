@@ -7,9 +7,10 @@ import os
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from datetime import datetime
 from functools import partial
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, Final, TypeAlias, TypeVar
 
 import anyio
 import anyio.abc
@@ -22,8 +23,10 @@ from paramclient.client.events import Discovered, Event, Found, Rebooted, Resync
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata import MetadataStore, metadata_of
+from paramclient.model.paramset import ParamSet
 from paramclient.protocol.fetch import FetchResult, Progress
 from paramclient.protocol.watch import SyncState
+from paramclient.provision.inspection import wait_for_identity
 from paramclient.service import documents
 from paramclient.service.event_feed import EventFeed
 from paramclient.service.gateway import Gateway
@@ -37,7 +40,9 @@ if TYPE_CHECKING:
 __all__ = ["Hub"]
 
 CHECK_INTERVAL: Final = 0.2
-"""Seconds between two checks for changes of states, and between two progress events."""
+"""Seconds between two checks for changes of states, among them the progress of a fetch."""
+CHANGING_MEMBERS: Final = ("silence_s", "round_trip_s", "params")
+"""Members of a vehicle that change all the time: they cause no event."""
 REOPEN_DELAYS: Final = (0.25, 0.5, 1.0, 2.0, 5.0)
 """Seconds before each attempt to reopen a failed link; the last one repeats."""
 
@@ -189,8 +194,13 @@ class Hub:
         target.metadata, target.described = found, identity
         self._check(target)
 
-    async def read_cache(self, work: Callable[[ParamCache], Result]) -> Result:
-        """Run a function of the cache in a thread.
+    async def read_cache(
+        self,
+        call: Callable[Concatenate[ParamCache, str, int, ...], Result],
+        target: Target,
+        *more: Any,
+    ) -> Result:
+        """Call a function of the cache, in a thread, with the place of these parameters in it.
 
         Raises:
             ServiceError: the service has no cache, or ends.
@@ -202,7 +212,16 @@ class Hub:
             raise ServiceError(409, "no-cache", detail)
         if self._tasks is None:
             raise ServiceError(503, "closing", "The service is shutting down.")
-        return await anyio.to_thread.run_sync(partial(work, cache), limiter=self._cache_thread)
+        component = target.component
+        await wait_for_identity(component)
+        place = component.identity.key, component.component
+        work = partial(call, cache, *place, *more, extended=component.is_extended)
+        return await anyio.to_thread.run_sync(work, limiter=self._cache_thread)
+
+    async def state_at(self, target: Target, at: int | datetime) -> ParamSet:
+        """Return the parameters of a snapshot, or at a time; see `read_cache`."""
+        when = at if isinstance(at, int) else at.timestamp()
+        return await self.read_cache(ParamCache.state_at, target, when)
 
     async def _run_link(self, link: ServiceLink) -> None:
         """Keep a link open until cancelled."""
@@ -288,12 +307,10 @@ class Hub:
                 self._check(target)
 
     def _check(self, target: Target) -> None:
-        """Publish the state of a component if it has changed, or the progress of its fetch."""
-        if target.progress is not None:
-            self.feed.publish("progress", **target.address, **documents.progress(target.progress))
-        vehicle = documents.vehicle(target) if target.is_listed else {}
-        state = documents.lasting_members(vehicle)
-        if state != target.published and vehicle:
+        """Publish the state of a component if it has changed."""
+        vehicle = documents.vehicle(target)
+        state = {**vehicle, **dict.fromkeys(CHANGING_MEMBERS)}
+        if target.is_listed and state != target.published:
             target.published = state
             self.feed.publish("vehicle", **target.address, vehicle=vehicle)
 

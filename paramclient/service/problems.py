@@ -8,7 +8,7 @@ import re
 from http import HTTPStatus
 from typing import Any, Final
 
-from fastapi import FastAPI, Request
+from fastapi import Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict
 from pydantic_core import to_json
@@ -31,7 +31,7 @@ from paramclient.errors import (
     VehicleError,
 )
 
-__all__ = ["RESPONSES", "Problem", "ServiceError", "install_handlers", "problem_response"]
+__all__ = ["ERRORS", "RESPONSES", "Problem", "ServiceError", "problem_response", "respond"]
 
 MEDIA_TYPE: Final = "application/problem+json"
 FAULTS_MAX: Final = 20
@@ -97,6 +97,10 @@ class ServiceError(Exception):
         self.members = members
 
 
+ERRORS: Final = (RequestValidationError, HTTPException, ParamClientError, ServiceError, Exception)
+"""Exceptions that are answered by `respond`."""
+
+
 def problem_response(error: Exception) -> Response:
     """Return the response to an exception: a problem document; of an unexpected one without details."""
     status, kind, detail, members = 500, "internal", "Internal error of the service; see its log.", {}
@@ -127,13 +131,8 @@ def problem_response(error: Exception) -> Response:
     return Response(json.dumps(members | about), status, headers=headers, media_type=MEDIA_TYPE)
 
 
-def install_handlers(app: FastAPI) -> None:
-    """Set the exception handlers of an application."""
-    for kind in (RequestValidationError, HTTPException, ParamClientError, ServiceError, Exception):
-        app.add_exception_handler(kind, _respond)
-
-
-async def _respond(request: Request, error: Exception) -> Response:
+async def respond(request: Request, error: Exception) -> Response:
+    """Return the response to an exception, and log an unexpected one."""
     response = problem_response(error)
     if response.status_code == HTTPStatus.INTERNAL_SERVER_ERROR:
         logger.error("%s failed", request.url.path, exc_info=error)

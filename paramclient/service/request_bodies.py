@@ -19,7 +19,7 @@ from pydantic import (
 from paramclient.errors import UsageError
 from paramclient.files import FileFormat, ParamFile, loads
 from paramclient.metadata.info import number_of
-from paramclient.model.ext_values import encode_ext_value, ext_param, parse_ext_value
+from paramclient.model.ext_values import parse_ext_value
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import WireValue, check_name
 from paramclient.service.problems import ServiceError
@@ -187,10 +187,9 @@ class ApplyRequest(SetupOptions, PlanRequest):
 
 
 class RestoreRequest(SetupOptions):
-    """The state to restore; without `at`, the state before the last apply. `dry_run` writes nothing."""
+    """The state to restore; without `at`, the state before the last apply."""
 
     at: Moment | None = None
-    dry_run: bool = False
 
 
 class SnapshotRequest(Body):
@@ -207,11 +206,12 @@ async def read_values(values: dict[str, GivenValue], target: Target) -> dict[str
         ParamClientError: the component did not send the type of an extended parameter.
     """
     found: dict[str, WireValue] = {}
+    component = target.component
     for name, given in values.items():
         info = target.info(name)
-        if target.component.is_extended:
-            number = await _type_of(target, name)
-            found[name] = parse_ext_value(name, given, number) if isinstance(given, str) else given
+        if component.is_extended:
+            known = component.params.get(name) or await component.get(name)
+            found[name] = parse_ext_value(name, given, known.type_number) if isinstance(given, str) else given
         elif not isinstance(given, str):
             found[name] = given
         elif (value := number_of(given) if info is None else info.parse(given)) is not None:
@@ -239,21 +239,11 @@ async def values_in_range(
 
 
 async def values_set(values: dict[str, GivenValue], target: Target) -> ParamSet:
-    """Return values as a set. Values of extended parameters take the types that the component reports.
+    """Return values as a set.
 
     Raises:
         UsageError, ParamClientError: as from `read_values`.
     """
-    found, is_extended = {}, target.component.is_extended
-    for name, value in (await read_values(values, target)).items():
-        if is_extended:
-            number = await _type_of(target, name)
-            found[name] = WrittenParam.of(ext_param(name, encode_ext_value(value, number), number))
-        else:
-            found[name] = WrittenParam(check_name(name), value)
-    return ParamSet(found, is_extended=is_extended)
-
-
-async def _type_of(target: Target, name: str) -> int:
-    component = target.component
-    return (component.params.get(name) or await component.get(name)).type_number
+    read = (await read_values(values, target)).items()
+    written = {name: WrittenParam(check_name(name), value) for name, value in read}
+    return ParamSet(written, is_extended=target.component.is_extended)

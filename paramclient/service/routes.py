@@ -1,33 +1,25 @@
 """Routes of the service itself, of vehicles and their parameters.
 
 With `?ext=true`, the routes of parameters are about the extended parameters of a component.
-With `?key=KEY`, the routes that read are about a vehicle in the cache.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import AsyncIterator, Callable
-from dataclasses import dataclass
-from datetime import datetime
-from typing import Annotated, Any, Concatenate, Final, TypeVar
+from collections.abc import AsyncIterator
+from typing import Annotated, Any, Final, TypeVar
 
 import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Path, Query, Request
 from fastapi.responses import PlainTextResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from paramclient.cache import ParamCache
-from paramclient.cli.json_output import FetchJson, ParamJson, WriteJson, WrittenJson
-from paramclient.errors import NotInCache
-from paramclient.metadata import Metadata, ParamInfo
+from paramclient.cli.json_output import FetchJson, ParamJson, VehicleJson, WriteJson, WrittenJson, as_json
 from paramclient.model.names import NameChoice
-from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.service import documents
 from paramclient.service.access import author_of, require_write
-from paramclient.service.documents import ParamsJson, WritesJson
+from paramclient.service.documents import ParamsJson
 from paramclient.service.hub import Hub
 from paramclient.service.metrics import METRICS_MEDIA_TYPE, metrics_text
 from paramclient.service.request_bodies import (
@@ -40,7 +32,7 @@ from paramclient.service.request_bodies import (
 from paramclient.service.targets import Target
 from paramclient.version import __version__
 
-__all__ = ["ROUTERS", "VEHICLE", "At", "HubArgument", "Table", "TableArgument", "TargetArgument"]
+__all__ = ["ROUTERS", "VEHICLE", "At", "HubArgument", "TargetArgument"]
 
 VEHICLE: Final = "/api/vehicles/{system}/{component}"
 
@@ -64,7 +56,6 @@ LinkName = Annotated[
 ]
 At = Annotated[Moment | None, Query(description="An earlier state: a snapshot's number, or a time.")]
 Names = Annotated[list[str] | None, Query(max_length=64, description="Names, or patterns such as MC_*.")]
-Key = Annotated[str | None, Query(max_length=400, description="Key of a vehicle in the cache.")]
 Ext = Annotated[bool, Query(description="The extended parameters (PARAM_EXT_*).")]
 
 
@@ -76,59 +67,6 @@ async def _target_of(
 
 TargetArgument = Annotated[Target, Depends(_target_of)]
 """The plain parameters of a component on a link; with `ext`, the extended ones."""
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """The plain or extended parameters of a component on a link, or of one in the cache.
-
-    Attributes:
-        hub: the hub.
-        key: the key of its vehicle in the cache.
-        component: its component id.
-        extended: whether the parameters are the extended ones.
-        target: the connected component, or None.
-    """
-
-    hub: Hub
-    key: str
-    component: int
-    extended: bool
-    target: Target | None
-
-    @classmethod
-    def of(cls, hub: Hub, target: Target) -> Table:
-        """Return the table of a connected component."""
-        component = target.component
-        return cls(hub, component.identity.key, component.component, component.is_extended, target)
-
-    async def read(
-        self, call: Callable[Concatenate[ParamCache, str, int, ...], Result], *more: Any
-    ) -> Result:
-        """Call a function of the cache with the place of the table; see `Hub.read_cache`."""
-        place = self.key, self.component
-        return await self.hub.read_cache(lambda cache: call(cache, *place, *more, extended=self.extended))
-
-    async def state_at(self, at: int | datetime) -> ParamSet:
-        """Return the parameters of a snapshot, or at a time."""
-        when = at if isinstance(at, int) else at.timestamp()
-        return await self.read(ParamCache.state_at, when)
-
-
-async def _table_of(
-    hub: HubArgument,
-    system: System,
-    component: ComponentId,
-    link: LinkName = None,
-    key: Key = None,
-    ext: Ext = False,
-) -> Table:
-    if key is not None:
-        return Table(hub, key, component, ext, None)
-    return Table.of(hub, hub.target(system, component, link, extended=ext))
-
-
-TableArgument = Annotated[Table, Depends(_table_of)]
 
 
 # the service
@@ -168,12 +106,8 @@ async def stations(hub: HubArgument) -> list[dict[str, Any]]:
 
 @reading.get("/api/vehicles")
 async def vehicles(hub: HubArgument) -> dict[str, Any]:
-    """Return the components on the links, the lowest ids first, and the tables in the cache."""
-    found = {**hub.feed.position, "vehicles": [documents.vehicle(target) for target in hub.targets]}
-    if hub.cache is None:
-        return found | {"cached": []}
-    known = await hub.read_cache(lambda cache: (cache.vehicles(), cache.components()))
-    return found | {"cached": documents.cached_vehicles(*known)}
+    """Return the components on the links, the lowest ids first."""
+    return {**hub.feed.position, "vehicles": [documents.vehicle(target) for target in hub.targets]}
 
 
 # parameters
@@ -182,46 +116,25 @@ async def vehicles(hub: HubArgument) -> dict[str, Any]:
 @reading.get(f"{VEHICLE}/params")
 async def params(
     hub: HubArgument,
-    table: TableArgument,
+    target: TargetArgument,
     names: Names = None,
     metadata: Annotated[bool, Query(description="Include the whole metadata of the parameters.")] = False,
     at: At = None,
 ) -> ParamsJson:
     """Return the known parameters by name, without traffic."""
-    position, target = hub.feed.position, table.target
+    position = hub.feed.position
     choice = NameChoice(names or ["*"])
     if at is not None:
-        state = await table.state_at(at)
+        state = await hub.state_at(target, at)
         earlier = {name: WrittenJson.of(each) for name, each in state.items() if choice.has(name)}
         return ParamsJson(**position, params=earlier)
-    if target is None:
-        known, info = await _cached(table)
-    else:
-        known, info = dict(target.component.params), target.info
+    known = [each for name, each in target.component.params.items() if choice.has(name)]
 
     def encode() -> ParamsJson:
-        chosen = (each for each in known.values() if choice.has(each.name))
-        found = {each.name: documents.param(each, info(each.name), whole=metadata) for each in chosen}
+        found = {each.name: documents.param(each, target.info(each.name), whole=metadata) for each in known}
         return ParamsJson(**position, params=found)
 
     return await anyio.to_thread.run_sync(encode)
-
-
-async def _cached(table: Table) -> tuple[dict[str, Param], Callable[[str], ParamInfo | None]]:
-    """Return the parameters of a vehicle in the cache, and a function with their metadata.
-
-    Raises:
-        NotInCache: the cache has no such table.
-    """
-    found = await table.read(ParamCache.load)
-    if found is None:
-        raise NotInCache(f"The cache has no table of component {table.component} of vehicle {table.key!r}.")
-    store = table.hub.metadata_store
-    described = Metadata({})
-    if store is not None and not table.extended:
-        known = await anyio.to_thread.run_sync(store.known, found.identity, table.component)
-        described = described if known is None else known
-    return dict(found.params), described.find
 
 
 @reading.get(f"{VEHICLE}/params/{{name:path}}")
@@ -246,7 +159,7 @@ async def set_param(request: Request, target: TargetArgument, name: str, body: W
 
 
 @writing.patch(f"{VEHICLE}/params")
-async def set_params(request: Request, target: TargetArgument, body: WriteManyRequest) -> WritesJson:
+async def set_params(request: Request, target: TargetArgument, body: WriteManyRequest) -> dict[str, Any]:
     """Write several parameters in order, many at a time, and verify each.
 
     If a value is invalid or out of range, nothing is written. A value that the vehicle refuses does not stop
@@ -255,7 +168,8 @@ async def set_params(request: Request, target: TargetArgument, body: WriteManyRe
     values = await values_in_range(body.values, target, force=body.force)
     options = body.model_dump(exclude={"values"})
     result = await target.component.set_many(values, **options, author=author_of(request))
-    return WritesJson.of(result, target)
+    found = {"vehicle": VehicleJson.of(target.component), "error": result.error and str(result.error)}
+    return dict(as_json(found | {"results": [documents.write(each, target) for each in result.outcomes]}))
 
 
 @reading.post(f"{VEHICLE}/fetch")

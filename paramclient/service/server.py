@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import socket
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ CONNECTIONS_MAX: Final = 200
 """Maximum number of connections, and of requests; further ones get the status 503."""
 IDLE_TIMEOUT: Final = 30
 """Seconds after which an idle connection is closed."""
+PORT_MAX: Final = 65_535
+"""The highest TCP port."""
 HEADER_BYTES_MAX: Final = 32_768
 """Maximum size of the headers of a request in bytes."""
 SHUTDOWN_TIMEOUT: Final = 1
@@ -48,18 +51,11 @@ class Listening:
         Raises:
             UsageError: the text has another format.
         """
-        host, colon, port = text.rpartition(":")
-        bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
-        is_number = port.isascii() and port.isdecimal() and int(port) < 1 << 16
-        if not (colon and bare and is_number) or (":" in bare and bare == host):
+        found = re.fullmatch(r"(?:\[([0-9a-fA-F:.]+)\]|([^:\s]+)):([0-9]{1,5})", text)
+        if found is None or int(found[3]) > PORT_MAX:
             what = "is not a listening address HOST:PORT such as 127.0.0.1:8765 or [::1]:0"
             raise UsageError(f"{text!r} {what}")
-        return cls(bare, int(port))
-
-    @property
-    def name(self) -> str:
-        """The host as it is in URLs and in the header Host."""
-        return f"[{self.host}]" if ":" in self.host else self.host
+        return cls(found[1] or found[2], int(found[3]))
 
     @property
     def is_loopback(self) -> bool:
@@ -68,6 +64,22 @@ class Listening:
             return ip_address(self.host).is_loopback
         except ValueError:
             return self.host == "localhost"
+
+    def open(self) -> tuple[socket.socket, str]:
+        """Return a listening socket and its URL.
+
+        Raises:
+            LinkError: the address cannot be listened on.
+        """
+        is_v6 = ":" in self.host
+        name = f"[{self.host}]" if is_v6 else self.host
+        try:
+            family = socket.AF_INET6 if is_v6 else socket.AF_INET
+            opened = socket.create_server((self.host, self.port), family=family)
+        except OSError as error:
+            where = f"{name}:{self.port}"
+            raise LinkError(f"cannot listen on {where}: {error.strerror}", link=where) from error
+        return opened, f"http://{name}:{opened.getsockname()[1]}"
 
 
 class _Server(uvicorn.Server):
@@ -119,8 +131,8 @@ async def serve(
         h11_max_incomplete_event_size=HEADER_BYTES_MAX,
     )
     server = _Server(config)
-    with _open(listening) as opened:
-        url = f"http://{listening.name}:{opened.getsockname()[1]}"
+    opened, url = listening.open()
+    with opened:
         async with anyio.create_task_group() as tasks:
             try:
                 async with hub:
@@ -132,19 +144,3 @@ async def serve(
                     await stop.wait()
             finally:
                 server.should_exit = True
-
-
-def _open(listening: Listening) -> socket.socket:
-    """Return a listening socket.
-
-    Raises:
-        LinkError: the address cannot be listened on.
-    """
-    family = socket.AF_INET6 if ":" in listening.host else socket.AF_INET
-    try:
-        opened = socket.create_server((listening.host, listening.port), family=family)
-    except OSError as error:
-        where = f"{listening.name}:{listening.port}"
-        raise LinkError(f"cannot listen on {where}: {error.strerror}", link=where) from error
-    opened.setblocking(False)
-    return opened

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import AsyncIterator, Callable
@@ -14,9 +15,9 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import Response
 from pydantic import AwareDatetime
 
-from paramclient.cache import ParamCache
+from paramclient.cache import ParamCache, SnapshotSummary
 from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson
-from paramclient.cli.json_output import VehicleJson
+from paramclient.cli.json_output import SetJson, VehicleJson, as_json
 from paramclient.cli.json_setup import ApplyJson, PlanJson
 from paramclient.errors import UsageError
 from paramclient.files import FileFormat, dumps
@@ -24,12 +25,9 @@ from paramclient.files.formats import ENDINGS
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
 from paramclient.provision import ApplyProgress, ApplyResult, apply, prepare, restore
-from paramclient.provision.apply_restore import restore_categories
-from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.restore_point import load_state_before_apply
-from paramclient.provision.vehicle_params import fetch_set, load_cached_set, select_non_defaults, set_maker
+from paramclient.provision.vehicle_params import fetch_set, select_non_defaults, set_maker
 from paramclient.service.access import author_of, require_write
-from paramclient.service.documents import FileJson, HistoryJson, SnapshotsJson
 from paramclient.service.hub import Hub
 from paramclient.service.problems import ServiceError
 from paramclient.service.request_bodies import (
@@ -40,7 +38,7 @@ from paramclient.service.request_bodies import (
     UploadedFile,
     values_set,
 )
-from paramclient.service.routes import VEHICLE, At, HubArgument, Table, TableArgument, TargetArgument
+from paramclient.service.routes import VEHICLE, At, HubArgument, TargetArgument
 from paramclient.service.targets import Target
 
 __all__ = ["ROUTERS"]
@@ -59,26 +57,26 @@ ROUTERS: Final = (reading, writing)
 
 
 @reading.post("/api/files")
-async def read_file(body: UploadedFile) -> FileJson:
+async def read_file(body: UploadedFile) -> dict[str, Any]:
     """Parse a parameter file of any format. It is not stored."""
-    return await anyio.to_thread.run_sync(lambda: FileJson.of(body.read()))
+    file = await anyio.to_thread.run_sync(body.read)
+    sets = as_json([SetJson.with_sources(each, {}) for each in file.sets])
+    return {"file": file.source, "format": file.file_format, "notes": file.notes, "components": sets}
 
 
 @reading.get(f"{VEHICLE}/file", response_class=Response)
 async def file(
-    table: TableArgument,
+    hub: HubArgument,
+    target: TargetArgument,
     file_format: Annotated[FileFormat, Query(alias="format")] = FileFormat.QGC,
     changed: Annotated[bool, Query(description="Only parameters that differ from the defaults.")] = False,
     at: At = None,
 ) -> Response:
-    """Return the parameters as a file. Those of a connected vehicle are fetched first, unless in sync."""
+    """Return the parameters as a file. They are fetched first, unless they are in sync."""
     described: dict[str, int | float] = {}
     if at is not None:
-        found = await table.state_at(at)
-    elif table.target is None:
-        found = await table.read(load_cached_set)
+        found = await hub.state_at(target, at)
     else:
-        target = table.target
         found = (await fetch_set(target.component, source=f"link {target.link.name}")).set
         described = {} if target.metadata is None else target.metadata.defaults_of(found)
     if changed:
@@ -116,7 +114,9 @@ async def _only_setup(target: TargetArgument) -> AsyncIterator[None]:
 @reading.post(f"{VEHICLE}/plan")
 async def plan(hub: HubArgument, target: TargetArgument, body: PlanRequest) -> PlanJson:
     """Return which values an apply would write, in which order, and which it would skip, and why."""
-    return await _plan(target, await _wanted(hub, target, body), body.include, force=body.force)
+    component, wanted = target.component, await _wanted(hub, target, body)
+    found = await prepare(component, wanted, include=body.include, info=target.metadata, force=body.force)
+    return PlanJson.of(found, system=component.system, component=component.component)
 
 
 @writing.post(f"{VEHICLE}/apply", dependencies=[Depends(_only_setup)])
@@ -126,27 +126,21 @@ async def apply_(request: Request, hub: HubArgument, target: TargetArgument, bod
     The progress is in the events. If the client disconnects, the apply ends; written values stay.
     """
     wanted = await _wanted(hub, target, body)
-    options = body.model_dump(exclude={"values", "file", "at", "only"})
-    return _applied(
-        target, await apply(target.component, wanted, **options, **_context(request, hub, target))
-    )
+    options = body.model_dump(exclude={"values", "file", "at", "only"}) | _context(request, hub, target)
+    return _applied(target, await apply(target.component, wanted, **options))
 
 
 @writing.post(f"{VEHICLE}/restore", dependencies=[Depends(_only_setup)])
 async def restore_(
     request: Request, hub: HubArgument, target: TargetArgument, body: RestoreRequest
-) -> ApplyJson | PlanJson:
-    """Restore an earlier state, with the vehicle's own identity and calibration; `dry_run` writes nothing."""
-    await wait_for_identity(target.component)
-    table = Table.of(hub, target)
-    state = await (table.read(load_state_before_apply) if body.at is None else table.state_at(body.at))
-    if body.dry_run:
-        categories = await restore_categories(target.component, state)
-        return await _plan(target, state, (*categories, *body.include), force=body.force)
-    options = body.model_dump(exclude={"at", "dry_run"})
-    return _applied(
-        target, await restore(target.component, state, **options, **_context(request, hub, target))
-    )
+) -> ApplyJson:
+    """Restore an earlier state, with the vehicle's own identity and calibration."""
+    if body.at is None:
+        state = await hub.read_cache(load_state_before_apply, target)
+    else:
+        state = await hub.state_at(target, body.at)
+    options = body.model_dump(exclude={"at"}) | _context(request, hub, target)
+    return _applied(target, await restore(target.component, state, **options))
 
 
 async def _wanted(hub: Hub, target: Target, body: PlanRequest) -> ParamSet:
@@ -154,17 +148,10 @@ async def _wanted(hub: Hub, target: Target, body: PlanRequest) -> ParamSet:
     if body.file is not None:
         found = await anyio.to_thread.run_sync(body.file.read_set, target)
     elif body.at is not None:
-        await wait_for_identity(target.component)
-        found = await Table.of(hub, target).state_at(body.at)
+        found = await hub.state_at(target, body.at)
     else:
         found = await values_set(body.values or {}, target)
     return found if body.only is None else found.only(body.only)
-
-
-async def _plan(target: Target, wanted: ParamSet, include: tuple[str, ...], *, force: bool) -> PlanJson:
-    component = target.component
-    found = await prepare(component, wanted, include=include, info=target.metadata, force=force)
-    return PlanJson.of(found, system=component.system, component=component.component)
 
 
 def _applied(target: Target, result: ApplyResult) -> ApplyJson:
@@ -195,41 +182,40 @@ def _publisher(publish: Callable[..., None]) -> Callable[[ApplyProgress], None]:
 
 
 @reading.get(f"{VEHICLE}/snapshots")
-async def snapshots(table: TableArgument) -> SnapshotsJson:
+async def snapshots(hub: HubArgument, target: TargetArgument) -> dict[str, list[SnapshotJson]]:
     """Return the snapshots, the newest last."""
-    return SnapshotsJson(snapshots=[SnapshotJson.of(each) for each in await table.read(ParamCache.snapshots)])
+    found = await hub.read_cache(ParamCache.snapshots, target)
+    return {"snapshots": [SnapshotJson.of(each) for each in found]}
 
 
 @writing.post(f"{VEHICLE}/snapshots", status_code=201)
 async def create_snapshot(hub: HubArgument, target: TargetArgument, body: SnapshotRequest) -> SnapshotJson:
     """Store a snapshot of the known table."""
     component = target.component
-    await wait_for_identity(component)
-    if not component.params:
+    known = list(component.params.values())
+    if not known:
         raise UsageError("no parameter of the vehicle is known")
-    table = set_maker(component, f"link {target.link.name}")(list(component.params.values()))
-    complete = component.count is not None and len(component.params) >= component.count
-    store = partial(
-        ParamCache.store_snapshot,
-        vehicle=component.identity,
-        component=component.component,
-        params=table,
-        reason=body.reason,
-        hash=component.hash,
-        complete=complete,
-        extended=component.is_extended,
-    )
-    return SnapshotJson.of(await hub.read_cache(store))
+    table = set_maker(component, f"link {target.link.name}")(known)
+    is_whole, crc = len(known) >= (component.count or math.inf), component.hash
+
+    def store(cache: ParamCache, _: str, number: int, **which: bool) -> SnapshotSummary:
+        vehicle, reason = component.identity, body.reason
+        return cache.store_snapshot(
+            vehicle, number, table, reason=reason, hash=crc, complete=is_whole, **which
+        )
+
+    return SnapshotJson.of(await hub.read_cache(store, target))
 
 
 @reading.get(f"{VEHICLE}/history")
 async def history(
-    table: TableArgument,
+    hub: HubArgument,
+    target: TargetArgument,
     name: Annotated[str | None, Query(max_length=16)] = None,
     limit: Annotated[int, Query(ge=1, le=1_000)] = HISTORY_ENTRIES,
     since: Annotated[AwareDatetime | None, Query(description="Only from this time on.")] = None,
-) -> HistoryJson:
+) -> dict[str, list[HistoryLineJson]]:
     """Return the newest changes of values, the newest last."""
     begin = None if since is None else since.timestamp()
-    entries = await table.read(ParamCache.history, name, limit, begin)
-    return HistoryJson(history=[HistoryLineJson.of(each) for each in entries])
+    entries = await hub.read_cache(ParamCache.history, target, name, limit, begin)
+    return {"history": [HistoryLineJson.of(each) for each in entries]}

@@ -51,7 +51,7 @@ async def vehicle(browser: httpx.AsyncClient, address: str = V) -> dict[str, Any
     if url.path == "/api/vehicles":
         return listed
     system, component = map(int, url.path.split("/")[3:5])
-    wanted = {"system": system, "component": component, "extended": "ext" in url.params}
+    wanted: dict[str, Any] = {"system": system, "component": component, "extended": "ext" in url.params}
     wanted |= {"link": url.params["link"]} if "link" in url.params else {}
     return next((each for each in listed["vehicles"] if wanted.items() <= each.items()), None)
 

@@ -197,9 +197,9 @@ def test_a_token_file_is_private_and_holds_digests(tmp_path: Path) -> None:
     other = add_token(file, "wall", "read")
     known = Tokens.read(file)
     holders = [known.holder(each) for each in (token, other, "wrong", "")]
-    assert [each and (each.name, each.may_write) for each in holders] == [
-        ("anna", True),
-        ("wall", False),
+    assert [each and (each.name, each.role) for each in holders] == [
+        ("anna", "write"),
+        ("wall", "read"),
         None,
         None,
     ]

@@ -10,7 +10,7 @@ import { Grid } from "./grid.js";
 import { nameOf, outcomesText, review, undo, undoButton } from "./review.js";
 import { showStations } from "./stations.js";
 import { HIGHLIGHT_TIME, OTHERS, store } from "./store.js";
-import { defaultOf, many, parse } from "./values.js";
+import { defaultOf, many, parse, recentText } from "./values.js";
 import { drawActions, drawVehicles, offerDescriptions, showError } from "./vehicles.js";
 
 const FILTERS = {
@@ -93,13 +93,8 @@ const drawState = onceAFrame(() => {
 });
 
 function drawGroups() {
-  const { groups, pending, rows } = store.table;
-  const waiting = new Map();
-  for (const name of pending.keys()) {
-    const group = rows.get(name)?.group;
-    waiting.set(group, (waiting.get(group) ?? 0) + 1);
-  }
-  const key = JSON.stringify([store.selected, shown.group, [...groups], [...waiting]]);
+  const { groups, rows } = store.table;
+  const key = JSON.stringify([store.selected, shown.group, [...groups]]);
   const list = byId("groups");
   if (list.dataset.shown === key) return;
   list.dataset.shown = key;
@@ -119,7 +114,6 @@ function drawGroups() {
           on: { click: () => choose({ group }) },
         },
         el("span", { text }),
-        waiting.has(group) && el("i", { class: "dot warn" }),
         el("small", { text: String(count) }),
       ),
     );
@@ -183,7 +177,7 @@ function emptyText(count, total, component, table) {
     return component.fetch
       ? "Loading the parameters."
       : table.isLoaded
-        ? `No parameters are known${component.is_kept ? "." : " yet. Fetch requests them from the vehicle."}`
+        ? "No parameters are known yet. Fetch requests them from the vehicle."
         : "Loading …";
   if (shown.filter === "changed" && !shown.words.length)
     return table.sorted.some((row) => row.isChanged !== null)
@@ -255,31 +249,18 @@ store.on("other", () => {
 store.on("armed", (component) =>
   announce(`${nameOf(component)} is ${component.is_armed ? "armed" : "not armed any more"}.`),
 );
-store.on("lost", (component) => announce(`${nameOf(component)} ${component.is_lost ? "is lost" : "is heard again"}.`));
-
-/** Describes recent changes of one or several rows in one sentence for each kind. */
-function changesText(recent) {
-  const of = (kind) => recent.filter((each) => each.kind === kind);
-  const said = ["changed", "added", "removed"].map((kind) => {
-    const all = of(kind);
-    const [first] = all;
-    if (all.length > 1) return `${all.length} parameters were ${kind}${kind === "changed" ? " by others" : ""}.`;
-    if (!first) return "";
-    return kind === "changed" ? `${first.name} is ${first.text} now, by ${first.by}.` : `${first.name} was ${kind}.`;
-  });
-  return said.filter(Boolean).join(" ");
-}
 
 const recent = [];
 store.on("recent", ({ key, row }) => {
   if (key !== store.selected) return;
   if (!recent.length) {
     setTimeout(() => {
-      announce(changesText(recent));
+      const [first] = recent;
+      announce(recent.length > 1 ? `${recent.length} parameters were changed by others.` : `${first.name}: ${recentText(first)}.`);
       recent.length = 0;
     }, 1000);
   }
-  recent.push({ name: row.name, text: row.text, ...row.recent });
+  recent.push({ name: row.name, ...row.recent });
 });
 setInterval(() => {
   for (const table of store.tables.values())
@@ -343,12 +324,6 @@ const KEYS = {
     byId("search").select();
   },
   "?": showKeys,
-  g: () =>
-    (isNarrow()
-      ? byId("group-choice")
-      : (byId("groups").querySelector(".chosen") ?? byId("groups").querySelector("button"))
-    ).focus(),
-  v: () => (isNarrow() ? byId("vehicle-choice") : byId("vehicles").querySelector(".chosen"))?.focus(),
   d: () => take((row) => defaultOf(row.document)),
   t: () => take((row) => store.table.other?.values.get(row.name)?.text ?? null),
   u: () => grid.active && store.unstage(grid.active.name),
@@ -377,16 +352,6 @@ document.addEventListener("keydown", (event) => {
     KEYS[event.key]();
   } else if (event.key === "Escape" && !isTyping && !event.defaultPrevented) grid.root.focus({ preventScroll: true });
 });
-
-for (const list of [byId("groups"), byId("vehicles")]) {
-  list.addEventListener("keydown", (event) => {
-    const steps = { ArrowDown: 1, ArrowUp: -1 };
-    if (!(event.key in steps)) return;
-    event.preventDefault();
-    const buttons = [...list.querySelectorAll("button")];
-    buttons[buttons.indexOf(document.activeElement) + steps[event.key]]?.focus();
-  });
-}
 
 addEventListener("dragover", (event) => {
   if (event.dataTransfer?.types.includes("Files")) event.preventDefault();

@@ -1,7 +1,7 @@
 /** Comparison with a file, an earlier state or another vehicle, and applying values from it. */
 
 import { Problem, at, get, request } from "./api.js";
-import { announce, button, byId, changesTable, choice, el, faultText, fileChoice, nothing, setText } from "./dom.js";
+import { announce, button, byId, changesTable, choice, el, faultText, nothing, setText } from "./dom.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { valueText } from "./details.js";
 import { Caution, OUTCOMES, nameOf, outcomesText } from "./review.js";
@@ -30,11 +30,9 @@ export async function chooseOther(file = null) {
       fault.textContent = error.message;
     }
   };
-  const [input, label] = fileChoice(
-    "file",
-    "A parameter file of any ground station. You can also drop it onto the page.",
-    (chosen) => chosen && attempt(() => fromFile(chosen)),
-  );
+  const take = () => input.files[0] && attempt(() => fromFile(input.files[0]));
+  const input = el("input", { type: "file", on: { change: take } });
+  const text = "A parameter file of any ground station. You can also drop it onto the page.";
   const snapshots = el("ul", { class: "choices" }, nothing("Looking …"));
   const vehicles = el("ul", { class: "choices" });
   const content = el(
@@ -42,7 +40,7 @@ export async function chooseOther(file = null) {
     {},
     fault,
     el("h3", { text: "A file" }),
-    label,
+    el("label", { class: "drop" }, el("span", { text }), input),
     el("h3", { text: "An earlier state" }),
     snapshots,
     el("h3", { text: "Another vehicle" }),
@@ -91,10 +89,10 @@ async function fillSnapshots(component, list, attempt) {
 }
 
 function fillVehicles(component, list, attempt) {
-  const others = [...store.components.values(), ...store.unheard].filter((each) => keyOf(each) !== keyOf(component));
+  const others = [...store.components.values()].filter((each) => keyOf(each) !== keyOf(component));
   fill(list, others, "No other vehicle is known.", (each) => [
     nameOf(each),
-    each.is_kept ? `${each.uid ?? each.key}, in the cache since ${moment(each.last_seen)}` : `on ${each.link}`,
+    `on ${each.link}`,
     () =>
       attempt(async () => {
         const { params } = await get(at(each, "/params"));
@@ -248,10 +246,6 @@ export async function takeOver() {
   }
 
   async function makePlan() {
-    lines = [];
-    body.replaceChildren();
-    summary.textContent = "Planning the changes …";
-    refresh();
     try {
       const plan = await request("POST", at(component, "/plan"), other.source, { timeout: PLAN_TIMEOUT });
       lines = linesOf(plan, table, other, refresh);

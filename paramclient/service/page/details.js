@@ -49,9 +49,7 @@ export class Details {
   }
 
   close() {
-    this.root.hidden = true;
-    document.body.classList.remove("with-sheet");
-    this.name = null;
+    this.forget();
     this.leave();
   }
 
@@ -112,11 +110,9 @@ export class Details {
     const facts = [
       ["Default", standard !== null && `${standard}${meaning(standard, row)}`, defaultSourceOf(known)],
       ["Range", rangeOf(info)],
-      ["Step", info?.increment !== undefined && numberText(info.increment, row.type)],
       ["Type", row.type],
       ["Index", known.index],
       ["Group", row.group],
-      ["Category", info?.category],
       ["Value", TRUST[known.trust] ?? known.trust],
       ["Restart", info?.reboot_required && "a new value counts from the next start on"],
       ["Read-only", info?.is_read_only && "the vehicle sets it by itself"],

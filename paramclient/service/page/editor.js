@@ -41,7 +41,7 @@ export function editorOf(row, pending, { stage, leave, isCompact = true }) {
         },
         keydown: (event) => {
           if (event.key === "Escape") leave();
-          else if (event.key === "Enter" && event.target.tagName !== "BUTTON") form.requestSubmit();
+          else if (event.key === "Enter" && !["BUTTON", "TEXTAREA"].includes(event.target.tagName)) form.requestSubmit();
           else return;
           event.preventDefault();
           event.stopPropagation();
@@ -130,7 +130,7 @@ function inputOf(row, value, hintId, report) {
 
 function number(row, value, hintId, report) {
   const { info, type, name } = row;
-  const first = el("input", {
+  const first = el(/[\r\n]/.test(value) ? "textarea" : "input", {
     class: "number",
     value,
     inputmode: isFloat(type) ? "decimal" : isWhole(type) ? "numeric" : "text",
@@ -141,18 +141,6 @@ function number(row, value, hintId, report) {
     "aria-describedby": hintId,
     on: {
       input: () => report(parse(first.value, type)),
-      keydown: (event) => {
-        if (!["ArrowUp", "ArrowDown"].includes(event.key) || !(isFloat(type) || isWhole(type))) return;
-        event.preventDefault();
-        const read = parse(first.value, type);
-        if (read.error || !Number.isFinite(Number(read.text))) return;
-        const step =
-          (event.key === "ArrowUp" ? 1 : -1) *
-          (info?.increment ?? (isFloat(type) ? 0.1 : 1)) *
-          (event.shiftKey ? 10 : 1);
-        first.value = stepped(read.text, step, type);
-        report(parse(first.value, type));
-      },
     },
   });
   const write = (text) => {
@@ -233,15 +221,6 @@ function boxes(row, value, report) {
     el("label", { class: "bit" }, box, el("span", { text: info.bits[bit] }), el("small", { text: `bit ${bit}` })),
   );
   const group = el("fieldset", { class: "bits", "aria-label": `Bits of ${name}` }, labels);
-  const step = (by, event) => {
-    const place = made.findIndex(([, box]) => box === document.activeElement);
-    made[place + by]?.[1].focus();
-    event.preventDefault();
-  };
-  group.addEventListener("keydown", (event) => {
-    if (event.key === "ArrowDown") step(1, event);
-    else if (event.key === "ArrowUp") step(-1, event);
-  });
   show();
   return {
     first: made[0]?.[1] ?? total,
@@ -253,16 +232,6 @@ function boxes(row, value, report) {
     },
   };
 }
-
-/** Returns the next number of a step, without rounding errors. */
-function stepped(text, step, type) {
-  if (!isFloat(type)) return String(BigInt(text) + BigInt(Math.round(step) || Math.sign(step)));
-  const places = Math.max(decimals(text), decimals(String(step)));
-  return String(Number((Number(text) + step).toFixed(Math.min(20, places))));
-}
-
-const decimals = (text) =>
-  (text.split("e")[0].split(".")[1] ?? "").length + Math.max(0, -Number(text.split("e")[1] ?? 0));
 
 function hints(row) {
   const { info, type } = row;

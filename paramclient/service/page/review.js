@@ -182,19 +182,11 @@ export function outcomesText(outcomes) {
 
 /** Returns the display name of a vehicle. */
 export function nameOf(component) {
-  const name = KINDS[component.vehicle_type] ?? AUTOPILOTS[component.autopilot] ?? component.autopilot;
+  const name = AUTOPILOTS[component.autopilot] ?? (component.kind || component.autopilot);
   return `${name} ${component.system}/${component.component}${component.extended ? ", extended" : ""}`;
 }
 
-/** Components that are no vehicles, by MAV_TYPE. */
-const KINDS = { 26: "Gimbal", 30: "Camera" };
-const AUTOPILOTS = {
-  px4: "PX4",
-  ardupilot: "ArduPilot",
-  ardupilotmega: "ArduPilot",
-  generic: "Generic",
-  unknown: "Unknown",
-};
+const AUTOPILOTS = { px4: "PX4", ardupilot: "ArduPilot" };
 
 /** A row of the review. `follow()` updates it with the vehicle's current value. */
 function lineOf(change, rowNow, drop) {

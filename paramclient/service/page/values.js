@@ -40,17 +40,8 @@ export function textOf(param) {
 /** Formats a number without bits, such as a default or a limit. */
 export function numberText(value, type) {
   if (typeof value !== "number") return String(value ?? "");
-  const text = Object.is(value, -0) ? "-0" : String(type === "REAL32" ? shortest(value) : value);
+  const text = Object.is(value, -0) ? "-0" : String(value);
   return isFloat(type) && /^-?\d+$/.test(text) ? `${text}.0` : text;
-}
-
-/** Returns the shortest number with the same float32: 0.07 for 0.07000000029802322. */
-function shortest(value) {
-  for (let digits = 1; digits < 9; digits++) {
-    const short = Number(value.toPrecision(digits));
-    if (Math.fround(short) === Math.fround(value)) return short;
-  }
-  return value;
 }
 
 /** Returns the meaning of a value from its metadata: `Loiter`, `GPS | Baro`; "" for a plain number. */
