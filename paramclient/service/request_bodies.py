@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from base64 import b64decode
 from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
 from pydantic import (
     AwareDatetime,
-    Base64Bytes,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -36,9 +36,7 @@ __all__ = [
     "SnapshotRequest",
     "UploadedFile",
     "WriteManyRequest",
-    "WriteOptions",
     "WriteRequest",
-    "read_values",
     "values_in_range",
     "values_set",
 ]
@@ -57,6 +55,10 @@ class Body(BaseModel):
 
 def _parse_number(given: object) -> object:
     return int(given) if isinstance(given, str) and given.isdecimal() else given
+
+
+def _decode(given: object) -> object:
+    return b64decode(given, validate=True) if isinstance(given, str) else given
 
 
 def _check_text(given: object) -> object:
@@ -125,7 +127,7 @@ class UploadedFile(Body):
 
     name: Annotated[str, Field(max_length=255)] = ""
     text: Annotated[str, Field(max_length=FILE_BYTES_MAX)] | None = None
-    base64: Annotated[Base64Bytes, Field(max_length=FILE_BYTES_MAX)] | None = None
+    base64: Annotated[bytes, BeforeValidator(_decode), Field(max_length=FILE_BYTES_MAX)] | None = None
     format: FileFormat | None = None
     component: Annotated[int, Field(ge=1, le=255)] | None = None
 
