@@ -27,6 +27,7 @@ import multiprocessing
 import os
 import platform
 import re
+import shutil
 import socket
 import statistics
 import struct
@@ -294,7 +295,7 @@ def compare(cases: list[Case], arguments: argparse.Namespace, vehicle: str) -> N
         f"\nMedian of {arguments.repeat}, in seconds; in brackets the ratio to paramclient. Datagrams are "
         f"lost in both directions, and where they are, the round trip is {ROUND_TRIP * 1000:.0f} ms. "
         f"{time.strftime('%Y-%m-%d')}, {machine()}, load {min(loads):.1f} to {max(loads):.1f}, "
-        f"{(time.monotonic() - began) / 60:.0f} minutes. {versions()}.{vehicle}"
+        f"{(time.monotonic() - began) / 60:.0f} minutes. {versions(MAVPROXY)}.{vehicle}"
     )
 
 
@@ -363,10 +364,9 @@ def machine() -> str:
     return f"{os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"
 
 
-def versions() -> str:
-    return ", ".join(
-        f"{package} {installed(package)}" for package in ("paramclient", "pymavlink", "mavsdk", "MAVProxy")
-    )
+def versions(mavproxy: MavProxy) -> str:
+    packages = [f"{package} {installed(package)}" for package in ("paramclient", "pymavlink", "mavsdk")]
+    return ", ".join([*packages, f"MAVProxy {mavproxy.version or 'not installed'}"])
 
 
 def firmware(identity: Identity) -> str:
@@ -564,17 +564,33 @@ def fetch_with_mavsdk(port: int, limit: float) -> tuple[float, Values]:
 
 
 class MavProxy:
-    """MAVProxy as a program. It requests the parameters itself after the first heartbeat."""
+    """MAVProxy as a program. It requests the parameters itself after the first heartbeat.
+
+    Args:
+        command: the program; None: the one beside Python, or on the PATH.
+    """
 
     ways = ("list", "file")
 
+    def __init__(self, command: str | None = None) -> None:
+        beside = shutil.which("mavproxy.py", path=Path(sys.executable).parent)
+        self._command = command or beside or shutil.which("mavproxy.py")
+
+    @property
+    def version(self) -> str:
+        """Its version; "" if it is not installed."""
+        if self._command is None:
+            return ""
+        output = subprocess.run([self._command, "--version"], capture_output=True, text=True, check=True)
+        return output.stdout.rpartition("Version: ")[2].strip()
+
     def run(self, case: Case, seed: int, limit: float) -> Outcome:
-        if installed("MAVProxy") == "not installed":
+        if self._command is None:
             return Outcome(math.inf, "not installed")
         with tempfile.TemporaryDirectory() as folder, case.flying(seed) as (port, requested_at):
             # with its module for MAVFTP it always tries the file first, without it downloads by list
             modules = "ftp,param" if case.way == "file" else "param"
-            command = [sys.executable, "-m", "MAVProxy.mavproxy", f"--master=udpin:127.0.0.1:{port}"]
+            command = [self._command, f"--master=udpin:127.0.0.1:{port}"]
             command += [
                 "--non-interactive",
                 f"--default-modules={modules}",
@@ -617,6 +633,7 @@ class MavProxy:
         )
 
 
+MAVPROXY = MavProxy()
 CLIENTS: dict[str, PythonClient | MavProxy] = {
     "paramclient": PythonClient(
         "paramclient",
@@ -628,7 +645,7 @@ CLIENTS: dict[str, PythonClient | MavProxy] = {
     ),
     "pymavlink, the usual loop": PythonClient("pymavlink", {"list": fetch_with_pymavlink}),
     "MAVSDK": PythonClient("mavsdk", {"list": fetch_with_mavsdk}),
-    "MAVProxy": MavProxy(),
+    "MAVProxy": MAVPROXY,
 }
 
 

@@ -18,7 +18,7 @@ import anyio.from_thread
 from paramclient.links import SimLink
 from paramclient.model.values import ParamType, WireValue
 from paramclient.service import Hub, Listening, Tokens, serve
-from paramclient.sim import ArduPilotVehicle, PX4Vehicle, Vehicle
+from paramclient.sim import ArduPilotVehicle, Camera, PX4Vehicle, Vehicle
 from paramclient.wire.frames import Frame
 from paramclient.wire.messages import Message
 from tests.simulation import clamped
@@ -58,15 +58,21 @@ class Bench:
 
     Attributes:
         url: where it is.
+        endpoint: where ground stations connect.
         vehicles: the vehicles by the name of their link; what is done to them goes through `do`.
         token: what other programs show to the service, where it wants one.
     """
 
     def __init__(
-        self, portal: anyio.from_thread.BlockingPortal, url: str, vehicles: Mapping[str, Vehicle]
+        self,
+        portal: anyio.from_thread.BlockingPortal,
+        url: str,
+        endpoint: str,
+        vehicles: Mapping[str, Vehicle],
     ) -> None:
         self._portal = portal
         self.url = url
+        self.endpoint = endpoint
         self.token = ""
         self.vehicles = vehicles
 
@@ -94,9 +100,10 @@ class Bench:
         found = self.ask("GET", "/vehicles")["vehicles"]
         px4 = next((each for each in found if each["link"] == "px4" and each["state"] == "synced"), None)
         if px4 is not None and not px4["has_metadata"]:
-            self.ask("POST", "/vehicles/1/1/metadata?link=px4", {})
+            self.ask("POST", "/vehicles/1/1/fetch?link=px4", {"metadata": True})
         is_described = px4 is not None and px4["has_metadata"]
-        return is_described and sum(each["state"] == "synced" for each in found) == len(self.vehicles)
+        autopilots = [each for each in found if each["component"] == 1]
+        return is_described and sum(each["state"] == "synced" for each in autopilots) == 3
 
 
 @contextmanager
@@ -107,14 +114,10 @@ def at_work(folder: Path, *, tokens: Tokens | None = None, port: int = 0) -> Ite
         "px4": PX4Vehicle(metadata=True, param_error=True),
         "ardupilot": Limited(),
         "odd": PX4Vehicle(system=3, uid=3, table=HOSTILE, metadata=True),
+        "camera": Camera(system=4, component=100),
     }
-    url = ""
+    url = endpoint = ""
     listens = threading.Event()
-
-    def reported(where: str) -> None:
-        nonlocal url
-        url = where
-        listens.set()
 
     with anyio.from_thread.start_blocking_portal() as portal:
 
@@ -122,14 +125,20 @@ def at_work(folder: Path, *, tokens: Tokens | None = None, port: int = 0) -> Ite
             stop = anyio.Event()
             task_status.started(stop)
             links = [SimLink(vehicle, name) for name, vehicle in vehicles.items()]
-            hub = Hub(links, cache=folder / "cache.sqlite3")
+            hub = Hub(links, cache=folder / "cache.sqlite3", mavlink=["tcpin:0"])
+
+            def reported(where: str) -> None:
+                nonlocal url, endpoint
+                url, endpoint = where, hub.gateway.endpoints[0].address
+                listens.set()
+
             listening = Listening(port=port)
             await serve(hub, listening=listening, tokens=tokens, stop=stop, listens=reported)
 
         running, stop = portal.start_task(run)
         try:
             assert listens.wait(20)
-            yield Bench(portal, url, vehicles)
+            yield Bench(portal, url, endpoint, vehicles)
         finally:
             portal.call(stop.set)
             running.result(20)

@@ -63,6 +63,12 @@ def test_the_oracle_by_file_waits_one_round_trip_for_what_was_lost(
     assert burst + 2 * 2.5 < seconds(0.05, 2.5) < burst + 5 * 2.5
 
 
+def test_gateway_prints_a_table() -> None:
+    row, *_, own = bench("gateway", "--skip-direct", "--only", "PX4 clean").split("\n\n")[0].splitlines()[2:]
+    assert re.fullmatch(r"\| PX4 clean \| pymavlink, the usual loop \|( \d+\.\d\d \|){4}  \|", row)
+    assert re.fullmatch(r"\| PX4 clean \| the gateway itself \|  \|  \|( \d+\.\d\d \|){2} \d+ \|", own)
+
+
 def test_peers_prints_a_table_of_a_real_vehicle() -> None:
     with flying(PX4Vehicle(table={"MC_ROLL_P": 6.5, "MC_PITCH_P": 6.5})) as link:
         text = bench("peers", "--repeat", "1", "--only", "paramclient", "clean", "5%", "--live", link)

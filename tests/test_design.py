@@ -64,7 +64,7 @@ LIBRARIES = {
     "pyulog": ("logs",),
     "httpx": (),
     **dict.fromkeys(["rich", "cyclopts"], ("cli", "__main__")),
-    **dict.fromkeys(["fastapi", "starlette", "uvicorn", "websockets", "prometheus_client"], ("service",)),
+    **dict.fromkeys(["fastapi", "starlette", "uvicorn", "websockets"], ("service",)),
 }
 """The rooms or modules that may import a library: few know an event loop."""
 

@@ -24,7 +24,7 @@ value_of() {
 }
 
 # the service listens before it has heard the vehicle
-until ask "$service/api/vehicles/1/1" > /dev/null 2>&1; do
+until ask "$service/api/vehicles/1/1/params?names=$name" > /dev/null 2>&1; do
     sleep 0.2
 done
 now=$(ask "$parameter?live=true" | value_of)

@@ -31,7 +31,7 @@ def ask(address: str, body: dict[str, Any] | None = None, method: str | None = N
 def main(service: str, name: str, value: float) -> None:
     while True:
         try:
-            ask(service + VEHICLE)
+            ask(f"{service}{VEHICLE}/params?names={name}")
             break
         except urllib.error.URLError:  # the service listens before it has heard the vehicle
             time.sleep(0.2)

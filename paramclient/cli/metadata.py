@@ -37,10 +37,9 @@ from paramclient.metadata import (
 )
 from paramclient.metadata.added_files import AddedFiles, file_address
 from paramclient.metadata.info import number_of
-from paramclient.model.ext_values import check_ext_value, encode_ext_value
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import HEX, Param, ParamType, WireValue, check_name, format_value, type_name
+from paramclient.model.values import Param, WireValue, check_name, format_value
 from paramclient.model.wording import counted
 
 __all__ = [
@@ -61,7 +60,6 @@ __all__ = [
     "metadata_remove",
     "needs_reboot",
     "parse_pairs",
-    "parse_value",
     "print_descriptions",
     "problems",
     "request_from_vehicle",
@@ -255,25 +253,6 @@ def parse_pairs(words: Sequence[str], *, as_text: bool = False) -> list[tuple[st
             return pairs
     end = f", and {words[-1]} has no value" if words else ""
     raise UsageError(f"set takes pairs of NAME and VALUE, or NAME=VALUE{end}")
-
-
-def parse_value(name: str, text: str, number: int) -> WireValue:
-    """Return the value that a text gives in a type: a number, text, or bytes after `hex:`.
-
-    Raises:
-        UsageError: the text is no value of this type.
-    """
-    try:
-        value: WireValue = bytes.fromhex(text.removeprefix(HEX)) if text.startswith(HEX) else text
-        if isinstance(value, str) and ParamType.UINT8 <= number <= ParamType.REAL64:
-            value = float(text) if number >= ParamType.REAL32 else int(text, 0)
-    except ValueError:
-        raise UsageError(f"{name}: {text!r} is not a value of type {type_name(number)}") from None
-    try:
-        encode_ext_value(check_ext_value(value), number)
-    except UsageError as error:
-        raise UsageError(f"{name}: {error}") from None
-    return value
 
 
 def _check_no_option(word: str) -> None:

@@ -172,9 +172,6 @@ class LinkOptions(TrafficOptions):
     listen_only: Annotated[bool, CONNECTION] = False
     """Send nothing; receive what other stations on the link request."""
 
-    forward: Annotated[str | None, CONNECTION] = None
-    """Share the link with another program over this link."""
-
     @property
     def place(self) -> str | bool:
         """The cache argument of `ParamClient`.

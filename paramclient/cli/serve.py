@@ -17,33 +17,37 @@ from paramclient.errors import UsageError
 
 __all__ = ["serve", "token"]
 
-SERVICE_LIBRARIES: Final = ("fastapi", "prometheus_client", "uvicorn")
+SERVICE_LIBRARIES: Final = ("fastapi", "uvicorn")
 """Libraries that the extra `service` installs."""
 _UNSIGNED: Final = SigningOptions()
 
 
 async def serve(
     *links: str,
+    mavlink: tuple[str, ...] = (),
     listen: str = "127.0.0.1:8765",
     cache: str | None = None,
     no_cache: bool = False,
     fetch: Annotated[bool, Parameter(negative="--no-fetch")] = True,
     listen_only: bool = False,
     tokens: Path | None = None,
-    host: tuple[str, ...] = (),
-    allow_origin: tuple[str, ...] = (),
-    tls_cert: Path | None = None,
-    tls_key: Path | None = None,
     verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False,
     options: SigningOptions = _UNSIGNED,
 ) -> int:
-    """Open links and the cache, and share them with programs and browsers over HTTP.
+    """Open links and the cache, and share them with ground stations, programs and browsers.
+
+    Ground stations connect to the endpoints of `--mavlink` as to a vehicle. All frames pass, and requests
+    about parameters are answered from the table.
 
     A link that cannot be opened, or that has failed, is retried. On SIGTERM and Ctrl-C, the service answers
     waiting requests, writes the cache and exits.
 
     Args:
         links: The links, such as udpin:0.0.0.0:14550 or serial:/dev/ttyACM0:57600.
+        mavlink: Endpoint for ground stations, such as udpin:14551, tcpin:5760, udpout:127.0.0.1:14550 or
+            serial:/dev/ttyUSB0:57600, with the options ?readonly, ?sign=KEYFILE and ?trusted (may write to a
+            signed vehicle without signing). Without an address, only this computer can connect. May be given
+            several times.
         listen: Address to listen on, HOST:PORT; with port 0, the system chooses the port.
         cache: The cache file, or the postgresql:// URL of a shared cache. Default: the user's own cache.
         no_cache: Neither read nor write a cache.
@@ -52,12 +56,6 @@ async def serve(
             request.
         tokens: A file with access tokens, made by `paramclient token`. Without it, only this computer can
             connect.
-        host: A name of this service for browsers and programs, such as companion.local; may be given several
-            times.
-        allow_origin: Origin of a web page of another site that may use the service with a token, such as
-            https://station.example; may be given several times.
-        tls_cert: A certificate file (PEM), to serve over TLS.
-        tls_key: The key file of the certificate (PEM).
         verbose: Log each step on stderr.
     """
     if missing := [name for name in SERVICE_LIBRARIES if find_spec(name) is None]:
@@ -72,20 +70,25 @@ async def serve(
         links,
         cache=not no_cache if cache is None else cache,
         fetches=fetch,
+        mavlink=mavlink,
         listen_only=listen_only,
         signing=options.signing,
         **options.source,
     )
     stop = anyio.Event()
+
+    def started(url: str) -> None:
+        for endpoint in hub.gateway.endpoints:
+            print_line(f"ground stations: {endpoint.address}")
+        print_line(f"serving on {url}")
+
     with on_end_signal(lambda _: stop.set()):
         await service.serve(
             hub,
-            listening=service.Listening.at(listen, tls_cert=tls_cert, tls_key=tls_key),
+            listening=service.Listening.at(listen),
             tokens=None if tokens is None else service.Tokens.read(tokens),
-            hosts=host,
-            origins=allow_origin,
             stop=stop,
-            listens=lambda url: print_line(f"serving on {url}"),
+            listens=started,
         )
     return ExitCode.DONE
 

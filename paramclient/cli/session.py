@@ -255,7 +255,6 @@ async def sessions(
         encoding=options.encoding,
         policy=policy,
         listen_only=options.listen_only,
-        forward=options.forward,
         tlog=options.tlog,
         signing=options.signing,
         **options.source,

@@ -20,7 +20,6 @@ from paramclient.cli.metadata import (
     info_of,
     known_of_session,
     parse_pairs,
-    parse_value,
     problems,
     resolved,
 )
@@ -49,6 +48,7 @@ from paramclient.cli.write_outcomes import (
 from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
+from paramclient.model.ext_values import parse_ext_value
 from paramclient.model.values import ParamType, WireValue, format_value
 from paramclient.protocol.set_results import SetOutcome
 
@@ -177,7 +177,9 @@ async def _extended_values(
             raise error
     types = {param.name: param.type_number for param in found}
     names = [(spelling(name, session.component), str(text)) for name, text in wanted]
-    return [(name, parse_value(name, text, types[name]) if name in types else text) for name, text in names]
+    return [
+        (name, parse_ext_value(name, text, types[name]) if name in types else text) for name, text in names
+    ]
 
 
 async def _check_values(jobs: Sequence[_Job], *, force: bool) -> None:

@@ -8,6 +8,5 @@
 - `streams`, `events`: streams of items and of parameter changes; events of components and their stream.
 - `fleet_fetch`, `files`: fetches of several components, MAVFTP calls.
 - `signing`: keys, options, persistent timestamps.
-- `taps`, `recording`, `forwarding`, `traffic`: the receivers of all frames of a link: the telemetry log, one
-  other program, counts.
+- `taps`, `recording`, `traffic`: the receivers of all frames of a link: the telemetry log, counts.
 """

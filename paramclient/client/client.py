@@ -19,7 +19,6 @@ from paramclient.client.core import ClientCore
 from paramclient.client.events import Events
 from paramclient.client.files import Ftp
 from paramclient.client.fleet_fetch import FetchedAll, fetch_components
-from paramclient.client.forwarding import Forwarder
 from paramclient.client.recording import Capture
 from paramclient.client.signing import Signing, refused_in_words
 from paramclient.client.streams import Subscribers
@@ -82,8 +81,6 @@ class ParamClient:
             but "auto" also disables the checks of `watch_interval`.
         traffic: whether to count all frames for `traffic_report`. This takes time for each frame.
         listen_only: send nothing, not even a heartbeat. Tables fill from responses to other stations.
-        forward: link to one other program, by name or as an object, such as `udpout:127.0.0.1:14551`. The
-            program receives every received frame, and its frames are sent to the vehicles.
         tlog: path of a telemetry log to create, with every frame of both directions.
         signing: key to sign sent frames and to check received ones, or a `Signing` with more options. None:
             frames are not signed, and signatures are not checked.
@@ -99,7 +96,7 @@ class ParamClient:
         UsageError: the link name, an id, the interval or the policy is not valid, or one of the latter two is
             given with `listen_only`. On entering: the client was
             entered before, or the telemetry log exists or cannot be created.
-        LinkError: on entering: the link, or the link to the other program, cannot be opened.
+        LinkError: on entering: the link cannot be opened.
     """
 
     def __init__(
@@ -114,7 +111,6 @@ class ParamClient:
         policy: Policy | str = Policy.AUTO,
         traffic: bool = False,
         listen_only: bool = False,
-        forward: str | Link | None = None,
         tlog: str | os.PathLike[str] | None = None,
         signing: Signing | SigningKey | None = None,
         split_peers: bool = False,
@@ -137,13 +133,12 @@ class ParamClient:
         self.watch_interval = watch_interval
         self._components: dict[Address, Component] = {}
         self._events: Subscribers[events.Event] = Subscribers()
-        forwarder = None if forward is None else Forwarder(create_link(forward))
         capture = None if tlog is None else Capture(tlog)
         self._traffic = Traffic() if traffic else None
         self.core = core = ClientCore(
             opened,
             CacheWriter(self.cache, owned=self.cache is not cache),
-            [tap for tap in (forwarder, capture, self._traffic) if tap is not None],
+            [tap for tap in (capture, self._traffic) if tap is not None],
             Signing(signing) if isinstance(signing, SigningKey) else signing,
             self._end_streams,
         )

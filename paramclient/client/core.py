@@ -66,8 +66,8 @@ class ClientCore:
         self.cache_writer = cache_writer
         self.cache = cache_writer.cache
         self.is_over = False
-        self.link_task = LinkTask(link, taps=taps, ended=self._link_ended)
-        self._taps = taps
+        self._taps = list(taps)
+        self.link_task = LinkTask(link, taps=self._taps, ended=self._link_ended)
         self._signing = signing
         self._ended = ended
         self._work: anyio.abc.TaskGroup | None = None
@@ -83,6 +83,10 @@ class ClientCore:
         if self._work is None or self.station.gate.is_closed:
             return "closed"
         return "reconnecting" if self.link_task.is_disconnected else "open"
+
+    def add_tap(self, tap: Tap) -> None:
+        """Pass all frames of the link also to this receiver; before `open`."""
+        self._taps.append(tap)
 
     def spawn(self, work: Callable[..., Any], *arguments: Any) -> None:
         """Run a function in the background. Its errors are logged, and never end the link."""
@@ -173,7 +177,7 @@ class ClientCore:
                 io.start_soon(self.link_task.send, name="paramclient sender")
                 io.start_soon(self.cache_writer.run, name="paramclient cache writer")
                 for tap in self._taps:
-                    io.start_soon(tap.run, self.link_task.forward)
+                    io.start_soon(tap.run)
                 try:
                     async with anyio.create_task_group() as self._work:
                         self.spawn(self.station.send_heartbeats)

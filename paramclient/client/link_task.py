@@ -55,6 +55,7 @@ class LinkTask:
         station: takes the received data; set before `read`.
         is_disconnected: whether the link is disconnected and being reopened.
         bytes_received, bytes_sent: on this link.
+        accepts: whether to take received data of a peer; called with each chunk.
         cutter: cuts the received data for the taps.
     """
 
@@ -65,6 +66,7 @@ class LinkTask:
         self._activity = anyio.Event()
         self.bytes_received = self.bytes_sent = 0
         self.cutter = FrameCutter(stream=link.is_stream)
+        self.accepts: Callable[[bytes, Peer], bool] = lambda data, peer: True
         self._link = link
         self._taps = taps
         self._ended = ended
@@ -117,8 +119,9 @@ class LinkTask:
                 return
             for place, (peer, data) in enumerate(chunks, start=1):
                 self.bytes_received += len(data)
-                self.station.receive(data, peer, anyio.current_time())
-                self._show(data, peer)
+                if self.accepts(data, peer):
+                    self.station.receive(data, peer, anyio.current_time())
+                    self._show(data, peer)
                 if not place % CHUNKS_PER_TURN:
                     await anyio.lowlevel.checkpoint()
             self.notify()

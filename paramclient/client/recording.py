@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from io import FileIO
 from pathlib import Path
 from typing import Final
@@ -79,7 +79,7 @@ class Capture(Tap):
         if len(self._unwritten) > UNWRITTEN_BYTES_MAX:
             self._fail("the disk is slower than the link")
 
-    async def run(self, to_vehicles: Callable[[bytes], None]) -> None:
+    async def run(self) -> None:
         """Write the queued frames in batches, until cancelled or a write error."""
         while not self._has_failed:
             await self._something_to_write.wait()

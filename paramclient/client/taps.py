@@ -7,7 +7,7 @@ counts, and speed does not matter: this runs only for the receivers of all frame
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from typing import Final, NamedTuple
 
 from paramclient.wire.frames import Frame, checksum
@@ -54,7 +54,7 @@ class Tap:
         """Prepare to receive.
 
         Raises:
-            UsageError, LinkError: it cannot receive.
+            UsageError: it cannot receive.
         """
 
     def received(self, frames: Sequence[SeenFrame], size: int, peer: Hashable) -> None:
@@ -63,8 +63,8 @@ class Tap:
     def sent(self, frame: bytes) -> None:
         """Take a frame that is passed to the link. Neither blocks nor raises."""
 
-    async def run(self, to_vehicles: Callable[[bytes], None]) -> None:
-        """Work in the background, until cancelled; `to_vehicles` sends a frame of another program."""
+    async def run(self) -> None:
+        """Work in the background, until cancelled."""
 
     async def close(self) -> None:
         """Process the remaining frames and release what `open` has taken."""

@@ -7,6 +7,7 @@ import os
 import selectors
 import socket
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Final, NamedTuple
 
@@ -102,7 +103,11 @@ class TcpOut(SocketLink):
 
 
 class TcpIn(SocketLink):
-    """`tcpin`: listens, and sends to every connection. The end of one connection does not affect others."""
+    """`tcpin`: listens, and sends to every connection. The end of one connection does not affect others.
+
+    Attributes:
+        accepted: called with each new connection, before it has sent anything.
+    """
 
     is_stream = True
     reconnects = False
@@ -111,6 +116,7 @@ class TcpIn(SocketLink):
         super().__init__(spec)
         self._selector: selectors.DefaultSelector | None = None
         self._clients: dict[Peer, socket.socket] = {}
+        self.accepted: Callable[[Peer], object] = lambda peer: None
         self._accepted = 0
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
@@ -205,6 +211,7 @@ class TcpIn(SocketLink):
         peer = TcpConnection(self._accepted, host, port)
         self._clients[peer] = client
         selector.register(client, selectors.EVENT_READ, peer)
+        self.accepted(peer)
 
     def _read(self, peer: Peer, selector: selectors.DefaultSelector) -> list[tuple[Peer, bytes]]:
         client = self._clients[peer]

@@ -7,6 +7,7 @@ from typing import Final, SupportsFloat, SupportsIndex
 
 from paramclient.errors import UsageError
 from paramclient.model.values import (
+    HEX,
     Param,
     ParamType,
     Settable,
@@ -18,7 +19,15 @@ from paramclient.model.values import (
     type_name,
 )
 
-__all__ = ["EXT_VALUE_SIZE", "check_ext_value", "encode_ext_value", "ext_bytes", "ext_param", "own_bytes"]
+__all__ = [
+    "EXT_VALUE_SIZE",
+    "check_ext_value",
+    "encode_ext_value",
+    "ext_bytes",
+    "ext_param",
+    "own_bytes",
+    "parse_ext_value",
+]
 
 EXT_VALUE_SIZE: Final = 128
 """Bytes of `param_value` in PARAM_EXT_VALUE, PARAM_EXT_SET and PARAM_EXT_ACK (MAVLink common message set)."""
@@ -91,6 +100,25 @@ def encode_ext_value(value: WireValue, number: int) -> bytes:
     if isinstance(value, str | bytes):
         raise UsageError(f"{value!r} is not a number, and the parameter is {name}")
     return bits_of(value, number).to_bytes(layout.size, "little")
+
+
+def parse_ext_value(name: str, text: str, number: int) -> WireValue:
+    """Return the value that a text gives in a type: a number, text, or bytes after `hex:`.
+
+    Raises:
+        UsageError: the text is no value of this type.
+    """
+    try:
+        value: WireValue = bytes.fromhex(text.removeprefix(HEX)) if text.startswith(HEX) else text
+        if isinstance(value, str) and ParamType.UINT8 <= number <= ParamType.REAL64:
+            value = float(text) if number >= ParamType.REAL32 else int(text, 0)
+    except ValueError:
+        raise UsageError(f"{name}: {text!r} is not a value of type {type_name(number)}") from None
+    try:
+        encode_ext_value(check_ext_value(value), number)
+    except UsageError as error:
+        raise UsageError(f"{name}: {error}") from None
+    return value
 
 
 def _is_encodable(text: str) -> bool:

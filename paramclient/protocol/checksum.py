@@ -26,7 +26,7 @@ from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
 from paramclient.protocol.table import Table
 
-__all__ = ["ChecksumUnavailable", "TableDiffers", "prove"]
+__all__ = ["CHECKED_READ_SIZE", "ChecksumUnavailable", "TableDiffers", "may_be_rounded", "prove"]
 
 CHECKED_READ_SIZE: Final = 64
 """Bytes that ArduPilot reads at a time for a checksum: the padding of the file depends on it (measured)."""
@@ -156,7 +156,7 @@ class _Proof:
         learnt = self._session.table.volatile
         for at, row in enumerate(self._rows):
             is_learnt = row.name in learnt and not MEASURED.fullmatch(row.name)
-            if is_learnt or MOVING.fullmatch(row.name) or _may_be_rounded(row):
+            if is_learnt or MOVING.fullmatch(row.name) or may_be_rounded(row):
                 yield at
 
     async def _agrees(self) -> bool:
@@ -308,7 +308,7 @@ def _row(table: Table, name: str) -> PackedParam:
     return PackedParam(name, ParamType(param.type_number), param.bits, default)
 
 
-def _may_be_rounded(row: PackedParam) -> bool:
+def may_be_rounded(row: PackedParam) -> bool:
     """Return whether the integer may stand for others, as a C-cast PARAM_VALUE rounds them to float32."""
     if row.type is not ParamType.INT32 or abs(int(from_bits(row.bits, row.type))) <= FLOAT32_EXACT:
         return False

@@ -79,6 +79,7 @@ class Opcode(IntEnum):
     READ_FILE = 5
     CREATE_FILE = 6
     WRITE_FILE = 7
+    OPEN_FILE_WO = 11
     CALC_FILE_CRC32 = 14
     BURST_READ_FILE = 15
     ACK = 128

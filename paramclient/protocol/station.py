@@ -91,6 +91,7 @@ class Station:
         listening_since: since when everything on the link is received.
         verifier: verifies signatures; None without a key.
         broadcaster: the last heartbeat with the system id 0, which no vehicle may have; None without one.
+        own_address, own_type: our system and component ids, and the MAV_TYPE of our heartbeat.
     """
 
     def __init__(
@@ -111,6 +112,7 @@ class Station:
         self.nodes: dict[Address, Node] = {}
         self.gate = Gate()
         self.own_address = (system, component)
+        self.own_type = MAV_TYPE_GCS
         self.listens_only = listens_only
         self.listening_since = -math.inf
         self.verifier: Verifier | None = None
@@ -236,7 +238,7 @@ class Station:
 
     async def send_heartbeats(self) -> None:
         """Send our heartbeat once a second."""
-        beat = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, system_status=MAV_STATE_ACTIVE)
+        beat = Heartbeat(self.own_type, MAV_AUTOPILOT_INVALID, system_status=MAV_STATE_ACTIVE)
         while not self.listens_only:
             if self.gate.is_open:
                 if self._signer is not None:

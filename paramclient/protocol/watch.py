@@ -54,6 +54,9 @@ class Watch:
         interval: seconds between two checks of an idle table; None: 30 for a vehicle that confirms tables, no
             checks of others; 0 for none.
         policy: any but AUTO disables the checks.
+
+    Attributes:
+        confirmed_at: when the table was last known to be the vehicle's; minus infinity before.
     """
 
     def __init__(
@@ -70,6 +73,7 @@ class Watch:
         self._emit = emit
         self._interval = interval
         self._policy = policy
+        self.confirmed_at = -math.inf
         self._is_fetched = False
         self._is_doubted = False
         self._before: Mapping[str, Param] = {}  # the table at the first sign of change
@@ -90,7 +94,15 @@ class Watch:
         """Take note of a complete fetch."""
         self._is_fetched = True
         self._is_doubted = self._is_due = False
+        self.confirmed_at = anyio.current_time()
         self._signal.set()
+
+    def check(self, *, older_than: float) -> None:
+        """Check soon whether the table is current, if the vehicle confirms tables and did not so recently."""
+        is_old = anyio.current_time() - self.confirmed_at > older_than
+        if is_old and self._is_fetched and may_confirm(self._session):
+            self._is_due = True
+            self._signal.set()
 
     def unconfirmed(self) -> None:
         """Take note that the table is only what the cache has."""
@@ -170,6 +182,7 @@ class Watch:
             if not result.complete:
                 return
         self._is_doubted = False
+        self.confirmed_at = anyio.current_time()
         changed = _differing(before, table.params)
         if was_doubted or changed:
             self._emit(Resynced(changed, table.hash))

@@ -8,17 +8,17 @@ recognized by the header Origin, which browsers send with every write.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
 from typing import Final
 
+import anyio
 from fastapi import Request
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from paramclient.service.problems import ServiceError, problem_of, problem_response
+from paramclient.service.problems import ServiceError, problem_response
 from paramclient.service.tokens import TokenHolder, Tokens
 
-__all__ = ["AccessMiddleware", "author_of", "holder_of", "require_write"]
+__all__ = ["AccessMiddleware", "author_of", "cancel_on_disconnect", "require_write"]
 
 PROTECTED: Final = ("/api/", "/metrics")
 """Begin of the paths that require a token. The others are the page, its description, and `/health`."""
@@ -42,19 +42,13 @@ class AccessMiddleware:
     Args:
         app: the application.
         tokens: the valid tokens; None lets every request read and write.
-        origins: origins of other sites whose pages may write with a token.
     """
 
-    def __init__(self, app: ASGIApp, tokens: Tokens | None, origins: Collection[str]) -> None:
+    def __init__(self, app: ASGIApp, tokens: Tokens | None) -> None:
         self._app = app
         self._tokens = tokens
-        self._origins = frozenset(origins) if tokens is not None else frozenset[str]()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
@@ -62,18 +56,17 @@ class AccessMiddleware:
                     headers.setdefault(name, value)
             await send(message)
 
-        headers = Headers(scope=scope)
         try:
+            headers = Headers(scope=scope)
             if scope["method"] not in SAFE_METHODS:
-                self._check_origin(headers)
+                _check_origin(headers)
             holder = self._holder(headers)
             if holder is None and scope["path"].startswith(PROTECTED):
                 detail = "This service requires a token in the header Authorization: Bearer TOKEN."
                 raise ServiceError(401, "unauthorized", detail)
             scope.setdefault("state", {})["holder"] = holder
         except ServiceError as error:
-            challenge = {"www-authenticate": "Bearer"} if error.status == 401 else None
-            await problem_response(problem_of(error), challenge)(scope, receive, send_with_headers)
+            await problem_response(error)(scope, receive, send_with_headers)
             return
         await self._app(scope, receive, send_with_headers)
 
@@ -94,41 +87,50 @@ class AccessMiddleware:
             raise ServiceError(401, "unauthorized", "The token is not valid for this service.")
         return holder
 
-    def _check_origin(self, headers: Headers) -> None:
-        """Check that a request that may change something is not from a page of another site.
 
-        Raises:
-            ServiceError: 403, it is.
-        """
-        origin = headers.get("origin")
-        if origin is None or origin in self._origins:
-            return
-        own = headers.get("host")
-        if own and origin.partition("://")[2] == own:
-            return
+def _check_origin(headers: Headers) -> None:
+    """Check that a request that may change something is not from a page of another site.
+
+    Raises:
+        ServiceError: 403, it is.
+    """
+    origin = headers.get("origin")
+    if origin is not None and origin.partition("://")[2] != headers.get("host"):
         raise ServiceError(403, "other-origin", f"Pages of {origin[:200]} may not change anything here.")
 
 
-def holder_of(request: Request) -> TokenHolder | None:
-    """Return the holder of the token of a request; None without a token."""
-    holder: TokenHolder | None = request.state.holder
-    return holder
+def cancel_on_disconnect(app: ASGIApp) -> ASGIApp:
+    """Return an application whose work for a request is cancelled when the client disconnects."""
+
+    async def cancellable(scope: Scope, receive: Receive, send: Send) -> None:
+        pieces, inbox = anyio.create_memory_object_stream[Message](1)
+
+        async def watch() -> None:
+            while (message := await receive())["type"] != "http.disconnect":
+                await pieces.send(message)
+            tasks.cancel_scope.cancel()
+
+        with pieces, inbox:
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(watch)
+                await app(scope, inbox.receive, send)
+                tasks.cancel_scope.cancel()
+
+    return cancellable
 
 
 def author_of(request: Request) -> str:
     """Return the author of the changes of a request: the name of the token, and that in X-Author, if any."""
-    holder = holder_of(request)
-    name = "" if holder is None else holder.name
+    name: str = request.state.holder.name
     page = request.headers.get("x-author", "")
     return f"{name} ({page})" if _PAGE_NAME.fullmatch(page) else name
 
 
 async def require_write(request: Request) -> None:
-    """Reject a request without a token that may write.
+    """Reject a request with a token that may not write.
 
     Raises:
-        ServiceError: 403, it has none.
+        ServiceError: 403, it may not.
     """
-    holder = holder_of(request)
-    if holder is None or not holder.may_write:
+    if request.state.holder.role != "write":
         raise ServiceError(403, "forbidden", "This request requires a token that may write.")

@@ -12,19 +12,15 @@ import secrets
 import time
 from collections import deque
 from collections.abc import AsyncIterator
-from itertools import islice
 from typing import Any, Final
 
 import anyio
+from fastapi.sse import ServerSentEvent
 
 __all__ = ["EventFeed"]
 
 EVENTS_KEPT: Final = 4_096
 """Number of kept events, 0.5 kB each: more than two whole tables."""
-BATCH_EVENTS_MAX: Final = 64
-"""Maximum number of events that a listener gets at once; the event loop runs other tasks between two."""
-KEEP_ALIVE_INTERVAL: Final = 15.0
-"""Seconds without an event after which a comment is sent, so that both sides notice a lost connection."""
 
 
 class EventFeed:
@@ -36,13 +32,11 @@ class EventFeed:
     Attributes:
         run: id of the run; numbers of other runs are not comparable.
         seq: number of the newest event.
-        listeners: number of open streams.
     """
 
     def __init__(self, *, kept: int = EVENTS_KEPT) -> None:
         self.run = secrets.token_hex(8)
         self.seq = 0
-        self.listeners = 0
         self._is_ended = False
         self._texts: deque[str] = deque(maxlen=kept)
         self._arrived = anyio.Event()
@@ -69,45 +63,29 @@ class EventFeed:
         self._is_ended = True
         self._wake()
 
-    def can_resume(self, last_id: str | None) -> bool:
-        """Return whether the event after the one with this id is still kept."""
-        run, _, seq = (last_id or "").partition("-")
-        return run == self.run and seq.isascii() and seq.isdecimal() and self._oldest <= int(seq) <= self.seq
-
-    async def follow(self, last_id: str | None = None) -> AsyncIterator[str]:
-        """Yield server-sent events: `hello`, then all events after the one with this id, or after now.
+    async def follow(self, last_id: str | None = None) -> AsyncIterator[ServerSentEvent]:
+        """Yield `hello`, then all events after the one with this id, or after now.
 
         Ends with the feed, or when the listener was too slow and its next event is lost.
         """
-        resumed = self.can_resume(last_id)
-        position = int((last_id or "").partition("-")[2]) if resumed else self.seq
+        run, _, seq = (last_id or "").partition("-")
+        resumed = run == self.run and seq.isascii() and seq.isdecimal() and self._has_after(int(seq))
+        position = int(seq) if resumed else self.seq
         hello = {"run": self.run, "seq": position, "type": "hello", "resumed": resumed}
-        self.listeners += 1
-        try:
-            yield f"id: {self.run}-{position}\ndata: {json.dumps(hello)}\n\n"
-            while position >= self._oldest:
-                start = position - self._oldest
-                batch = list(islice(self._texts, start, start + BATCH_EVENTS_MAX))
-                if batch:
-                    numbered = enumerate(batch, position + 1)
-                    position += len(batch)
-                    yield "".join([f"id: {self.run}-{seq}\ndata: {text}\n\n" for seq, text in numbered])
-                elif self._is_ended:
-                    return
-                else:
-                    arrived = False
-                    with anyio.move_on_after(KEEP_ALIVE_INTERVAL):
-                        await self._arrived.wait()
-                        arrived = True
-                    if not arrived:
-                        yield ": nothing new\n\n"
-        finally:
-            self.listeners -= 1
+        yield ServerSentEvent(raw_data=json.dumps(hello), id=f"{self.run}-{position}")
+        while self._has_after(position):
+            if position < self.seq:
+                text = self._texts[position - self.seq]
+                position += 1
+                yield ServerSentEvent(raw_data=text, id=f"{self.run}-{position}")
+            elif self._is_ended:
+                return
+            else:
+                await self._arrived.wait()
 
-    @property
-    def _oldest(self) -> int:
-        """The number of the event before the oldest kept one."""
-        return self.seq - len(self._texts)
+    def _has_after(self, position: int) -> bool:
+        """Return whether the event after this position, if there is one, is still kept."""
+        return self.seq - len(self._texts) <= position <= self.seq
 
     def _wake(self) -> None:
         arrived, self._arrived = self._arrived, anyio.Event()

@@ -7,24 +7,31 @@ import os
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from datetime import datetime
 from functools import partial
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, Final, TypeAlias, TypeVar
 
 import anyio
 import anyio.abc
 import anyio.to_thread
 
 from paramclient.cache import ParamCache
+from paramclient.client.cache_writer import choose_cache
 from paramclient.client.client import ParamClient
 from paramclient.client.events import Discovered, Event, Found, Rebooted, Resynced
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.links import Link, create_link
-from paramclient.metadata import Metadata, MetadataStore, metadata_of
+from paramclient.metadata import MetadataStore, metadata_of
+from paramclient.model.paramset import ParamSet
 from paramclient.protocol.fetch import FetchResult, Progress
+from paramclient.protocol.watch import SyncState
+from paramclient.provision.inspection import wait_for_identity
 from paramclient.service import documents
 from paramclient.service.event_feed import EventFeed
+from paramclient.service.gateway import Gateway
 from paramclient.service.problems import ServiceError
+from paramclient.service.stations import MavlinkEndpoint, parse_endpoint
 from paramclient.service.targets import ServiceLink, Target
 
 if TYPE_CHECKING:
@@ -33,9 +40,14 @@ if TYPE_CHECKING:
 __all__ = ["Hub"]
 
 CHECK_INTERVAL: Final = 0.2
-"""Seconds between two checks for changes of states, and between two progress events."""
+"""Seconds between two checks for changes of states, among them the progress of a fetch."""
+CHANGING_MEMBERS: Final = ("silence_s", "round_trip_s", "params")
+"""Members of a vehicle that change all the time: they cause no event."""
 REOPEN_DELAYS: Final = (0.25, 0.5, 1.0, 2.0, 5.0)
 """Seconds before each attempt to reopen a failed link; the last one repeats."""
+
+REFETCH_DELAYS: Final = (5.0, 15.0, 60.0)
+"""Seconds before each further fetch of a table that is not complete: some components have no parameters."""
 
 Result = TypeVar("Result")
 LinkChoice: TypeAlias = "str | Link | Endpoint"
@@ -52,17 +64,19 @@ class Hub:
         links: links by name, object or simulated vehicle, as for `ParamClient`.
         cache: as for `ParamClient`; shared by all links.
         fetches: whether the table of every component is fetched when it is heard.
+        mavlink: endpoints to which ground stations connect, see `parse_endpoint`.
         options: options of each `ParamClient`.
 
     Attributes:
         cache: the cache, or None.
         feed: the event feed.
+        gateway: the ground stations.
         links: the links, by name.
         metadata_store: the metadata files beside the cache; None without a cache.
         started: `time.monotonic()` of the start.
 
     Raises:
-        UsageError: a link or option is invalid, or two links have one name.
+        UsageError: a link, endpoint or option is invalid, or two links have one name.
     """
 
     def __init__(
@@ -71,12 +85,16 @@ class Hub:
         *,
         cache: ParamCache | str | os.PathLike[str] | bool | None = None,
         fetches: bool = True,
+        mavlink: Iterable[str | MavlinkEndpoint] = (),
         **options: Any,
     ) -> None:
-        self.cache = _open_cache(cache)
+        self.cache = choose_cache(cache, is_log=False)
         self._owns_cache = self.cache is not cache
         self._fetches = fetches
         self.feed = EventFeed()
+        self.gateway = Gateway(parse_endpoint(each) if isinstance(each, str) else each for each in mavlink)
+        if self.gateway.endpoints and options.get("listen_only"):
+            raise UsageError("a client that only listens cannot answer ground stations")
         self.metadata_store = None if self.cache is None else MetadataStore.beside(self.cache.path)
         self.started = time.monotonic()
         self.links: dict[str, ServiceLink] = {}
@@ -87,14 +105,22 @@ class Hub:
             if name in self.links:
                 raise UsageError(f"the link {name} is given twice")
             is_log = isinstance(link, str) and link.startswith("replay:")
-            make = partial(ParamClient, link, cache=False if is_log else self.cache or False, **options)
+            make = partial(self._new_client, link, cache=False if is_log else self.cache or False, **options)
             make()  # an invalid option raises here
             self.links[name] = ServiceLink(name, make)
 
+    def _new_client(self, link: LinkChoice, **options: Any) -> ParamClient:
+        client = ParamClient(link, **options)
+        if self.gateway.endpoints:
+            self.gateway.attach(client)
+        return client
+
     async def __aenter__(self) -> Hub:
+        await self.gateway.open()
         self._tasks = await anyio.create_task_group().__aenter__()
         for link in self.links.values():
             self._tasks.start_soon(self._run_link, link)
+        self._tasks.start_soon(self.gateway.run)
         return self
 
     async def __aexit__(
@@ -112,21 +138,21 @@ class Hub:
 
     @property
     def targets(self) -> list[Target]:
-        """All components, the lowest ids first."""
-        found = [target for link in self.links.values() for target in link.targets.values()]
-        return sorted(found, key=lambda each: (each.component.system, each.component.component))
+        """All parameters of components, the lowest ids first."""
+        pairs = [pair for link in self.links.values() for pair in link.targets.items() if pair[1].is_listed]
+        return [target for _, target in sorted(pairs, key=lambda pair: pair[0])]
 
-    def target(self, system: int, component: int, link: str | None = None) -> Target:
-        """Return the component with this address.
+    def target(
+        self, system: int, component: int, link: str | None = None, *, extended: bool = False
+    ) -> Target:
+        """Return the parameters of the component with this address.
 
         Raises:
             ServiceError: the component is unknown, or on several links and none is given.
         """
-        found = [
-            target
-            for each in self.links.values()
-            if link in (None, each.name) and (target := each.targets.get((system, component))) is not None
-        ]
+        key = system, component, extended
+        links = [each for each in self.links.values() if link in (None, each.name)]
+        found = [each.targets[key] for each in links if key in each.targets]
         if not found:
             on = "any link" if link is None else link
             detail = f"No message of {system}/{component} was received on {on}."
@@ -140,7 +166,7 @@ class Hub:
     async def fetch(
         self, target: Target, *, refresh: bool = False, timeout: float | None = None
     ) -> FetchResult:
-        """Fetch the table of a component; see `Component.fetch_all`. The progress is published."""
+        """Fetch the parameters of a component; see `Component.fetch_all`. The progress is published."""
 
         def note(progress: Progress) -> None:
             target.progress = progress
@@ -154,7 +180,7 @@ class Hub:
         await self._load_known_metadata(target)
         return result
 
-    async def load_metadata(self, target: Target, *, timeout: float | None = None) -> Metadata:
+    async def load_metadata(self, target: Target, *, timeout: float | None = None) -> None:
         """Load the metadata of a component from the vehicle; see `metadata_of`.
 
         Raises:
@@ -167,10 +193,14 @@ class Hub:
             raise ServiceError(404, "no-metadata", detail)
         target.metadata, target.described = found, identity
         self._check(target)
-        return found
 
-    async def read_cache(self, work: Callable[[ParamCache], Result]) -> Result:
-        """Run a function of the cache in a thread.
+    async def read_cache(
+        self,
+        call: Callable[Concatenate[ParamCache, str, int, ...], Result],
+        target: Target,
+        *more: Any,
+    ) -> Result:
+        """Call a function of the cache, in a thread, with the place of these parameters in it.
 
         Raises:
             ServiceError: the service has no cache, or ends.
@@ -182,7 +212,16 @@ class Hub:
             raise ServiceError(409, "no-cache", detail)
         if self._tasks is None:
             raise ServiceError(503, "closing", "The service is shutting down.")
-        return await anyio.to_thread.run_sync(partial(work, cache), limiter=self._cache_thread)
+        component = target.component
+        await wait_for_identity(component)
+        place = component.identity.key, component.component
+        work = partial(call, cache, *place, *more, extended=component.is_extended)
+        return await anyio.to_thread.run_sync(work, limiter=self._cache_thread)
+
+    async def state_at(self, target: Target, at: int | datetime) -> ParamSet:
+        """Return the parameters of a snapshot, or at a time; see `read_cache`."""
+        when = at if isinstance(at, int) else at.timestamp()
+        return await self.read_cache(ParamCache.state_at, target, when)
 
     async def _run_link(self, link: ServiceLink) -> None:
         """Keep a link open until cancelled."""
@@ -198,8 +237,9 @@ class Hub:
                 self._set_state(link, "failed", str(_first(group)))
             finally:
                 link.client = None
-                for target in list(link.targets.values()):
-                    self._forget(target)
+                for target in link.targets.values():
+                    self.feed.publish("vehicle", **target.address, vehicle=None)
+                link.targets.clear()
             await anyio.sleep(REOPEN_DELAYS[min(attempts, len(REOPEN_DELAYS) - 1)])
             attempts += 1
 
@@ -216,11 +256,14 @@ class Hub:
     def _take(self, link: ServiceLink, event: Event, tasks: anyio.abc.TaskGroup) -> None:
         """Handle an event of a client."""
         component = event.component
-        target = link.targets.get((component.system, component.component))
-        if target is None or target.component is not component:
-            target = link.targets[component.system, component.component] = Target.of(link, component)
-            for each in filter(None, (target, target.extended)):
-                tasks.start_soon(self._publish_changes, each)
+        key = component.system, component.component, False
+        if key not in link.targets or link.targets[key].component is not component:
+            setup = anyio.Lock()
+            for each in (component, component.ext):
+                target = Target(link, each, setup)
+                link.targets[component.system, component.component, each.is_extended] = target
+                tasks.start_soon(self._publish_changes, target)
+        target = link.targets[key]
         if isinstance(event, Resynced):
             target.fetches += 1
         self._check(target)
@@ -229,19 +272,21 @@ class Hub:
             tasks.start_soon(self._load, target)
 
     async def _load(self, target: Target) -> None:
-        """Fetch the table of a component that was heard."""
-        if not self._fetches:
-            return
-        with suppress(ParamClientError):
-            await self.fetch(target)
+        """Fetch the table of a component that was heard, again if that ends without all of it."""
+        for delay in (0.0, *REFETCH_DELAYS) if self._fetches else ():
+            await anyio.sleep(delay)
+            if delay and target.component.sync_state in (SyncState.SYNCED, SyncState.LOST):
+                return
+            with suppress(ParamClientError):
+                await self.fetch(target)
 
     async def _load_known_metadata(self, target: Target) -> None:
         """Load the metadata of the firmware of a component that this computer has, if any."""
-        identity, store = target.component.identity, self.metadata_store
-        if store is None or target.described == identity:
+        component, store = target.component, self.metadata_store
+        identity = component.identity
+        if store is None or target.described == identity or component.is_extended:
             return
-        component = target.component.component
-        target.metadata = await anyio.to_thread.run_sync(store.known, identity, component)
+        target.metadata = await anyio.to_thread.run_sync(store.known, identity, component.component)
         target.described = identity
 
     async def _publish_changes(self, target: Target) -> None:
@@ -252,7 +297,8 @@ class Hub:
         with suppress(ParamClientError):
             async for change in target.component.changes():
                 if change.kind != "first":
-                    self.feed.publish("change", **target.address, **documents.change(change, target))
+                    members = documents.change(change, target.info(change.name))
+                    self.feed.publish("change", **target.address, **members)
 
     async def _check_regularly(self, link: ServiceLink) -> None:
         while True:
@@ -261,20 +307,12 @@ class Hub:
                 self._check(target)
 
     def _check(self, target: Target) -> None:
-        """Publish the state of a component if it has changed, or the progress of its fetch."""
-        if target.progress is not None:
-            self.feed.publish("progress", **target.address, **documents.progress(target.progress))
+        """Publish the state of a component if it has changed."""
         vehicle = documents.vehicle(target)
-        state = documents.lasting_members(vehicle)
-        if state != target.published:
+        state = {**vehicle, **dict.fromkeys(CHANGING_MEMBERS)}
+        if target.is_listed and state != target.published:
             target.published = state
             self.feed.publish("vehicle", **target.address, vehicle=vehicle)
-
-    def _forget(self, target: Target) -> None:
-        component, targets = target.component, target.link.targets
-        if targets.get((component.system, component.component)) is target:
-            del targets[component.system, component.component]
-            self.feed.publish("vehicle", **target.address, vehicle=None)
 
     def _set_state(self, link: ServiceLink, state: str, error: str | None = None) -> None:
         if (state, error) == (link.state, link.error):
@@ -283,14 +321,6 @@ class Hub:
         logger.log(level, "%s: %s%s", link.name, state, "" if error is None else f": {error}")
         link.state, link.error = state, error
         self.feed.publish("link", link=link.name, state=state, error=error)
-
-
-def _open_cache(cache: ParamCache | str | os.PathLike[str] | bool | None) -> ParamCache | None:
-    if isinstance(cache, ParamCache):
-        return cache
-    if cache is False:
-        return None
-    return ParamCache(None if cache is None or cache is True else cache)
 
 
 def _first(group: BaseExceptionGroup[BaseException]) -> BaseException:

@@ -1,15 +1,10 @@
-"""Metrics of the service for Prometheus."""
+"""Metrics of the service in the text format of Prometheus."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Final
-
-from prometheus_client import CollectorRegistry, generate_latest
-from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
-from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
-from prometheus_client.registry import Collector
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from paramclient.version import __version__
 
@@ -18,71 +13,57 @@ if TYPE_CHECKING:
 
 __all__ = ["METRICS_MEDIA_TYPE", "metrics_text"]
 
-METRICS_MEDIA_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
+METRICS_MEDIA_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 """Media type of the metrics."""
-_COUNTERS: Final = {
-    "bytes_received": "Received bytes.",
-    "bytes_sent": "Sent bytes.",
+STATION_SUMS: Final = {
+    "relayed": "Frames of vehicles.",
+    "answered": "Answers from the tables.",
+    "saved": "Bytes of answers that were not sent over the link of a vehicle.",
+    "dropped": "Frames dropped because a station did not read.",
 }
-"""Help texts of the counters of a link, by attribute of `ParamClient`."""
-_GAUGES: Final = {
-    "up": "1 if the vehicle is not lost.",
-    "synced": "1 if the table matches that of the vehicle.",
-    "parameters": "Parameters in the table.",
-    "round_trip_seconds": "Smoothed round-trip time in seconds.",
-}
-"""Help texts of the gauges of a component."""
+"""Help texts of the sums over the connected stations of an endpoint, by attribute of `GroundStation`."""
+_ESCAPES: Final = str.maketrans({"\\": r"\\", "\n": r"\n", '"': r"\""})
+
+Sample: TypeAlias = tuple[Mapping[str, object], float]
+"""Labels and a value."""
 
 
-def metrics_text(hub: Hub) -> bytes:
-    """Return the current metrics in text format."""
-    registry = CollectorRegistry()  # not the library's global one, which has metrics of the process
-    registry.register(_HubCollector(hub))
-    return generate_latest(registry)
+def metrics_text(hub: Hub) -> str:
+    """Return the current metrics."""
+    lines = []
+    for name, text, samples in _metrics(hub):
+        kind = "counter" if name.endswith("_total") else "gauge"
+        lines += [f"# HELP paramclient_{name} {text}", f"# TYPE paramclient_{name} {kind}"]
+        for labels, value in samples:
+            pairs = [f'{label}="{str(each).translate(_ESCAPES)}"' for label, each in labels.items()]
+            lines.append(f"paramclient_{name}{{{','.join(pairs)}}} {float(value)}")
+    return "\n".join([*lines, ""])
 
 
-class _HubCollector(Collector):
-    def __init__(self, hub: Hub) -> None:
-        self._hub = hub
+def _metrics(hub: Hub) -> Iterator[tuple[str, str, Sequence[Sample]]]:
+    """Yield name, help text and samples of each metric. The name of a counter ends with `_total`."""
+    yield "info", "Version of paramclient.", [({"version": __version__}, 1)]
+    yield "uptime_seconds", "Seconds since the start.", [({}, time.monotonic() - hub.started)]
+    yield "events_total", "Published events.", [({}, hub.feed.seq)]
 
-    def collect(self) -> Iterable[Metric]:
-        hub = self._hub
-        info = GaugeMetricFamily("paramclient_info", "Version of paramclient.", labels=["version"])
-        info.add_metric([__version__], 1)
-        yield info
-        uptime = round(time.monotonic() - hub.started, 3)
-        yield GaugeMetricFamily("paramclient_uptime_seconds", "Seconds since the start.", uptime)
-        yield CounterMetricFamily("paramclient_events_total", "Published events.", hub.feed.seq)
-        yield GaugeMetricFamily("paramclient_listeners", "Open event streams.", hub.feed.listeners)
-        yield from _link_metrics(hub)
-        yield from _component_metrics(hub)
+    links = [({"link": link.name}, link) for link in hub.links.values()]
+    yield "link_open", "1 if the link is open.", [(at, link.state == "open") for at, link in links]
+    opened = [(at, link.client) for at, link in links if link.client is not None]
+    yield "link_bytes_received_total", "Received bytes.", [(at, each.bytes_received) for at, each in opened]
+    yield "link_bytes_sent_total", "Sent bytes.", [(at, each.bytes_sent) for at, each in opened]
 
+    tables = [(target.address, target.component) for target in hub.targets]
+    is_up = [(at, each.sync_state != "lost") for at, each in tables]
+    yield "component_up", "1 if the vehicle is not lost.", is_up
+    is_synced = [(at, each.sync_state == "synced") for at, each in tables]
+    yield "component_synced", "1 if the table matches that of the vehicle.", is_synced
+    sizes = [(at, len(each.params)) for at, each in tables]
+    yield "component_parameters", "Parameters in the table.", sizes
+    times = [(at, each.round_trip) for at, each in tables if each.round_trip is not None]
+    yield "component_round_trip_seconds", "Smoothed round-trip time in seconds.", times
 
-def _link_metrics(hub: Hub) -> Iterator[Metric]:
-    is_open = GaugeMetricFamily("paramclient_link_open", "1 if the link is open.", labels=["link"])
-    for link in hub.links.values():
-        is_open.add_metric([link.name], link.state == "open")
-    yield is_open
-    opened = [(link.name, link.client) for link in hub.links.values() if link.client is not None]
-    for name, text in _COUNTERS.items():
-        counter = CounterMetricFamily(f"paramclient_link_{name}_total", text, labels=["link"])
-        for link_name, client in opened:
-            counter.add_metric([link_name], getattr(client, name))
-        yield counter
-
-
-def _component_metrics(hub: Hub) -> list[GaugeMetricFamily]:
-    labels = ["link", "system", "component"]
-    families = {
-        name: GaugeMetricFamily(f"paramclient_component_{name}", text, labels=labels)
-        for name, text in _GAUGES.items()
-    }
-    for target in hub.targets:
-        component = target.component
-        values = [target.link.name, str(component.system), str(component.component)]
-        families["up"].add_metric(values, component.sync_state != "lost")
-        families["synced"].add_metric(values, component.sync_state == "synced")
-        families["parameters"].add_metric(values, len(component.params))
-        if component.round_trip is not None:
-            families["round_trip_seconds"].add_metric(values, component.round_trip)
-    return list(families.values())
+    endpoints = [({"endpoint": each.name}, each.stations.values()) for each in hub.gateway.endpoints]
+    yield "stations", "Connected ground stations.", [(at, len(stations)) for at, stations in endpoints]
+    for name, text in STATION_SUMS.items():
+        sums = [(at, sum(getattr(each, name) for each in stations)) for at, stations in endpoints]
+        yield f"stations_{name}", text, sums

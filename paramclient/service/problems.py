@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any, Final
 
-from fastapi import FastAPI, Request
+from fastapi import Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict
 from pydantic_core import to_json
@@ -20,12 +19,8 @@ from paramclient.errors import (
     AlreadyRestored,
     AmbiguousVehicle,
     CacheError,
-    ClientClosed,
-    FileError,
     FileTransferError,
-    InvalidParameters,
     LinkError,
-    MetadataError,
     NoReply,
     NotInCache,
     PackError,
@@ -36,11 +31,27 @@ from paramclient.errors import (
     VehicleError,
 )
 
-__all__ = ["RESPONSES", "Problem", "ServiceError", "install_handlers", "problem_of", "problem_response"]
+__all__ = ["ERRORS", "RESPONSES", "Problem", "ServiceError", "problem_response", "respond"]
 
 MEDIA_TYPE: Final = "application/problem+json"
 FAULTS_MAX: Final = 20
 """Maximum number of listed errors of one request."""
+STATUSES: Final[dict[type[ParamClientError], int]] = {
+    UnknownParameter: 404,
+    NotInCache: 404,
+    UnknownVehicle: 404,
+    AlreadyRestored: 409,
+    AmbiguousVehicle: 409,
+    UsageError: 422,
+    PackError: 422,
+    FileTransferError: 502,
+    VehicleError: 409,
+    NoReply: 504,
+    LinkError: 503,
+    CacheError: 503,
+    ParamClientError: 500,
+}
+"""HTTP status of each exception; the first class that matches counts."""
 
 logger = logging.getLogger(__name__)
 
@@ -86,81 +97,43 @@ class ServiceError(Exception):
         self.members = members
 
 
-def problem_of(error: Exception) -> dict[str, Any]:
-    """Return an exception as a problem document; an unexpected one without details."""
+ERRORS: Final = (RequestValidationError, HTTPException, ParamClientError, ServiceError, Exception)
+"""Exceptions that are answered by `respond`."""
+
+
+def problem_response(error: Exception) -> Response:
+    """Return the response to an exception: a problem document; of an unexpected one without details."""
+    status, kind, detail, members = 500, "internal", "Internal error of the service; see its log.", {}
+    headers = None
     if isinstance(error, ServiceError):
-        return _problem(error.status, error.kind, str(error), error.members)
-    if isinstance(error, ParamClientError):
-        status = next(status for kind, status in _STATUSES.items() if isinstance(error, kind))
+        status, kind, detail, members = error.status, error.kind, str(error), error.members
+    elif isinstance(error, ParamClientError):
+        status = next(status for each, status in STATUSES.items() if isinstance(error, each))
         name = type(error).__name__
+        kind, detail = re.sub("(?<=[a-z])([A-Z])", r"-\1", name).lower(), str(error)
         public = {key: value for key, value in vars(error).items() if not key.startswith("_")}
         text = to_json(public, inf_nan_mode="strings", bytes_mode="hex", fallback=str)
         members = {**json.loads(text), "error": name}
-        kind = re.sub("(?<=[a-z])([A-Z])", r"-\1", name).lower()
-        return _problem(status, kind, str(error), members)
-    return _problem(500, "internal", "Internal error of the service. Its log has the details.", {})
-
-
-def problem_response(problem: Mapping[str, Any], headers: Mapping[str, str] | None = None) -> Response:
-    """Return the response with a problem document."""
-    content = json.dumps(problem, allow_nan=False)
-    return Response(content, problem["status"], headers=dict(headers or {}), media_type=MEDIA_TYPE)
-
-
-def install_handlers(app: FastAPI) -> None:
-    """Set the exception handlers of an application."""
-    app.add_exception_handler(RequestValidationError, _invalid)
-    app.add_exception_handler(HTTPException, _refused)
-    for kind in (ParamClientError, ServiceError, Exception):
-        app.add_exception_handler(kind, _failed)
-
-
-async def _invalid(_: Request, error: Exception) -> Response:
-    assert isinstance(error, RequestValidationError)
-    faults = [
-        {"where": ".".join(str(part)[:100] for part in fault["loc"]), "what": fault["msg"]}
-        for fault in error.errors()[:FAULTS_MAX]
-    ]
-    detail = "; ".join(f"{fault['where']}: {fault['what']}" for fault in faults)
-    return problem_response(_problem(422, "invalid-request", detail, {"faults": faults}))
-
-
-async def _refused(_: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    phrase = HTTPStatus(error.status_code).phrase
-    problem = _problem(error.status_code, phrase.lower().replace(" ", "-"), error.detail, {})
-    return problem_response(problem, error.headers)
-
-
-async def _failed(request: Request, error: Exception) -> Response:
-    problem = problem_of(error)
-    if problem["status"] == 500:
-        logger.error("%s failed", request.url.path, exc_info=error)
-    return problem_response(problem)
-
-
-def _problem(status: int, kind: str, detail: str, members: Mapping[str, Any]) -> dict[str, Any]:
+    elif isinstance(error, RequestValidationError):
+        faults = [
+            {"where": ".".join(str(part)[:100] for part in fault["loc"]), "what": fault["msg"]}
+            for fault in error.errors()[:FAULTS_MAX]
+        ]
+        status, kind, members = 422, "invalid-request", {"faults": faults}
+        detail = "; ".join(f"{fault['where']}: {fault['what']}" for fault in faults)
+    elif isinstance(error, HTTPException):
+        status, detail, headers = error.status_code, error.detail, error.headers
+        kind = HTTPStatus(status).phrase.lower().replace(" ", "-")
+    if status == HTTPStatus.UNAUTHORIZED:
+        headers = {"www-authenticate": "Bearer"}
     title = kind.replace("-", " ").capitalize()
-    return {**members, "type": f"urn:paramclient:{kind}", "title": title, "status": status, "detail": detail}
+    about = {"type": f"urn:paramclient:{kind}", "title": title, "status": status, "detail": detail}
+    return Response(json.dumps(members | about), status, headers=headers, media_type=MEDIA_TYPE)
 
 
-_STATUSES: Final[dict[type[ParamClientError], int]] = {
-    UnknownParameter: 404,
-    FileTransferError: 502,
-    VehicleError: 409,
-    NoReply: 504,
-    ClientClosed: 503,
-    LinkError: 503,
-    NotInCache: 404,
-    UnknownVehicle: 404,
-    AlreadyRestored: 409,
-    CacheError: 503,
-    AmbiguousVehicle: 409,
-    FileError: 422,
-    InvalidParameters: 422,
-    MetadataError: 422,
-    PackError: 422,
-    UsageError: 422,
-    ParamClientError: 500,
-}
-"""HTTP status of each exception; the first class that matches counts."""
+async def respond(request: Request, error: Exception) -> Response:
+    """Return the response to an exception, and log an unexpected one."""
+    response = problem_response(error)
+    if response.status_code == HTTPStatus.INTERNAL_SERVER_ERROR:
+        logger.error("%s failed", request.url.path, exc_info=error)
+    return response

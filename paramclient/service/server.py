@@ -1,21 +1,20 @@
-"""The HTTP server of the service: address, uvicorn with its limits and TLS, start and shutdown."""
+"""The HTTP server of the service: address, uvicorn with its limits, start and shutdown."""
 
 from __future__ import annotations
 
 import contextlib
+import re
 import socket
-import ssl
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from ipaddress import ip_address
-from pathlib import Path
 from typing import Final
 
 import anyio
 import uvicorn
 
 from paramclient.errors import LinkError, UsageError
-from paramclient.service.app import LOOPBACK_NAMES, create_app
+from paramclient.service.app import create_app
 from paramclient.service.hub import Hub
 from paramclient.service.tokens import Tokens
 
@@ -25,6 +24,8 @@ CONNECTIONS_MAX: Final = 200
 """Maximum number of connections, and of requests; further ones get the status 503."""
 IDLE_TIMEOUT: Final = 30
 """Seconds after which an idle connection is closed."""
+PORT_MAX: Final = 65_535
+"""The highest TCP port."""
 HEADER_BYTES_MAX: Final = 32_768
 """Maximum size of the headers of a request in bytes."""
 SHUTDOWN_TIMEOUT: Final = 1
@@ -38,34 +39,23 @@ class Listening:
     Attributes:
         host: host name or IP address.
         port: TCP port; 0 for any free port.
-        tls_cert: path of the certificate in PEM, or None.
-        tls_key: path of its private key in PEM, or None.
     """
 
     host: str = "127.0.0.1"
     port: int = 8765
-    tls_cert: Path | None = None
-    tls_key: Path | None = None
 
     @classmethod
-    def at(cls, text: str, *, tls_cert: Path | None = None, tls_key: Path | None = None) -> Listening:
+    def at(cls, text: str) -> Listening:
         """Parse `HOST:PORT`; an IPv6 address is in brackets.
 
         Raises:
             UsageError: the text has another format.
         """
-        host, colon, port = text.rpartition(":")
-        bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
-        is_number = port.isascii() and port.isdecimal() and int(port) < 1 << 16
-        if not (colon and bare and is_number) or (":" in bare and bare == host):
+        found = re.fullmatch(r"(?:\[([0-9a-fA-F:.]+)\]|([^:\s]+)):([0-9]{1,5})", text)
+        if found is None or int(found[3]) > PORT_MAX:
             what = "is not a listening address HOST:PORT such as 127.0.0.1:8765 or [::1]:0"
             raise UsageError(f"{text!r} {what}")
-        return cls(bare, int(port), tls_cert, tls_key)
-
-    @property
-    def name(self) -> str:
-        """The host as it is in URLs and in the header Host."""
-        return f"[{self.host}]" if ":" in self.host else self.host
+        return cls(found[1] or found[2], int(found[3]))
 
     @property
     def is_loopback(self) -> bool:
@@ -74,6 +64,22 @@ class Listening:
             return ip_address(self.host).is_loopback
         except ValueError:
             return self.host == "localhost"
+
+    def open(self) -> tuple[socket.socket, str]:
+        """Return a listening socket and its URL.
+
+        Raises:
+            LinkError: the address cannot be listened on.
+        """
+        is_v6 = ":" in self.host
+        name = f"[{self.host}]" if is_v6 else self.host
+        try:
+            family = socket.AF_INET6 if is_v6 else socket.AF_INET
+            opened = socket.create_server((self.host, self.port), family=family)
+        except OSError as error:
+            where = f"{name}:{self.port}"
+            raise LinkError(f"cannot listen on {where}: {error.strerror}", link=where) from error
+        return opened, f"http://{name}:{opened.getsockname()[1]}"
 
 
 class _Server(uvicorn.Server):
@@ -89,8 +95,6 @@ async def serve(
     *,
     listening: Listening | None = None,
     tokens: Tokens | None = None,
-    hosts: Sequence[str] = (),
-    origins: Sequence[str] = (),
     stop: anyio.Event | None = None,
     listens: Callable[[str], None] | None = None,
 ) -> None:
@@ -100,15 +104,12 @@ async def serve(
         hub: links and cache, not yet open.
         listening: listening address.
         tokens: the valid tokens; None only for a loopback address.
-        hosts: names of the service for clients, besides the address; with tokens and none, all are accepted,
-            because only the token gives authority.
-        origins: origins of other sites whose pages may use the service with a token.
         stop: ends the call when set; None for no end but cancellation.
         listens: called with the URL as soon as the service accepts connections.
 
     Raises:
         LinkError: the address cannot be listened on.
-        UsageError: the certificate is invalid, or other computers could connect without tokens.
+        UsageError: other computers could connect without tokens.
     """
     listening = Listening() if listening is None else listening
     stop = anyio.Event() if stop is None else stop
@@ -116,10 +117,8 @@ async def serve(
         raise UsageError(
             f"{listening.host} is not a loopback address: a service for other computers needs --tokens FILE"
         )
-    names = [*LOOPBACK_NAMES, listening.name, *hosts] if hosts or tokens is None else ["*"]
-    app = create_app(hub, tokens=tokens, hosts=names, origins=origins)
     config = uvicorn.Config(
-        app,
+        create_app(hub, tokens=tokens),
         lifespan="off",
         ws="none",
         log_config=None,
@@ -130,17 +129,10 @@ async def serve(
         timeout_keep_alive=IDLE_TIMEOUT,
         timeout_graceful_shutdown=SHUTDOWN_TIMEOUT,
         h11_max_incomplete_event_size=HEADER_BYTES_MAX,
-        ssl_certfile=listening.tls_cert,
-        ssl_keyfile=listening.tls_key,
     )
-    try:
-        config.load()
-    except (OSError, ssl.SSLError) as error:
-        raise UsageError(f"the certificate cannot be used: {error}") from error
     server = _Server(config)
-    with _open(listening) as opened:
-        scheme = "http" if listening.tls_cert is None else "https"
-        url = f"{scheme}://{listening.name}:{opened.getsockname()[1]}"
+    opened, url = listening.open()
+    with opened:
         async with anyio.create_task_group() as tasks:
             try:
                 async with hub:
@@ -152,19 +144,3 @@ async def serve(
                     await stop.wait()
             finally:
                 server.should_exit = True
-
-
-def _open(listening: Listening) -> socket.socket:
-    """Return a listening socket.
-
-    Raises:
-        LinkError: the address cannot be listened on.
-    """
-    family = socket.AF_INET6 if ":" in listening.host else socket.AF_INET
-    try:
-        opened = socket.create_server((listening.host, listening.port), family=family)
-    except OSError as error:
-        where = f"{listening.name}:{listening.port}"
-        raise LinkError(f"cannot listen on {where}: {error.strerror}", link=where) from error
-    opened.setblocking(False)
-    return opened

@@ -1,4 +1,4 @@
-"""The links of the service and the components on them, as the hub holds them."""
+"""The links of the service and the parameters on them, as the hub holds them."""
 
 from __future__ import annotations
 
@@ -6,24 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import anyio
+
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.metadata import Metadata, ParamInfo
 from paramclient.model.identity import Identity
 from paramclient.protocol.fetch import Progress
+from paramclient.protocol.identity import expects_extended
 
 __all__ = ["ServiceLink", "Target"]
-
-
-@dataclass
-class Setup:
-    """The running apply or restore of a component.
-
-    Attributes:
-        author: its author; None if none runs.
-    """
-
-    author: str | None = None
 
 
 @dataclass(eq=False)
@@ -33,30 +25,22 @@ class Target:
     Attributes:
         link: its link.
         component: the component.
-        setup: the running apply or restore of plain or extended parameters.
-        extended: the target with the extended parameters; None if it is this one.
+        setup: held by the running apply or restore of plain or extended parameters.
         metadata: the metadata of its parameters, or None: extended ones have none.
+        described: the identity to which `metadata` belongs.
         progress: the progress of a running fetch, or None.
         fetches: number of ended fetches: a page loads the table again when it has changed.
         published: the last published state.
-        described: the identity to which `metadata` belongs.
     """
 
     link: ServiceLink
     component: Component
-    setup: Setup
-    extended: Target | None = None
+    setup: anyio.Lock
     metadata: Metadata | None = None
+    described: Identity | None = None
     progress: Progress | None = None
     fetches: int = 0
     published: object = None
-    described: Identity | None = None
-
-    @classmethod
-    def of(cls, link: ServiceLink, component: Component) -> Target:
-        """Return the target with the plain parameters of a component; it has that with the extended ones."""
-        setup = Setup()
-        return cls(link, component, setup, cls(link, component.ext, setup))
 
     @property
     def address(self) -> dict[str, Any]:
@@ -65,7 +49,15 @@ class Target:
             "link": self.link.name,
             "system": self.component.system,
             "component": self.component.component,
+            "extended": self.component.is_extended,
         }
+
+    @property
+    def is_listed(self) -> bool:
+        """Whether it is in lists: extended parameters are if there are some, or usually."""
+        component = self.component
+        is_usual = expects_extended(component.identity.vehicle_type, component.component)
+        return not component.is_extended or is_usual or bool(component.params)
 
     def info(self, name: str) -> ParamInfo | None:
         """Return the metadata of a parameter, or None."""
@@ -82,7 +74,7 @@ class ServiceLink:
         state: its state.
         error: the reason of `failed`, or None.
         client: the open client, or None.
-        targets: the components on it, by system and component id.
+        targets: the parameters on it, by system and component id, and whether they are extended.
     """
 
     name: str
@@ -90,4 +82,4 @@ class ServiceLink:
     state: str = "opening"
     error: str | None = None
     client: ParamClient | None = None
-    targets: dict[tuple[int, int], Target] = field(default_factory=dict)
+    targets: dict[tuple[int, int, bool], Target] = field(default_factory=dict)

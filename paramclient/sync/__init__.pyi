@@ -229,7 +229,6 @@ class ParamClient:
         policy: Policy | str = Policy.AUTO,
         traffic: bool = False,
         listen_only: bool = False,
-        forward: str | Link | None = None,
         tlog: str | os.PathLike[str] | None = None,
         signing: Signing | SigningKey | None = None,
         split_peers: bool = False,

@@ -18,6 +18,7 @@ from paramclient.wire.signing import SIGNATURE_LENGTH, Signer
 
 __all__ = [
     "BOOT_CLOCK_OFFSETS",
+    "TARGET_OFFSETS",
     "Frame",
     "Framer",
     "bears_key",
@@ -25,6 +26,7 @@ __all__ = [
     "checksum",
     "enum_word",
     "message_name",
+    "renumber_frame",
     "sign_frame",
     "unsign_frame",
 ]
@@ -256,6 +258,22 @@ def unsign_frame(frame: bytes) -> bytes:
     return _flagged(frame[: -2 - SIGNATURE_LENGTH], 0)
 
 
+def renumber_frame(frame: bytes, sequence: int) -> bytes:
+    """Return the frame with another sequence number, also one with an id outside the dialect.
+
+    The checksum is linear: it changes by that of the difference alone, so that the CRC_EXTRA, which is the
+    last byte of the checksum's input, need not be known.
+    """
+    at, payload_at = (4, _HEADER_LENGTH) if frame[0] == _MAGIC_V2 else (2, 6)
+    if frame[at] == sequence:
+        return frame
+    crc_at = payload_at + frame[1]
+    difference = bytes((frame[at] ^ sequence,)) + bytes(crc_at - at)
+    crc: int = _CRC_AT(frame, crc_at)[0] ^ mcrf4xx(difference, 0)
+    body = frame[:at] + bytes((sequence,)) + frame[at + 1 : crc_at]
+    return body + crc.to_bytes(2, "little") + frame[crc_at + 2 :]
+
+
 def bears_key(frame: bytes) -> bool:
     """Return whether it is a SETUP_SIGNING, with a key in clear: the guide requires not to log or forward
     it."""
@@ -288,17 +306,16 @@ def _by_id_bytes(ids: Collection[int]) -> dict[bytes, int]:
     return {number.to_bytes(3, "little"): number for number in ids}
 
 
-def _boot_clock_offsets() -> dict[int, int]:
-    """Return the offset of `time_boot_ms` in the payload, for each message with the sender's own clock."""
+def _offsets_of(field: str) -> dict[int, int]:
+    """Return the offset of a field in the payload, for each message that has it."""
     offsets = {}
     for number, message in dialect.mavlink_map.items():
         names = message.ordered_fieldnames
-        if "time_boot_ms" not in names or "target_system" in names or number in _OTHER_CLOCKS:
-            continue
-        types = dict(zip(message.fieldnames, message.fieldtypes, strict=True))
-        before = names[: names.index("time_boot_ms")]
-        lengths = dict(zip(names, message.array_lengths, strict=True))
-        offsets[number] = sum(_SIZES[types[name]] * max(1, lengths[name]) for name in before)
+        if field in names:
+            types = dict(zip(message.fieldnames, message.fieldtypes, strict=True))
+            lengths = dict(zip(names, message.array_lengths, strict=True))
+            before = names[: names.index(field)]
+            offsets[number] = sum(_SIZES[types[name]] * max(1, lengths[name]) for name in before)
     return offsets
 
 
@@ -336,6 +353,13 @@ _OTHER_CLOCKS = frozenset({251, 252, 254, 257, 263, 11060})
 NAMED_VALUE_INT, DEBUG and NAMED_VALUE_STRING have the time of an application, BUTTON_CHANGE and
 CAMERA_IMAGE_CAPTURED that of an earlier event, and are repeated."""
 
-BOOT_CLOCK_OFFSETS: Final = _boot_clock_offsets()
+TARGET_OFFSETS: Final = _offsets_of("target_system")
+"""The offset of `target_system` in the payload, by message id. A payload that is cut before it has 0."""
+
+BOOT_CLOCK_OFFSETS: Final = {
+    number: at
+    for number, at in _offsets_of("time_boot_ms").items()
+    if number not in TARGET_OFFSETS and number not in _OTHER_CLOCKS
+}
 """The offset of the 4 bytes of `time_boot_ms` in the payload, by message id. Messages with a target are
 requests to a vehicle, with the time of another program, and are left out. SYSTEM_TIME is included."""

@@ -283,6 +283,10 @@ class Puppet:
         self._sequence = (self._sequence + 1) & 0xFF
         self._out.append(encode(message, sequence=self._sequence, **self._address))
 
+    def say_bytes(self, data: bytes) -> None:
+        """Send a datagram."""
+        self._out.append(data)
+
     def tick(self, now: float) -> None:
         """Send the heartbeat if it is due."""
         if self._heartbeat is not None and now >= self._beat_at:

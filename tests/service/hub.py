@@ -35,13 +35,25 @@ async def synced(browser: httpx.AsyncClient, address: str = V) -> dict[str, Any]
 async def until(
     browser: httpx.AsyncClient, address: str, is_so: Callable[[dict[str, Any]], bool]
 ) -> dict[str, Any]:
-    """What is at an address, as soon as it is so."""
+    """The vehicle at an address, as soon as it is so; without ids, the whole list."""
     for _ in range(1000):
-        answer = await browser.get(address)
-        if answer.status_code == 200 and is_so(found := answer.json()):
-            return dict(found)
+        found = await vehicle(browser, address)
+        if found is not None and is_so(found):
+            return found
         await asyncio.sleep(0.1)
-    raise AssertionError(f"{address}: {answer.text[:500]}")
+    raise AssertionError(f"{address}: {found}")
+
+
+async def vehicle(browser: httpx.AsyncClient, address: str = V) -> dict[str, Any] | None:
+    """The vehicle at an address, as the list has it."""
+    url = httpx.URL(address)
+    listed: dict[str, Any] = (await browser.get("/api/vehicles")).json()
+    if url.path == "/api/vehicles":
+        return listed
+    system, component = map(int, url.path.split("/")[3:5])
+    wanted: dict[str, Any] = {"system": system, "component": component, "extended": "ext" in url.params}
+    wanted |= {"link": url.params["link"]} if "link" in url.params else {}
+    return next((each for each in listed["vehicles"] if wanted.items() <= each.items()), None)
 
 
 def problem(answer: httpx.Response, status: int, kind: str) -> dict[str, Any]:

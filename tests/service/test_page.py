@@ -11,6 +11,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
+from pymavlink import mavutil
 
 from paramclient.files import read_file
 from paramclient.service import Tokens, add_token
@@ -174,6 +175,7 @@ def test_a_value_out_of_range_needs_a_confirmation(bench: Bench, visit: Callable
     send = sight.dialog.get_by_role("button", name="Send")
     expect(sight.dialog.get_by_role("alert").filter(has_text="out of range")).to_be_visible()
     expect(send).to_be_disabled()
+    expect(send).not_to_have_class(re.compile("strong"))  # Enter in the dialog sends nothing
     sight.dialog.get_by_label("Send them anyway").check()
     send.click()
     expect(sight.line("MC_ROLL_P")).to_contain_text("accepted")
@@ -244,6 +246,44 @@ def test_a_table_is_fetched_and_saved(bench: Bench, visit: Callable[..., Sight],
     assert "MC_ROLL_P" in read_file(file).sets[0]
 
 
+def test_ground_stations_are_shown_with_what_the_cache_saved(
+    bench: Bench, visit: Callable[..., Sight]
+) -> None:
+    station = mavutil.mavlink_connection(bench.endpoint.replace("tcpin", "tcp"), source_system=254)
+    station.wait_heartbeat(timeout=20)
+    station.param_fetch_all()
+    assert station.recv_match(type="PARAM_VALUE", blocking=True, timeout=20)
+    sight = visit(bench.url)
+    sight.page.get_by_role("button", name="Ground stations").click()
+    expect(sight.dialog).to_contain_text("1 station.")
+    expect(sight.dialog).to_contain_text("as 254/")
+    expect(sight.dialog).to_contain_text(re.compile(r"kept \d+\.\d kB off the links"))
+    sight.dialog.get_by_role("button", name="Close").last.click()
+    station.close()
+
+
+def test_extended_parameters_are_staged_and_undone_like_others(
+    bench: Bench, visit: Callable[..., Sight]
+) -> None:
+    sight = visit(bench.url)
+    camera = "Camera 4/100, extended"
+    sight.page.get_by_role("navigation").get_by_role("button", name=camera).click()
+    expect(sight.page.locator("#empty")).to_contain_text("Fetch requests them")
+    sight.act("Fetch")
+    name = "CAM_NAME"
+    expect(sight.row(name)).to_be_visible()
+    before = bench.ask("GET", f"/vehicles/4/100/params/{name}?ext=true")["value"]
+    sight.stage(name, "Rear left")
+    sight.send()
+    expect(sight.line(name)).to_contain_text("accepted")
+    sight.done()
+    assert bench.ask("GET", f"/vehicles/4/100/params/{name}?ext=true&live=true")["value"] == "Rear left"
+    sight.bar.get_by_role("button", name="Undo").click()
+    sight.dialog.get_by_role("button", name="Send").click()
+    sight.done()
+    assert bench.ask("GET", f"/vehicles/4/100/params/{name}?ext=true&live=true")["value"] == before
+
+
 def test_names_with_markup_are_shown_as_text(bench: Bench, visit: Callable[..., Sight]) -> None:
     sight = visit(bench.url)
     sight.choose("PX4 3/1")
@@ -282,8 +322,9 @@ def test_before_a_token_the_page_only_asks_to_sign_in(
         until(bench.is_ready)
         sight = visit(bench.url, is_open=False)
         expect(sight.dialog).to_contain_text("requires a token")
-        expect(sight.page.locator("#empty")).to_be_hidden()
-        assert sight.page.locator("#rows .row").count() == 0
+        for part in ("#main", "#rail", "#vehicle-choice"):
+            expect(sight.page.locator(part)).to_be_hidden()
+        expect(sight.page.locator("#role")).to_have_text("")
         token = sight.dialog.get_by_label("Token")
         token.fill("wrong")
         sight.dialog.get_by_role("button", name="Sign in").click()

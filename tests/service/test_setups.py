@@ -83,7 +83,7 @@ async def test_an_apply_is_limited_to_names_and_refuses_values_out_of_range(cach
     vehicle = PX4Vehicle(metadata=True)
     async with service(vehicle, cache=cache) as (_, browser):
         await synced(browser)
-        await browser.post(f"{V}/metadata", json={})
+        await browser.post(f"{V}/fetch", json={"metadata": True})
         high = (await browser.get(f"{V}/params/MC_ROLL_P")).json()["metadata"]["maximum"] + 1
         body: dict[str, Any] = {"values": {"MC_ROLL_P": high, "MC_PITCH_P": 5.0}}
         problem(await browser.post(f"{V}/apply", json=body), 422, "invalid-parameters")
@@ -101,13 +101,11 @@ async def test_a_restore_goes_back_to_before_the_last_apply_once(cache: str) -> 
         await synced(browser)
         problem(await browser.post(f"{V}/restore", json={}), 404, "not-in-cache")
         await browser.post(f"{V}/apply", json={"values": {"PARAM_04": 44}})
-        plan = (await browser.post(f"{V}/restore", json={"dry_run": True})).json()
-        assert plan["params"]["PARAM_04"]["wanted"] == 4
         done = (await browser.post(f"{V}/restore", json={})).json()
         assert done["complete"]
         assert vehicle.param("PARAM_04").value == 4
         again = problem(await browser.post(f"{V}/restore", json={}), 409, "already-restored")
-        body = {"snapshot": again["before_restore"]}
+        body = {"at": again["before_restore"]}
         assert (await browser.post(f"{V}/restore", json=body)).json()["complete"]
         assert vehicle.param("PARAM_04").value == 44
 
@@ -121,15 +119,15 @@ async def test_snapshots_are_stored_listed_read_and_applied(cache: str) -> None:
         assert made.status_code == 201
         await browser.put(f"{V}/params/PARAM_04", json={"value": 44})
         (kept,) = (await browser.get(f"{V}/snapshots")).json()["snapshots"]
-        assert made.json() == {"id": kept["id"]}
+        assert made.json() == kept
         assert (kept["reason"], kept["size"], kept["complete"]) == ("before the flight", 25, True)
-        query = {"snapshot": kept["id"]}
+        query = {"at": kept["id"]}
         params = (await browser.get(f"{V}/params", params=query)).json()["params"]
         assert params["PARAM_04"]["value"] == 4
         assert "PARAM_04\t4\t" in (await browser.get(f"{V}/file", params=query)).text
         plan = (await browser.post(f"{V}/plan", json=query)).json()
         assert [name for name, each in plan["params"].items() if each["status"] == "set"] == ["PARAM_04"]
-        problem(await browser.get(f"{V}/params?snapshot=99"), 404, "not-in-cache")
+        problem(await browser.get(f"{V}/params?at=99"), 404, "not-in-cache")
 
 
 @in_simulated_time
@@ -188,12 +186,13 @@ async def test_an_armed_vehicle_is_set_up_only_if_that_is_allowed(cache: str) ->
     ("call", "body"),
     [
         ("apply", {}),
-        ("apply", {"values": {"PARAM_04": 1}, "snapshot": 1}),
+        ("apply", {"values": {"PARAM_04": 1}, "at": 1}),
         ("apply", {"values": {}}),
         ("plan", {"file": {"name": "x"}}),
         ("plan", {"values": {"A_NAME_THAT_IS_LONG": 1}}),
-        ("restore", {"snapshot": 1, "at": 1}),
-        ("restore", {"snapshot": 0}),
+        ("restore", {"at": True}),
+        ("restore", {"at": 0}),
+        ("restore", {"at": "2026-11-20T14:00"}),
         ("snapshots", {"reason": ""}),
         ("fetch", {"refresh": "maybe", "x": 1}),
     ],

@@ -42,10 +42,10 @@ export async function roleOf(token = sessionStorage.getItem(TOKEN)) {
   return (await answer.json()).role;
 }
 
-/** Returns the path of a component's resource, on its link or in the cache (`is_kept`). */
+/** Returns the path of a component's resource. */
 export function at(component, what = "", query = {}) {
-  const place = component.is_kept ? { key: component.key } : { link: component.link };
-  return `/api/vehicles/${component.system}/${component.component}${what}?${new URLSearchParams({ ...place, ...query })}`;
+  const place = { link: component.link, ext: component.extended, ...query };
+  return `/api/vehicles/${component.system}/${component.component}${what}?${new URLSearchParams(place)}`;
 }
 
 /** Sends a request with a JSON body and returns the JSON of the response. `signal` ends it. */

@@ -6,11 +6,11 @@ import { Details } from "./details.js";
 import { showKeys } from "./dialogs.js";
 import { announce, button, byId, el, isNarrow, onceAFrame, setText } from "./dom.js";
 import { CellEditor } from "./editor.js";
-import { hasExtended } from "./extended.js";
 import { Grid } from "./grid.js";
 import { nameOf, outcomesText, review, undo, undoButton } from "./review.js";
+import { showStations } from "./stations.js";
 import { HIGHLIGHT_TIME, OTHERS, store } from "./store.js";
-import { defaultOf, many, parse } from "./values.js";
+import { defaultOf, many, parse, recentText } from "./values.js";
 import { drawActions, drawVehicles, offerDescriptions, showError } from "./vehicles.js";
 
 const FILTERS = {
@@ -29,7 +29,7 @@ const grid = new Grid({
   show: (row) => details.open(row, true),
   moved: (row) => details.follow(row),
 });
-const editor = new CellEditor({ grid, stage: (name, text, send) => store.stage(name, text, send) });
+const editor = new CellEditor({ grid, stage: (name, text) => store.stage(name, text) });
 const details = new Details({ leave: () => grid.root.focus({ preventScroll: true }) });
 
 function edit(row) {
@@ -93,13 +93,8 @@ const drawState = onceAFrame(() => {
 });
 
 function drawGroups() {
-  const { groups, pending, rows } = store.table;
-  const waiting = new Map();
-  for (const name of pending.keys()) {
-    const group = rows.get(name)?.group;
-    waiting.set(group, (waiting.get(group) ?? 0) + 1);
-  }
-  const key = JSON.stringify([store.selected, shown.group, [...groups], [...waiting]]);
+  const { groups, rows } = store.table;
+  const key = JSON.stringify([store.selected, shown.group, [...groups]]);
   const list = byId("groups");
   if (list.dataset.shown === key) return;
   list.dataset.shown = key;
@@ -119,7 +114,6 @@ function drawGroups() {
           on: { click: () => choose({ group }) },
         },
         el("span", { text }),
-        waiting.has(group) && el("i", { class: "dot warn" }),
         el("small", { text: String(count) }),
       ),
     );
@@ -183,9 +177,7 @@ function emptyText(count, total, component, table) {
     return component.fetch
       ? "Loading the parameters."
       : table.isLoaded
-        ? `No parameters are known${component.is_kept ? "." : " yet. Fetch requests them from the vehicle."}${
-            hasExtended(component) ? " Extended shows the extended ones." : ""
-          }`
+        ? "No parameters are known yet. Fetch requests them from the vehicle."
         : "Loading …";
   if (shown.filter === "changed" && !shown.words.length)
     return table.sorted.some((row) => row.isChanged !== null)
@@ -232,6 +224,7 @@ function choose(change) {
 // events of the service
 
 store.on("all", () => {
+  byId("rail").hidden = byId("main").hidden = false; // hidden until a valid token is there
   editor.close(false);
   details.forget();
   shown.group = "";
@@ -256,31 +249,18 @@ store.on("other", () => {
 store.on("armed", (component) =>
   announce(`${nameOf(component)} is ${component.is_armed ? "armed" : "not armed any more"}.`),
 );
-store.on("lost", (component) => announce(`${nameOf(component)} ${component.is_lost ? "is lost" : "is heard again"}.`));
-
-/** Describes recent changes of one or several rows in one sentence for each kind. */
-function changesText(recent) {
-  const of = (kind) => recent.filter((each) => each.kind === kind);
-  const said = ["changed", "added", "removed"].map((kind) => {
-    const all = of(kind);
-    const [first] = all;
-    if (all.length > 1) return `${all.length} parameters were ${kind}${kind === "changed" ? " by others" : ""}.`;
-    if (!first) return "";
-    return kind === "changed" ? `${first.name} is ${first.text} now, by ${first.by}.` : `${first.name} was ${kind}.`;
-  });
-  return said.filter(Boolean).join(" ");
-}
 
 const recent = [];
 store.on("recent", ({ key, row }) => {
   if (key !== store.selected) return;
   if (!recent.length) {
     setTimeout(() => {
-      announce(changesText(recent));
+      const [first] = recent;
+      announce(recent.length > 1 ? `${recent.length} parameters were changed by others.` : `${first.name}: ${recentText(first)}.`);
       recent.length = 0;
     }, 1000);
   }
-  recent.push({ name: row.name, text: row.text, ...row.recent });
+  recent.push({ name: row.name, ...row.recent });
 });
 setInterval(() => {
   for (const table of store.tables.values())
@@ -334,19 +314,9 @@ byId("search").addEventListener("keydown", (event) => {
 byId("group-choice").addEventListener("change", () => choose({ group: byId("group-choice").value }));
 byId("vehicle-choice").addEventListener("change", () => store.select(byId("vehicle-choice").value).catch(showError));
 byId("tools").append(
+  button("", () => showStations().catch(showError), { kind: "quiet only", drawing: "station", label: "Ground stations" }),
   button("", showKeys, { kind: "quiet only", drawing: "help", label: "Keys" }),
-  button("", turnTheme, { kind: "quiet only", drawing: "theme", label: "Dark or light" }),
 );
-
-function turnTheme() {
-  const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
-  document.documentElement.dataset.theme = theme;
-  try {
-    localStorage.setItem("theme", theme);
-  } catch {
-    // without storage the choice lasts until the page is closed
-  }
-}
 
 const KEYS = {
   "/": () => {
@@ -354,12 +324,6 @@ const KEYS = {
     byId("search").select();
   },
   "?": showKeys,
-  g: () =>
-    (isNarrow()
-      ? byId("group-choice")
-      : (byId("groups").querySelector(".chosen") ?? byId("groups").querySelector("button"))
-    ).focus(),
-  v: () => (isNarrow() ? byId("vehicle-choice") : byId("vehicles").querySelector(".chosen"))?.focus(),
   d: () => take((row) => defaultOf(row.document)),
   t: () => take((row) => store.table.other?.values.get(row.name)?.text ?? null),
   u: () => grid.active && store.unstage(grid.active.name),
@@ -371,7 +335,7 @@ function take(valueOf) {
   const text = row && store.mayWrite ? valueOf(row) : null;
   if (text === null) return;
   const read = parse(text, row.type);
-  if (!read.error) store.stage(row.name, read.text, read.send);
+  if (!read.error) store.stage(row.name, read.text);
 }
 
 document.addEventListener("keydown", (event) => {
@@ -389,16 +353,6 @@ document.addEventListener("keydown", (event) => {
   } else if (event.key === "Escape" && !isTyping && !event.defaultPrevented) grid.root.focus({ preventScroll: true });
 });
 
-for (const list of [byId("groups"), byId("vehicles")]) {
-  list.addEventListener("keydown", (event) => {
-    const steps = { ArrowDown: 1, ArrowUp: -1 };
-    if (!(event.key in steps)) return;
-    event.preventDefault();
-    const buttons = [...list.querySelectorAll("button")];
-    buttons[buttons.indexOf(document.activeElement) + steps[event.key]]?.focus();
-  });
-}
-
 addEventListener("dragover", (event) => {
   if (event.dataTransfer?.types.includes("Files")) event.preventDefault();
 });
@@ -412,5 +366,4 @@ addEventListener("beforeunload", (event) => {
   if ([...store.tables.values()].some((table) => table.pending.size)) event.preventDefault();
 });
 
-drawActions();
 stream.open();

@@ -1,12 +1,12 @@
 /** Comparison with a file, an earlier state or another vehicle, and applying values from it. */
 
 import { Problem, at, get, request } from "./api.js";
-import { announce, button, byId, changesTable, choice, el, faultText, fileChoice, nothing, setText } from "./dom.js";
+import { announce, button, byId, changesTable, choice, el, faultText, nothing, setText } from "./dom.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { valueText } from "./details.js";
 import { Caution, OUTCOMES, nameOf, outcomesText } from "./review.js";
 import { keyOf, store } from "./store.js";
-import { isWhole, many, moment, numberText, textOf } from "./values.js";
+import { many, moment, numberText, textOf } from "./values.js";
 
 /** Maximum size of a parameter file in bytes, as in the service. */
 const FILE_BYTES_MAX = 2 * 2 ** 20;
@@ -30,11 +30,9 @@ export async function chooseOther(file = null) {
       fault.textContent = error.message;
     }
   };
-  const [input, label] = fileChoice(
-    "file",
-    "A parameter file of any ground station. You can also drop it onto the page.",
-    (chosen) => chosen && attempt(() => fromFile(chosen)),
-  );
+  const take = () => input.files[0] && attempt(() => fromFile(input.files[0]));
+  const input = el("input", { type: "file", on: { change: take } });
+  const text = "A parameter file of any ground station. You can also drop it onto the page.";
   const snapshots = el("ul", { class: "choices" }, nothing("Looking …"));
   const vehicles = el("ul", { class: "choices" });
   const content = el(
@@ -42,7 +40,7 @@ export async function chooseOther(file = null) {
     {},
     fault,
     el("h3", { text: "A file" }),
-    label,
+    el("label", { class: "drop" }, el("span", { text }), input),
     el("h3", { text: "An earlier state" }),
     snapshots,
     el("h3", { text: "Another vehicle" }),
@@ -81,8 +79,8 @@ async function fillSnapshots(component, list, attempt) {
       `${each.reason}, ${many(each.size, "parameter")}`,
       () =>
         attempt(async () => {
-          const state = await get(at(component, "/params", { snapshot: each.id }));
-          return otherOf(`state of ${moment(each.time)}`, state.params, { snapshot: each.id }, false);
+          const state = await get(at(component, "/params", { at: each.id }));
+          return otherOf(`state of ${moment(each.time)}`, state.params, { at: each.id }, false);
         }),
     ]);
   } catch (error) {
@@ -91,21 +89,18 @@ async function fillSnapshots(component, list, attempt) {
 }
 
 function fillVehicles(component, list, attempt) {
-  const others = [...store.components.values(), ...store.unheard].filter((each) => keyOf(each) !== keyOf(component));
+  const others = [...store.components.values()].filter((each) => keyOf(each) !== keyOf(component));
   fill(list, others, "No other vehicle is known.", (each) => [
     nameOf(each),
-    each.is_kept ? `${each.uid ?? each.key}, in the cache since ${moment(each.last_seen)}` : `on ${each.link}`,
+    `on ${each.link}`,
     () =>
       attempt(async () => {
         const { params } = await get(at(each, "/params"));
-        const values = Object.entries(params).map(([name, param]) => [name, sendable(param)]);
+        const values = Object.entries(params).map(([name, param]) => [name, textOf(param)]);
         return otherOf(nameOf(each), params, { values: Object.fromEntries(values) }, false);
       }),
   ]);
 }
-
-/** Returns a value as it is sent: digits of an integer that a JavaScript number cannot represent. */
-const sendable = (param) => (Number.isSafeInteger(param.value) || !isWhole(param.type) ? param.value : textOf(param));
 
 function fill(list, items, remark, parts) {
   const made = items.map((item) => choice(...parts(item)));
@@ -233,14 +228,12 @@ export async function takeOver() {
         el("b", { class: `outcome ${word.kind}`, text: word.text }),
         ` ${made}${row.reason ?? ""}`,
       );
-      const known = table.rows.get(line.name)?.document;
       const isTaken = ["set", "adjusted", "unproven"].includes(row.status);
       outcomes.push({
         name: line.name,
         status: row.status,
         isTaken,
         before: line.before,
-        restore: line.restore ?? known?.value,
       });
     }
     table.sent = { names: new Set(chosen.map((line) => line.name)), outcomes, at: Date.now() };
@@ -253,10 +246,6 @@ export async function takeOver() {
   }
 
   async function makePlan() {
-    lines = [];
-    body.replaceChildren();
-    summary.textContent = "Planning the changes …";
-    refresh();
     try {
       const plan = await request("POST", at(component, "/plan"), other.source, { timeout: PLAN_TIMEOUT });
       lines = linesOf(plan, table, other, refresh);
@@ -341,9 +330,7 @@ function linesOf(plan, table, other, refresh) {
       );
       const line = { name, status, box, remark, element };
       line.follow = () => {
-        const { text, document } = table.rows.get(name) ?? {};
-        line.before = text ?? "";
-        line.restore = document?.bits ? { bits: document.bits } : document?.value;
+        line.before = table.rows.get(name)?.text ?? "";
         setText(now, line.before);
       };
       line.follow();

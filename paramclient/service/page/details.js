@@ -49,9 +49,7 @@ export class Details {
   }
 
   close() {
-    this.root.hidden = true;
-    document.body.classList.remove("with-sheet");
-    this.name = null;
+    this.forget();
     this.leave();
   }
 
@@ -66,7 +64,7 @@ export class Details {
     this.key = store.selected;
     this.form = store.mayWrite
       ? editorOf(row, store.table.pending.get(row.name), {
-          stage: (text, send) => store.stage(row.name, text, send),
+          stage: (text) => store.stage(row.name, text),
           leave: () => this.close(),
           isCompact: false,
         })
@@ -112,11 +110,9 @@ export class Details {
     const facts = [
       ["Default", standard !== null && `${standard}${meaning(standard, row)}`, defaultSourceOf(known)],
       ["Range", rangeOf(info)],
-      ["Step", info?.increment !== undefined && numberText(info.increment, row.type)],
       ["Type", row.type],
       ["Index", known.index],
       ["Group", row.group],
-      ["Category", info?.category],
       ["Value", TRUST[known.trust] ?? known.trust],
       ["Restart", info?.reboot_required && "a new value counts from the next start on"],
       ["Read-only", info?.is_read_only && "the vehicle sets it by itself"],
@@ -150,8 +146,8 @@ export class Details {
     const old = valueText(entry.old, row.type);
     const now = entry.new === null ? "gone" : valueText(entry.new, row.type);
     const take = () => {
-      const { error, text, send } = parse(old, row.type);
-      if (!error) store.stage(row.name, text, send);
+      const { error, text } = parse(old, row.type);
+      if (!error) store.stage(row.name, text);
     };
     return el(
       "li",

@@ -94,14 +94,11 @@ export function showKeys() {
     ["Enter", "edit the value; stage what was edited"],
     ["Esc", "leave: the editor, the details, the search"],
     ["Space or →", "all that is known of the parameter"],
-    ["↑ ↓ in a number", "one step more or less; with Shift, ten"],
     ["d", "take the default"],
     ["t", "take the value that is compared with"],
     ["u", "drop the change of the parameter"],
     ["Ctrl Enter", "review what is to be sent"],
     ["Ctrl Z", "undo what was sent last, after a review"],
-    ["g", "go to the groups"],
-    ["v", "go to the vehicles"],
     ["?", "this list"],
   ];
   const list = el(

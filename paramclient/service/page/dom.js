@@ -63,12 +63,6 @@ export function setAttribute(element, name, value) {
   } else if (element.getAttribute(name) !== String(value)) element.setAttribute(name, value);
 }
 
-/** Returns an input for a file, and its label. */
-export function fileChoice(id, text, take, more = {}) {
-  const input = el("input", { type: "file", id, ...more, on: { change: () => take(input.files[0]) } });
-  return [input, el("label", { class: "drop", for: id }, el("span", { text }), input)];
-}
-
 /** Returns an item of a list of choices. */
 export const choice = (name, remark, click) => {
   const texts = [el("b", { text: name }), el("small", { text: remark })];
@@ -119,16 +113,12 @@ const ANNOUNCEMENTS_MAX = 5;
 const HIDDEN_FRAME_INTERVAL = 200;
 const PROPERTIES = { value: 1, checked: 1, disabled: 1, hidden: 1, indeterminate: 1, selected: 1, max: 1 };
 const DRAWINGS = {
-  search: "M7 2.5a4.5 4.5 0 1 0 0 9 4.5 4.5 0 0 0 0-9ZM10.4 10.4 14 14",
   keep: "M2.5 5h2.7l1-1.5h3.6l1 1.5h2.7v8h-11ZM8 11a2.2 2.2 0 1 0 0-4.4A2.2 2.2 0 0 0 8 11Z",
   close: "M4 4l8 8M12 4l-8 8",
   refresh: "M13 8a5 5 0 1 1-1.5-3.6M13 2v3h-3",
   save: "M8 2.5v7M5 7l3 3 3-3M3 13h10",
   compare: "M5 2.5v11M2.5 5 5 2.5 7.5 5M11 13.5v-11M8.5 11l2.5 2.5 2.5-2.5",
-  theme: "M8 2.5a5.5 5.5 0 1 0 0 11ZM8 2.5a5.5 5.5 0 0 1 0 11",
+  station: "M8 9v5M5 14h6M8 7.5a1 1 0 1 0 0-2 1 1 0 0 0 0 2ZM4.8 9.7a4.5 4.5 0 0 1 0-6.4M11.2 3.3a4.5 4.5 0 0 1 0 6.4",
   help: "M5.8 6a2.2 2.2 0 1 1 3.2 2c-.7.4-1 .8-1 1.6M8 12.2v.3",
-  extended: "M3 4h10M3 8h6M3 12h10M12 6.5v3",
   undo: "M3 6.5h6.5a3.5 3.5 0 0 1 0 7H6M3 6.5 6 3.5M3 6.5l3 3",
-  left: "M10 3 5 8l5 5",
-  warning: "M8 2.5 14 13H2ZM8 6.5v3M8 11.3v.2",
 };

@@ -1,12 +1,12 @@
 /** Editors of a value: a number with its range, a list of named values, or check boxes for bits. */
 
 import { button, byId, el, faultText, isNarrow } from "./dom.js";
-import { defaultOf, isFloat, maskOf, parse, rangeOf, sameText, textOf, textOfMask, warningOf } from "./values.js";
+import { defaultOf, isFloat, isWhole, maskOf, parse, rangeOf, sameText, textOf, textOfMask, warningOf } from "./values.js";
 
 const OTHER = "other";
 
 /**
- * Creates the form for one parameter. Calls `stage(text, send)` with a valid value, and `leave()` at the end.
+ * Creates the form for one parameter. Calls `stage(text)` with a valid value, and `leave()` at the end.
  * `first` receives the focus, and `refresh(row)` handles a changed value.
  */
 export function editorOf(row, pending, { stage, leave, isCompact = true }) {
@@ -35,13 +35,13 @@ export function editorOf(row, pending, { stage, leave, isCompact = true }) {
           report(read);
           if (read.error) input.first.focus();
           else {
-            stage(read.text, read.send);
+            stage(read.text);
             leave();
           }
         },
         keydown: (event) => {
           if (event.key === "Escape") leave();
-          else if (event.key === "Enter" && event.target.tagName !== "BUTTON") form.requestSubmit();
+          else if (event.key === "Enter" && !["BUTTON", "TEXTAREA"].includes(event.target.tagName)) form.requestSubmit();
           else return;
           event.preventDefault();
           event.stopPropagation();
@@ -87,7 +87,7 @@ export class CellEditor {
   open(row, pending) {
     this.row = row;
     this.form = editorOf(row, pending, {
-      stage: (text, send) => this.stage(row.name, text, send),
+      stage: (text) => this.stage(row.name, text),
       leave: () => this.close(true),
     });
     this.box.replaceChildren(this.form);
@@ -130,10 +130,10 @@ function inputOf(row, value, hintId, report) {
 
 function number(row, value, hintId, report) {
   const { info, type, name } = row;
-  const first = el("input", {
+  const first = el(/[\r\n]/.test(value) ? "textarea" : "input", {
     class: "number",
     value,
-    inputmode: isFloat(type) ? "decimal" : "numeric",
+    inputmode: isFloat(type) ? "decimal" : isWhole(type) ? "numeric" : "text",
     autocomplete: "off",
     spellcheck: "false",
     enterkeyhint: "done",
@@ -141,18 +141,6 @@ function number(row, value, hintId, report) {
     "aria-describedby": hintId,
     on: {
       input: () => report(parse(first.value, type)),
-      keydown: (event) => {
-        if (event.key !== "ArrowUp" && event.key !== "ArrowDown") return;
-        event.preventDefault();
-        const read = parse(first.value, type);
-        if (read.error || !Number.isFinite(Number(read.text))) return;
-        const step =
-          (event.key === "ArrowUp" ? 1 : -1) *
-          (info?.increment ?? (isFloat(type) ? 0.1 : 1)) *
-          (event.shiftKey ? 10 : 1);
-        first.value = stepped(read.text, step, type);
-        report(parse(first.value, type));
-      },
     },
   });
   const write = (text) => {
@@ -233,15 +221,6 @@ function boxes(row, value, report) {
     el("label", { class: "bit" }, box, el("span", { text: info.bits[bit] }), el("small", { text: `bit ${bit}` })),
   );
   const group = el("fieldset", { class: "bits", "aria-label": `Bits of ${name}` }, labels);
-  const step = (by, event) => {
-    const place = made.findIndex(([, box]) => box === document.activeElement);
-    made[place + by]?.[1].focus();
-    event.preventDefault();
-  };
-  group.addEventListener("keydown", (event) => {
-    if (event.key === "ArrowDown") step(1, event);
-    else if (event.key === "ArrowUp") step(-1, event);
-  });
   show();
   return {
     first: made[0]?.[1] ?? total,
@@ -253,16 +232,6 @@ function boxes(row, value, report) {
     },
   };
 }
-
-/** Returns the next number of a step, without rounding errors. */
-function stepped(text, step, type) {
-  if (!isFloat(type)) return String(BigInt(text) + BigInt(Math.round(step) || Math.sign(step)));
-  const places = Math.max(decimals(text), decimals(String(step)));
-  return String(Number((Number(text) + step).toFixed(Math.min(20, places))));
-}
-
-const decimals = (text) =>
-  (text.split("e")[0].split(".")[1] ?? "").length + Math.max(0, -Number(text.split("e")[1] ?? 0));
 
 function hints(row) {
   const { info, type } = row;

@@ -203,8 +203,6 @@ export class Grid {
       PageUp: -page,
       Home: -Infinity,
       End: Infinity,
-      j: 1,
-      k: -1,
     };
     if (event.key in steps) this.go(this.index + steps[event.key]);
     else if (!this.active) return;

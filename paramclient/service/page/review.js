@@ -102,6 +102,7 @@ export async function review() {
     if (isSending || sent) return;
     range.show([...lines.values()].some((line) => line.isOutOfRange));
     send.disabled = !count || armed.forbids || range.forbids;
+    send.classList.toggle("strong", !armed.isNeeded && !range.isNeeded);
     send.replaceChildren(el("span", { text: `Send ${many(count, "change")}` }));
   }
 
@@ -162,7 +163,7 @@ export function undo() {
   closeDialog();
   const { sent } = store.table;
   if (!sent) return;
-  for (const each of sent.outcomes) if (each.isTaken) store.stage(each.name, each.before, each.restore);
+  for (const each of sent.outcomes) if (each.isTaken) store.stage(each.name, each.before);
   if (store.table.pending.size) review();
   else announce("Nothing to undo: the vehicle has the previous values.");
 }
@@ -181,16 +182,11 @@ export function outcomesText(outcomes) {
 
 /** Returns the display name of a vehicle. */
 export function nameOf(component) {
-  return `${AUTOPILOTS[component.autopilot] ?? component.autopilot} ${component.system}/${component.component}`;
+  const name = AUTOPILOTS[component.autopilot] ?? (component.kind || component.autopilot);
+  return `${name} ${component.system}/${component.component}${component.extended ? ", extended" : ""}`;
 }
 
-const AUTOPILOTS = {
-  px4: "PX4",
-  ardupilot: "ArduPilot",
-  ardupilotmega: "ArduPilot",
-  generic: "Generic",
-  unknown: "Unknown",
-};
+const AUTOPILOTS = { px4: "PX4", ardupilot: "ArduPilot" };
 
 /** A row of the review. `follow()` updates it with the vehicle's current value. */
 function lineOf(change, rowNow, drop) {
@@ -264,7 +260,6 @@ function outcomeBefore({ change: { name }, rowNow }) {
   return {
     name,
     before: row.text,
-    restore: row.document.bits ? { bits: row.document.bits } : row.document.value,
     type: row.type,
     isTaken: false,
     isLate: Boolean(row.info?.reboot_required),
@@ -274,7 +269,7 @@ function outcomeBefore({ change: { name }, rowNow }) {
 /** Sends the changes, and completes their outcomes. `force` sends values that are out of range. */
 async function writeValues(component, parts, force) {
   try {
-    const values = Object.fromEntries(parts.map(({ line: { change } }) => [change.name, change.send]));
+    const values = Object.fromEntries(parts.map(({ line: { change } }) => [change.name, change.text]));
     const timeout = WRITE_TIMEOUT + parts.length * WRITE_TIMEOUT_PER_VALUE;
     const { results } = await request("PATCH", at(component, "/params"), { values, force }, { timeout });
     const byName = new Map(results.map((each) => [each.name, each]));

@@ -11,10 +11,8 @@ const RELOAD_DELAY = 2_000;
 const GROUP_SIZE_MIN = 2;
 export const OTHERS = "Others";
 
-/** Prefix of the keys of cached vehicles; no link name starts with it. */
-const CACHED_PREFIX = "kept:";
-
-export const keyOf = (component) => `${component.link} ${component.system}/${component.component}`;
+export const keyOf = ({ link, system, component, extended }) =>
+  `${link} ${system}/${component}${extended ? " extended" : ""}`;
 
 /** One parameter: the document of the service, and derived values. */
 class Row {
@@ -141,7 +139,6 @@ class Store {
     this.role = null;
     this.components = new Map();
     this.tables = new Map();
-    this.kept = new Map();
     this.selected = null;
     this.isConnected = null;
     this.seq = -1;
@@ -171,13 +168,7 @@ class Store {
 
   /** The selected component, or null. */
   get component() {
-    return this.components.get(this.selected) ?? this.kept.get(this.selected) ?? null;
-  }
-
-  /** Cached components that are on no link, the last heard first. */
-  get unheard() {
-    const present = new Set([...this.components.values()].map((each) => `${each.component} ${each.key}`));
-    return [...this.kept.values()].filter((each) => !present.has(`${each.component} ${each.key}`));
+    return this.components.get(this.selected) ?? null;
   }
 
   get table() {
@@ -185,7 +176,7 @@ class Store {
   }
 
   get mayWrite() {
-    return this.role === "write" && !this.component?.is_kept;
+    return this.role === "write";
   }
 
   /** Loads the state of the service; events during the load are applied afterwards. */
@@ -202,7 +193,6 @@ class Store {
     const role = await roleOf();
     if (load !== this.loads) return;
     this.role = role;
-    this.kept = keptOf(found.cached);
     const documents = new Map(found.vehicles.map((each) => [keyOf(each), each]));
     const before = this.components.get(this.selected);
     if (before && !documents.has(this.selected)) documents.set(this.selected, asLost(before));
@@ -213,14 +203,7 @@ class Store {
     for (const event of early) this.take(event);
     if (!this.component) this.selected = first(this.components);
     this.emit("all");
-    this.emit("extended", null);
     if (this.selected) await this.loadTable(this.selected);
-  }
-
-  /** Loads the vehicles in the cache again. */
-  async loadKept() {
-    this.kept = keptOf((await get("/api/vehicles")).cached);
-    this.emit("components");
   }
 
   async select(key) {
@@ -230,7 +213,7 @@ class Store {
   }
 
   async loadTable(key) {
-    const component = this.components.get(key) ?? this.kept.get(key);
+    const component = this.components.get(key);
     if (!component) return;
     const table = this.tableOf(key);
     table.isLoaded = false;
@@ -290,13 +273,8 @@ class Store {
     }
     const key = keyOf(event);
     if (event.type === "vehicle") this.takeComponent(key, event);
-    else if (event.type === "change" && event.extended) this.emit("extended", event);
     else if (event.type === "change") this.takeChange(key, event);
-    else if (event.type === "progress") {
-      const component = this.components.get(key);
-      if (component) component.fetch = event;
-      this.emit("components");
-    } else if (event.type === "setup") this.emit("setup", event);
+    else if (event.type === "setup") this.emit("setup", event);
   }
 
   takeComponent(key, event) {
@@ -307,7 +285,6 @@ class Store {
       const before = this.components.get(key);
       if (key === this.selected && before) this.components.set(key, asLost(before));
       else this.components.delete(key);
-      this.loadKept().catch(() => {});
       const table = this.tables.get(key);
       if (table) table.isLoaded = false; // staged changes wait for the vehicle's return
     } else {
@@ -316,7 +293,6 @@ class Store {
       const isReady = (each) => each && `${each.fetches} ${each.has_metadata} ${each.state === "synced"}`;
       if (before && isReady(before) !== isReady(document)) this.reload(key, event.seq);
       if (before && Boolean(before.is_armed) !== Boolean(document.is_armed)) this.emit("armed", document);
-      if (before && before.is_lost !== document.is_lost) this.emit("lost", document);
     }
     const isBack = key === this.selected && !isForgotten && !this.table.isLoaded && !this.table.isLoading;
     if (isBack) this.loadTable(key).catch(() => {});
@@ -350,11 +326,11 @@ class Store {
   }
 
   /** Stages a value; one equal to the vehicle's is removed. */
-  stage(name, text, send) {
+  stage(name, text) {
     const row = this.table.rows.get(name);
     if (!row) return;
     if (sameText(text, row.text, row.type)) this.table.pending.delete(name);
-    else this.table.pending.set(name, { name, text, send, before: row.text });
+    else this.table.pending.set(name, { name, text, before: row.text });
     this.emit("pending");
   }
 
@@ -373,15 +349,6 @@ const NO_TABLE = new Table();
 /** A selected component that the service has removed: only the user changes the selection. */
 const asLost = (component) => ({ ...component, is_lost: true, is_armed: null, state: "lost", silence_s: 0, fetch: null });
 
-/** The tables in the cache in the shape of connected components: they can be viewed, not changed. */
-const keptOf = (cached) =>
-  new Map(
-    cached.map((each) => {
-      const kept = { ...each, link: CACHED_PREFIX + each.key, state: "cached", is_kept: true, is_lost: false, is_armed: null, fetch: null };
-      return [keyOf(kept), kept];
-    }),
-  );
-
 /** Names the source of a change. */
 export function authorOf(by) {
   if (!by || by === "vehicle") return "the vehicle";
@@ -393,7 +360,7 @@ export function authorOf(by) {
 /** Returns the key of the lowest autopilot, else of the lowest component: they are sorted. */
 function first(components) {
   const all = [...components.values()].sort((a, b) => a.system - b.system || a.component - b.component);
-  const chosen = all.find((each) => each.component === 1) ?? all[0];
+  const chosen = all.find((each) => each.component === 1) ?? all.find((each) => each.params) ?? all[0];
   return chosen ? keyOf(chosen) : null;
 }
 

@@ -40,17 +40,8 @@ export function textOf(param) {
 /** Formats a number without bits, such as a default or a limit. */
 export function numberText(value, type) {
   if (typeof value !== "number") return String(value ?? "");
-  const text = Object.is(value, -0) ? "-0" : String(type === "REAL32" ? shortest(value) : value);
+  const text = Object.is(value, -0) ? "-0" : String(value);
   return isFloat(type) && /^-?\d+$/.test(text) ? `${text}.0` : text;
-}
-
-/** Returns the shortest number with the same float32: 0.07 for 0.07000000029802322. */
-function shortest(value) {
-  for (let digits = 1; digits < 9; digits++) {
-    const short = Number(value.toPrecision(digits));
-    if (Math.fround(short) === Math.fround(value)) return short;
-  }
-  return value;
 }
 
 /** Returns the meaning of a value from its metadata: `Loiter`, `GPS | Baro`; "" for a plain number. */
@@ -84,10 +75,14 @@ export function textOfMask(mask, type) {
 }
 
 /**
- * Parses an input as a value of this type: `{text, send}`, where `send` is the value for the service, or `{error}`.
- * Integers may be hexadecimal; a comma is a decimal point.
+ * Parses an input as a value of this type: `{text}`, which the service takes, or `{error}`. Integers may be
+ * hexadecimal; a comma is a decimal point. A value of another type is text, or bytes after `hex:`.
  */
 export function parse(written, type) {
+  if (!isWhole(type) && !isFloat(type)) {
+    const isWrong = written.startsWith("hex:") && !/^hex:([\da-f]{2}){0,128}$/i.test(written);
+    return isWrong ? { error: "hex: takes pairs of hexadecimal digits." } : { text: written };
+  }
   const text = written.trim();
   if (text === "") return { error: "A value is missing." };
   if (isWhole(type)) {
@@ -97,18 +92,16 @@ export function parse(written, type) {
     const number = text.startsWith("-") ? -size : size;
     const [low, high] = BOUNDS[type];
     if (number < low || number > high) return { error: `${type} holds ${low} to ${high}.` };
-    const isSafe = number >= Number.MIN_SAFE_INTEGER && number <= Number.MAX_SAFE_INTEGER;
-    const bits = () => BigInt.asUintN(64, number).toString(16).padStart(16, "0");
-    return { text: String(number), send: isSafe ? Number(number) : { bits: bits() } };
+    return { text: String(number) };
   }
   const word = WORDS[text.toLowerCase()];
-  if (word !== undefined) return { text: word, send: word };
+  if (word !== undefined) return { text: word };
   const plain = text.replace(",", ".");
   if (!/^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d{1,3})?$/i.test(plain))
     return { error: "Not a number. Examples: 12, -1.5, 1e-3, nan, inf." };
   const number = type === "REAL64" ? Number(plain) : Math.fround(Number(plain));
   if (!Number.isFinite(number)) return { error: `${text} is more than a ${type} holds.` };
-  return { text: numberText(Number(plain), type), send: Number(plain) };
+  return { text: numberText(Number(plain), type) };
 }
 
 /** Returns a warning about a value from its metadata. */

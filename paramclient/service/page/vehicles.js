@@ -4,10 +4,9 @@ import { at, download, request } from "./api.js";
 import { announce, button, byId, choice, el, faultText, nothing, setText } from "./dom.js";
 import { chooseOther } from "./compare.js";
 import { closeDialog, openDialog } from "./dialogs.js";
-import { offerExtended, showExtended } from "./extended.js";
 import { nameOf } from "./review.js";
 import { keyOf, store } from "./store.js";
-import { many, moment, span } from "./values.js";
+import { many, span } from "./values.js";
 
 const STATES = {
   new: "no parameters yet",
@@ -31,30 +30,10 @@ const FORMATS = [
   ["json", "paramclient, JSON", ".json"],
 ];
 const KINDS = { new: "idle", cached: "warn", partial: "warn", synced: "good", fetching: "busy", lost: "bad" };
-/** Display names of MAV_TYPE values of vehicles with parameters. */
-const TYPES = {
-  1: "plane",
-  2: "quadrotor",
-  3: "coaxial",
-  4: "helicopter",
-  10: "rover",
-  11: "boat",
-  12: "submarine",
-  13: "hexarotor",
-  14: "octorotor",
-  15: "tricopter",
-  19: "tailsitter",
-  20: "tailsitter",
-  21: "tiltrotor",
-  22: "VTOL",
-  26: "gimbal",
-  30: "camera",
-};
 const LINK_PROBLEMS = { failed: "link failed", opening: "link opening", ended: "end of the log" };
 
 /** Returns the state of a component in words, and the kind of its dot. */
 export function stateOf(component) {
-  if (component.is_kept) return { text: `in the cache, heard last ${moment(component.last_seen)}`, kind: "idle" };
   const link = component.link_state;
   if (link !== "open") return { text: LINK_PROBLEMS[link] ?? link, kind: link === "ended" ? "idle" : "bad" };
   if (component.is_lost)
@@ -72,24 +51,10 @@ export function drawVehicles() {
   const components = [...store.components.values()].sort(
     (a, b) => a.system - b.system || a.component - b.component || (a.link < b.link ? -1 : 1),
   );
-  const { unheard, component } = store;
-  if (component?.is_kept && !unheard.includes(component)) unheard.unshift(component); // connected again
   drawList(byId("vehicles"), components);
   if (!components.length) byId("vehicles").append(nothing("None found yet."));
-  drawCached(unheard);
-  drawChoice(components, unheard);
-  drawVehicle(component);
-}
-
-/** Renders cached vehicles apart: there may be hundreds, which do not change. */
-function drawCached(unheard) {
-  const box = byId("kept-box");
-  const key = JSON.stringify([store.selected, unheard.map((each) => [keyOf(each), each.last_seen])]);
-  if (box.dataset.shown === key) return;
-  box.dataset.shown = key;
-  drawList(byId("kept"), unheard);
-  box.hidden = !unheard.length;
-  setText(byId("kept-count"), String(unheard.length));
+  drawChoice(components);
+  drawVehicle(store.component);
 }
 
 function drawList(list, components) {
@@ -113,8 +78,7 @@ function drawList(list, components) {
     const [dot, name, remark] = choose.children;
     const state = stateOf(component);
     setText(name, nameOf(component));
-    const place = component.is_kept ? (component.uid ?? component.key) : component.link;
-    setText(remark, `${component.is_armed ? "armed · " : ""}${state.text} · ${place}`);
+    setText(remark, `${component.is_armed ? "armed · " : ""}${state.text} · ${component.link}`);
     dot.className = `dot ${component.is_armed ? "bad" : state.kind}`;
     choose.classList.toggle("chosen", key === store.selected);
     if (key === store.selected) choose.setAttribute("aria-current", "true");
@@ -125,17 +89,14 @@ function drawList(list, components) {
     list.replaceChildren(...items);
 }
 
-function drawChoice(components, unheard) {
+function drawChoice(components) {
   const choice = byId("vehicle-choice");
-  const named = (each) => `${nameOf(each)}, ${moment(each.last_seen)}`;
-  const live = components.map((each) => [keyOf(each), nameOf(each)]);
-  const wanted = [live, unheard.map((each) => [keyOf(each), named(each)])];
+  const wanted = components.map((each) => [keyOf(each), nameOf(each)]);
   if (JSON.stringify(wanted) !== choice.dataset.shown) {
     choice.dataset.shown = JSON.stringify(wanted);
-    const [present, kept] = wanted.map((each) => each.map(([value, text]) => el("option", { value, text })));
-    choice.replaceChildren(...present, ...(kept.length ? [el("optgroup", { label: "Not connected" }, kept)] : []));
+    choice.replaceChildren(...wanted.map(([value, text]) => el("option", { value, text })));
   }
-  choice.hidden = !choice.options.length;
+  choice.hidden = !wanted.length;
   choice.value = store.selected ?? "";
 }
 
@@ -151,16 +112,11 @@ function drawVehicle(component) {
     byId("badges").dataset.shown = shown;
     byId("badges").replaceChildren(...badges.map(([kind, text]) => el("span", { class: `badge ${kind}`, text })));
   }
-  const { link, count, vehicle_type: type, identity } = component;
-  const place = component.is_kept ? (component.uid ?? component.key) : link;
-  const parts = [TYPES[type], versionOf(identity?.firmware), place, count && many(count, "parameter")];
+  const { kind, firmware, link, count } = component;
+  const parts = [kind, firmware, link, count && many(count, "parameter")];
   setText(byId("subtitle"), parts.filter(Boolean).join(" · "));
   drawFetch(component);
-  offerExtended();
 }
-
-/** Formats a version of AUTOPILOT_VERSION: three bytes, then its type. */
-const versionOf = (packed) => (packed ? `${packed >>> 24}.${(packed >> 16) & 255}.${(packed >> 8) & 255}` : null);
 
 function drawFetch(component) {
   const { fetch } = component;
@@ -175,25 +131,17 @@ function drawFetch(component) {
 
 /** Returns the actions of a vehicle, created once for each role and kind. */
 export function drawActions() {
-  const isHeard = !store.component?.is_kept;
   const actions = [
     button("Compare", () => chooseOther(), { drawing: "compare" }),
     button("Save", shown(save), { drawing: "save" }),
-    isHeard && button("Load descriptions", shown(describe), { drawing: "help", id: "describe", hidden: true }),
-    button("Extended", shown(showExtended), {
-      drawing: "extended",
-      label: "Extended parameters of the component: text and 64-bit numbers",
-      id: "extended",
-      hidden: true,
-    }),
+    button("Load descriptions", shown(describe), { drawing: "help", id: "describe", hidden: true }),
     store.mayWrite &&
       button("Snapshot", shown(keepState), { drawing: "keep", label: "Snapshot: record the current values for a later restore" }),
-    isHeard && button("Fetch", shown(fetchAll), { drawing: "refresh", label: "Fetch all parameters from the vehicle" }),
+    button("Fetch", shown(fetchAll), { drawing: "refresh", label: "Fetch all parameters from the vehicle" }),
   ];
   byId("actions").replaceChildren(...actions.filter(Boolean));
   byId("meter-cancel").replaceChildren(button("Stop", stopFetch, { kind: "quiet" }));
   setText(byId("role"), store.mayWrite ? "" : "read-only");
-  offerExtended();
   offerDescriptions();
 }
 
@@ -208,8 +156,8 @@ async function describe() {
   announce("Loading the descriptions.");
   byId("describe").disabled = true;
   try {
-    const { count } = await request("POST", at(store.component, "/metadata"), {}, { timeout: DESCRIPTION_TIMEOUT });
-    announce(`${many(count, "parameter")} described.`);
+    await request("POST", at(store.component, "/fetch"), { metadata: true }, { timeout: DESCRIPTION_TIMEOUT });
+    announce("The descriptions are loaded.");
   } finally {
     byId("describe").disabled = false;
   }
@@ -256,7 +204,7 @@ async function save() {
 
   async function take(format) {
     fault.textContent = "";
-    state.textContent = component.is_kept ? "Reading …" : "Fetching all parameters from the vehicle …";
+    state.textContent = "Fetching all parameters from the vehicle …";
     try {
       const { name, content } = await download(at(component, "/file", { format }), SAVE_TIMEOUT);
       const address = URL.createObjectURL(content);

@@ -1,0 +1,431 @@
+"""The gateway: every ground station is answered from the tables that the service keeps.
+
+Ground stations connect to an endpoint as to a vehicle. All frames pass, and the parameter conversation is
+answered from the table: one download over the vehicle's link serves all stations.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Hashable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Final, TypeAlias
+
+import anyio
+
+from paramclient.client.client import ParamClient
+from paramclient.client.taps import SeenFrame, Tap
+from paramclient.errors import LinkError
+from paramclient.protocol.ftp import Opcode, Packet
+from paramclient.protocol.node import Node
+from paramclient.protocol.session import Session
+from paramclient.service.kept_file import KeptFile
+from paramclient.service.kept_table import Asker, KeptTable
+from paramclient.service.stations import GroundStation, MavlinkEndpoint, Source
+from paramclient.wire import messages
+from paramclient.wire.frames import TARGET_OFFSETS, Frame, bears_key
+from paramclient.wire.messages import (
+    AUTOPILOT_COMPONENT,
+    COMP_ID_ALL,
+    HASH_CHECK,
+    Message,
+    decode,
+    encode,
+    message_id,
+)
+
+__all__ = ["GATEWAY_ADDRESS", "Gateway"]
+
+GATEWAY_ADDRESS: Final = (254, 191)
+"""System and component id of the gateway (MAV_COMP_ID_ONBOARD_COMPUTER): not those of a ground station, so
+that vehicles notice when they lose all of these."""
+GROUND_STATION_SYSTEM: Final = 255
+"""The system id of ground stations by default, and of a client."""
+OWN_TYPE: Final = 18
+"""MAV_TYPE_ONBOARD_CONTROLLER, for the same reason."""
+GROUND_STATION_PARAMS: Final = ("SYSID_MYGCS", "MAV_GCS_SYSID")
+"""ArduPilot's parameter with the system id of its ground station, whose heartbeats it watches."""
+LOOP_TIME: Final = 2.0
+"""Seconds after which a frame that was sent is not taken for its own copy any more."""
+
+ListRequest: TypeAlias = messages.ParamRequestList | messages.ParamExtRequestList
+ReadRequest: TypeAlias = messages.ParamRequestRead | messages.ParamExtRequestRead
+SetRequest: TypeAlias = messages.ParamSet | messages.ParamExtSet
+Request: TypeAlias = ListRequest | ReadRequest | SetRequest | messages.FileTransfer
+"""Messages of a station that the gateway answers."""
+PLAIN_ANSWERS: Final = {message_id(messages.ParamValue), message_id(messages.ParamError)}
+EXTENDED_REQUESTS: Final = {
+    message_id(each)
+    for each in (messages.ParamExtRequestList, messages.ParamExtRequestRead, messages.ParamExtSet)
+}
+EXTENDED_ANSWERS: Final = {message_id(messages.ParamExtValue), message_id(messages.ParamExtAck)}
+HEARTBEAT: Final = message_id(messages.Heartbeat)
+FILE_TRANSFER: Final = message_id(messages.FileTransfer)
+HARMLESS: Final = frozenset({HEARTBEAT, message_id(messages.SystemTime), 4, 66, 111})
+"""What passes from the stations of a read-only endpoint, with PING, REQUEST_DATA_STREAM and TIMESYNC."""
+HARMLESS_COMMANDS: Final = (messages.MAV_CMD_REQUEST_MESSAGE, messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
+HARMLESS_OPCODES: Final = frozenset(Opcode) - {
+    Opcode.CREATE_FILE,
+    Opcode.WRITE_FILE,
+    Opcode.OPEN_FILE_WO,
+}
+"""The requests of MAVFTP that write nothing."""
+
+logger = logging.getLogger(__name__)
+
+
+class Gateway:
+    """The ground stations at some endpoints, and the clients of the vehicles' links.
+
+    `open` the gateway and `run` it; `attach` each client before it is opened. Clients may come and go.
+
+    Args:
+        endpoints: where stations connect.
+
+    Attributes:
+        endpoints: as given.
+        links: the open links to vehicles.
+    """
+
+    def __init__(self, endpoints: Iterable[MavlinkEndpoint]) -> None:
+        self.endpoints = list(endpoints)
+        self.links: list[VehicleLink] = []
+        self.copies = _Copies()
+        self._warned: set[Source] = set()
+        for endpoint in self.endpoints:
+            endpoint.sending = self.copies.sent_down
+
+    @property
+    def stations(self) -> list[GroundStation]:
+        """All connected stations."""
+        return [station for endpoint in self.endpoints for station in endpoint.stations.values()]
+
+    def attach(self, client: ParamClient) -> None:
+        """Serve the vehicles of a client, which is not open yet. It is no ground station any more."""
+        station = client.core.station
+        station.own_type = OWN_TYPE
+        if station.own_address[0] == GROUND_STATION_SYSTEM:
+            station.own_address = GATEWAY_ADDRESS
+        link = VehicleLink(self, client)
+        client.core.add_tap(link)
+        client.core.link_task.accepts = link.accepts
+
+    async def open(self) -> None:
+        """Open the endpoints.
+
+        Raises:
+            LinkError: one cannot be opened, and none is open then.
+        """
+        try:
+            for endpoint in self.endpoints:
+                await endpoint.open()
+        except LinkError:
+            for endpoint in self.endpoints:
+                await endpoint.link.close()
+            raise
+
+    async def run(self) -> None:
+        """Serve the stations at the open endpoints, until cancelled."""
+        async with anyio.create_task_group() as tasks:
+            for endpoint in self.endpoints:
+                tasks.start_soon(endpoint.run, self._take)
+
+    def pass_on(self, link: VehicleLink, seen: SeenFrame, peer: Hashable) -> None:
+        """Pass a frame of a vehicle to all stations, but for answers to the gateway."""
+        table = link.table_of_answer(seen, peer)
+        is_answer = table is not None and table.withholds
+        is_copy = not is_answer and self.copies.is_copy(seen.data, (link, peer))
+        if bears_key(seen.data) or is_copy:
+            return
+        for station in self.stations:
+            if is_answer and table is not None and self._serves(station, table, link):
+                station.withhold(seen)
+            else:
+                station.relay(seen)
+
+    def announce(self, link: VehicleLink, table: KeptTable, message: Message) -> None:
+        """Send a value that has changed to all stations."""
+        for station in self.stations:
+            if self._serves(station, table, link):
+                station.say(message, table.source)
+
+    # requests
+
+    def _take(self, station: GroundStation, seen: SeenFrame) -> None:
+        """Take a frame of a station: answer it, or pass it to the vehicles."""
+        frame = seen.frame
+        source = (frame.system, frame.component)
+        is_vehicle = any(link.is_vehicle(source) for link in self.links)
+        if bears_key(seen.data) or is_vehicle or self.copies.has(seen.data, but_of=station):
+            return
+        for link in self.links:
+            link.avoid(frame.system)
+        message = decode(frame) if seen.is_proven else None
+        if isinstance(message, Request):
+            station.requests[type(message).__name__] += 1
+            if self._answer(station, source, message, seen):
+                return
+        if not station.endpoint.is_readonly or _is_harmless(frame, message):
+            self._pass(station, seen)
+            if getattr(message, "command", None) == messages.MAV_CMD_PREFLIGHT_STORAGE:
+                for link in self.links:
+                    for table in link.tables(_target_of(frame), COMP_ID_ALL, extended=False):
+                        table.component.watch.doubt()  # it may reset all, which PX4 does not announce
+
+    def _answer(self, station: GroundStation, source: Source, message: Request, seen: SeenFrame) -> bool:
+        """Answer a request about parameters; return False for one that passes to the vehicles."""
+        address = (message.target_system, message.target_component)
+        extended = message_id(type(message)) in EXTENDED_REQUESTS
+        found = {table: link for link in self.links for table in link.tables(*address, extended=extended)}
+        served = [table for table, link in found.items() if self._serves(station, table, link)]
+        if not served:
+            return False
+        is_list = isinstance(message, ListRequest)
+        if not is_list and len({table.source[0] for table in found}) > 1:
+            return False  # for whichever vehicle: they answer themselves
+        present = [table for table in served if not table.is_lost]
+        autopilots = [table for table in present if table.source[1] == AUTOPILOT_COMPONENT]
+        one = (autopilots or present)[:1]  # that answers a request which all components receive
+        may_write = station.may_sign or not any(link.is_signed for link in found.values())
+        asker = Asker(station, *source, may_write)
+        match message:
+            case messages.ParamRequestList() | messages.ParamExtRequestList():
+                for table in present:
+                    table.send_list(station)
+                for table, link in found.items():
+                    if table not in served:
+                        link.send(_readdressed(message, seen.frame, table.source))
+            case messages.ParamRequestRead() | messages.ParamExtRequestRead():
+                which = message.param_id if message.param_index < 0 else message.param_index
+                for table in [each for each in present if each.known(which) is not None] or one:
+                    table.read(asker, which)
+            case messages.ParamSet() | messages.ParamExtSet():
+                if message.param_id != HASH_CHECK:  # it would stop the gateway's own list
+                    for table in one:
+                        table.set(asker, message)
+            case messages.FileTransfer(payload=payload):
+                for table in one:
+                    return found[table].file(table).take(asker, payload, lambda: self._pass(station, seen))
+        return True
+
+    def _serves(self, station: GroundStation, table: KeptTable, link: VehicleLink) -> bool:
+        """Return whether requests of a station to a component are answered from its table."""
+        if not table.is_kept or (table.source in link.signing and not station.may_sign):
+            return False
+        is_double = any(each is not link and each.is_vehicle(table.source) for each in self.links)
+        if is_double and table.source not in self._warned:
+            self._warned.add(table.source)
+            logger.warning(
+                "%d/%d is on two links: stations are not answered from its table, and all frames pass",
+                *table.source,
+            )
+        return not is_double
+
+    def _pass(self, station: GroundStation, seen: SeenFrame) -> None:
+        """Send a frame to the links on which its target was heard; to all for an unknown one, and for all."""
+        self.copies.sent_up(seen.data, station)
+        self.copies.sent_down(seen.data)  # no traffic between stations, not even by a vehicle's link
+        system = _target_of(seen.frame)
+        heard = [link for link in self.links if system in link.systems]
+        for link in heard if system and heard else self.links:
+            link.send(seen.data)
+
+
+class VehicleLink(Tap):
+    """A link to vehicles, as its client has opened it.
+
+    Args:
+        gateway: the gateway.
+        client: of the link.
+
+    Attributes:
+        systems: the system ids that were heard.
+        signing: the components that sign.
+    """
+
+    def __init__(self, gateway: Gateway, client: ParamClient) -> None:
+        self.systems: set[int] = set()
+        self.signing: set[Source] = set()
+        self._gateway = gateway
+        self._client = client
+        self._tables: dict[Session, KeptTable] = {}
+        self._files: dict[KeptTable, KeptFile] = {}
+
+    @property
+    def _own_address(self) -> Source:
+        return self._client.core.station.own_address
+
+    @property
+    def is_signed(self) -> bool:
+        """Whether the client signs what it sends."""
+        return self._client.signing_report() is not None
+
+    async def run(self) -> None:
+        """Take part in the gateway while the client is open."""
+        self._gateway.links.append(self)
+        try:
+            await anyio.sleep_forever()
+        finally:
+            self._gateway.links.remove(self)
+
+    def accepts(self, data: bytes, peer: Hashable) -> bool:
+        """Return whether received data is no datagram of the gateway that has come back over another peer."""
+        peers = (node.peer for node in self._client.core.station.nodes.values())
+        return not self._gateway.copies.has(data) or peer in peers
+
+    def sent(self, frame: bytes) -> None:
+        """Take note of a frame to the vehicles."""
+        self._gateway.copies.sent_up(frame)
+
+    def send(self, data: bytes) -> None:
+        """Send a frame of a station to the vehicles."""
+        self._client.core.link_task.forward(data)
+
+    def received(self, frames: Sequence[SeenFrame], size: int, peer: Hashable) -> None:
+        """Pass the frames of a chunk on; the client has taken them before."""
+        for seen in frames:
+            source = (seen.frame.system, seen.frame.component)
+            if source != self._own_address:
+                self.systems.add(source[0])
+                if seen.is_signed:
+                    self.signing.add(source)
+                if seen.frame.message_id == HEARTBEAT:
+                    self._avoid_watched_id(source)
+                self._gateway.pass_on(self, seen, peer)
+
+    def avoid(self, system: int) -> None:
+        """Take another system id if a ground station has ours, or a vehicle watches it as that of one."""
+        own, component = self._own_address
+        if own == system:
+            systems = {source[0] for each in self._gateway.stations for source in each.sources}
+            free = (each for each in range(own - 1, 0, -1) if each not in systems | self.systems)
+            self._client.core.station.own_address = (next(free, own), component)
+
+    def _avoid_watched_id(self, source: Source) -> None:
+        node = self._client.core.station.nodes.get(source)
+        params = {} if node is None else node.plain.table.params
+        own = self._own_address[0]
+        if any(name in params and params[name].value == own for name in GROUND_STATION_PARAMS):
+            self.avoid(own)
+
+    def is_vehicle(self, source: Source) -> bool:
+        """Return whether a component with parameters is heard under these ids."""
+        node = self._client.core.station.nodes.get(source)
+        return node is not None and node.identification.has_parameters and not node.presence.is_lost
+
+    def tables(self, system: int, component: int, *, extended: bool) -> Iterator[KeptTable]:
+        """Return the tables of the components with an address; 0 stands for all."""
+        for node in list(self._client.core.station.nodes.values()):
+            is_meant = system in (0, node.system) and component in (COMP_ID_ALL, node.component)
+            if is_meant and node.identification.has_parameters:
+                yield self._table(node, extended=extended)
+
+    def file(self, table: KeptTable) -> KeptFile:
+        """Return the parameter file of a component."""
+        if table not in self._files:
+            self._files[table] = KeptFile(table)
+        return self._files[table]
+
+    def table_of_answer(self, seen: SeenFrame, peer: Hashable) -> KeptTable | None:
+        """Return the table to which a value or an answer belongs; None for another frame."""
+        frame = seen.frame
+        node = self._client.core.station.nodes.get((frame.system, frame.component))
+        if node is None or node.peer != peer:
+            return None
+        table = self._table(node, extended=False)  # from its first frame on, for its changes
+        extended = self._table(node, extended=True)
+        if frame.message_id in EXTENDED_ANSWERS:
+            return extended
+        is_answer = frame.message_id in PLAIN_ANSWERS or (
+            frame.message_id == FILE_TRANSFER and _target_of(frame) == self._own_address[0]
+        )
+        return table if is_answer else None
+
+    def _table(self, node: Node, *, extended: bool) -> KeptTable:
+        session = node.extended if extended else node.plain
+        if session not in self._tables:
+            component = self._client.components[node.system, node.component]
+            announce = partial(self._gateway.announce, self)
+            self._tables[session] = KeptTable(component.ext if extended else component, announce)
+        return self._tables[session]
+
+
+class _Copies:
+    """Recognizes frames that have come back: a link or an endpoint leads to the gateway itself.
+
+    Vehicles and stations send equal frames too, such as heartbeats: only those of another origin are copies.
+    """
+
+    def __init__(self) -> None:
+        self._recent: dict[int, Hashable] = {}
+        self._earlier: dict[int, Hashable] = {}
+        self._turned_at = 0.0
+
+    def sent_down(self, data: bytes) -> None:
+        """Take note of a frame, or of a whole datagram, that is sent to a station."""
+        self._note(_key_of(data), self)
+        self._note(hash(data), self)
+
+    def sent_up(self, data: bytes, origin: Hashable = None) -> None:
+        """Take note of a frame that is sent to vehicles, by a station or by the gateway."""
+        self._note(hash(data), origin or self)
+
+    def has(self, data: bytes, *, but_of: Hashable = None) -> bool:
+        """Return whether these bytes were sent a moment ago, and not by this station."""
+        return self._origin(hash(data), but_of) != but_of
+
+    def is_copy(self, data: bytes, origin: Hashable) -> bool:
+        """Return whether a frame was sent to a station, or came from another origin, a moment ago.
+
+        Vehicles' frames are renumbered for each station, so that their numbers are not compared.
+        """
+        key = _key_of(data)
+        if self._origin(key, origin) != origin:
+            return True  # and no note of it: a vehicle that has moved is heard again after a moment
+        self._recent[key] = origin
+        return False
+
+    def _note(self, key: int, origin: Hashable) -> None:
+        self._recent.setdefault(key, self._origin(key, origin))
+
+    def _origin(self, key: int, default: Hashable) -> Hashable:
+        now = anyio.current_time()
+        if now - self._turned_at > LOOP_TIME:
+            self._turned_at = now
+            self._recent, self._earlier = {}, self._recent
+        return self._recent.get(key, self._earlier.get(key, default))
+
+
+def _key_of(data: bytes) -> int:
+    """Return the hash of a frame without its sequence number and checksum."""
+    if data[0] == 0xFD:
+        return hash(data[:4] + data[5 : 10 + data[1]])
+    return hash(data[:2] + data[3 : 6 + data[1]])
+
+
+def _target_of(frame: Frame) -> int:
+    """Return the target system of a frame; 0 for all, and for a message without one."""
+    at = TARGET_OFFSETS.get(frame.message_id, len(frame.payload))
+    return frame.payload[at] if at < len(frame.payload) else 0
+
+
+def _readdressed(message: ListRequest, frame: Frame, target: Source) -> bytes:
+    """Return a request for a list to one component, in the name of the station."""
+    system, component = target
+    single = replace(message, target_system=system, target_component=component)
+    sender = {"system": frame.system, "component": frame.component, "version": frame.version}
+    return encode(single, sequence=frame.sequence, **sender)
+
+
+def _is_harmless(frame: Frame, message: Message | None) -> bool:
+    """Return whether a frame changes nothing on a vehicle."""
+    match message:
+        case messages.CommandLong(command=command):
+            return command in HARMLESS_COMMANDS
+        case messages.FileTransfer(payload=payload):
+            return Packet.unpack(payload).opcode in HARMLESS_OPCODES
+        case messages.ParamSet() | messages.ParamExtSet():
+            return False
+        case _:
+            return frame.message_id in HARMLESS or isinstance(message, Request)

@@ -1,0 +1,256 @@
+"""KeptFile: the parameter file of a kept table, for the stations that read it over MAVFTP."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import anyio
+
+from paramclient.errors import FileErrorCode
+from paramclient.model.px4_hash import crc32_px4
+from paramclient.model.values import ParamType, bits_of
+from paramclient.protocol.checksum import CHECKED_READ_SIZE, may_be_rounded
+from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
+from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode
+from paramclient.protocol.session import Session
+from paramclient.service.kept_table import Asker, KeptTable
+from paramclient.wire.messages import FileTransfer
+
+__all__ = ["FileQuery", "KeptFile", "Rows", "answers_of", "rows_of"]
+
+ENTRY_SIZE: Final = 12
+"""Bytes of an entry in param.pck, on average: the size in the answer to an open is an estimate."""
+FILE_WAIT: Final = 2.5
+"""Seconds that the opening of the file waits for a fetch; then there is no such file, and the station asks
+for the list, which it gets as it is fetched. QGroundControl asks three times, 1 s apart."""
+OPEN_FILES_MAX: Final = 64
+"""Files that stations have open of one component, at most; the oldest is closed first."""
+
+
+class FileQuery(NamedTuple):
+    """The part of the parameter file that a path names; `length` 0 for all that follows."""
+
+    start: int = 0
+    length: int = 0
+    with_defaults: bool = False
+
+    @classmethod
+    def of(cls, path: str) -> FileQuery | None:
+        """Parse a path; None for that of another file, and for options that a vehicle refuses."""
+        name, _, text = path.partition("?")
+        given = {"start": "0", "count": "0", "withdefaults": "0"}
+        known = given.keys()
+        given |= dict(each.partition("=")[::2] for each in text.split("&") if each)
+        are_numbers = all(each.isascii() and each.isdecimal() and len(each) <= 5 for each in given.values())
+        if name != PARAM_FILE or given.keys() != known or not are_numbers:
+            return None
+        start, length, defaults = (int(given[each]) for each in known)
+        return cls(start, length, bool(defaults)) if defaults < 2 else None
+
+
+class Rows(NamedTuple):
+    """The entries of the file, by index, and whether the default of each one is known."""
+
+    entries: Sequence[PackedParam]
+    has_defaults: bool
+
+    def content(self, query: FileQuery, read_size: int) -> bytes:
+        """Return the file as the vehicle serves it to a client that reads so many bytes at a time.
+
+        Without the defaults, a file that is asked for with defaults has the magic of one without.
+        """
+        end = query.start + query.length if query.length else None
+        return encode(
+            self.entries[query.start : end],
+            total=len(self.entries),
+            with_defaults=query.with_defaults and self.has_defaults,
+            read_size=read_size,
+        )
+
+
+def rows_of(session: Session) -> Rows | None:
+    """Return the entries of the file of a complete table; None if the table does not have them exactly."""
+    table = session.table
+    entries, has_defaults = [], True
+    for _, name in sorted(table.names.items()):
+        param = table.params[name]
+        if param.is_raw or param.type_number not in PACKABLE:
+            return None
+        default = None
+        if param.default is None:
+            has_defaults = False
+        elif param.is_changed:
+            default = bits_of(param.default, param.type_number)
+        entries.append(PackedParam(name, ParamType(param.type_number), param.bits, default))
+    if table.hash is None and any(may_be_rounded(row) for row in entries):
+        return None
+    return Rows(entries, has_defaults)
+
+
+def reply(
+    request: Packet, data: bytes = b"", *, error: FileErrorCode | None = None, offset: int = 0, step: int = 1
+) -> Packet:
+    """Return the answer to a request: ACK with data, or NAK with an error."""
+    return Packet(
+        (request.sequence + step) & 0xFFFF,
+        request.session,
+        Opcode.ACK if error is None else Opcode.NAK,
+        data if error is None else bytes((error,)),
+        offset=offset,
+        requested=request.opcode,
+    )
+
+
+def answers_of(request: Packet, content: bytes) -> Iterator[Packet]:
+    """Return the answers to a read, or to a burst: all that follows, and then the end of the file."""
+    size = min(request.size or DATA_SIZE_MAX, DATA_SIZE_MAX)
+    step, offset = 1, request.offset
+    while offset < len(content):
+        data = content[offset : offset + size]
+        yield reply(request, data, offset=offset, step=step)
+        if request.opcode != Opcode.BURST_READ_FILE:
+            return
+        step, offset = step + 1, offset + len(data)
+    yield reply(request, error=FileErrorCode.EOF, offset=offset, step=step)
+
+
+@dataclass(slots=True)
+class _OpenFile:
+    """A file that a station has open; `sequence` of its opening, `content` from the first read on."""
+
+    query: FileQuery
+    rows: Rows
+    sequence: int
+    content: bytes | None = None
+
+
+class KeptFile:
+    """Answers requests of MAVFTP about the parameter file of one component.
+
+    A station is told apart from others by its ids and its session, which its answers have too.
+
+    Args:
+        table: of the component, plain.
+    """
+
+    def __init__(self, table: KeptTable) -> None:
+        self._table = table
+        self._rows: tuple[object, Rows | None] = (None, None)
+        self._open: dict[Hashable, _OpenFile] = {}
+        self._opening: set[Hashable] = set()
+        self._uploads: set[Hashable] = set()
+
+    def take(self, asker: Asker, payload: bytes, route: Callable[[], None]) -> bool:
+        """Answer a request; return False for one that the vehicle has to answer.
+
+        Args:
+            asker: the station.
+            payload: of the message.
+            route: passes the request to the vehicle.
+        """
+        request = Packet.unpack(payload)
+        key = (asker, request.session)
+        match request.opcode:
+            case Opcode.OPEN_FILE_RO | Opcode.CALC_FILE_CRC32:
+                return self._begin(asker, request, route)
+            case Opcode.READ_FILE | Opcode.BURST_READ_FILE if key in self._open:
+                self._send(asker, request, self._open[key])
+                return True
+            case Opcode.CREATE_FILE | Opcode.OPEN_FILE_WO if FileQuery.of(_path_of(request)) is not None:
+                if len(self._uploads) < OPEN_FILES_MAX:
+                    self._uploads.add(key)
+            case Opcode.TERMINATE_SESSION | Opcode.RESET_SESSIONS:
+                if key in self._uploads:
+                    self._uploads.remove(key)
+                    self._table.component.watch.doubt()
+                if self._open.pop(key, None) is not None:
+                    self._say(asker, reply(request))
+                    return True
+        return False
+
+    def _begin(self, asker: Asker, request: Packet, route: Callable[[], None]) -> bool:
+        """Open the file, or answer its checksum; wait for a fetch that may bring the table."""
+        key, query = (asker, request.session), FileQuery.of(_path_of(request))
+        opened = self._open.get(key)
+        if request.opcode == Opcode.OPEN_FILE_RO and opened is not None:
+            if (opened.query, opened.sequence) == (query, request.sequence):
+                self._say(asker, _opened(request, opened.rows))
+                return True
+            del self._open[key]
+        if query is None or not self._is_served:
+            return False
+        if self._table.list_if_current is None:
+            opening = (key, request.opcode, request.sequence)
+            if opening not in self._opening:
+                self._opening.add(opening)
+                self._table.component.core.spawn(self._begin_later, opening, asker, request, route)
+            return True
+        rows = self._current_rows()
+        if rows is None or query.start >= len(rows.entries):
+            return False
+        self._table.check()
+        if request.opcode == Opcode.CALC_FILE_CRC32:
+            checksum = crc32_px4(rows.content(query, CHECKED_READ_SIZE))
+            self._say(asker, reply(request, checksum.to_bytes(4, "little")))
+            return True
+        self._open[key] = _OpenFile(query, rows, request.sequence)
+        if len(self._open) > OPEN_FILES_MAX:
+            del self._open[next(iter(self._open))]
+        self._say(asker, _opened(request, rows))
+        return True
+
+    async def _begin_later(
+        self, opening: Hashable, asker: Asker, request: Packet, route: Callable[[], None]
+    ) -> None:
+        with anyio.move_on_after(FILE_WAIT):
+            await self._table.load().wait()
+        self._opening.discard(opening)
+        if self._table.list_if_current is not None and self._begin(asker, request, route):
+            return
+        if self._table.is_loading and request.opcode == Opcode.OPEN_FILE_RO:
+            self._say(asker, reply(request, error=FileErrorCode.FILE_NOT_FOUND))
+        else:
+            route()
+
+    @property
+    def _is_served(self) -> bool:
+        """Whether the vehicle serves the file, or probably does."""
+        session = self._table.session
+        is_likely = session.identification.is_ardupilot and session.identification.may_serve_file
+        return is_likely if session.serves_file is None else session.serves_file
+
+    def _current_rows(self) -> Rows | None:
+        key = self._table.state_key
+        if self._rows[0] != key:
+            self._rows = (key, rows_of(self._table.session))
+        return self._rows[1]
+
+    def _send(self, asker: Asker, request: Packet, file: _OpenFile) -> None:
+        """Send a part of an open file: the first read says in which pieces it is read."""
+        if file.content is None:
+            size = min(request.size or DATA_SIZE_MAX, DATA_SIZE_MAX)
+            is_px4 = self._table.session.identification.is_px4
+            file.content = file.rows.content(file.query, DATA_SIZE_MAX if is_px4 else size)
+        answers = answers_of(request, file.content)
+        if request.opcode == Opcode.READ_FILE:
+            self._say(asker, next(answers))
+        else:
+            messages = (_message(asker, each) for each in answers if not self._table.is_lost)
+            asker.station.stream((self, asker, request.session), self._table.source, messages)
+
+    def _say(self, asker: Asker, packet: Packet) -> None:
+        asker.station.say(_message(asker, packet), self._table.source)
+
+
+def _message(asker: Asker, packet: Packet) -> FileTransfer:
+    return FileTransfer(0, asker.system, asker.component, packet.pack())
+
+
+def _opened(request: Packet, rows: Rows) -> Packet:
+    return reply(request, (ENTRY_SIZE * len(rows.entries)).to_bytes(4, "little"))
+
+
+def _path_of(request: Packet) -> str:
+    return request.data.split(b"\0", 1)[0].decode("latin-1")

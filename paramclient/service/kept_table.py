@@ -1,0 +1,458 @@
+"""KeptTable: one component's parameters, for which the gateway answers every ground station."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final, NamedTuple, TypeAlias
+
+import anyio
+
+from paramclient.client.component import Component
+from paramclient.client.streams import Stream
+from paramclient.errors import (
+    AmbiguousVehicle,
+    ExtAckResult,
+    ParamClientError,
+    ParamErrorCode,
+    Refused,
+    TypeMismatch,
+    UnknownParameter,
+    UsageError,
+    ValueNotApplied,
+)
+from paramclient.model.ext_values import EXT_VALUE_SIZE, ext_bytes, ext_param
+from paramclient.model.values import WIRE_SIZE, Encoding, Param, ParamType, Trust, as_reported, decode_value
+from paramclient.protocol.dialect import ReportedValue
+from paramclient.protocol.events import Change
+from paramclient.protocol.reads import read
+from paramclient.protocol.session import Session
+from paramclient.protocol.watch import SyncState
+from paramclient.service.stations import GroundStation
+from paramclient.wire import messages
+from paramclient.wire.messages import HASH_CHECK, NO_INDEX, Message
+
+__all__ = ["Asker", "KeptTable", "digest_of", "listed", "value_of"]
+
+PROOF_AGE_MAX: Final = 5.0
+"""Seconds since the vehicle last confirmed the table, above which an answer has it checked in the
+background."""
+SILENT_AFTER: Final = 60.0
+"""Seconds of silence after which a component without heartbeats counts as lost."""
+UNSERVED_TIME: Final = 30.0
+"""Seconds for which requests pass to a component that did not answer the gateway's own fetch."""
+PROGRESS_INTERVAL: Final = 0.05
+"""Seconds between two looks for values that a running fetch has brought."""
+FIRST_VALUE_TIME: Final = 1.0
+"""Seconds without a value of a running fetch, after which one is read beside it: MAVSDK repeats its list
+after 2 s and gives up at the sixth."""
+LOADING_WAIT: Final = 1.0
+"""Seconds that a read by name waits for a fetch to bring the value before the vehicle is asked."""
+READ_TIMEOUT: Final = 3.0
+"""Seconds for a value or a name that the table does not have."""
+SET_TIMEOUT: Final = 2.9
+"""Seconds for a verified write: a station has a result within 3 s."""
+ASKED_AT_ONCE: Final = 4
+"""Reads by stations that the vehicle is asked for at once."""
+PENDING_MAX: Final = 1_000
+"""Reads, and sets, that wait for one component, at most; further ones are dropped, as on a full link."""
+UNKNOWN_TIME: Final = 30.0
+"""Seconds for which a name that the vehicle does not have is remembered."""
+UNKNOWN_NAMES_MAX: Final = 4_096
+"""Names that are remembered as unknown, at most."""
+
+Which: TypeAlias = "str | int"
+SetKey: TypeAlias = tuple[str, bytes, int]
+"""Name, bytes and type in a set."""
+
+
+class Asker(NamedTuple):
+    """A station, and the ids under which it asks.
+
+    Attributes:
+        station: to which the answer goes.
+        system, component: its ids.
+        may_write: whether its sets are carried out.
+    """
+
+    station: GroundStation
+    system: int
+    component: int
+    may_write: bool
+
+
+# Messages from parameters
+
+
+def value_of(session: Session, param: Param, *, index: int | None = None) -> ReportedValue:
+    """Return a parameter as its component would send it: the same bytes, index and count.
+
+    Args:
+        session: the component's.
+        param: of its table.
+        index: of the parameter in an answer by index; None for an answer by name, and for a change: an
+            ArduPilot sends these without an index.
+    """
+    count = session.table.count or 0
+    if index is None:
+        is_ardupilot = session.identification.is_ardupilot
+        index = NO_INDEX if param.index is None or is_ardupilot else param.index
+    if session.dialect.has_ack:
+        raw = ext_bytes(param).ljust(EXT_VALUE_SIZE, b"\0")
+        return messages.ParamExtValue(param.name, raw, param.type_number, count, index)
+    if param.is_raw:
+        raw = param.bits.to_bytes(WIRE_SIZE, "little")
+    else:
+        raw = as_reported(param.bits, param.type_number, session.table.encoding)
+    return messages.ParamValue(param.name, raw, param.type_number, count, index)
+
+
+def digest_of(session: Session) -> messages.ParamValue | None:
+    """Return the `_HASH_CHECK` of a PX4; None for another vehicle, or while it is unknown."""
+    table = session.table
+    if not session.identification.is_px4 or table.hash is None or table.count is None:
+        return None
+    raw = table.hash.to_bytes(WIRE_SIZE, "little")
+    return messages.ParamValue(HASH_CHECK, raw, ParamType.UINT32, table.count, NO_INDEX)
+
+
+def listed(session: Session) -> list[ReportedValue]:
+    """Return the values of the list that are known to be the vehicle's, by index."""
+    table = session.table
+    known = ((index, table.params.get(name)) for index, name in sorted(table.names.items()))
+    return [
+        value_of(session, param, index=index)
+        for index, param in known
+        if param is not None and param.trust is not Trust.CACHED
+    ]
+
+
+class _Announcer(Stream[Change]):
+    """Passes each change on at once."""
+
+    most = 0
+
+    def __init__(self, take: Callable[[Change], None]) -> None:
+        super().__init__()
+        self._take = take
+
+    def push(self, item: Change) -> None:
+        self._take(item)
+
+
+class KeptTable:
+    """The parameters of one component in one protocol, plain or extended.
+
+    Args:
+        component: with plain or with extended parameters.
+        announce: called with each value that has changed, for all stations.
+
+    Attributes:
+        component, session, source: of the component.
+        changes: the number of changes so far.
+    """
+
+    def __init__(self, component: Component, announce: Callable[[KeptTable, Message], None]) -> None:
+        self.component = component
+        self.session = component.session
+        self.source = (component.system, component.component)
+        self.changes = 0
+        self._announce = announce
+        self._snapshot: tuple[object, list[ReportedValue]] = (None, [])
+        self._unserved_until = -math.inf
+        self._unknown: dict[Which, float] = {}
+        self._reads: dict[Which, set[Asker]] = {}
+        self._sets: dict[SetKey, set[Asker]] = {}
+        self._waiting: dict[GroundStation, set[int]] = {}  # for a list, and the indices that each has
+        self._waiting_count: int | None = None
+        self._loaded: anyio.Event | None = None  # while a fetch runs
+        self._asking = anyio.CapacityLimiter(ASKED_AT_ONCE)
+        self._announcer = _Announcer(self._changed)  # a stream lives as long as it is referenced
+        component.subscribers.add(self._announcer)
+
+    # the state
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the component is lost: nothing is answered in its name."""
+        return self.component.node.presence.is_lost or self.component.silence > SILENT_AFTER
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the gateway answers for the component; otherwise requests pass to it."""
+        node, now = self.component.node, anyio.current_time()
+        is_usable = not (self.session.table.left_out or node.has_rival(now))
+        return is_usable and node.identification.has_parameters and now >= self._unserved_until
+
+    @property
+    def is_loading(self) -> bool:
+        """Whether a fetch is in progress."""
+        return self._loaded is not None or self.session.fetching.is_running
+
+    @property
+    def withholds(self) -> bool:
+        """Whether values of the component are answers to the gateway: it announces changes itself."""
+        return self.session.table.is_complete or self.is_loading
+
+    @property
+    def state_key(self) -> object:
+        """What differs where the list may differ; None while the table is not in sync."""
+        table, component = self.session.table, self.component
+        if component.sync_state is not SyncState.SYNCED:
+            return None
+        return (self.changes, table.count, component.watch.confirmed_at, table.hash)
+
+    @property
+    def list_if_current(self) -> list[ReportedValue] | None:
+        """The answers to a request for the list; None while the table is not complete and in sync."""
+        key = self.state_key
+        if key is not None and self._snapshot[0] != key:
+            values, table = listed(self.session), self.session.table
+            is_whole = table.is_complete and len(values) == len(table.names)
+            digest = digest_of(self.session)
+            self._snapshot = (key, (values if digest is None else [digest, *values]) if is_whole else [])
+        return (self._snapshot[1] or None) if key is not None else None
+
+    def check(self) -> None:
+        """Have a table checked in the background that was not confirmed for a while."""
+        self.component.watch.check(older_than=PROOF_AGE_MAX)
+
+    def _changed(self, change: Change) -> None:
+        self.changes += 1
+        if change.new is not None:
+            self._unknown.pop(change.name, None)
+            if change.kind != "first" and not self.is_lost:
+                self._announce(self, value_of(self.session, change.new))
+
+    # lists
+
+    def send_list(self, station: GroundStation) -> None:
+        """Answer a request for the list: from the table, or as a fetch brings it."""
+        values = self.list_if_current
+        if values is not None:
+            self.check()
+            station.stream((self, "list"), self.source, self._current(values))
+        else:
+            self._waiting.setdefault(station, set())
+            self.load()
+
+    def _current(self, values: Iterable[ReportedValue]) -> Iterator[Message]:
+        """Yield the values of one list, each as it is by then, until the component is lost or restarts."""
+        node, before = self.component.node, self.changes
+        generation = node.generation
+        for value in values:
+            if self.is_lost or node.generation != generation:
+                return
+            param = self.session.table.params.get(value.param_id)
+            if self.changes != before and param is not None:
+                now = value_of(self.session, param, index=value.param_index)
+                value = now._replace(param_count=value.param_count)
+            yield value
+
+    def load(self) -> anyio.Event:
+        """Fetch the table, unless that is in progress; return the event of its end."""
+        loaded = self._loaded
+        if loaded is None:
+            loaded = self._loaded = anyio.Event()
+            self.component.core.spawn(self._load, loaded)
+        return loaded
+
+    async def _load(self, loaded: anyio.Event) -> None:
+        try:
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(self._send_progress)
+                try:
+                    await self.component.fetch_all()
+                except ParamClientError:
+                    if not self.is_lost:
+                        self._unserved_until = anyio.current_time() + UNSERVED_TIME
+                tasks.cancel_scope.cancel()
+            self._send_known()
+        finally:
+            self._loaded = None
+            self._waiting.clear()
+            loaded.set()
+
+    async def _send_progress(self) -> None:
+        """Send what the fetch has brought to the stations that wait; read one value if it brings none."""
+        late_at = anyio.current_time() + FIRST_VALUE_TIME
+        while True:
+            await anyio.sleep(PROGRESS_INTERVAL)
+            self._send_known()
+            if anyio.current_time() >= late_at and not all(self._waiting.values()):
+                late_at = math.inf
+                self.component.core.spawn(read, self.session, 0)
+
+    def _send_known(self) -> None:
+        """Send the values of the list that the stations do not have; another count begins it again."""
+        if self._waiting_count != self.session.table.count:
+            self._waiting_count = self.session.table.count
+            for sent in self._waiting.values():
+                sent.clear()
+        whole = self.list_if_current
+        values = (whole or listed(self.session)) if self._waiting else []
+        for station, sent in self._waiting.items():
+            new = [value for value in values if value.param_index not in sent]
+            sent.update(value.param_index for value in new)
+            if whole is not None:
+                station.stream((self, "list"), self.source, self._current(new))
+                continue
+            for value in new:
+                station.say(value, self.source)
+
+    # single values
+
+    def read(self, asker: Asker, which: Which) -> None:
+        """Answer a read; the vehicle is asked for what the table does not have."""
+        value = self.known(which)
+        if value is not None:
+            self.check()
+            asker.station.say(value, self.source)
+        elif self._is_unknown(which):
+            self._refuse([asker], which, ParamErrorCode.DOES_NOT_EXIST)
+        elif which in self._reads:
+            self._reads[which].add(asker)
+        elif len(self._reads) < PENDING_MAX:
+            self._reads[which] = {asker}
+            self.component.core.spawn(self._read, which)
+
+    def known(self, which: Which) -> ReportedValue | None:
+        """Return a value that is known to be the vehicle's, by name or index."""
+        table = self.session.table
+        if which == HASH_CHECK:
+            return None if self.state_key is None else digest_of(self.session)
+        name = table.names.get(which) if isinstance(which, int) else which
+        param = None if name is None else table.params.get(name)
+        if param is None or param.trust is Trust.CACHED:
+            return None
+        return value_of(self.session, param, index=which if isinstance(which, int) else None)
+
+    def _is_unknown(self, which: Which) -> bool:
+        is_beyond = isinstance(which, int) and which not in self.session.table.names
+        is_listed = is_beyond and self.list_if_current is not None
+        return is_listed or self._unknown.get(which, -math.inf) > anyio.current_time()
+
+    async def _read(self, which: Which) -> None:
+        try:
+            with anyio.move_on_after(READ_TIMEOUT):
+                value = await self._find(which)
+                for asker in self._reads[which]:
+                    asker.station.say(value, self.source)
+        except (UnknownParameter, Refused) as error:
+            if len(self._unknown) >= UNKNOWN_NAMES_MAX:
+                self._unknown.clear()
+            self._unknown[which] = anyio.current_time() + UNKNOWN_TIME
+            self._refuse(self._reads[which], which, _code_of(error))
+        finally:
+            del self._reads[which]
+
+    async def _find(self, which: Which) -> ReportedValue:
+        """Wait for the value if a fetch may bring it; then ask the vehicle.
+
+        An index is a gap in a station's list, which the fetch closes. A hash is asked for at once:
+        QGroundControl waits 1 s for it.
+        """
+        by_name = 0.0 if which == HASH_CHECK else LOADING_WAIT
+        with anyio.move_on_after(READ_TIMEOUT if isinstance(which, int) else by_name):
+            while self.is_loading and not self.known(which):  # noqa: ASYNC110 - no event for one value
+                await anyio.sleep(PROGRESS_INTERVAL)
+        known = self.known(which)
+        if known is not None:
+            return known
+        async with self._asking:
+            value = await read(self.session, which)
+        return value._replace(param_id=which) if isinstance(which, str) else value
+
+    def set(self, asker: Asker, message: messages.ParamSet | messages.ParamExtSet) -> None:
+        """Carry out a set as a verified write; equal ones at the same time are one."""
+        key = (message.param_id, message.raw, message.param_type)
+        if asker.station.endpoint.is_readonly:
+            self._reject([asker], key, ParamErrorCode.READ_ONLY)
+        elif not asker.may_write:
+            self._reject([asker], key, ParamErrorCode.PERMISSION_DENIED)
+        elif key in self._sets:
+            self._sets[key].add(asker)
+        elif len(self._sets) < PENDING_MAX:
+            self._sets[key] = {asker}
+            self.component.core.spawn(self._set, key, f"station {asker.system}/{asker.component}")
+
+    async def _set(self, key: SetKey, author: str) -> None:
+        askers, code = self._sets[key], int(ParamErrorCode.COMPONENT_NOT_FOUND)  # it does not answer
+        try:
+            with anyio.move_on_after(SET_TIMEOUT):
+                await self._write(*key, author)
+                code = ParamErrorCode.NO_ERROR
+        except ParamClientError as error:
+            code = _code_of(error)
+        finally:
+            del self._sets[key]
+        if code:
+            self._reject(askers, key, code)
+
+    async def _write(self, name: str, raw: bytes, number: int, author: str) -> None:
+        """Write a value, and acknowledge it to the askers.
+
+        Raises:
+            TypeMismatch: the component takes values byte by byte, and the type is another one.
+            ParamClientError: as from `Component.set`.
+        """
+        session, is_extended = self.session, self.session.dialect.has_ack
+        askers, params = self._sets[name, raw, number], session.table.params
+        if name not in params or params[name].trust is Trust.CACHED:
+            await read(session, name)
+        known = params[name].type_number
+        if number != known and (is_extended or session.table.encoding is not Encoding.C_CAST):
+            system, component = self.source
+            what = f"{name} of {system}/{component} has another type"
+            raise TypeMismatch(what, system=system, component=component, name=name)
+        if is_extended:
+            value = ext_param(name, raw, number).settable
+        else:
+            value, _ = decode_value(raw, known, session.table.encoding)
+        result = await self.component.set(name, value, author=author)
+        done = value_of(session, result.param)
+        if is_extended:
+            answer = messages.ParamExtAck(name, done.raw, number, ExtAckResult.ACCEPTED)
+            for asker in askers:
+                asker.station.say(answer, self.source)
+        else:
+            self._announce(self, done)
+
+    def _reject(self, askers: Iterable[Asker], key: SetKey, code: int) -> None:
+        """Refuse a set, and show the value that stays."""
+        name, raw, number = key
+        if self.session.dialect.has_ack:
+            is_value = code in (ExtAckResult.VALUE_UNSUPPORTED, ParamErrorCode.TYPE_MISMATCH)
+            result = ExtAckResult.VALUE_UNSUPPORTED if is_value else ExtAckResult.FAILED
+            for asker in askers:
+                asker.station.say(messages.ParamExtAck(name, raw, number, result), self.source)
+            return
+        self._refuse(askers, name, code)
+        value = self.known(name)
+        if value is not None and code in (ParamErrorCode.READ_ONLY, ParamErrorCode.VALUE_OUT_OF_RANGE):
+            for asker in askers:
+                asker.station.say(value, self.source)
+
+    def _refuse(self, askers: Iterable[Asker], which: Which, code: int) -> None:
+        """Send a PARAM_ERROR to each asker, with its ids: others would take it for their own requests."""
+        name, index = (which, -1) if isinstance(which, str) else ("", which)
+        for station, system, component, _ in askers:
+            if not (self.session.dialect.has_ack or self.is_lost):
+                station.say(messages.ParamError(system, component, name, index, code), self.source)
+
+
+def _code_of(error: ParamClientError) -> int:
+    """Return the PARAM_ERROR of an error."""
+    match error:
+        case UnknownParameter():
+            return ParamErrorCode.DOES_NOT_EXIST
+        case Refused(code=code):
+            return code
+        case TypeMismatch():
+            return ParamErrorCode.TYPE_MISMATCH
+        case AmbiguousVehicle():
+            return ParamErrorCode.PERMISSION_DENIED
+        case UsageError() | ValueNotApplied():
+            return ParamErrorCode.VALUE_OUT_OF_RANGE
+        case _:
+            return ParamErrorCode.COMPONENT_NOT_FOUND

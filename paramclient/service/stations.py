@@ -1,0 +1,398 @@
+"""Ground stations of the gateway: the endpoints to which they connect, their queues and sequence numbers."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter, deque
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import suppress
+from typing import Final, TypeAlias
+
+import anyio
+import anyio.abc
+
+from paramclient.client.signing import Signing, read_key
+from paramclient.client.taps import FrameCutter, SeenFrame
+from paramclient.errors import LinkError, UsageError
+from paramclient.links import Link, Peer, create_link
+from paramclient.links.tcp import TcpIn
+from paramclient.protocol.addresses import peer_in_words
+from paramclient.wire.frames import renumber_frame, sign_frame
+from paramclient.wire.messages import Message, encode, message_id
+from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier
+
+__all__ = ["GroundStation", "MavlinkEndpoint", "Numbering", "Source", "parse_endpoint"]
+
+FRAMES_PER_DATAGRAM: Final = 37
+"""Frames in one datagram, at most: as many PARAM_VALUEs as fit in `DATAGRAM_SIZE`."""
+DATAGRAM_SIZE: Final = 1_400
+"""Bytes in one datagram, at most: MAVSDK reads 2,048, and an Ethernet frame carries 1,472."""
+DATAGRAM_INTERVAL: Final = 0.002
+"""Seconds between two datagrams to a station: one that sleeps for 0.5 s loses nothing then, as Linux' default
+buffer holds 256 of them (measured)."""
+STATION_QUEUE_MAX: Final = 4_000
+"""Frames that wait for a station, at most: two seconds of a busy link. Further ones are dropped."""
+STREAMS_PER_STATION_MAX: Final = 256
+"""Lists and files in progress for one station, at most: one of each vehicle."""
+STATION_TIMEOUT: Final = 60.0
+"""Seconds of silence after which a station on UDP is forgotten."""
+STATIONS_MAX: Final = 64
+"""Stations of one endpoint, at most; the one that was silent for longest is forgotten first."""
+SOURCES_MAX: Final = 64
+"""Senders that are named of one station, at most."""
+ENDPOINT_BACKOFF: Final = 1.0
+"""Seconds before an endpoint that failed is opened again."""
+ANSWER_LINK_ID: Final = 200
+"""Link id of the signatures of answers: vehicles number their links from 0, and a newer timestamp under an id
+of theirs would make their own frames replays."""
+V1_MESSAGE_ID_MAX: Final = 255
+"""The highest message id in MAVLink 1."""
+
+Source: TypeAlias = tuple[int, int]
+"""System and component of a sender."""
+
+logger = logging.getLogger(__name__)
+
+
+class Numbering:
+    """The sequence numbers of one sender as a station sees them: no gap by frames that are inserted or
+    withheld, and the gaps of frames that were lost before."""
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+        self._offset: int | None = None
+
+    def relay(self, number: int) -> int:
+        """Return the number of a relayed frame."""
+        if self._offset is None:
+            self._offset = 0 if self._last is None else self._last + 1 - number
+        self._last = (number + self._offset) & 0xFF
+        return self._last
+
+    def insert(self) -> int:
+        """Return the number of an inserted frame."""
+        self._last = 0 if self._last is None else (self._last + 1) & 0xFF
+        if self._offset is not None:
+            self._offset += 1
+        return self._last
+
+    def withhold(self) -> None:
+        """Close the gap of a frame that is not relayed."""
+        if self._offset is not None:
+            self._offset -= 1
+
+
+class GroundStation:
+    """One partner at an endpoint.
+
+    Frames are numbered as they leave, so that the numbers follow the order on the wire. Lists and files are
+    streams, whose messages are made as the station takes them; they take turns with the frames of vehicles.
+
+    Args:
+        endpoint: where it is connected.
+        peer: its address on the link; None for the only one of a link with one remote end.
+
+    Attributes:
+        endpoint, peer: as given.
+        scope: of `send`.
+        received_at: when its last frame arrived.
+        sources: the system and component ids under which it sends.
+        version: of MAVLink, of the answers: 1 only for a station that has sent version 1 and never 2.
+        requests: of parameters, by kind.
+        relayed, answered, dropped: frames.
+        saved: bytes of answers that did not have to come over the vehicle's link.
+    """
+
+    def __init__(self, endpoint: MavlinkEndpoint, peer: Peer | None) -> None:
+        self.endpoint = endpoint
+        self.peer = peer
+        self.scope = anyio.CancelScope()
+        self.received_at = anyio.current_time()
+        self.sources: set[Source] = set()
+        self.version = 2
+        self.requests: Counter[str] = Counter()
+        self.relayed = self.answered = self.dropped = self.saved = 0
+        self._has_sent_version_2 = False
+        self._numbering: dict[Source, Numbering] = {}
+        self._queue: deque[tuple[Source, bytes | Message | None]] = deque()  # relayed, inserted, withheld
+        self._streams: dict[Hashable, tuple[Source, Iterator[Message]]] = {}
+        self._is_turn_of_streams = False
+        self._held: bytes | None = None  # numbered, but too long for the last datagram
+        self._something_to_send = anyio.Event()
+
+    @property
+    def name(self) -> str:
+        """The endpoint's name, and its address there."""
+        return self.endpoint.name + ("" if self.peer is None else f"#{peer_in_words(self.peer)}")
+
+    @property
+    def silence(self) -> float:
+        """Seconds since its last frame."""
+        return anyio.current_time() - self.received_at
+
+    @property
+    def may_sign(self) -> bool:
+        """Whether what the station asks may be sent with the gateway's signature."""
+        return self.endpoint.is_trusted or self.endpoint.signer is not None
+
+    def received(self, seen: SeenFrame) -> None:
+        """Take note of a frame of the station."""
+        self.received_at = anyio.current_time()
+        if len(self.sources) < SOURCES_MAX:
+            self.sources.add((seen.frame.system, seen.frame.component))
+        self._has_sent_version_2 |= seen.frame.version == 2
+        self.version = 2 if self._has_sent_version_2 else 1
+
+    def relay(self, seen: SeenFrame) -> None:
+        """Queue a frame of a vehicle."""
+        self._put((seen.frame.system, seen.frame.component), seen.data)
+
+    def withhold(self, seen: SeenFrame) -> None:
+        """Leave a frame of a vehicle out, so that it does not count as lost."""
+        self._put((seen.frame.system, seen.frame.component), None)
+
+    def say(self, message: Message, source: Source) -> None:
+        """Queue a message in the name of a component; none that MAVLink 1 lacks for a station of that."""
+        if self.version == 2 or message_id(type(message)) <= V1_MESSAGE_ID_MAX:
+            self._put(source, message)
+
+    def stream(self, key: Hashable, source: Source, messages: Iterator[Message]) -> None:
+        """Send messages one by one as the station takes them, in place of an earlier stream of this key."""
+        self._streams.pop(key, None)
+        if len(self._streams) < STREAMS_PER_STATION_MAX:
+            self._streams[key] = (source, messages)
+            self._something_to_send.set()
+
+    def next_datagram(self) -> bytes:
+        """Return the next frames, as many as fit in one datagram; empty if there are none."""
+        frames: list[bytes] = []
+        size = 0
+        while len(frames) < FRAMES_PER_DATAGRAM:
+            data = self._held if self._held is not None else self._next_frame()
+            self._held = None
+            if data is None:
+                break
+            if frames and size + len(data) > DATAGRAM_SIZE:
+                self._held = data
+                break
+            frames.append(data)
+            size += len(data)
+            self.endpoint.sending(data)
+        if len(frames) > 1:
+            self.endpoint.sending(b"".join(frames))
+        return b"".join(frames)
+
+    async def send(self) -> None:
+        """Send what is queued, until the scope is cancelled."""
+        turn_at = anyio.current_time()
+        with self.scope:
+            while True:
+                self._something_to_send = anyio.Event()
+                while data := self.next_datagram():
+                    await anyio.sleep_until(turn_at)
+                    turn_at = max(turn_at, anyio.current_time() - DATAGRAM_INTERVAL) + DATAGRAM_INTERVAL
+                    with suppress(LinkError):  # the endpoint opens its link again
+                        await self.endpoint.link.send(data, self.peer)
+                await self._something_to_send.wait()
+
+    def _put(self, source: Source, item: bytes | Message | None) -> None:
+        if len(self._queue) < STATION_QUEUE_MAX:
+            self._queue.append((source, item))
+            self._something_to_send.set()
+        else:
+            self.dropped += 1
+
+    def _next_frame(self) -> bytes | None:
+        self._is_turn_of_streams = not self._is_turn_of_streams
+        if self._is_turn_of_streams:  # so that more telemetry than the link carries holds no list up
+            return self._next_of_streams() or self._next_of_queue()
+        return self._next_of_queue() or self._next_of_streams()
+
+    def _next_of_queue(self) -> bytes | None:
+        while self._queue:
+            source, item = self._queue.popleft()
+            numbering = self._numbering.setdefault(source, Numbering())
+            if item is None:
+                numbering.withhold()
+            elif not isinstance(item, bytes):
+                return self._inserted(source, item)
+            else:
+                self.relayed += 1
+                is_version_2 = item[0] == 0xFD
+                if is_version_2 and item[2]:  # signed: renumbered, it would be rejected
+                    return item
+                return renumber_frame(item, numbering.relay(item[4 if is_version_2 else 2]))
+        return None
+
+    def _next_of_streams(self) -> bytes | None:
+        for key, (source, messages) in list(self._streams.items()):
+            for message in messages:
+                return self._inserted(source, message)
+            del self._streams[key]
+        return None
+
+    def _inserted(self, source: Source, message: Message) -> bytes:
+        number = self._numbering.setdefault(source, Numbering()).insert()
+        system, component = source
+        data = encode(message, system=system, component=component, sequence=number, version=self.version)
+        if self.endpoint.signer is not None:
+            self.endpoint.signer.advance(anyio.current_time())
+            data = sign_frame(data, self.endpoint.signer)
+        self.answered += 1
+        self.saved += len(data)
+        return data
+
+
+class MavlinkEndpoint:
+    """A link on which ground stations connect to the gateway.
+
+    `udpin:` and `tcpin:` take any number of stations; on any other link, there is one.
+
+    Args:
+        link: its name, or a link.
+        is_readonly: whether nothing of its stations changes a vehicle.
+        is_trusted: whether its stations, which need not sign, may write to a signed vehicle.
+        key: with which its stations and the answers are signed; None for unsigned stations.
+
+    Attributes:
+        link, name, is_readonly, is_trusted: as given.
+        signer: signs the answers; None without a key.
+        stations: the connected stations.
+        sending: called with each frame and each datagram that is about to be sent to a station.
+    """
+
+    def __init__(
+        self,
+        link: str | Link,
+        *,
+        is_readonly: bool = False,
+        is_trusted: bool = False,
+        key: SigningKey | None = None,
+    ) -> None:
+        self.link = create_link(link)
+        self.name = self.link.name
+        self.is_readonly = is_readonly
+        self.is_trusted = is_trusted
+        self.signer: Signer | None = None
+        self.stations: dict[Peer | None, GroundStation] = {}
+        self.sending: Callable[[bytes], None] = lambda data: None
+        self._verifier: Verifier | None = None
+        if key is not None:
+            self.signer, self._verifier = Signing(key, SigningPolicy.SIGNED_ONLY, ANSWER_LINK_ID).begin()
+        self._listens = self.name.startswith(("udpin:", "tcpin:"))
+
+    @property
+    def address(self) -> str:
+        """The name, with the port that the system has chosen in place of 0."""
+        bound = getattr(self.link, "address", None)
+        if bound is None or not self.name.endswith(":0"):
+            return self.name
+        return f"{self.name.removesuffix('0')}{bound[1]}"
+
+    async def open(self) -> None:
+        """Open the link.
+
+        Raises:
+            LinkError: a listening link cannot be opened. Another one is opened later.
+        """
+        try:
+            await self.link.open()
+        except LinkError as error:
+            if self._listens:
+                raise
+            logger.warning("%s", error)
+
+    async def run(self, take: Callable[[GroundStation, SeenFrame], None]) -> None:
+        """Receive frames of the stations and send theirs to them, until cancelled.
+
+        Args:
+            take: called with each frame of a station.
+        """
+        try:
+            async with anyio.create_task_group() as tasks:
+                if isinstance(self.link, TcpIn):  # a station may wait for the first heartbeat
+                    self.link.accepted = lambda peer: self._station(peer, tasks)
+                elif not self._listens:
+                    self._station(None, tasks)
+                await self._read(take, tasks)
+        finally:
+            with anyio.CancelScope(shield=True):
+                await self.link.close()
+
+    async def _read(
+        self, take: Callable[[GroundStation, SeenFrame], None], tasks: anyio.abc.TaskGroup
+    ) -> None:
+        cutter = FrameCutter(stream=self.link.is_stream)
+        while True:
+            try:
+                chunks = await self.link.receive()
+            except LinkError as error:
+                logger.warning("%s; reopening", error)
+                cutter = FrameCutter(stream=self.link.is_stream)
+                await self._reopen()
+                continue
+            for peer, data in chunks:
+                frames = [each for each in cutter.cut(data, peer) if each.is_proven or not each.is_known]
+                if self._verifier is not None:
+                    frames = [each for each in frames if self._verifier.accepts(each.data)]
+                for seen in frames:
+                    station = self._station(peer if self._listens else None, tasks)
+                    station.received(seen)
+                    take(station, seen)
+                if not data and self._listens:
+                    self._forget(peer)
+            if self._listens and not self.link.is_stream:
+                for peer in [peer for peer, each in self.stations.items() if each.silence > STATION_TIMEOUT]:
+                    self._forget(peer)
+
+    async def _reopen(self) -> None:
+        for peer in list(self.stations) if self._listens else ():
+            self._forget(peer)
+        while True:
+            await anyio.sleep(ENDPOINT_BACKOFF)
+            with suppress(LinkError):
+                await self.link.open()
+                return
+
+    def _station(self, peer: Peer | None, tasks: anyio.abc.TaskGroup) -> GroundStation:
+        station = self.stations.get(peer)
+        if station is None:
+            if len(self.stations) >= STATIONS_MAX:
+                self._forget(max(self.stations, key=lambda each: self.stations[each].silence))
+            station = self.stations[peer] = GroundStation(self, peer)
+            logger.info("%s: connected", station.name)
+            tasks.start_soon(station.send)
+        return station
+
+    def _forget(self, peer: Peer | None) -> None:
+        station = self.stations.pop(peer, None)
+        if station is not None:
+            logger.info("%s: disconnected", station.name)
+            station.scope.cancel()
+
+
+def parse_endpoint(text: str) -> MavlinkEndpoint:
+    """Return the endpoint with this name: that of a link, with options, such as `tcpin:5760?readonly`.
+
+    A listening link without an address listens on the loopback address.
+
+    Raises:
+        UsageError: the name or an option is invalid.
+    """
+    link, _, query = text.partition("?")
+    kind, _, port = link.partition(":")
+    if kind in ("udpin", "udp", "tcpin") and port.isdecimal():
+        link = f"{kind}:127.0.0.1:{port}"
+    options = [each for each in query.split("&") if each]
+    keys = [each.removeprefix("sign=") for each in options if each.startswith("sign=")]
+    for each in options:
+        if each not in ("readonly", "trusted") and not each.startswith("sign="):
+            raise UsageError(
+                f"{each!r} is not an option of an endpoint; these are readonly, trusted and sign=KEYFILE"
+            )
+    return MavlinkEndpoint(
+        link,
+        is_readonly="readonly" in options,
+        is_trusted="trusted" in options,
+        key=read_key(keys[0]) if keys else None,
+    )

@@ -1,0 +1,234 @@
+"""Ground stations in virtual time: a link with any number of them, and a gateway between it and vehicles."""
+
+from __future__ import annotations
+
+import socket
+from collections import deque
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any, TypeVar
+
+import anyio
+
+from paramclient import ParamClient
+from paramclient.client.signing import timestamp_now
+from paramclient.errors import LinkError
+from paramclient.links import Peer
+from paramclient.protocol.ftp import Opcode, Packet
+from paramclient.service.gateway import Gateway
+from paramclient.service.stations import MavlinkEndpoint
+from paramclient.sim import Endpoint
+from paramclient.wire.frames import Frame, Framer, sign_frame
+from paramclient.wire.messages import DECODED_IDS, FileTransfer, Message, decode, encode
+from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier
+from tests.shell import a_client
+
+T = TypeVar("T")
+
+
+def free_port() -> int:
+    """A UDP port of this computer that no program uses."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+    return port
+
+
+class StationsLink:
+    """A link on which ground stations of the test speak to the gateway.
+
+    Attributes:
+        stations: by their peer.
+        is_stuck: nothing is taken, and a sender waits.
+    """
+
+    is_stream = False
+    reconnects = True
+
+    def __init__(self, name: str = "udpin:stations:14551") -> None:
+        self.name = name
+        self.stations: dict[Peer, Partner] = {}
+        self.said: deque[tuple[Peer, bytes]] = deque()
+        self.activity = anyio.Event()
+        self.is_stuck = False
+        self._is_open = False
+
+    async def open(self) -> None:
+        self._is_open = True
+
+    async def receive(self) -> list[tuple[Peer, bytes]]:
+        while not self.said:
+            if not self._is_open:
+                raise LinkError(f"{self.name}: closed", link=self.name)
+            self.activity = anyio.Event()
+            await self.activity.wait()
+        found = list(self.said)
+        self.said.clear()
+        return found
+
+    async def send(self, data: bytes, peer: Peer | None) -> None:
+        await anyio.lowlevel.checkpoint()
+        while self.is_stuck:  # noqa: ASYNC110 - set by the test
+            await anyio.sleep(0.1)
+        for each, station in self.stations.items():
+            if peer in (None, each):
+                station.take(data)
+
+    async def close(self) -> None:
+        self._is_open = False
+        self.activity.set()
+
+
+class Partner:
+    """A ground station: it sends messages, and keeps what it receives.
+
+    Attributes:
+        datagrams, frames: received.
+        times: when each frame was received.
+        signer, verifier: sign what is sent, and judge what is received; None without a key.
+        lost: frames that the sequence numbers say are lost, by sender.
+    """
+
+    def __init__(
+        self,
+        link: StationsLink,
+        *,
+        system: int = 255,
+        component: int = 190,
+        version: int = 2,
+        key: SigningKey | None = None,
+    ) -> None:
+        self.datagrams: list[bytes] = []
+        self.frames: list[Frame] = []
+        self.times: list[float] = []
+        self.lost: dict[tuple[int, int], int] = {}
+        self.address = (system, component)
+        self._version = version
+        self._link = link
+        self._peer = ("station", len(link.stations))
+        self._framer = Framer(stream=False)
+        self.signer = None if key is None else Signer(key, link_id=100, timestamp=timestamp_now())
+        self.verifier = None if self.signer is None else Verifier(self.signer, SigningPolicy.SIGNED_ONLY)
+        if self.verifier is not None:
+            self._framer.guard = self.verifier.accepts
+        self._last: dict[tuple[int, int], int] = {}
+        self._sequence = 0
+        link.stations[self._peer] = self
+
+    def send(self, *messages: Message) -> None:
+        for message in messages:
+            system, component = self.address
+            options: dict[str, Any] = {"sequence": self._sequence, "version": self._version}
+            data = encode(message, system=system, component=component, **options)
+            self.send_bytes(data if self.signer is None else sign_frame(data, self.signer))
+            self._sequence = (self._sequence + 1) & 0xFF
+
+    def send_bytes(self, data: bytes) -> None:
+        self._link.said.append((self._peer, data))
+        self._link.activity.set()
+
+    def take(self, data: bytes) -> None:
+        self.datagrams.append(data)
+        for frame in self._framer.receive(data):
+            source = (frame.system, frame.component)
+            if source in self._last:
+                gap = (frame.sequence - self._last[source] - 1) & 0xFF
+                self.lost[source] = self.lost.get(source, 0) + gap
+            self._last[source] = frame.sequence
+            self.frames.append(frame)
+            self.times.append(anyio.current_time())
+
+    def of(self, kind: type[T], *, system: int | None = None) -> list[T]:
+        """The received messages of a kind."""
+        found = [
+            decode(each)
+            for each in self.frames
+            if each.message_id in DECODED_IDS and system in (None, each.system)
+        ]
+        return [each for each in found if isinstance(each, kind)]
+
+    def clear(self) -> None:
+        self.datagrams.clear()
+        self.frames.clear()
+        self.times.clear()
+
+    async def ask(self, *messages: Message, seconds: float = 0.5) -> None:
+        """Forget what was received, send, and wait."""
+        self.clear()
+        self.send(*messages)
+        await anyio.sleep(seconds)
+
+    async def ask_file(self, opcode: Opcode, *, seconds: float = 0.5, **fields: Any) -> list[Packet]:
+        """Send a request of MAVFTP to 1/1, and return the answers."""
+        packet = Packet(**{"sequence": 1, "session": 0, "opcode": opcode} | fields)
+        await self.ask(FileTransfer(0, 1, 1, packet.pack()), seconds=seconds)
+        return [Packet.unpack(each.payload) for each in self.of(FileTransfer)]
+
+
+class _Behind:
+    """An endpoint whose data is what a partner of a gateway receives."""
+
+    def __init__(self, partner: Partner) -> None:
+        self._partner = partner
+
+    def receive(self, data: bytes, now: float) -> None:
+        self._partner.send_bytes(data)
+
+    def tick(self, now: float) -> None:
+        self._at = now + 0.005
+
+    def next_deadline(self) -> float:
+        return self._at
+
+    def data_to_send(self) -> list[bytes]:
+        data = list(self._partner.datagrams)
+        self._partner.datagrams.clear()
+        return data
+
+
+class Served:
+    """A gateway over the links of some vehicles, with ground stations.
+
+    Attributes:
+        gateway, clients, link: the parts.
+    """
+
+    def __init__(self, gateway: Gateway, clients: list[ParamClient], link: StationsLink) -> None:
+        self.gateway = gateway
+        self.clients = clients
+        self.link = link
+
+    def partner(self, **options: Any) -> Partner:
+        """A new ground station; it is known from its first frame on."""
+        return Partner(self.link, **options)
+
+    def as_vehicles(self) -> Endpoint:
+        """The gateway as another one sees it: an endpoint with the vehicles."""
+        return _Behind(self.partner(system=254, component=191))
+
+    async def synced(self) -> None:
+        """Fetch all tables."""
+        for client in self.clients:
+            await (await client.component()).fetch_all()
+
+
+@asynccontextmanager
+async def gateway_over(
+    *links: Any, endpoint: dict[str, Any] | None = None, **options: Any
+) -> AsyncIterator[Served]:
+    """Open a gateway over vehicles. `endpoint`: options of the endpoint."""
+    link = StationsLink()
+    gateway = Gateway([MavlinkEndpoint(link, **(endpoint or {}))])
+    clients = [a_client(each, **options) for each in links]
+    async with anyio.create_task_group() as tasks:
+        await gateway.open()
+        tasks.start_soon(gateway.run)
+        for client in clients:
+            gateway.attach(client)
+            await client.open()
+        try:
+            yield Served(gateway, clients, link)
+        finally:
+            for client in clients:
+                await client.aclose()
+            tasks.cancel_scope.cancel()

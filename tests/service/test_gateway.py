@@ -1,0 +1,1219 @@
+"""The gateway: each rule by which ground stations are answered from the tables of the service."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import math
+import random
+import socket
+import struct
+import sys
+import tracemalloc
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import anyio
+import fastcrc
+import pytest
+
+from paramclient import ParamType
+from paramclient.errors import LinkError, UsageError
+from paramclient.links import create_link, serve_endpoint, tcp
+from paramclient.model.values import Encoding, encode_value
+from paramclient.protocol.ftp import Opcode, Packet
+from paramclient.protocol.param_pck import PackedParam, decode, encode
+from paramclient.service import Hub, kept_table, stations
+from paramclient.service.kept_file import FileQuery, Rows
+from paramclient.service.stations import MavlinkEndpoint, Numbering, parse_endpoint
+from paramclient.sim import Air, ArduPilotVehicle, Camera, Endpoint, PX4Vehicle
+from paramclient.wire import frames, messages
+from paramclient.wire.messages import (
+    CommandLong,
+    FileTransfer,
+    Heartbeat,
+    ParamError,
+    ParamExtAck,
+    ParamExtRequestList,
+    ParamExtRequestRead,
+    ParamExtSet,
+    ParamExtValue,
+    ParamRequestList,
+    ParamRequestRead,
+    ParamSet,
+    ParamValue,
+)
+from paramclient.wire.signing import SigningKey
+from tests.conversations.virtual import Puppet
+from tests.service.ground_stations import Partner, StationsLink, free_port, gateway_over
+from tests.service.hub import service, synced
+from tests.shell import PeersLink, Radio, Tap, a_client, bits, generic, in_simulated_time, small_px4, until
+
+LIST = ParamRequestList(1, 1)
+REQUESTS = (ParamRequestList, ParamRequestRead, ParamSet)
+GCS = Heartbeat(6, 8)
+
+
+def set_to(name: str, value: float, kind: ParamType = ParamType.INT32) -> ParamSet:
+    return ParamSet(1, 1, name, encode_value(value, kind, Encoding.BYTEWISE), kind)
+
+
+def requested(vehicle: Tap) -> list[object]:
+    """What was requested of a vehicle about its parameters."""
+    return [message for _, _, message in vehicle.received if isinstance(message, REQUESTS)]
+
+
+def askers(vehicle: Tap) -> set[int]:
+    """The system ids under which a vehicle was asked about its parameters."""
+    return {frame.system for _, frame, message in vehicle.received if isinstance(message, REQUESTS)}
+
+
+def by_name(station: Partner) -> dict[str, bytes]:
+    return {each.param_id: each.raw for each in station.of(ParamValue)}
+
+
+# 1: frames pass
+
+
+@in_simulated_time
+async def test_rule_1_frames_pass_and_none_between_stations() -> None:
+    vehicle = Tap(small_px4())
+    async with gateway_over(vehicle) as served:
+        first, second = served.partner(), served.partner(system=250)
+        first.send(GCS)
+        second.send(GCS)
+        await anyio.sleep(3.0)
+        for each in (first, second):
+            assert each.of(Heartbeat, system=1)
+            assert {frame.system for frame in each.frames} == {1}
+        assert {frame.system for _, frame, _ in vehicle.received} == {250, 254, 255}
+
+
+@in_simulated_time
+async def test_rule_1_a_frame_goes_to_the_link_of_its_target() -> None:
+    vehicles = [Tap(small_px4(system=number)) for number in (1, 2)]
+    async with gateway_over(*vehicles) as served:
+        station = served.partner()
+        await served.synced()
+        await station.ask(CommandLong(2, 1, 400), CommandLong(0, 0, 401), CommandLong(9, 1, 402))
+        assert [
+            [each.command for each in vehicle.messages(CommandLong) if each.command in (400, 401, 402)]
+            for vehicle in vehicles
+        ] == [[401, 402], [400, 401, 402]]
+
+
+@in_simulated_time
+async def test_rule_1_stations_with_equal_ids_send_equal_frames() -> None:
+    """As two programs with pymavlink do, whose first message is a list."""
+    vehicle = Tap(small_px4())
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        stations = [served.partner() for _ in range(3)]
+        vehicle.received.clear()
+        for each in stations:
+            each.send(LIST, ParamRequestRead(1, 1, "NONE", -1), CommandLong(1, 1, 400))
+        await anyio.sleep(3.0)
+        for each in stations:
+            assert len(each.of(ParamValue)) == 26
+            assert len(each.of(ParamError)) == 1
+        assert len(vehicle.messages(CommandLong)) == 1  # the others are equal, and arrive at once
+
+
+@in_simulated_time
+async def test_rule_1_a_request_for_any_vehicle_is_no_request_for_one() -> None:
+    vehicles = [Tap(small_px4(system=number)) for number in (1, 2)]
+    async with gateway_over(*vehicles) as served:
+        await served.synced()
+        station = served.partner()
+        await station.ask(ParamSet(0, 1, "PARAM_01", bytes(4), ParamType.INT32), ParamRequestList(0, 0))
+        for each in vehicles:
+            assert {frame.system for _, frame, message in each.received if isinstance(message, ParamSet)} == {
+                255
+            }
+        assert len(station.of(ParamValue)) >= 2 * 26
+
+
+@in_simulated_time
+async def test_rule_1_a_list_at_the_first_heartbeat_stays_off_the_radio() -> None:
+    vehicle = Tap(small_px4())
+    async with gateway_over(vehicle) as served:
+        station = served.partner()
+        station.send(GCS)
+        await until(lambda: station.frames)
+        await station.ask(LIST, seconds=3.0)
+        assert {each.param_index for each in station.of(ParamValue)} >= set(range(25))
+        assert askers(vehicle) == {254}
+
+
+@in_simulated_time
+async def test_rule_1_a_key_is_never_passed_on() -> None:
+    vehicle = Tap(small_px4())
+    async with gateway_over(vehicle) as served:
+        station = served.partner()
+        await station.ask(messages.SetupSigning(1, 1, SigningKey(bytes(range(32))), 1))
+        assert not vehicle.messages(messages.SetupSigning)
+
+
+# 2: answered from the table
+
+
+def directly(vehicle: Endpoint, *requests: messages.Message, seconds: float = 4.0) -> list[messages.Message]:
+    """What a vehicle answers to a station that is connected to it."""
+    framer, found, now = frames.Framer(messages.DECODED_IDS, stream=False), [], 0.0
+    vehicle.tick(now)
+    for sequence, request in enumerate(requests):
+        vehicle.receive(messages.encode(request, system=255, component=190, sequence=sequence), now)
+    while now < seconds:
+        now += 0.01
+        vehicle.tick(now)
+        found += [messages.decode(each) for data in vehicle.data_to_send() for each in framer.receive(data)]
+    return [each for each in found if each is not None]
+
+
+@in_simulated_time
+@pytest.mark.parametrize("kind", [PX4Vehicle, ArduPilotVehicle, generic])
+async def test_rule_2_a_list_has_the_bytes_of_the_vehicle(kind: Callable[..., Endpoint]) -> None:
+    wanted = [each for each in directly(kind(), LIST) if isinstance(each, ParamValue)]
+    vehicle = Tap(kind())
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        station = served.partner()
+        vehicle.received.clear()
+        await station.ask(LIST)
+        assert station.of(ParamValue) == wanted
+        assert not requested(vehicle)
+
+
+@in_simulated_time
+async def test_rule_2_px4_answers_its_hash_and_goes_on_with_its_list() -> None:
+    vehicle = Tap(small_px4())
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        station = served.partner()
+        vehicle.received.clear()
+        await station.ask(ParamRequestRead(1, 1, "_HASH_CHECK", -1), seconds=0.1)
+        [answer] = station.of(ParamValue)
+        component = await served.clients[0].component()
+        assert (answer.param_id, answer.param_index, answer.param_count) == ("_HASH_CHECK", 65535, 25)
+        assert int.from_bytes(answer.raw, "little") == component.hash
+        await station.ask(ParamSet(1, 1, "_HASH_CHECK", bytes(4), 5))
+        assert not requested(vehicle)
+
+
+@in_simulated_time
+@pytest.mark.parametrize("kind", [small_px4, partial(ArduPilotVehicle, table={"A": 1.0, "PARAM_03": 2.0})])
+async def test_rule_2_reads_by_name_and_index(kind: Callable[..., Endpoint]) -> None:
+    reads = [ParamRequestRead(1, 1, "PARAM_03", -1), ParamRequestRead(1, 1, "", 1)]
+    wanted = [each for each in directly(kind(), *reads) if isinstance(each, ParamValue)]
+    vehicle = Tap(kind())
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        station = served.partner()
+        vehicle.received.clear()
+        await station.ask(*reads)
+        assert station.of(ParamValue) == wanted
+        assert not requested(vehicle)
+
+
+@in_simulated_time
+async def test_rule_2_an_unknown_name_is_asked_of_the_vehicle_once() -> None:
+    vehicle = Tap(small_px4())
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        station, other = served.partner(), served.partner(system=9)
+        other.send(ParamRequestRead(1, 1, "NONE", -1))
+        await station.ask(ParamRequestRead(1, 1, "NONE", -1), seconds=3.0)
+        assert station.of(ParamError) == [ParamError(255, 190, "NONE", -1, 1)]
+        assert other.of(ParamError) == [ParamError(9, 190, "NONE", -1, 1)]
+        vehicle.received.clear()
+        await station.ask(ParamRequestRead(1, 1, "NONE", -1), ParamRequestRead(1, 1, "", 999))
+        assert len(station.of(ParamError)) == 2
+        assert not requested(vehicle)
+
+
+@in_simulated_time
+@pytest.mark.parametrize("seed", range(4))
+async def test_rule_2_an_unknown_name_is_known_to_be_unknown_in_3_seconds_also_with_losses(seed: int) -> None:
+    vehicle = Tap(Air.symmetric([PX4Vehicle()], loss=0.2, delay=0.05, seed=seed))
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        station = served.partner()
+        await station.ask(ParamRequestRead(1, 1, "NONE", -1), seconds=3.0)
+        asked = len(requested(vehicle))
+        await station.ask(ParamRequestRead(1, 1, "NONE", -1), seconds=3.0)
+        assert len(requested(vehicle)) == asked
+
+
+@in_simulated_time
+async def test_rule_2_extended_parameters() -> None:
+    camera = Tap(Camera())
+    wanted = [
+        each for each in directly(Camera(), ParamExtRequestList(1, 100)) if isinstance(each, ParamExtValue)
+    ]
+    async with gateway_over(camera) as served:
+        await served.clients[0].component(1, 100)
+        station = served.partner()
+        await station.ask(ParamExtRequestList(1, 100), seconds=5.0)
+        assert station.of(ParamExtValue) == wanted
+        camera.received.clear()
+        await station.ask(ParamExtRequestList(1, 100))
+        assert station.of(ParamExtValue) == wanted
+        one = wanted[2]
+        await station.ask(ParamExtRequestRead(1, 100, one.param_id, -1), ParamExtRequestRead(1, 100, "", 2))
+        assert station.of(ParamExtValue) == [one, one]
+        assert not camera.messages(ParamExtRequestList)
+        new = ParamExtSet(1, 100, "CAM_NAME", b"Rear".ljust(128, b"\0"), ParamType.CUSTOM)
+        await station.ask(new, new, seconds=3.0)
+        assert station.of(ParamExtAck) == [ParamExtAck("CAM_NAME", new.raw, ParamType.CUSTOM, 0)]
+        wrong = ParamExtSet(1, 100, "CAM_NAME", bytes(128), ParamType.UINT8)
+        await station.ask(wrong)
+        assert [each.param_result for each in station.of(ParamExtAck)] == [1]
+
+
+def direct_file(path: str, size: int) -> bytes:
+    """A file as the simulated vehicle serves it."""
+    requests = [
+        Packet(1, 0, Opcode.OPEN_FILE_RO, path.encode()),
+        Packet(3, 0, Opcode.BURST_READ_FILE, size=size),
+    ]
+    said = directly(ArduPilotVehicle(), *(FileTransfer(0, 1, 1, each.pack()) for each in requests))
+    return content_of([Packet.unpack(each.payload) for each in said if isinstance(each, FileTransfer)][1:])
+
+
+def content_of(packets: list[Packet]) -> bytes:
+    """The content in the answers to a burst."""
+    *pieces, last = packets
+    assert (last.opcode, last.code) == (Opcode.NAK, 6)
+    assert [each.sequence for each in packets] == [packets[0].sequence + at for at in range(len(packets))]
+    return b"".join(each.data for each in pieces)
+
+
+@in_simulated_time
+@pytest.mark.parametrize("size", [239, 110, 80])
+@pytest.mark.parametrize("query", ["", "?withdefaults=1", "?start=100&count=50"])
+async def test_rule_2_the_parameter_file_in_the_requested_pieces(size: int, query: str) -> None:
+    vehicle = Tap(ArduPilotVehicle())
+    path = f"@PARAM/param.pck{query}"
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        station = served.partner()
+        vehicle.received.clear()
+        [opened] = await station.ask_file(Opcode.OPEN_FILE_RO, data=path.encode(), session=3, sequence=5)
+        assert (opened.opcode, opened.session, opened.sequence) == (Opcode.ACK, 3, 6)
+        assert await station.ask_file(Opcode.OPEN_FILE_RO, data=path.encode(), session=3, sequence=5) == [
+            opened
+        ]
+        content = content_of(await station.ask_file(Opcode.BURST_READ_FILE, size=size, session=3))
+        pack = decode(direct_file(path, size))
+        rows = [each._replace(default=None) if each.default == each.bits else each for each in pack.entries]
+        options: dict[str, Any] = {
+            "total": pack.total,
+            "with_defaults": pack.with_defaults,
+            "read_size": size,
+        }
+        assert content == encode(rows, **options)
+        [part] = await station.ask_file(Opcode.READ_FILE, offset=size, size=size, session=3)
+        assert part.data == content[size : 2 * size]
+        [closed] = await station.ask_file(Opcode.TERMINATE_SESSION, session=3)
+        assert closed.opcode == Opcode.ACK
+        assert not vehicle.messages(FileTransfer)
+
+
+def test_rule_2_a_file_with_defaults_that_are_unknown_is_one_without() -> None:
+    entries = [PackedParam("A", ParamType.INT8, 5), PackedParam("B", ParamType.REAL32, 7)]
+    plain, full = FileQuery(), FileQuery(with_defaults=True)
+    unknown, known = Rows(entries, has_defaults=False), Rows(entries, has_defaults=True)
+    assert unknown.content(full, 80) == unknown.content(plain, 80) == known.content(plain, 80)
+    assert known.content(full, 80)[:2] == b"\x1c\x67"
+    assert unknown.content(full, 80)[:2] == b"\x1b\x67"
+
+
+@in_simulated_time
+async def test_rule_2_the_checksum_of_the_parameter_file() -> None:
+    data = b"@PARAM/param.pck"
+    request = FileTransfer(0, 1, 1, Packet(1, 0, Opcode.CALC_FILE_CRC32, data).pack())
+    [wanted] = [each for each in directly(ArduPilotVehicle(), request) if isinstance(each, FileTransfer)]
+    vehicle = Tap(ArduPilotVehicle())
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        vehicle.received.clear()
+        assert await served.partner().ask_file(Opcode.CALC_FILE_CRC32, data=data) == [
+            Packet.unpack(wanted.payload)
+        ]
+        assert not vehicle.messages(FileTransfer)
+
+
+@in_simulated_time
+async def test_rule_2_other_files_pass_and_an_upload_has_the_table_proven() -> None:
+    vehicle = Tap(ArduPilotVehicle())
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        station = served.partner()
+        component = await served.clients[0].component()
+        [answer] = await station.ask_file(Opcode.OPEN_FILE_RO, data=b"nothing.txt")
+        assert answer.opcode == Opcode.NAK
+        assert vehicle.messages(FileTransfer)
+        await station.ask_file(Opcode.CREATE_FILE, data=b"@PARAM/param.pck", sequence=5)
+        await station.ask_file(Opcode.TERMINATE_SESSION, sequence=7, seconds=0.1)
+        assert component.sync_state == "checking"
+        await anyio.sleep(10.0)
+        assert component.sync_state == "synced"
+
+
+# 3: never older than known
+
+
+@in_simulated_time
+async def test_rule_3_a_list_that_is_asked_during_the_fetch_streams_it() -> None:
+    """All who ask share one fetch; the first value comes within 2 s."""
+    air = Air.symmetric([PX4Vehicle()], loss=0.2, delay=0.05, seed=1)
+    vehicle = Tap(air)
+    async with gateway_over(vehicle) as served:
+        await served.clients[0].component()
+        stations = [served.partner(system=number) for number in range(250, 254)]
+        began = anyio.current_time()
+        for each in stations:
+            each.send(LIST, LIST)
+        component = await served.clients[0].component()
+        await until(lambda: component.sync_state == "synced")
+        await anyio.sleep(1.0)
+        for each in stations:
+            values = each.of(ParamValue)
+            indices = [value.param_index for value in values if value.param_id != "_HASH_CHECK"]
+            assert sorted(set(indices)) == list(range(component.count or 0))
+            arrivals = zip(each.times, each.frames, strict=True)
+            assert next(at for at, frame in arrivals if frame.message_id == 22) - began <= 2.0
+        assert len(vehicle.messages(ParamRequestList)) <= 5  # of the gateway alone
+        assert askers(vehicle) == {254}
+
+
+@in_simulated_time
+async def test_rule_3_the_first_value_comes_within_two_seconds_of_a_slow_file() -> None:
+    vehicle = ArduPilotVehicle(ftp_rate=2_000.0)
+    async with gateway_over(vehicle) as served:
+        await served.clients[0].component()
+        station = served.partner()
+        await station.ask(LIST, seconds=2.0)
+        assert station.of(ParamValue)
+
+
+@in_simulated_time
+async def test_rule_3_reads_of_gaps_wait_for_the_fetch() -> None:
+    vehicle = Tap(ArduPilotVehicle(ftp_rate=4_000.0))
+    async with gateway_over(vehicle) as served:
+        await served.clients[0].component()
+        station = served.partner()
+        station.send(LIST)
+        await anyio.sleep(2.5)
+        vehicle.received.clear()
+        for _ in range(3):
+            await station.ask(*(ParamRequestRead(1, 1, "", index) for index in range(700, 710)), seconds=2.0)
+        assert {each.param_index for each in station.of(ParamValue)} >= set(range(700, 710))
+        assert not requested(vehicle)
+
+
+@in_simulated_time
+async def test_rule_3_a_file_that_is_opened_during_a_long_fetch_is_none() -> None:
+    """So that the station asks for the list, and no second download begins."""
+    vehicle = Tap(ArduPilotVehicle(ftp_rate=2_000.0))
+    async with gateway_over(vehicle) as served:
+        await served.clients[0].component()
+        station = served.partner()
+        [answer] = await station.ask_file(
+            Opcode.OPEN_FILE_RO, data=b"@PARAM/param.pck?withdefaults=1", seconds=2.9
+        )
+        assert (answer.opcode, answer.code) == (Opcode.NAK, 10)
+        await station.ask(LIST, seconds=20.0)
+        assert len(by_name(station)) == 1382
+        assert {frame.system for _, frame, _ in vehicle.received} == {254}
+
+
+@in_simulated_time
+async def test_rule_3_an_old_proof_is_renewed_behind_the_answer_and_differences_are_announced() -> None:
+    model = small_px4()
+    vehicle = Tap(model)
+    async with gateway_over(vehicle, watch_interval=0) as served:
+        await served.synced()
+        station = served.partner()
+        station.send(GCS)
+        await anyio.sleep(6.0)
+        model.load({"PARAM_01": 77})  # announces nothing
+        vehicle.received.clear()
+        await station.ask(LIST, seconds=0.3)
+        assert by_name(station)["PARAM_01"] == struct.pack("<i", 1)
+        assert not requested(vehicle)
+        await anyio.sleep(5.0)
+        assert by_name(station)["PARAM_01"] == struct.pack("<i", 77)
+        vehicle.received.clear()
+        await station.ask(LIST, seconds=1.0)
+        assert by_name(station)["PARAM_01"] == struct.pack("<i", 77)
+        assert not requested(vehicle)  # the proof is young
+
+
+@in_simulated_time
+async def test_rule_3_the_hash_is_answered_in_under_a_second_before_the_table_is() -> None:
+    async with gateway_over(Air.symmetric([PX4Vehicle()], delay=0.1, rate=20_000.0)) as served:
+        station = served.partner()
+        station.send(GCS)
+        await until(lambda: station.frames)
+        await station.ask(ParamRequestRead(1, 1, "_HASH_CHECK", -1), seconds=0.9)
+        assert by_name(station).keys() == {"_HASH_CHECK"}
+        assert not (await served.clients[0].component()).session.table.is_complete
+
+
+@in_simulated_time
+async def test_rule_3_cached_values_are_never_served(tmp_path: Path) -> None:
+    cache = tmp_path / "cache.db"
+    async with gateway_over(small_px4(), cache=cache) as served:
+        await served.synced()
+    vehicle = Tap(small_px4())
+    async with gateway_over(vehicle, cache=cache) as served:
+        component = await served.clients[0].component()
+        assert {each.trust for each in component.params.values()} == {"cached"}
+        vehicle.is_deaf = True
+        station = served.partner()
+        await station.ask(LIST, ParamRequestRead(1, 1, "PARAM_01", -1), seconds=2.0)
+        assert not station.of(ParamValue)
+
+
+@in_simulated_time
+async def test_rule_3_a_lost_vehicle_is_silent() -> None:
+    vehicle = Tap(small_px4())
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        station = served.partner()
+        vehicle.is_mute = True
+        await anyio.sleep(6.0)
+        vehicle.received.clear()
+        read, write = ParamRequestRead(1, 1, "PARAM_01", -1), set_to("PARAM_01", 5)
+        await station.ask(LIST, read, write, seconds=5.0)
+        assert not station.frames
+        vehicle.is_mute = False
+        await anyio.sleep(10.0)
+        assert not station.of(ParamValue)
+        assert not vehicle.messages(ParamSet)
+        await station.ask(LIST)
+        assert len(station.of(ParamValue)) == 26
+
+
+@in_simulated_time
+async def test_rule_3_a_vehicle_that_is_lost_during_the_fetch_is_served_when_it_is_back() -> None:
+    vehicle = Tap(Air.symmetric([PX4Vehicle()], rate=20_000.0))
+    async with gateway_over(vehicle) as served:
+        station = served.partner()
+        station.send(GCS)
+        await until(lambda: station.frames)
+        await station.ask(LIST, seconds=0.5)
+        vehicle.is_mute = True
+        await anyio.sleep(30.0)
+        vehicle.is_mute = False
+        await anyio.sleep(3.0)
+        vehicle.received.clear()
+        await station.ask(LIST, seconds=6.0)
+        assert len(by_name(station)) == 904
+        assert askers(vehicle) <= {254}
+
+
+@in_simulated_time
+async def test_rule_3_a_vehicle_that_is_lost_during_an_answer_ends_it() -> None:
+    vehicle = Tap(PX4Vehicle())
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        station = served.partner()
+        station.send(LIST)
+        await anyio.sleep(0.01)
+        served.clients[0].core.station.nodes[1, 1].presence.is_lost = True
+        await anyio.sleep(0.01)
+        received = len(station.frames)
+        assert 0 < received < 903
+        await anyio.sleep(0.5)
+        assert len(station.frames) - received <= 37
+
+
+@in_simulated_time
+async def test_rule_3_a_change_during_an_answer_is_in_it() -> None:
+    vehicle = PX4Vehicle()
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        station = served.partner()
+        component = await served.clients[0].component()
+        name = component.session.table.names[900]
+        station.send(LIST)
+        await anyio.sleep(0.01)
+        assert component.params[name].type is ParamType.INT32 or component.params[name].value is not None
+        await component.set(name, 1)
+        await anyio.sleep(0.5)
+        [*_, last] = [each for each in station.of(ParamValue) if each.param_id == name]
+        param = component.params[name]
+        assert last.raw == encode_value(param.settable, param.type_number, component.encoding)
+        assert {each.param_count for each in station.of(ParamValue)} == {component.count}
+
+
+# 4: sets
+
+
+@in_simulated_time
+async def test_rule_4_a_set_is_a_verified_write_of_its_station() -> None:
+    vehicle = Tap(small_px4())
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        station, other = served.partner(), served.partner(system=9)
+        other.send(GCS)
+        component = await served.clients[0].component()
+        changes = component.changes()
+        vehicle.received.clear()
+        for _ in range(3):
+            station.send(set_to("PARAM_01", 33))
+        await station.ask(seconds=1.0)
+        assert by_name(station) == by_name(other) == {"PARAM_01": struct.pack("<i", 33)}
+        assert len(vehicle.messages(ParamSet)) == 1
+        assert (await anext(changes)).by == "us for station 255/190"
+        other.clear()
+        await station.ask(
+            set_to("PARAM_01", 33), seconds=1.0
+        )  # all others hear of it again, as from a vehicle
+        assert by_name(station) == by_name(other) == {"PARAM_01": struct.pack("<i", 33)}
+
+
+@in_simulated_time
+async def test_rule_4_different_sets_queue() -> None:
+    vehicle = Tap(Air.symmetric([small_px4()], loss=0.3, delay=0.05, seed=4))
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        first, second = served.partner(), served.partner(system=9)
+        second.send(set_to("PARAM_01", 9))
+        await first.ask(set_to("PARAM_01", 33), seconds=5.0)
+        component = await served.clients[0].component()
+        await component.get("PARAM_01")
+        assert component.params["PARAM_01"].value == 33
+        assert by_name(first)["PARAM_01"] == by_name(second)["PARAM_01"] == struct.pack("<i", 33)
+
+
+@in_simulated_time
+async def test_rule_4_an_error_goes_to_the_asker_alone_within_3_seconds() -> None:
+    vehicle = Tap(small_px4())
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        station, other = served.partner(), served.partner(system=9)
+        other.send(GCS)
+        await station.ask(set_to("PARAM_01", 5, ParamType.INT16), seconds=0.1)
+        assert station.of(ParamError) == [ParamError(255, 190, "PARAM_01", -1, 7)]
+        await station.ask(ParamSet(1, 1, "PARAM_00", struct.pack("<f", math.nan), 9), seconds=0.1)
+        assert station.of(ParamError) == [ParamError(255, 190, "PARAM_00", -1, 2)]
+        await station.ask(set_to("NONE", 5), seconds=3.0)
+        assert station.of(ParamError) == [ParamError(255, 190, "NONE", -1, 1)]
+        vehicle.is_deaf = True
+        await station.ask(set_to("PARAM_01", 5), seconds=3.0)
+        assert station.of(ParamError) == [ParamError(255, 190, "PARAM_01", -1, 4)]
+        assert not other.of(ParamError)
+
+
+# 5: changes
+
+
+@in_simulated_time
+async def test_rule_5_changes_by_others_are_announced() -> None:
+    radio = Radio(small_px4())
+    async with gateway_over(radio) as served:
+        await served.synced()
+        station = served.partner()
+        await station.ask(GCS)
+        radio.other.append(messages.encode(set_to("PARAM_02", 8), system=7, component=1, sequence=0))
+        await anyio.sleep(2.0)
+        assert by_name(station) == {"PARAM_02": struct.pack("<i", 8)}
+
+
+# 6: packed, not paced
+
+
+@in_simulated_time
+async def test_rule_6_frames_are_packed() -> None:
+    async with gateway_over(PX4Vehicle()) as served:
+        await served.synced()
+        station = served.partner()
+        await station.ask(LIST, seconds=0.1)
+        values = [data for data in station.datagrams if len(data) > 100]
+        assert len(station.of(ParamValue)) == 904
+        assert max(map(len, values)) <= 1_400
+        assert len(values) <= 26
+
+
+@in_simulated_time
+async def test_rule_6_queues_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stations, "STATION_QUEUE_MAX", 10)
+    async with gateway_over(small_px4()) as served:
+        station = served.partner()
+        await station.ask(GCS)
+        served.link.is_stuck = True
+        await anyio.sleep(30.0)
+        [there] = served.gateway.stations
+        assert there.dropped > 10
+        station.clear()
+        served.link.is_stuck = False
+        await anyio.sleep(0.5)
+        assert len(station.frames) <= 20
+
+
+@in_simulated_time
+async def test_rule_6_telemetry_holds_no_list_up() -> None:
+    vehicle = Puppet(lambda message: ())
+    async with gateway_over(Air([small_px4(), vehicle])) as served:
+        await served.synced()
+        station = served.partner()
+        await station.ask(GCS)
+        frame = frames.build_frame(30, bytes(range(28)), system=1, component=1, sequence=1)
+        for _ in range(2_000):
+            vehicle.say_bytes(frame)
+        await station.ask(LIST, seconds=0.05)
+        assert len(station.of(ParamValue)) == 26
+
+
+# 7: sequence numbers
+
+
+@in_simulated_time
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+async def test_rule_7_no_losses_but_those_of_the_radio(loss: float) -> None:
+    air = Air.symmetric([PX4Vehicle()], loss=loss, seed=3)
+    async with gateway_over(air) as served:
+        station = served.partner()
+        station.send(GCS)
+        await served.synced()
+        for _ in range(5):
+            station.send(LIST)
+            await anyio.sleep(1.0)
+        await anyio.sleep(20.0)
+        if loss:
+            assert station.lost[1, 1] > 0
+        else:
+            assert station.lost[1, 1] == 0
+
+
+def test_rule_7_numbers_of_relayed_inserted_and_withheld_frames() -> None:
+    numbering = Numbering()
+    assert [numbering.insert(), numbering.relay(200), numbering.insert(), numbering.relay(201)] == [
+        0,
+        1,
+        2,
+        3,
+    ]
+    numbering.withhold()  # 202
+    assert [numbering.relay(203), numbering.relay(206)] == [4, 7]  # two were lost
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("extra", [0, 1, 111, 255])
+def test_rule_7_renumbered_frames_are_valid_whatever_their_extra_byte_is(version: int, extra: int) -> None:
+    payload = bytes(range(1, 26))
+    head = bytes((0xFE, 25)) if version == 1 else bytes((0xFD, 25, 0, 0))
+    tail = bytes((1, 1, 22)) if version == 1 else bytes((1, 1, 22, 0, 0))
+
+    def frame(sequence: int) -> bytes:
+        body = head + bytes((sequence,)) + tail + payload
+        return body + fastcrc.crc16.mcrf4xx(body[1:] + bytes((extra,))).to_bytes(2, "little")
+
+    for sequence in range(256):
+        assert frames.renumber_frame(frame(17), sequence) == frame(sequence)
+
+
+# 8: signing
+
+
+KEY = SigningKey(bytes(range(32)))
+
+
+@in_simulated_time
+async def test_rule_8_without_the_key_parameters_are_routed_and_frames_untouched() -> None:
+    async with gateway_over(small_px4(signing_key=KEY)) as served:
+        station = served.partner(key=KEY)
+        await station.ask(LIST, seconds=8.0)
+        assert len(station.of(ParamValue)) == 26
+        assert station.verifier is not None
+        report = station.verifier.report()
+        assert not report.refused
+        assert {each.link_id for each in report.streams} == {0}  # the vehicle's
+        assert station.lost[1, 1] == 0
+
+
+@in_simulated_time
+async def test_rule_8_answers_are_signed_with_a_link_id_of_their_own() -> None:
+    vehicle = Tap(small_px4(signing_key=KEY))
+    async with gateway_over(vehicle, endpoint={"key": KEY}, signing=KEY) as served:
+        await served.synced()
+        station, other = served.partner(key=KEY), served.partner(system=9)
+        other.send(GCS, LIST)  # unsigned
+        vehicle.received.clear()
+        await station.ask(LIST, set_to("PARAM_01", 5), seconds=3.0)
+        assert len(station.of(ParamValue)) >= 26
+        assert len(vehicle.messages(ParamSet)) == 1
+        assert not vehicle.messages(ParamRequestList)
+        assert station.of(Heartbeat)
+        assert station.verifier is not None
+        report = station.verifier.report()
+        assert not report.refused
+        own, *answers = sorted({each.link_id for each in report.streams})
+        assert own == 0
+        assert answers
+        assert min(answers) >= 200
+        assert not other.frames
+
+
+@in_simulated_time
+@pytest.mark.parametrize("is_trusted", [False, True])
+async def test_rule_8_an_unsigned_set_is_signed_for_a_trusted_endpoint_alone(is_trusted: bool) -> None:
+    model = small_px4(signing_key=KEY)
+    async with gateway_over(model, endpoint={"is_trusted": is_trusted}, signing=KEY) as served:
+        await served.synced()
+        await served.partner().ask(set_to("PARAM_01", 5), seconds=3.0)
+        assert model.values["PARAM_01"] == (5 if is_trusted else 1)
+
+
+# 9: no ground station
+
+
+@in_simulated_time
+async def test_rule_9_the_gateway_is_no_ground_station() -> None:
+    vehicle = Tap(ArduPilotVehicle(table={"SYSID_MYGCS": 254.0, "A": 1.0}))
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        await anyio.sleep(3.0)
+        vehicle.received.clear()
+        await anyio.sleep(3.0)
+        assert {each.type for each in vehicle.messages(Heartbeat)} == {18}
+        assert {frame.system for _, frame, _ in vehicle.received} == {253}
+
+
+@in_simulated_time
+async def test_rule_9_the_gateway_has_the_id_of_no_station() -> None:
+    """Otherwise it would take their answers for its own."""
+    vehicle = Tap(ArduPilotVehicle())
+    async with gateway_over(vehicle, system=255, component=1) as served:
+        await served.synced()
+        station = served.partner(system=254, component=191)
+        await station.ask(GCS, seconds=2.0)
+        vehicle.received.clear()
+        [answer] = await station.ask_file(Opcode.OPEN_FILE_RO, data=b"nothing.txt")
+        assert answer.opcode == Opcode.NAK
+        await anyio.sleep(2.0)
+        assert {frame.system for _, frame, _ in vehicle.received} == {253, 254}
+
+
+# 10: all components, and two vehicles with one id
+
+
+@in_simulated_time
+async def test_rule_10_a_list_of_all_components() -> None:
+    silent = Puppet(lambda message: (), component=5)
+    vehicle = Tap(Air([small_px4(), silent]))
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        station = served.partner()
+        station.send(ParamRequestList(1, 5))
+        await anyio.sleep(30.0)
+        vehicle.received.clear()
+        await station.ask(ParamRequestList(1, 0), seconds=1.0)
+        assert len(station.of(ParamValue)) == 26
+        asked = [message for _, frame, message in vehicle.received if frame.system == 255]
+        assert asked == [ParamRequestList(1, 5)]
+
+
+@in_simulated_time
+async def test_rule_10_two_vehicles_with_one_id(caplog: pytest.LogCaptureFixture) -> None:
+    vehicles = [Tap(small_px4()), Tap(small_px4())]
+    async with gateway_over(*vehicles) as served:
+        await served.synced()
+        station = served.partner()
+        with caplog.at_level(logging.WARNING):
+            await station.ask(LIST, seconds=2.0)
+        assert "1/1 is on two links" in caplog.text
+        for each in vehicles:
+            assert [frame.system for _, frame, message in each.received if message == LIST][-1] == 255
+        assert len(station.of(ParamValue)) == 52
+
+
+# 11: loops
+
+
+@in_simulated_time
+async def test_rule_11_a_loop_ends() -> None:
+    """The endpoint leads to the vehicle link itself."""
+    vehicle = small_px4()
+    loop = Puppet(lambda message: (), heartbeat=None)
+    link = PeersLink({"vehicle": vehicle, "loop": loop})
+    async with gateway_over(link) as served:
+        station = served.partner()
+        station.send(GCS)
+        await served.synced()
+        sent = len(station.frames)
+        for data in list(station.datagrams):
+            loop.say_bytes(data)
+        await anyio.sleep(0.2)
+        assert len(station.frames) - sent <= 3
+        before = len(station.frames)
+        own = frames.build_frame(0, bytes(9), system=1, component=1, sequence=1)
+        station.send_bytes(own)  # of a vehicle that is kept
+        await anyio.sleep(0.2)
+        assert len(station.frames) - before <= 2
+
+
+@in_simulated_time
+async def test_rule_11_a_vehicle_that_moves_is_no_copy_of_itself() -> None:
+    vehicle = small_px4()
+    link = PeersLink({"before": vehicle})
+    async with gateway_over(link) as served:
+        station = served.partner()
+        station.send(GCS)
+        await served.synced()
+        link.endpoints = {"after": vehicle}
+        await anyio.sleep(12.0)
+        station.clear()
+        await anyio.sleep(5.0)
+        assert len(station.of(Heartbeat)) >= 4
+        await station.ask(LIST)
+        assert len(station.of(ParamValue)) == 26
+
+
+@pytest.mark.asyncio
+async def test_rule_11_an_endpoint_that_leads_to_the_link_itself() -> None:
+    """As with a link that listens where QGroundControl is expected to."""
+    port = free_port()
+    vehicle = small_px4()
+    endpoints = [parse_endpoint(f"udpout:127.0.0.1:{port}"), parse_endpoint("tcpin:0")]
+    async with anyio.create_task_group() as tasks:
+        async with Hub([f"udpin:127.0.0.1:{port}"], cache=False, mavlink=endpoints) as hub:
+            tasks.start_soon(serve_endpoint, vehicle, create_link(f"udpout:127.0.0.1:{port}"))
+            await until(lambda: hub.targets and hub.targets[0].component.sync_state == "synced")
+            client = hub.links[f"udpin:127.0.0.1:{port}"].client
+            assert client is not None
+            before = client.bytes_received + client.bytes_sent
+            await anyio.sleep(1.0)
+            assert client.bytes_received + client.bytes_sent - before < 50_000
+            tcp = endpoints[1].address.replace("tcpin", "tcp")
+            async with a_client(tcp) as station:
+                component = await station.component()
+                assert (await component.fetch_all()).complete
+                assert (await component.set("PARAM_01", 5)).status == "accepted"
+        tasks.cancel_scope.cancel()
+
+
+@in_simulated_time
+async def test_rule_11_a_gateway_behind_a_gateway() -> None:
+    vehicle = Tap(small_px4())
+    async with gateway_over(vehicle) as inner:
+        await inner.synced()
+        async with gateway_over(inner.as_vehicles()) as outer:
+            await outer.synced()
+            vehicle.received.clear()
+            station = outer.partner()
+            await station.ask(LIST)
+            assert len(station.of(ParamValue)) == 26
+            await station.ask(set_to("PARAM_01", 33), seconds=1.0)
+            assert by_name(station)["PARAM_01"] == struct.pack("<i", 33)
+            assert len(requested(vehicle)) == 1
+
+
+@in_simulated_time
+async def test_rule_11_an_ardupilot_behind_two_gateways(tmp_path: Path) -> None:
+    """The outer gateway downloads the file from the inner one, and proves its cached table by checksums."""
+    model = ArduPilotVehicle()
+    vehicle = Tap(model)
+    async with gateway_over(vehicle) as inner:
+        await inner.synced()
+        vehicle.received.clear()
+        for source in ("ftp", "cache"):
+            async with gateway_over(inner.as_vehicles(), cache=tmp_path / "cache.db") as outer:
+                component = await outer.clients[0].component()
+                await component.wait_until_identified(5.0)
+                result = await component.fetch_all()
+                assert (result.source, result.missing) == (source, ())
+                assert bits(result.params) == bits(model.params)
+                assert all(each.default is not None for each in result.params.values())
+        assert not vehicle.messages(FileTransfer)
+        assert not requested(vehicle)
+
+
+# 12: MAVLink 1
+
+
+@in_simulated_time
+async def test_rule_12_mavlink_1_only_to_a_station_of_it() -> None:
+    async with gateway_over(small_px4()) as served:
+        await served.synced()
+        old, both = served.partner(version=1), served.partner(system=9)
+        both.send_bytes(messages.encode(GCS, system=9, component=190, sequence=0, version=1))
+        both.send(GCS)
+        both.send(LIST)
+        await old.ask(LIST)
+        assert {each.version for each in old.frames if each.message_id == 22} == {1}
+        assert {each.version for each in both.frames if each.message_id == 22} == {2}
+        assert len(old.of(ParamValue)) == 26
+
+
+# 13: endpoints
+
+
+@in_simulated_time
+async def test_rule_13_a_readonly_endpoint() -> None:
+    vehicle = Tap(small_px4())
+    async with gateway_over(vehicle, endpoint={"is_readonly": True}) as served:
+        await served.synced()
+        station = served.partner()
+        vehicle.received.clear()
+        mission = frames.build_frame(44, bytes(4), system=255, component=190, sequence=1)
+        station.send_bytes(mission)
+        await station.ask(
+            set_to("PARAM_01", 33), CommandLong(1, 1, 400), CommandLong(1, 1, 512, 148.0), LIST, GCS
+        )
+        assert station.of(ParamError) == [ParamError(255, 190, "PARAM_01", -1, 5)]
+        assert by_name(station)["PARAM_01"] == struct.pack("<i", 1)
+        await station.ask_file(Opcode.CREATE_FILE, data=b"a.txt")
+        await station.ask_file(Opcode.LIST_DIRECTORY, data=b"/")
+        commands = [message for _, frame, message in vehicle.received if frame.system == 255]
+        assert commands[:2] == [CommandLong(1, 1, 512, 148.0), GCS]
+        files = [Packet.unpack(each.payload).opcode for each in vehicle.messages(FileTransfer)]
+        assert files == [Opcode.LIST_DIRECTORY]
+
+
+def test_rule_13_names_of_endpoints(tmp_path: Path) -> None:
+    key = tmp_path / "key"
+    key.write_bytes(bytes(range(32)))
+    key.chmod(0o600)
+    assert parse_endpoint("tcpin:5760").name == "tcpin:127.0.0.1:5760"
+    assert parse_endpoint("udpin:0.0.0.0:14551?readonly&trusted").is_trusted
+    signed = parse_endpoint(f"udpout:127.0.0.1:14550?sign={key}")
+    assert signed.name == "udpout:127.0.0.1:14550"
+    assert signed.signer is not None
+    with pytest.raises(UsageError, match="not an option"):
+        parse_endpoint("tcpin:5760?writeonly")
+
+
+# 14: visible, and the whole service
+
+
+@in_simulated_time
+async def test_rule_14_stations_are_shown_with_what_they_save() -> None:
+    link = StationsLink()
+    async with service(small_px4(), mavlink=[MavlinkEndpoint(link)]) as (_, browser):
+        await synced(browser)
+        station = Partner(link)
+        await station.ask(LIST)
+        [shown] = (await browser.get("/api/stations")).json()
+        assert shown["name"] == "udpin:stations:14551#station:0"
+        assert (shown["ids"], shown["requests"]) == (["255/190"], {"ParamRequestList": 1})
+        assert shown["answered"] == 26
+        assert shown["saved_bytes"] == sum(map(len, station.datagrams)) > 700
+        metrics = (await browser.get("/metrics")).text
+        assert 'paramclient_stations_answered{endpoint="udpin:stations:14551"} 26.0' in metrics
+
+
+def test_rule_14_a_service_that_only_listens_has_no_stations() -> None:
+    with pytest.raises(UsageError, match="only listens"):
+        Hub([small_px4()], cache=False, mavlink=["tcpin:0"], listen_only=True)
+
+
+@in_simulated_time
+async def test_a_table_that_could_not_be_fetched_is_fetched_later() -> None:
+    vehicle = Tap(small_px4())
+    vehicle.is_deaf = True
+    async with Hub([vehicle], cache=False) as hub:
+        await anyio.sleep(30.0)
+        assert hub.targets[0].component.sync_state == "unsynced"
+        vehicle.is_deaf = False
+        await anyio.sleep(90.0)
+        assert hub.targets[0].component.sync_state == "synced"
+
+
+@pytest.mark.asyncio
+async def test_the_command_works_through_the_gateway() -> None:
+    endpoint = parse_endpoint("tcpin:0")
+    vehicle = Tap(small_px4())
+    async with Hub([vehicle], cache=False, mavlink=[endpoint]) as hub:
+        await until(lambda: hub.targets and hub.targets[0].component.sync_state == "synced")
+        vehicle.received.clear()
+        link = endpoint.address.replace("tcpin", "tcp")
+
+        async def command(*arguments: str) -> str:
+            words = [sys.executable, "-m", "paramclient", *arguments, "--no-cache"]
+            return (await anyio.run_process(words)).stdout.decode()
+
+        assert "PARAM_01" in await command("fetch", link)
+        assert "33" in await command("set", link, "PARAM_01", "33")
+        assert "33" in await command("get", link, "PARAM_01")
+        assert len(vehicle.messages(ParamSet)) == 1
+        assert not vehicle.messages(ParamRequestList)
+
+
+@pytest.mark.asyncio
+async def test_stations_on_tcp_and_udp() -> None:
+    """`ParamClient` works through a gateway like with a vehicle."""
+    endpoints = [parse_endpoint("tcpin:0"), parse_endpoint("udpin:0")]
+    vehicle = Tap(small_px4())
+    async with Hub([vehicle], cache=False, mavlink=endpoints) as hub:
+        ports = [each.link.address[1] for each in endpoints]  # type: ignore[attr-defined]  # of sockets
+        await until(lambda: hub.targets and hub.targets[0].component.sync_state == "synced")
+        vehicle.received.clear()
+        for name in (f"tcp:127.0.0.1:{ports[0]}", f"udpout:127.0.0.1:{ports[1]}"):
+            async with a_client(name) as client:
+                component = await client.component()
+                result = await component.fetch_all()
+                assert bits(result.params) == bits(hub.targets[0].component.params)
+                assert (await component.set("PARAM_01", ports[0] % 1000)).status == "accepted"
+        assert len(requested(vehicle)) <= 3  # the sets, and no list
+        assert not vehicle.messages(ParamRequestList)
+
+
+def test_an_endpoint_that_is_in_use_ends_the_start() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other, pytest.raises(LinkError, match="in use"):
+        anyio.run(_start, f"tcpin:{other.getsockname()[1]}")
+
+
+async def _start(endpoint: str) -> None:
+    async with Hub([small_px4()], cache=False, mavlink=[endpoint]):
+        raise AssertionError("it was opened")
+
+
+# faults
+
+
+@in_simulated_time
+async def test_a_silent_reset_by_a_station_is_found() -> None:
+    model = small_px4()
+    async with gateway_over(model) as served:
+        await served.synced()
+        station = served.partner()
+        await station.ask(set_to("PARAM_01", 9), seconds=3.0)
+        model.load({"PARAM_01": 1})
+        await station.ask(CommandLong(1, 1, 245, 2.0), seconds=3.0)
+        assert by_name(station)["PARAM_01"] == struct.pack("<i", 1)
+
+
+@in_simulated_time
+async def test_a_restart_during_a_list() -> None:
+    model = PX4Vehicle()
+    async with gateway_over(model) as served:
+        await served.synced()
+        station = served.partner()
+        station.send(GCS, LIST)
+        await anyio.sleep(0.01)
+        model.reboot(down=2.0)
+        await anyio.sleep(20.0)
+        component = await served.clients[0].component()
+        assert component.sync_state == "synced"
+        await station.ask(LIST)
+        wanted = {name for name, param in component.params.items() if param.index is not None}
+        assert by_name(station).keys() - {"_HASH_CHECK"} == wanted
+
+
+@in_simulated_time
+async def test_a_switch_of_a_group_during_a_list() -> None:
+    """The list has one count; what the switch has shown is announced."""
+    hidden = {f"GRP_{number}": float(number) for number in range(20)}
+    table = {f"P_{number:03}": float(number) for number in range(300)} | {"GRP_ENABLE": 0.0}
+    model = ArduPilotVehicle(table=table, groups={"GRP_ENABLE": hidden})
+    async with gateway_over(model) as served:
+        await served.synced()
+        station = served.partner()
+        station.send(GCS, LIST)
+        await anyio.sleep(0.004)
+        component = await served.clients[0].component()
+        await component.set("GRP_ENABLE", 1.0)
+        await anyio.sleep(20.0)
+        indexed = [each for each in station.of(ParamValue) if each.param_index != 65535]
+        assert {each.param_count for each in indexed} == {301}
+        await station.ask(LIST)
+        assert {each.param_count for each in station.of(ParamValue)} == {321}
+        assert by_name(station).keys() == {*table, *hidden}
+
+
+@in_simulated_time
+async def test_a_station_that_floods_and_one_that_sends_garbage() -> None:
+    vehicle = Tap(PX4Vehicle())
+    async with gateway_over(vehicle) as served:
+        await served.synced()
+        flood, garbage, station = served.partner(system=7), served.partner(system=8), served.partner()
+        vehicle.received.clear()
+        noise = random.Random(1)
+        for number in range(100):
+            flood.send(*[LIST] * 30, *[ParamRequestRead(1, 1, f"N{number}", -1)] * 20)
+            flood.send(*(ParamRequestRead(1, 1, "", index) for index in range(900, 950)))
+            garbage.send_bytes(noise.randbytes(500))
+            await anyio.sleep(0.01)
+        await station.ask(LIST)
+        assert len(station.of(ParamValue)) >= 904
+        assert len(requested(vehicle)) < 200
+        assert station.of(Heartbeat)
+
+
+@pytest.mark.asyncio
+async def test_a_station_that_never_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Others are served meanwhile, and its connection is closed."""
+    monkeypatch.setattr(tcp, "SEND_TIMEOUT", 0.5)
+    endpoint = parse_endpoint("tcpin:0")
+    async with Hub([PX4Vehicle()], cache=False, mavlink=[endpoint]) as hub:
+        await until(lambda: hub.targets and hub.targets[0].component.sync_state == "synced")
+        name = endpoint.address.replace("tcpin", "tcp")
+        with socket.socket() as deaf:
+            deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            deaf.connect(("127.0.0.1", int(name.rpartition(":")[2])))
+            deaf.setblocking(False)
+            await until(lambda: hub.gateway.stations)
+            [station] = hub.gateway.stations
+
+            async def ask() -> None:
+                while True:
+                    with suppress(OSError):
+                        deaf.send(messages.encode(LIST, system=9, component=190, sequence=0))
+                    await anyio.sleep(0.05)
+
+            async with anyio.create_task_group() as tasks, a_client(name) as client:
+                tasks.start_soon(ask)
+                component = await client.component()
+                assert len((await component.fetch_all()).params) == 903
+                await until(lambda: station not in hub.gateway.stations)
+                assert (await component.get(902)).index == 902
+                tasks.cancel_scope.cancel()
+
+
+@in_simulated_time
+async def test_memory_stays_flat(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept_table, "UNKNOWN_NAMES_MAX", 50)
+    sizes = []
+    async with gateway_over(small_px4()) as served:
+        await served.synced()
+        stations = [served.partner(system=number) for number in range(200, 220)]
+        tracemalloc.start()
+        for number in range(8):
+            for each in stations:
+                each.send(GCS, LIST, set_to("PARAM_01", number), CommandLong(1, 1, 400, number))
+                each.send(*(ParamRequestRead(1, 1, f"N{number}_{name}", -1) for name in range(20)))
+            await anyio.sleep(10.0)
+            for each in stations:
+                each.clear()
+            gc.collect()
+            sizes.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+    assert sizes[-1] - sizes[3] < 50_000, sizes
+
+
+@in_simulated_time
+async def test_twenty_stations_and_ten_vehicles() -> None:
+    vehicles = [small_px4(system=number) for number in range(1, 11)]
+    async with gateway_over(Air.symmetric(vehicles, loss=0.1, delay=0.05, seed=2)) as served:
+        stations = [served.partner(system=number) for number in range(200, 220)]
+        for each in stations:
+            each.send(GCS)
+        await anyio.sleep(3.0)
+        for each in stations:
+            each.send(ParamRequestList(0, 0))
+        await anyio.sleep(30.0)
+        for each in stations:
+            for vehicle in vehicles:
+                known = {value.param_id: value.raw for value in each.of(ParamValue, system=vehicle.system)}
+                wanted = {
+                    param.name: encode_value(param.settable, param.type_number, Encoding.BYTEWISE)
+                    for param in vehicle.listed
+                }
+                assert {name: known[name] for name in wanted} == wanted

@@ -1,0 +1,124 @@
+"""What no page and no program of ours sends: broken bodies, wrong types, odd addresses and tokens."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from paramclient.service import Tokens, add_token, create_app
+from tests.service.asgi import a_browser
+from tests.service.hub import V, problem, service, synced
+from tests.shell import VALUES, generic, in_simulated_time
+
+BODIES = [
+    b"",
+    b"null",
+    b"[]",
+    b"7",
+    b'"text"',
+    b"{",
+    b"\xff\xfe\x00",
+    b'{"value": 1e999}',
+    b'{"values": {"PARAM_04": ' + b"9" * 5_000 + b"}}",
+    b'{"value": NaN, "values": NaN, "reason": NaN, "at": NaN, "refresh": NaN, "text": NaN}',
+    b'{"value": "\\ud800", "values": {"\\ud800": "\\udfff"}, "reason": "\\ud800", "text": "\\ud800"}',
+    b'{"values": {"PARAM_04": {"deep": ' + b"[" * 5_000 + b"]" * 5_000 + b"}}}",
+    b'{"values": {"": 1}, "value": [], "at": {}, "file": 1, "only": 1, "include": "x", "force": 7}',
+]
+WRITES = [
+    ("PUT", "/params/PARAM_04"),
+    ("PATCH", "/params"),
+    ("POST", "/fetch"),
+    ("POST", "/plan"),
+    ("POST", "/apply"),
+    ("POST", "/restore"),
+    ("POST", "/snapshots"),
+]
+
+
+@pytest.mark.parametrize(("method", "what"), WRITES)
+@in_simulated_time
+async def test_no_broken_body_is_taken_or_breaks_the_service(method: str, what: str) -> None:
+    vehicle = generic()
+    async with service(vehicle) as (_, browser):
+        await synced(browser)
+        for body in BODIES:
+            for media_type in ("application/json", "text/plain"):
+                headers = {"Content-Type": media_type}
+                answer = await browser.request(method, f"{V}{what}", content=body, headers=headers)
+                assert 400 <= answer.status_code < 500, (body[:80], answer.text)
+                assert answer.headers["content-type"] == "application/problem+json"
+        assert {name: vehicle.param(name).value for name in VALUES} == VALUES
+
+
+@in_simulated_time
+async def test_odd_addresses_and_queries_are_problems() -> None:
+    async with service(generic()) as (_, browser):
+        await synced(browser)
+        for address in (
+            "/api/vehicles/0/1/params",
+            "/api/vehicles/256/1/params",
+            "/api/vehicles/one/1/params",
+            "/api/vehicles/1/-1/params",
+            f"/api/vehicles/{'9' * 5_000}/1/params",
+            f"{V}/params?at=0",
+            f"{V}/params?at={'9' * 5_000}",
+            f"{V}/params?at=2026-11-20T14:00",
+            f"{V}/params?link=" + "x" * 201,
+            f"{V}/params?ext=perhaps",
+            f"{V}/history?limit=0",
+            f"{V}/history?name=" + "N" * 17,
+            f"{V}/file?format=exe",
+        ):
+            problem(await browser.get(address), 422, "invalid-request")
+        for address in ("/api/nothing", "/api/vehicles/1/1", "/../tokens", "/%2e%2e/app.py", "/app.py"):
+            assert (await browser.get(address)).status_code == 404, address
+        for name in ("%00", "..%2F..%2Fetc", "%F0%9F%9B%A9", "A" * 17):
+            assert (await browser.get(f"{V}/params/{name}")).status_code in (404, 422), name
+            answer = await browser.put(f"{V}/params/{name}", json={"value": 1})
+            assert answer.status_code in (404, 422), name
+        assert (await browser.request("DELETE", f"{V}/params")).status_code == 405
+
+
+@in_simulated_time
+async def test_no_odd_token_is_valid(tmp_path: Path) -> None:
+    token = add_token(tmp_path / "tokens", "anna", "read")
+    async with service(generic(), app={"tokens": Tokens.read(tmp_path / "tokens")}) as (_, browser):
+        for given in (
+            b"",
+            b"Bearer",
+            b"Bearer ",
+            b"Basic " + token.encode(),
+            token.encode(),
+            b"Bearer " + token[:-1].encode(),
+            b"Bearer " + token.upper().encode(),
+            b"Bearer \xff\xfe" + token.encode(),
+            b"Bearer " + b"x" * 30_000,
+        ):
+            answer = await browser.get("/api/vehicles", headers={b"Authorization": given})
+            problem(answer, 401, "unauthorized")
+        problem(await browser.get(f"/api/vehicles?token={token}"), 401, "unauthorized")
+        assert (await browser.get("/api/vehicles", headers={"Authorization": f"bearer  {token}"})).is_success
+
+
+@in_simulated_time
+async def test_two_clients_at_once_each_get_their_own_answer() -> None:
+    vehicle = generic()
+    async with service(vehicle) as (hub, browser), a_browser(create_app(hub)) as other:
+        await synced(browser)
+        numbers = range(20, 40)
+
+        async def put(client: Any, number: int) -> dict[str, Any]:
+            answer = await client.put(f"{V}/params/PARAM_04", json={"value": number})
+            assert answer.is_success, answer.text
+            done: dict[str, Any] = answer.json()
+            return done
+
+        clients = [(browser, other)[number % 2] for number in numbers]
+        done = await asyncio.gather(*map(put, clients, numbers))
+        assert [(each["requested"], each["actual"]) for each in done] == [(each, each) for each in numbers]
+        values = [(await each.get(f"{V}/params/PARAM_04")).json()["value"] for each in (browser, other)]
+        assert values == [vehicle.param("PARAM_04").value] * 2
