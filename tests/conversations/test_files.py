@@ -184,7 +184,7 @@ async def test_a_silent_server_is_no_reply_and_a_file_that_is_cut_off_keeps_its_
         assert 5_000 < len(prefix) < 60_000
         assert CONTENT.startswith(prefix)
         with pytest.raises(NoReply):
-            await read_file(channel, "a.bin", open_attempts=3)
+            await read_file(channel, "a.bin", open_attempts=lambda: 3)
 
 
 @virtual_on_both
