@@ -17,7 +17,7 @@ from paramclient.cache.records import (
     default_value,
     written_value,
 )
-from paramclient.cache.sqlite import Transaction
+from paramclient.cache.schema import Transaction
 from paramclient.cache.tables import (
     identity_cells,
     load_rows,
@@ -176,7 +176,7 @@ def load_state(tx: Transaction, table: StoredTable, when: float) -> EarlierState
 
 def rows_of_table(rows: Mapping[str, StoredParam]) -> list[SnapshotRow]:
     """Return the parameters of a stored table as those of a snapshot."""
-    return [(name, row.stored, row.default) for name, row in rows.items()]
+    return [(name, row.stored, row.default) for name, row in rows.items() if row.stored is not None]
 
 
 def rows_of(params: ParamSet) -> list[SnapshotRow]:

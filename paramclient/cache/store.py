@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -21,12 +20,12 @@ from paramclient.cache.records import (
     CachedVehicle,
     HistoryEntry,
     SnapshotSummary,
-    StoredParam,
     StoredTable,
     TableUpdate,
 )
-from paramclient.cache.sqlite import SqliteStore, Transaction
-from paramclient.cache.tables import ensure_table, save_table
+from paramclient.cache.schema import Transaction
+from paramclient.cache.sqlite import SqliteStore
+from paramclient.cache.updates import ensure_table, import_tables, save_table
 from paramclient.errors import NotInCache, UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
@@ -141,44 +140,19 @@ class ParamCache:
         if updates or durable:
             self._store.run(work, writing=True, durable=durable)
 
-    def merge(
-        self, updates: Sequence[TableUpdate], *, based_on: Mapping[tuple[str, int], float] | None = None
-    ) -> None:
-        """Write earlier observations, such as those of a log, in one transaction.
+    def merge(self, updates: Sequence[TableUpdate]) -> None:
+        """Insert earlier observations, such as those of a log, by their times, in one transaction.
 
-        As `save`, but changes before the stored observations are inserted into the history by their times.
-        Repeating a merge changes nothing.
+        Later observations in the cache stay. Repeating a merge changes nothing.
 
         Args:
             updates: as for `save`, in the order of their times.
-            based_on: by key and component, `updated_at` of the stored tables on which the updates are based;
-                all other updates are independent of the stored tables.
 
         Raises:
             UsageError: a time is not in unix seconds.
         """
-        known = based_on or {}
-
-        def work(tx: Transaction) -> None:
-            earlier: dict[int, list[StoredParam]] = {}
-            stored: dict[tuple[str, int, bool], float | None] = {}  # `updated_at`, unless continued
-            for each in updates:
-                place = (each.identity.key, each.component, each.extended)
-                if place not in stored:
-                    before = tables.find_table(tx, each.identity.key, each.component, extended=each.extended)
-                    at = None if before is None else before.updated_at
-                    stored[place] = None if at == known.get(place[:2]) else at
-                last = stored[place]
-                is_apart = last is not None and each.at <= last
-                if each.replace and not is_apart:
-                    stored[place] = last = None
-                owner, found = save_table(tx, each, math.inf, keeps_state=last is not None, is_apart=is_apart)
-                earlier.setdefault(owner, []).extend(found)
-            for owner, items in earlier.items():
-                history.insert_observations(tx, owner, tables.load_rows(tx, owner), items)
-
         if updates:
-            self._store.run(work, writing=True)
+            self._store.run(lambda tx: import_tables(tx, updates), writing=True)
 
     def load(self, key: str, component: int, *, extended: bool = False) -> CachedComponent | None:
         """Return the table of a vehicle's component; None if there is none.
