@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from operator import attrgetter, itemgetter
 from typing import Any, Final, NamedTuple
 
+from paramclient.cache.database import Transaction
 from paramclient.cache.records import (
     BY_VEHICLE,
     HistoryEntry,
@@ -20,7 +21,6 @@ from paramclient.cache.records import (
     is_same_value,
     stored_value,
 )
-from paramclient.cache.schema import Transaction
 
 __all__ = [
     "HISTORY_ENTRIES_MAX",

@@ -163,31 +163,6 @@ class TableState:
     file_works: bool | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class StoredTable:
-    """A stored table without its parameters.
-
-    Attributes:
-        owner: its id in this cache.
-        key: key of the vehicle.
-        component: component id.
-        autopilot: MAV_AUTOPILOT of the component's heartbeat.
-        size: number of parameters.
-        updated_at: time of the last update.
-        known_since: time since which its states are known, or None.
-        state: its state.
-    """
-
-    owner: int
-    key: str
-    component: int
-    autopilot: int
-    size: int
-    updated_at: float
-    known_since: float | None
-    state: TableState
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TableUpdate:
     """Update of the table of one component.
@@ -293,8 +268,8 @@ class CachedVehicle:
         )
 
 
-@dataclass(frozen=True, slots=True, repr=False)
-class CachedSummary:
+@dataclass(frozen=True, slots=True, repr=False, kw_only=True)
+class CachedSummary(TableState):
     """The cached table of one component, without its parameters.
 
     Attributes:
@@ -303,7 +278,6 @@ class CachedSummary:
         component: component id.
         autopilot: MAV_AUTOPILOT of this component's heartbeat.
         size: number of cached parameters.
-        hash, count, complete, volatile_known, synced_at, file_works: as in `TableState`.
         updated_at: time of the last write to the table.
     """
 
@@ -312,13 +286,7 @@ class CachedSummary:
     component: int
     autopilot: int
     size: int
-    hash: int | None
-    count: int | None
-    complete: bool
-    volatile_known: bool
-    synced_at: float | None
     updated_at: float
-    file_works: bool | None
 
     @property
     def system(self) -> int:
@@ -345,6 +313,20 @@ class CachedComponent(CachedSummary):
     params: ParamMap = field(hash=False)
     volatile: frozenset[str]
     heard_at: Mapping[str, float] = field(hash=False)
+
+
+class StoredTable(NamedTuple):
+    """A stored table without its parameters.
+
+    Attributes:
+        owner: its id in this cache.
+        known_since: time since which its states are known, or None.
+        summary: its description for users.
+    """
+
+    owner: int
+    known_since: float | None
+    summary: CachedSummary
 
 
 def stored_params(rows: Mapping[str, StoredParam]) -> dict[str, Param]:

@@ -12,14 +12,13 @@ import itertools
 import logging
 import os
 import sqlite3
-import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Final, TypeVar
 
-from paramclient.cache.schema import SCHEMA_VERSION, TABLES, Transaction
+from paramclient.cache.database import SCHEMA_VERSION, TABLES, Store, Transaction
 from paramclient.errors import CacheError, ParamClientError
 
 __all__ = ["SqliteStore"]
@@ -28,8 +27,6 @@ APPLICATION_ID: Final = 0x5041524D
 """Application id of paramclient in the header of the file: `PARM`."""
 LOCK_WAIT_MAX: Final = 5.0
 """Seconds for which a call waits while another process writes. Transactions take milliseconds."""
-CALL_ATTEMPTS_MAX: Final = 3
-"""Attempts of one call: the file may be set aside, and another process may replace it, once each."""
 WAL_SWITCH_INTERVAL: Final = 0.01
 """Seconds between two attempts to switch a new file to WAL mode: SQLite does not wait for other processes."""
 
@@ -57,92 +54,29 @@ class _Replaced(Exception):
     """The open file is no longer the one under the path."""
 
 
-class SqliteStore:
-    """A cache in a file, opened by the first call. Thread-safe. Reading creates no file.
+class SqliteStore(Store):
+    """A cache in a file. Reading creates no file.
 
     A file that is damaged, of another version of paramclient or no cache is renamed, with a warning in the
     log, and a new one is created. No file is deleted.
 
     Args:
         path: the file, absolute.
-
-    Attributes:
-        place: the file, for messages.
-        notes: one text for each file that was set aside.
-        replacements: number of times that another file has taken the place of one that was used.
     """
 
     def __init__(self, path: Path) -> None:
-        self.place = str(path)
-        self.notes: list[str] = []
-        self.replacements = 0
+        super().__init__(str(path))
         self._path = path
-        self._lock = threading.Lock()
-        self._connection: sqlite3.Connection | None = None
         self._file: tuple[int, int] | None = None  # device and inode of the open file
         self._is_read_only = False  # whether the file is opened as one that nobody writes
-        self._is_closed = False
-
-    def run(self, work: Callable[[Transaction], T], *, writing: bool, durable: bool = False) -> T:
-        """Run a function in one transaction and return its result: either all or nothing is written.
-
-        Args:
-            work: the function. It may run again from the start.
-            writing: whether it writes.
-            durable: return only when this and all earlier transactions are safe from power loss.
-
-        Raises:
-            CacheError: the file cannot be used. Nothing was written.
-        """
-        with self._lock:
-            if self._is_closed:
-                raise CacheError(f"the cache {self.place} is closed")
-            for _ in range(CALL_ATTEMPTS_MAX):
-                if self._file is not None and self._which() != self._file:  # deleted, renamed or replaced
-                    self._drop()
-                    self._file = None
-                    self.replacements += 1
-                try:
-                    if not writing and not self._path.exists():
-                        return _read_nothing(work)
-                    return self._transact(work, writing=writing, durable=durable)
-                except _Replaced:
-                    self._drop()
-                except _Unusable as error:
-                    self._set_aside(str(error))
-                except sqlite3.DatabaseError as error:
-                    self._drop()
-                    if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGE:
-                        self._set_aside("damaged")
-                        continue
-                    is_unwritable = getattr(error, "sqlite_errorcode", 0) in _UNWRITABLE
-                    if is_unwritable and not writing and not self._is_read_only:
-                        self._is_read_only = True
-                        continue
-                    raise CacheError(f"the cache {self.place} cannot be used: {error}") from error
-                except OSError as error:
-                    self._drop()
-                    raise CacheError(f"the cache {self.place} cannot be used: {error}") from error
-                except ParamClientError:
-                    self._drop()
-                    raise
-                except Exception as error:  # a value that this program cannot have written, or cannot write
-                    if self._is_sound():
-                        raise CacheError(f"the cache {self.place} cannot be used: {error!r}") from error
-                    self._set_aside("damaged")
-                except BaseException:
-                    self._drop()
-                    raise
-            raise CacheError(f"the cache {self.place} was replaced {CALL_ATTEMPTS_MAX} times during one call")
-
-    def close(self) -> None:
-        """Close it; later calls raise CacheError."""
-        with self._lock:
-            self._is_closed = True
-            self._drop()
 
     def _transact(self, work: Callable[[Transaction], T], *, writing: bool, durable: bool) -> T:
-        """Run one attempt. After an error, closing the connection rolls the transaction back."""
+        if self._file is not None and self._which() != self._file:  # deleted, renamed or replaced
+            self._drop()
+            self._file = None
+            self.replacements += 1
+        if not writing and not self._path.exists():
+            return _read_nothing(work)
         if writing and self._is_read_only:
             self._drop()
             self._is_read_only = False
@@ -168,6 +102,27 @@ class SqliteStore:
             raise _Replaced
         return result
 
+    def _recover(self, error: BaseException, *, writing: bool) -> None:
+        code = getattr(error, "sqlite_errorcode", 0)
+        match error:
+            case _Replaced():
+                return
+            case _Unusable():
+                self._set_aside(str(error))
+            case sqlite3.DatabaseError() if code & 0xFF in _DAMAGE:
+                self._set_aside("damaged")
+            case sqlite3.DatabaseError() if code in _UNWRITABLE and not writing and not self._is_read_only:
+                self._is_read_only = True
+            case sqlite3.DatabaseError() | OSError():
+                raise CacheError(f"the cache {self.place} cannot be used: {error}") from error
+            case Exception() if not isinstance(error, ParamClientError):
+                # a value that this program cannot have written, or cannot write
+                if self._is_sound():
+                    raise CacheError(f"the cache {self.place} cannot be used: {error!r}") from error
+                self._set_aside("damaged")
+            case _:
+                raise error
+
     def _open(self, *, writing: bool) -> sqlite3.Connection:
         if writing:
             self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -186,15 +141,12 @@ class SqliteStore:
         return connection
 
     def _is_sound(self) -> bool:
-        """Return whether SQLite finds the open file undamaged, and close it."""
+        """Return whether SQLite finds the file undamaged."""
         try:
-            return self._connection is None or self._connection.execute(
-                "PRAGMA quick_check(1)"
-            ).fetchall() == [("ok",)]
-        except sqlite3.Error:
+            with closing(self._open(writing=False)) as connection:
+                return connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
+        except (sqlite3.Error, OSError):
             return False
-        finally:
-            self._drop()
 
     def _which(self) -> tuple[int, int] | None:
         """Return device and inode of the file under the path; None if there is none."""
@@ -208,7 +160,6 @@ class SqliteStore:
 
     def _set_aside(self, kind: str) -> None:
         """Rename the file that was open, with its -wal and -shm; unless another process has done so."""
-        self._drop()
         if self._which() != self._file:
             return
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
@@ -222,12 +173,6 @@ class SqliteStore:
             raise CacheError(f"the cache {self.place} is {kind}, and cannot be renamed: {error}") from error
         self.notes.append(f"the cache {self.place} is {_KINDS[kind]}. It is kept as {name}; a new one begins")
         logger.warning("%s", self.notes[-1])
-
-    def _drop(self) -> None:
-        connection, self._connection = self._connection, None
-        if connection is not None:
-            with suppress(sqlite3.Error):
-                connection.close()
 
 
 _KINDS: Final = {

@@ -8,11 +8,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import platformdirs
 
 from paramclient.cache import history, snapshots, tables
+from paramclient.cache.database import Store, Transaction
 from paramclient.cache.lookup import find_vehicle
 from paramclient.cache.records import (
     CachedComponent,
@@ -23,7 +24,6 @@ from paramclient.cache.records import (
     StoredTable,
     TableUpdate,
 )
-from paramclient.cache.schema import Transaction
 from paramclient.cache.sqlite import SqliteStore
 from paramclient.cache.updates import ensure_table, import_tables, save_table
 from paramclient.errors import NotInCache, UsageError
@@ -31,9 +31,6 @@ from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 
 __all__ = ["ParamCache", "default_path", "is_database_url"]
-
-if TYPE_CHECKING:
-    from paramclient.cache.postgres import PostgresStore
 
 T = TypeVar("T")
 
@@ -74,7 +71,7 @@ class ParamCache:
     """
 
     def __init__(self, path: str | os.PathLike[str] | None = None) -> None:
-        self._store: SqliteStore | PostgresStore
+        self._store: Store
         if is_database_url(path):
             try:
                 from paramclient.cache.postgres import PostgresStore  # psycopg is an extra
@@ -179,9 +176,12 @@ class ParamCache:
             UnknownVehicle: no vehicle in the cache has this name.
             AmbiguousVehicle: several vehicles have this name.
         """
-        return self._read(
-            lambda tx: tables.load_summaries(tx, None if vehicle is None else self._choose(tx, vehicle))
-        )
+
+        def work(tx: Transaction) -> list[CachedSummary]:
+            found = tables.load_tables(tx, None if vehicle is None else self._choose(tx, vehicle))
+            return [each.summary for each in found]
+
+        return self._read(work)
 
     def component(
         self,
@@ -219,7 +219,7 @@ class ParamCache:
         return self._read(
             lambda tx: {
                 (each.key, each.component): each.size
-                for each in tables.load_tables(tx, extended=True)
+                for _, _, each in tables.load_tables(tx, extended=True)
                 if each.size
             }
         )
@@ -312,21 +312,20 @@ class ParamCache:
         def work(tx: Transaction) -> SnapshotSummary:
             if isinstance(vehicle, str):
                 table = self._table(tx, vehicle, component, extended=extended)
-                [known] = tables.load_vehicles(tx, table.key)
-                identity = known.identity
+                identity = table.summary.identity
             else:
+                table = ensure_table(tx, vehicle, component, moment, extended=extended)
                 identity = vehicle
-                table = ensure_table(tx, identity, component, moment, extended=extended)
-            kept = snapshots.rows_of_table(tables.load_rows(tx, table.owner)) if rows is None else rows
+            known = rows is None
             return snapshots.store_snapshot(
                 tx,
                 table,
                 identity,
-                kept,
+                snapshots.rows_of_table(tables.load_rows(tx, table.owner)) if rows is None else rows,
                 at=moment,
                 reason=reason,
-                hash=table.state.hash if rows is None else hash,
-                complete=table.state.complete if rows is None else complete,
+                hash=table.summary.hash if known else hash,
+                complete=table.summary.complete if known else complete,
                 is_of_operation=is_of_operation,
             )
 
@@ -386,7 +385,7 @@ class ParamCache:
 
         def work(tx: Transaction) -> ParamSet:
             table = self._table(tx, vehicle, component, extended=extended)
-            return replace(snapshots.load_state(tx, table, when).params, is_extended=extended)
+            return replace(snapshots.load_state(tx, table, when), is_extended=extended)
 
         return self._read(work)
 

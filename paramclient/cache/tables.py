@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Iterable
-from dataclasses import asdict, astuple, replace
+from dataclasses import astuple, fields, replace
 from typing import Any, Final
 
+from paramclient.cache.database import IDENTITY, Transaction
 from paramclient.cache.records import (
     CachedComponent,
     CachedSummary,
     CachedVehicle,
     StoredParam,
     StoredTable,
-    TableState,
     stored_params,
     stored_value,
 )
-from paramclient.cache.schema import IDENTITY, Transaction
 from paramclient.errors import UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
@@ -28,7 +27,6 @@ __all__ = [
     "identity_cells",
     "load_component",
     "load_rows",
-    "load_summaries",
     "load_tables",
     "load_vehicles",
     "read_identity",
@@ -38,6 +36,9 @@ __all__ = [
 
 YEAR_10000: Final = 253402300800.0
 """Unix seconds at the start of the year 10000, above every stored time."""
+
+
+_IDENTITY_OF_VEHICLE: Final = ", ".join(f"vehicle.{column}" for column in IDENTITY.split(", "))
 
 
 def time_cell(at: float) -> float:
@@ -66,23 +67,41 @@ def read_identity(cells: Iterable[Any]) -> Identity:
 def load_tables(
     tx: Transaction, key: str | None = None, component: int | None = None, *, extended: bool = False
 ) -> list[StoredTable]:
-    """Return tables, ordered by component id, optionally of one vehicle or component."""
+    """Return tables, those of the last seen vehicle first, then by component id; optionally of one vehicle or
+    component."""
     given = {"vehicle": key, "component": component, "extended": int(extended)}
     known = {column: value for column, value in given.items() if value is not None}
     found = tx.all(
-        "SELECT id, vehicle, component, autopilot,"
-        " (SELECT count(*) FROM parameter WHERE owner = component.id AND type IS NOT NULL),"
-        " updated_at, known_since, hash, param_count, complete, volatile_known, synced_at, file_works"
-        f" FROM component WHERE {' AND '.join(f'{column} = ?' for column in known)} ORDER BY component",
+        "SELECT id, known_since, vehicle, component, component.autopilot,"
+        " (SELECT count(*) FROM parameter WHERE owner = component.id AND type IS NOT NULL), updated_at,"
+        f" hash, param_count, complete, volatile_known, synced_at, file_works, {_IDENTITY_OF_VEHICLE}"
+        " FROM component JOIN vehicle ON vehicle.key = component.vehicle"
+        f" WHERE {' AND '.join(f'{column} = ?' for column in known)}"
+        " ORDER BY last_seen DESC, vehicle, component",
         tuple(known.values()),
     )
-    tables = []
-    for *described, hash_, count, complete, volatile_known, synced_at, file_works in found:
-        works = None if file_works is None else bool(file_works)
-        state = TableState(hash_, count, bool(complete), bool(volatile_known), synced_at, works)
-        owner, vehicle, number, autopilot, size, updated_at, known_since = described
-        tables.append(StoredTable(owner, vehicle, number, autopilot, size, updated_at, known_since, state))
-    return tables
+    return [
+        StoredTable(
+            owner,
+            known_since,
+            CachedSummary(
+                hash=hash_,
+                count=count,
+                complete=bool(complete),
+                volatile_known=bool(volatile_known),
+                synced_at=synced_at,
+                file_works=None if file_works is None else bool(file_works),
+                key=vehicle,
+                identity=read_identity(identity),
+                component=number,
+                autopilot=autopilot,
+                size=size,
+                updated_at=updated_at,
+            ),
+        )
+        for owner, known_since, vehicle, number, autopilot, size, updated_at, *state_and_identity in found
+        for hash_, count, complete, volatile_known, synced_at, file_works, *identity in [state_and_identity]
+    ]
 
 
 def find_table(tx: Transaction, key: str, component: int, *, extended: bool = False) -> StoredTable | None:
@@ -90,41 +109,17 @@ def find_table(tx: Transaction, key: str, component: int, *, extended: bool = Fa
     return next(iter(load_tables(tx, key, component, extended=extended)), None)
 
 
-def load_vehicles(tx: Transaction, key: str | None = None) -> list[CachedVehicle]:
-    """Return all vehicles, the last seen first; or the one with this key."""
-    of_key, where, values = ("", "", ()) if key is None else (" AND vehicle = ?", " WHERE key = ?", (key,))
+def load_vehicles(tx: Transaction) -> list[CachedVehicle]:
+    """Return all vehicles, the last seen first."""
     components: dict[str, list[int]] = defaultdict(list)
     for vehicle, component in tx.all(
-        f"SELECT vehicle, component FROM component WHERE extended = 0{of_key} ORDER BY component", values
+        "SELECT vehicle, component FROM component WHERE extended = 0 ORDER BY component"
     ):
         components[vehicle].append(component)
-    rows = tx.all(f"SELECT key, first_seen, last_seen, {IDENTITY} FROM vehicle{where}", values)
-    found = [
+    rows = tx.all(f"SELECT key, first_seen, last_seen, {IDENTITY} FROM vehicle ORDER BY last_seen DESC, key")
+    return [
         CachedVehicle(vehicle, read_identity(cells), first, last, tuple(components[vehicle]))
         for vehicle, first, last, *cells in rows
-    ]
-    return sorted(found, key=lambda each: (-each.last_seen, each.key))
-
-
-def load_summaries(
-    tx: Transaction, key: str | None = None, component: int | None = None, *, extended: bool = False
-) -> list[CachedSummary]:
-    """Return tables without their parameters, optionally of one vehicle or component."""
-    of_vehicle: dict[str, list[StoredTable]] = defaultdict(list)
-    for table in load_tables(tx, key, component, extended=extended):
-        of_vehicle[table.key].append(table)
-    return [
-        CachedSummary(
-            key=table.key,
-            identity=vehicle.identity,
-            component=table.component,
-            autopilot=table.autopilot,
-            size=table.size,
-            updated_at=table.updated_at,
-            **asdict(table.state),
-        )
-        for vehicle in load_vehicles(tx, key)
-        for table in of_vehicle[vehicle.key]
     ]
 
 
@@ -167,11 +162,10 @@ def load_component(
     rows = load_rows(tx, table.owner)
     params = stored_params(rows)
     volatile = frozenset(name for name, row in rows.items() if row.volatile)
-    [summary] = load_summaries(tx, key, component, extended=extended)
-    described = {name: getattr(summary, name) for name in CachedSummary.__slots__}
-    if summary.hash is not None and summary.volatile_known:
+    described = {each.name: getattr(table.summary, each.name) for each in fields(table.summary)}
+    if table.summary.volatile_known:
         bits = {name: param.bits for name, param in params.items() if param.index is not None}
-        if hash_bits(bits, leave_out=volatile) != summary.hash:
+        if hash_bits(bits, leave_out=volatile) != table.summary.hash:
             described["hash"] = None
     return CachedComponent(
         **described,
@@ -185,6 +179,6 @@ def remove_tables(tx: Transaction, key: str, component: int | None) -> int:
     """Delete a vehicle's tables with history and snapshots. Return the number of plain tables."""
     removed = load_tables(tx, key, component)
     for table in removed:
-        tx.do("DELETE FROM component WHERE vehicle = ? AND component = ?", (key, table.component))
+        tx.do("DELETE FROM component WHERE vehicle = ? AND component = ?", (key, table.summary.component))
     tx.do("DELETE FROM vehicle WHERE key NOT IN (SELECT vehicle FROM component)")
     return len(removed)

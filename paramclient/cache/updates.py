@@ -15,9 +15,9 @@ from dataclasses import replace
 from operator import attrgetter
 from typing import Final
 
+from paramclient.cache.database import IDENTITY, Transaction
 from paramclient.cache.history import Line, add_lines, load_lines, merged_lines
 from paramclient.cache.records import StoredParam, StoredTable, TableState, TableUpdate, is_same_value
-from paramclient.cache.schema import IDENTITY, Transaction
 from paramclient.cache.tables import find_table, identity_cells, load_rows, time_cell
 from paramclient.model.identity import Identity
 
@@ -86,8 +86,8 @@ def save_table(tx: Transaction, update: TableUpdate, now: float) -> None:
             rows[item.name] = item
             is_rehashed = is_rehashed or item.hashed != (old and old.hashed)
     add_lines(tx, owner, lines)
-    kept = TableState() if before is None else before.state
-    is_late = before is not None and update.at < before.updated_at <= horizon
+    kept = TableState() if before is None else before.summary
+    is_late = before is not None and update.at < before.summary.updated_at <= horizon
     state = _state_to_write(update, kept, agrees=agrees, is_late=is_late) if is_whole else None
     if state is not None:
         _write_state(tx, owner, state, update, kept)

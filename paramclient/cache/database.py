@@ -1,4 +1,4 @@
-"""The tables of the cache, in the one SQL text for SQLite and PostgreSQL, and transactions on them.
+"""The tables of the cache in one SQL text for SQLite and PostgreSQL, and the store that runs transactions.
 
 A new column or another meaning needs another `SCHEMA_VERSION`: a file of another version is set aside, and a
 database keeps each version in a schema of its own. Values are marked by `?`.
@@ -6,10 +6,15 @@ database keeps each version in a schema of its own. Values are marked by `?`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Final
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any, Final, TypeVar
 
-__all__ = ["IDENTITY", "SCHEMA_VERSION", "TABLES", "Transaction"]
+from paramclient.errors import CacheError
+
+__all__ = ["IDENTITY", "SCHEMA_VERSION", "TABLES", "Store", "Transaction"]
 
 SCHEMA_VERSION: Final = 21
 """Version of the tables. Unreleased versions had lower numbers."""
@@ -110,6 +115,11 @@ TABLES: Final = (
 """Statements that create the tables. `{id}` is a number that is never used again, `{clustered}` stores the
 rows in the order of the primary key."""
 
+CALL_ATTEMPTS_MAX: Final = 3
+"""Attempts of one call: the file may be set aside, and another process may replace it, once each."""
+
+T = TypeVar("T")
+
 
 class Transaction:
     """Runs the statements of one transaction. A write transaction excludes all others.
@@ -138,3 +148,66 @@ class Transaction:
 
     def _marked(self, sql: str) -> str:
         return sql.replace("?", self._mark)
+
+
+class Store(ABC):
+    """A file or a database with the tables, opened by the first call. Thread-safe.
+
+    Args:
+        place: the file, or the URL of the database without password, for messages.
+
+    Attributes:
+        place: as given.
+        notes: one text for each file that was set aside.
+        replacements: number of times that another file has taken the place of one that was used.
+    """
+
+    def __init__(self, place: str) -> None:
+        self.place = place
+        self.notes: list[str] = []
+        self.replacements = 0
+        self._connection: Any = None
+        self._lock = threading.Lock()
+        self._is_closed = False
+
+    def run(self, work: Callable[[Transaction], T], *, writing: bool, durable: bool = False) -> T:
+        """Run a function in one transaction and return its result: either all or nothing is written.
+
+        Args:
+            work: the function. It may run again from the start.
+            writing: whether it writes.
+            durable: return only when this and all earlier transactions are safe from power loss.
+
+        Raises:
+            CacheError: the cache cannot be used. Nothing was written.
+        """
+        with self._lock:
+            if self._is_closed:
+                raise CacheError(f"the cache {self.place} is closed")
+            for _ in range(CALL_ATTEMPTS_MAX):
+                try:
+                    return self._transact(work, writing=writing, durable=durable)
+                except BaseException as error:
+                    self._drop()  # this rolls the transaction back
+                    self._recover(error, writing=writing)
+            raise CacheError(f"the cache {self.place} was replaced {CALL_ATTEMPTS_MAX} times during one call")
+
+    def close(self) -> None:
+        """Close it; later calls raise CacheError."""
+        with self._lock:
+            self._is_closed = True
+            self._drop()
+
+    @abstractmethod
+    def _transact(self, work: Callable[[Transaction], T], *, writing: bool, durable: bool) -> T:
+        """Run one attempt."""
+
+    @abstractmethod
+    def _recover(self, error: BaseException, *, writing: bool) -> None:
+        """Return if another attempt may succeed after an error; raise otherwise."""
+
+    def _drop(self) -> None:
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            with suppress(Exception):
+                connection.close()
