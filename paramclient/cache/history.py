@@ -101,8 +101,8 @@ def load_history(
     limit: int | None,
     since: float | None,
     extended: bool,
-) -> list[tuple[int, Line]]:
-    """Return the changes of a vehicle's values with their component ids, newest last."""
+) -> list[HistoryEntry]:
+    """Return the changes of a vehicle's values, newest last."""
     given = {"c.component = ?": component, "h.name = ?": name, "h.at >= ?": since}
     conditions = {condition: value for condition, value in given.items() if value is not None}
     found = tx.all(
@@ -113,14 +113,12 @@ def load_history(
         f" ORDER BY h.at DESC, h.id DESC{'' if limit is None or limit < 0 else f' LIMIT {int(limit)}'}",
         (key, int(extended), *conditions.values()),
     )
-    return [(component, _line(row)) for *row, component in reversed(found)]
-
-
-def entry_of(component: int, line: Line) -> HistoryEntry:
-    """Return a line as users see it."""
-    assert line.old is not None
-    new = None if line.new is None else line.new.param(line.name)
-    return HistoryEntry(line.at, component, line.name, line.old.param(line.name), new, line.by)
+    return [
+        HistoryEntry(at, number, name, old.param(name), new and new.param(name), by)
+        for *row, number in reversed(found)
+        for at, name, by, _, old, new in [_line(row)]
+        if old is not None
+    ]
 
 
 def values_at(

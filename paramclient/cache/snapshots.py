@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Any, Final, TypeAlias
+from typing import Final, TypeAlias
 
 from paramclient.cache.database import Transaction
 from paramclient.cache.history import values_at
@@ -167,19 +167,13 @@ def rows_of(params: ParamSet) -> list[SnapshotRow]:
 
 
 def _of_snapshot(tx: Transaction, table: StoredTable, number: int) -> ParamSet:
-    key = table.summary.key
-    kept: dict[int, Any] = {
-        each: (at, described)
-        for each, at, described in tx.all(
-            "SELECT id, at, identity FROM snapshot WHERE owner = ? ORDER BY id", (table.owner,)
-        )
-    }
-    if number not in kept:
-        listed = f"those kept are {', '.join(map(str, kept))}" if kept else "none is kept"
-        raise NotInCache(
-            f"there is no snapshot {number} of {key}, component {table.summary.component}: {listed}"
-        )
-    at, described = kept[number]
+    key, component = table.summary.key, table.summary.component
+    found = tx.all("SELECT at, identity FROM snapshot WHERE owner = ? AND id = ?", (table.owner, number))
+    if not found:
+        kept = [str(each.id) for each in load_snapshots(tx, table)]
+        listed = f"those kept are {', '.join(kept)}" if kept else "none is kept"
+        raise NotInCache(f"there is no snapshot {number} of {key}, component {component}: {listed}")
+    [(at, described)] = found
     rows: list[SnapshotRow] = [
         (name, StoredValue(*value), default)
         for name, default, *value in tx.all(

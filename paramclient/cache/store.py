@@ -158,7 +158,12 @@ class ParamCache:
             key: `Identity.key`.
             component: component id.
         """
-        return self._read(lambda tx: tables.load_component(tx, key, component, extended=extended))
+
+        def work(tx: Transaction) -> CachedComponent | None:
+            table = tables.find_table(tx, key, component, extended=extended)
+            return None if table is None else tables.load_component(tx, table)
+
+        return self._read(work)
 
     def vehicles(self) -> list[CachedVehicle]:
         """Return all vehicles, the last seen first."""
@@ -206,11 +211,8 @@ class ParamCache:
         """
 
         def work(tx: Transaction) -> CachedComponent:
-            key = self._choose(tx, vehicle, system=system, component=component)
-            found = tables.load_component(tx, key, component, extended=extended)
-            if found is None:  # only of extended parameters: a component has a plain table
-                raise NotInCache(f"{key}, component {component}, has no extended parameters in the cache")
-            return found
+            table = self._table(tx, vehicle, component, system=system, extended=extended)
+            return tables.load_component(tx, table)
 
         return self._read(work)
 
@@ -267,8 +269,7 @@ class ParamCache:
             AmbiguousVehicle: several vehicles have this name.
         """
         which = (component, name, limit, since, extended)
-        found = self._read(lambda tx: history.load_history(tx, self._choose(tx, vehicle), *which))
-        return [history.entry_of(number, line) for number, line in found]
+        return self._read(lambda tx: history.load_history(tx, self._choose(tx, vehicle), *which))
 
     def store_snapshot(
         self,
@@ -392,9 +393,17 @@ class ParamCache:
     def _read(self, work: Callable[[Transaction], T]) -> T:
         return self._store.run(work, writing=False)
 
-    def _table(self, tx: Transaction, vehicle: str, component: int, *, extended: bool = False) -> StoredTable:
-        """Return the table of the only vehicle with this name."""
-        key = self._choose(tx, vehicle, component=component)
+    def _table(
+        self,
+        tx: Transaction,
+        vehicle: str | None,
+        component: int,
+        *,
+        system: int | None = None,
+        extended: bool = False,
+    ) -> StoredTable:
+        """Return the table of the only vehicle that matches."""
+        key = self._choose(tx, vehicle, system=system, component=component)
         table = tables.find_table(tx, key, component, extended=extended)
         if table is None:  # only of extended parameters: a component has a plain table
             raise NotInCache(f"{key}, component {component}, has no extended parameters in the cache")

@@ -149,16 +149,11 @@ def load_rows(tx: Transaction, owner: int, names: Collection[str] | None = None)
     }
 
 
-def load_component(
-    tx: Transaction, key: str, component: int, *, extended: bool = False
-) -> CachedComponent | None:
-    """Return a table; None if there is none.
+def load_component(tx: Transaction, table: StoredTable) -> CachedComponent:
+    """Return a table with its parameters.
 
     A hash that the stored values do not have is left out: it cannot confirm them.
     """
-    table = find_table(tx, key, component, extended=extended)
-    if table is None:
-        return None
     rows = load_rows(tx, table.owner)
     params = stored_params(rows)
     volatile = frozenset(name for name, row in rows.items() if row.volatile)

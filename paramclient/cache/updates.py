@@ -45,23 +45,17 @@ def ensure_table(
     tx: Transaction, identity: Identity, component: int, at: float, *, extended: bool
 ) -> StoredTable:
     """Return the table of a vehicle's component, which is created if there is none."""
-    table = find_table(tx, identity.key, component, extended=extended)
-    if table is None:
-        autopilot = identity.autopilot if component == 1 else 0
-        new = TableUpdate(
-            identity=identity, component=component, autopilot=autopilot, at=at, extended=extended
-        )
-        _upsert_table(tx, new, math.inf)
-        table = find_table(tx, identity.key, component, extended=extended)
-    assert table is not None
-    return table
+    autopilot = identity.autopilot if component == 1 else 0
+    new = TableUpdate(identity=identity, component=component, autopilot=autopilot, at=at, extended=extended)
+    found = find_table(tx, identity.key, component, extended=extended)
+    return _upsert_table(tx, new, math.inf) if found is None else found
 
 
 def save_table(tx: Transaction, update: TableUpdate, now: float) -> None:
     """Write an update with its history lines; `now` is the current time in unix seconds."""
     horizon = max(now, update.at) + CLOCK_SLACK
     before = find_table(tx, update.identity.key, update.component, extended=update.extended)
-    owner = _upsert_table(tx, update, horizon)
+    owner = _upsert_table(tx, update, horizon).owner
     names = {item.name for item in update.params}
     is_all = update.replace or len(names) > NAMES_SELECTED_MAX
     rows = load_rows(tx, owner, None if is_all else names)
@@ -104,7 +98,7 @@ def import_tables(tx: Transaction, updates: Iterable[TableUpdate]) -> None:
     of_new_tables: dict[int, TableUpdate] = {}
     for each in updates:
         is_new = find_table(tx, each.identity.key, each.component, extended=each.extended) is None
-        owner = _upsert_table(tx, each, math.inf)
+        owner = _upsert_table(tx, each, math.inf).owner
         if is_new or owner in of_new_tables:
             of_new_tables[owner] = each
         observed.setdefault(owner, []).extend(each.params)
@@ -230,8 +224,8 @@ def _write_state(
         tx.do("UPDATE component SET known_since = ? WHERE id = ? AND known_since IS NULL", (update.at, owner))
 
 
-def _upsert_table(tx: Transaction, update: TableUpdate, horizon: float) -> int:
-    """Write the vehicle and component of an update, and return the id of the table, which may be new.
+def _upsert_table(tx: Transaction, update: TableUpdate, horizon: float) -> StoredTable:
+    """Write the vehicle and component of an update, and return the table, which may be new.
 
     Later information about the vehicle stays. A firmware other than the stored one removes what belongs to
     the previous one: defaults, and whether the vehicle serves its parameters as a file.
@@ -264,4 +258,4 @@ def _upsert_table(tx: Transaction, update: TableUpdate, horizon: float) -> int:
     )
     table = find_table(tx, key, update.component, extended=update.extended)
     assert table is not None
-    return table.owner
+    return table
