@@ -2,7 +2,7 @@
 
 - `store`: `ParamCache`, the public class, and the default path of the file.
 - `records`: records that the cache stores and returns.
-- `schema`: the one SQL text of the tables; `sqlite`: a file that stores them; `postgres`: a database.
+- `database`: the tables in one SQL text, and the store; `sqlite`, `postgres`: its two kinds of place.
 - `tables`: reads of tables; `updates`: updates of tables, import by time.
 - `history`: lines of changes, values at an earlier time.
 - `snapshots`: snapshots, and tables at an earlier time.
