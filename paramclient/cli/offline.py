@@ -92,7 +92,7 @@ def show(
             store = MetadataStore.beside(ParamCache(options.cache).path)
             return store.known_of_sets(sets) if given is None else [given] * len(sets)
 
-        return show_file(open_file(vehicle), known, changed=changed, json=options.json)
+        return show_file(open_file(vehicle, partial=True), known, changed=changed, json=options.json)
     name_patterns = tuple(check_given(names))
     described = from_file(metadata, offline=True)
     is_log = vehicle is not None and vehicle.lower().startswith("replay:")

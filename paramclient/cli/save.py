@@ -35,14 +35,19 @@ from paramclient.cli.sources import (
     whole_table,
 )
 from paramclient.errors import UsageError, VehicleError
-from paramclient.files import FileFormat, write_file
+from paramclient.files import FileFormat, writable, write_file
 from paramclient.files.formats import AUTOPILOT, address, format_of_name
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import default_of
 from paramclient.model.names import NameChoice
 from paramclient.model.paramset import ParamSet
-from paramclient.model.wording import counted
-from paramclient.provision.vehicle_params import NO_DEFAULTS, cached_param_set, select_non_defaults
+from paramclient.model.wording import counted, first_of
+from paramclient.provision.vehicle_params import (
+    NAMES_SHOWN_MAX,
+    NO_DEFAULTS,
+    cached_param_set,
+    select_non_defaults,
+)
 
 __all__ = ["save"]
 
@@ -85,7 +90,8 @@ async def save(
             those of its metadata.
         only: Write only this name or pattern, such as "MC_*". May be given several times.
         refresh: Download all parameters even if the cache is up to date.
-        incomplete: Write the parameters that were received where others were not; the file names these.
+        incomplete: Write the parameters that were received and that the file format can hold, where others
+            were not; the file names these.
         metadata: With --changed, a file with the firmware's defaults; or vehicle, to download the vehicle's
             own metadata. Default: the stored metadata of the firmware; else that of the vehicle if it can be
             downloaded in 2 s.
@@ -108,6 +114,8 @@ async def save(
     for fault in selection.faults:
         report(fault)
     sets = _chosen(selection.sets, only) if only else selection.sets
+    if incomplete:
+        sets = [_writable(each, written) for each in sets]
     files = _by_file(str(file), sets) if is_pattern_name(str(file)) else {file: sets}
     if sets:
         for path, each in files.items():
@@ -196,7 +204,7 @@ def _add_offline(
     """Add the parameters of a file, of an on-board log, or of a vehicle in the cache."""
     choice = ChosenVehicle.parse(options.vehicle)
     if is_file(where):
-        file = open_file(where)
+        file = open_file(where, partial=incomplete)
         sets = list(file.sets) if choice.is_all else [choose(file, choice.component, choice.system)]
     else:
         if options.place is False:
@@ -223,6 +231,16 @@ def _add_offline(
         metadata = known_of_sets(sets, options)
     for each, known_of_set in zip(sets, metadata, strict=True):
         selection.add(each, defaults_in(known_of_set, each))
+
+
+def _writable(params: ParamSet, file_format: FileFormat) -> ParamSet:
+    """Return a set without what the format cannot express, and report that; the source names it."""
+    kept, reasons = writable(params, file_format)
+    if not reasons or not kept:  # what is wrong with all of them is the error of writing
+        return params
+    for reason in reasons.values():
+        report(f"left out: {reason}")
+    return replace(kept, source=f"{kept.source}, without {first_of([*reasons], NAMES_SHOWN_MAX)}")
 
 
 def _chosen(sets: Sequence[ParamSet], only: Sequence[str]) -> list[ParamSet]:

@@ -1,21 +1,21 @@
-"""JSON documents as files of parameters: parsing, fields, and the line of each problem."""
+"""JSON documents as files: parsing, the fields of objects, and the line of each fault."""
 
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
 from typing import Any, Final, NoReturn, TypeAlias
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.text import Problems, excerpt
+from paramclient.files.reading import Reading
+from paramclient.files.text import excerpt, undecoded_byte
 
-__all__ = ["Checks", "Place", "Reader", "between", "found", "read_json_text", "typed"]
+__all__ = ["Checks", "Document", "Place", "between", "found", "read_json_text", "typed"]
 
-PROBLEM_LENGTH_MAX: Final = 300
-"""Characters of one problem in an error, so that a long field does not make the error unreadable."""
+FAULT_LENGTH_MAX: Final = 300
+"""Characters of one fault in an error, so that a long field does not make the error unreadable."""
 
 Place: TypeAlias = tuple[str | int, ...]
 """Position in a document: keys and list indices from the top."""
@@ -23,74 +23,65 @@ Checks: TypeAlias = Mapping[str, Callable[[Any], Any]]
 """By the name of a field, a function that returns the field's content, or raises UsageError."""
 
 
-def read_json_text(text: str, source: str) -> object:
+def read_json_text(text: str, source: str) -> Any:
     """Return the content of a JSON text without repeated keys.
 
     Raises:
         FileError: invalid JSON, or a repeated key.
     """
+    if (byte := undecoded_byte(text)) is not None:
+        raise FileError(byte[1], source=source, line=text.count("\n", 0, byte[0]) + 1, expected="UTF-8 text")
     try:
-        content: object = json.loads(
-            text,
-            object_pairs_hook=_unique,
-            parse_constant=_no_constant,
-            parse_float=_finite,
-            parse_int=_whole,
-        )
+        return json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant)
     except json.JSONDecodeError as error:
-        raise FileError(
-            f"expected JSON: {error.msg} (column {error.colno})",
-            source=source,
-            line=error.lineno,
-            expected="JSON",
-        ) from None
+        message = f"expected JSON: {error.msg} (column {error.colno})"
+        raise FileError(message, source=source, line=error.lineno, expected="JSON") from None
     except RecursionError:
         raise FileError("the document is nested too deep", source=source) from None
     except ValueError as error:
         line = _line_of(text, error.args[1], last=True) if len(error.args) > 1 else None
         raise FileError(str(error.args[0]), source=source, line=line) from None
-    return content
 
 
-class Reader:
-    """Reads the fields of one document, and collects the problems."""
+class Document:
+    """One document while it is read; its faults are those of the file."""
 
-    def __init__(self, text: str, source: str) -> None:
-        self.problems = Problems(source)
-        self._text = text
+    def __init__(self, reading: Reading) -> None:
+        self.reading = reading
 
-    def problem(self, place: Place, what: str) -> None:
-        """Add a problem at a position of the document."""
+    def fault(self, place: Place, what: str, *, is_name: bool = False) -> None:
+        """Add a fault at a position of the document."""
         line = None
-        if "params" in place[:-1] and not self.problems.is_full:
-            line = _line_of(self._text, str(place[place.index("params") + 1]))
+        if "params" in place[:-1] and not self.reading.is_full:
+            line = _line_of(self.reading.text, str(place[place.index("params") + 1]))
         described = f"{'.'.join(map(str, place)) or 'the document'}: {what}"
-        is_short = len(described) <= PROBLEM_LENGTH_MAX
-        self.problems.add(line, described if is_short else f"{described[:PROBLEM_LENGTH_MAX]}…")
+        if len(described) > FAULT_LENGTH_MAX:
+            described = f"{described[:FAULT_LENGTH_MAX]}…"
+        self.reading.fault(line, described, is_name=is_name)
 
     def fields(
         self, content: object, place: Place, checks: Checks, required: AbstractSet[str]
     ) -> dict[str, Any]:
-        """Return the valid fields of an object without nulls; add a problem for each other field."""
+        """Return the valid fields of an object without nulls; add a fault for each other field."""
         if not isinstance(content, dict):
-            self.problem(place, f"it should be an object{found(content)}")
+            self.fault(place, f"it should be an object{found(content)}")
             return {}
         valid = {}
         for key, each in content.items():
             if key not in checks:
-                self.problem((*place, key), "unknown field")
+                self.fault((*place, key), "unknown field")
             elif each is not None or key in required:
                 try:
                     valid[key] = checks[key](each)
                 except UsageError as error:
-                    self.problem((*place, key), str(error))
+                    self.fault((*place, key), str(error))
         for key in sorted(required - content.keys()):
-            self.problem((*place, key), "the field is missing")
+            self.fault((*place, key), "the field is missing")
         return valid
 
 
 def found(content: object) -> str:
-    """Return the end of a problem that shows a wrong value; "" for an object or a list."""
+    """Return the end of a fault that shows a wrong value; "" for an object or a list."""
     return "" if isinstance(content, dict | list) else f", found {content!r}"
 
 
@@ -107,9 +98,10 @@ def typed(kind: type, words: str) -> Callable[[Any], Any]:
 
 def between(low: int, high: float, words: str) -> Callable[[Any], Any]:
     """Return the check of a whole number."""
+    whole = typed(int, words)
 
     def check(content: Any) -> Any:
-        if not isinstance(content, int) or isinstance(content, bool) or not low <= content <= high:
+        if not low <= whole(content) <= high:
             raise UsageError(f"it should be {words}{found(content)}")
         return content
 
@@ -127,20 +119,6 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _no_constant(word: str) -> NoReturn:
     raise ValueError(f"{word} is not valid JSON; write it as text: {json.dumps(word)}")
-
-
-def _finite(text: str) -> float:
-    number = float(text)
-    if math.isinf(number):
-        raise ValueError(f"{excerpt(text)} is beyond the range of a double")
-    return number
-
-
-def _whole(text: str) -> int:
-    try:
-        return int(text)
-    except ValueError:  # Python limits the digits of an int
-        raise ValueError(f"{excerpt(text)} is beyond the range of every type") from None
 
 
 def _line_of(text: str, key: str, *, last: bool = False) -> int | None:

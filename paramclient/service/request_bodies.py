@@ -169,7 +169,7 @@ class UploadedFile(Body):
                 data = base64.b64decode(self.base64 or "", validate=True)
             except (binascii.Error, ValueError) as error:
                 raise UsageError(f"{self.name or 'the file'} is not valid base64: {error}") from None
-        return loads(data, source=self.name, file_format=self.format, params_max=VALUES_MAX)
+        return loads(data, source=self.name, file_format=self.format)
 
     def read_set(self, target: Target) -> ParamSet:
         """Parse the file, and return its set for a component; see `read`."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from paramclient import ParamCache, ParamType, read_file
+from paramclient import ParamCache, ParamSet, ParamType, WrittenParam, read_file, write_file
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.conversations.partial import TABLE, Partial
@@ -138,6 +138,21 @@ def test_a_vehicle_with_component_0_is_written_and_read(
         assert saved.code == 0
     [params] = read_file(path).sets
     assert (params.system, params.component, set(params)) == (1, 0, set(TABLE))
+
+
+def test_a_value_that_the_format_cannot_hold_is_left_out_with_incomplete(
+    command: Command, tmp_path: Path
+) -> None:
+    source, path = tmp_path / "quad.json", tmp_path / "quad.param"
+    params = {"A": WrittenParam("A", 1, ParamType.INT32), "RAW": WrittenParam("RAW", b"\1\0\0\0", 77)}
+    write_file(source, ParamSet(params, 1, 1))
+    refused = command("save", source, path)
+    assert (refused.code, "RAW is 0x00000001, which is not a number" in refused.err) == (2, True)
+    assert not path.exists()
+    saved = command("save", source, path, "--incomplete")
+    assert (saved.code, "left out: RAW is 0x00000001" in saved.err) == (0, True)
+    assert list(read_file(path).choose()) == ["A"]
+    assert "without RAW" in path.read_text()
 
 
 def test_an_incomplete_table_is_not_written(
