@@ -119,7 +119,8 @@ class PostgresStore(Store):
 
     def _error(self, error: psycopg.Error) -> CacheError:
         """Return the error without the password."""
-        text = " ".join(str(error).split())
+        lines = str(error).splitlines()
+        text = " ".join(line.strip() for line in lines if "Is the server running" not in line)
         for secret in self._secrets:
             for each in {secret, quote(secret), quote(secret, safe="")}:
                 text = text.replace(each, "***")

@@ -260,8 +260,8 @@ class CacheWriter:
             certain = [node for node in self._identities if self._is_certain(node)]
             records = [(node, each, self._record(node, each)) for node in certain for each in node.sessions]
             taken = [each for each in records if each[2].is_unwritten]
-            if durable and self._is_synced and not taken:
-                return
+            if not taken and (self._is_synced or not durable):
+                return  # which says nothing of the cache
             updates = [self._update(*each) for each in taken]
             before = [(record, len(record.changes), record.is_whole) for _, _, record in taken]
             for _, _, record in taken:
@@ -375,7 +375,7 @@ class CacheWriter:
             if self.failure is None and not self._is_closing:
                 logger.warning("continuing without the cache: %s", error)
             self.failure = error
-            raise CacheError(f"the last received values could not be written: {error}") from error
+            raise CacheError(str(error)) from error
 
 
 def choose_cache(

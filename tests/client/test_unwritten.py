@@ -91,6 +91,24 @@ async def test_values_written_late_keep_their_times_and_the_whole_history(
 
 
 @in_simulated_time
+async def test_a_cause_has_one_warning_from_open_to_close(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Also where nothing is to be written for a time: that is no success."""
+    async with ParamClient(small_px4(), cache=f"postgresql://me@/fleet?host={tmp_path}") as client:
+        component = await client.only_component()
+        await client.core.cache_writer.write_all()
+        await component.fetch_all()
+        await anyio.sleep(2 * RETRY_INTERVAL)
+        with pytest.raises(CacheError, match=r"nothing was sent, .*--no-cache"):
+            await apply(component, ParamSet({NAME: WrittenParam(NAME, 5.0)}))
+        assert (await component.set(NAME, 5.0)).actual == 5.0
+    [warning] = warnings(caplog)
+    assert warning.startswith("continuing without the cache: ")
+    assert "\n" not in warning
+
+
+@in_simulated_time
 async def test_after_very_many_changes_the_whole_table_is_written(path: Path) -> None:
     vehicle = small_px4()
     async with ParamClient(vehicle, cache=path) as client:
