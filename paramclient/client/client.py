@@ -136,7 +136,6 @@ class ParamClient:
         self.cache = choose_cache(cache, is_log=is_log)
         self.watch_interval = watch_interval
         self._components: dict[Address, Component] = {}
-        self._by_node: dict[Node, Component] = {}
         self._events: Subscribers[events.Event] = Subscribers()
         forwarder = None if forward is None else Forwarder(create_link(forward))
         capture = None if tlog is None else Capture(tlog)
@@ -206,7 +205,7 @@ class ParamClient:
     def autopilots(self) -> list[Component]:
         """The autopilot of each system, sorted by system id, without cameras, gimbals and the like."""
         found = selection.autopilots_of(self.core.station.nodes.values())
-        return [self._by_node[each] for each in sorted(found, key=lambda node: node.system)]
+        return [self._components[each.address] for each in sorted(found, key=lambda node: node.system)]
 
     @property
     def bytes_received(self) -> int:
@@ -297,12 +296,11 @@ class ParamClient:
             raise UsageError(f"expect must be a number of vehicles from 1 up, not {expect}")
         began = anyio.current_time()
         await self.component(timeout=timeout)
-        wait = VEHICLES_LISTENING_TIME
-        if expect is not None:
-            wait = math.inf if timeout is None else began + timeout - anyio.current_time()
-        with anyio.move_on_after(wait):
+        if expect is None:
+            timeout = anyio.current_time() - began + VEHICLES_LISTENING_TIME
+        with anyio.CancelScope(deadline=math.inf if timeout is None else began + timeout):
             while expect is None or len(self.autopilots) < expect:
-                await self._activity()
+                await self.core.link_task.wait_for_activity()
         if expect is not None and len(self.autopilots) < expect:
             heard = ", ".join(selection.node_in_words(each.node) for each in self.autopilots)
             waited = anyio.current_time() - began
@@ -450,24 +448,21 @@ class ParamClient:
 
     def _meet(self, node: Node) -> None:
         """Follow a new component."""
-        component = self._by_node[node] = Component(self, node, node.plain)
-        self._components[component.address] = component
+        component = self._components[node.address] = Component(self, node, node.plain)
         node.emit = partial(self._emit, component)
         self._events.push(events.Discovered(component))
-        self.core.spawn(self._join_vehicle, node)
+        self.core.spawn(component.join_vehicle)
 
     def _emit(self, component: Component, event: protocol.ComponentEvent) -> None:
         """Tell the subscribers and the cache what has happened to a component."""
-        node = component.node
         match event:
             case protocol.Identified():
-                nodes = self.core.station.nodes.values()
-                for each in nodes:
-                    if selection.vehicle_of(nodes, each) is node:
-                        self.core.spawn(self._load, each)
+                for each in self._components.values():
+                    if each.vehicle is component.node:
+                        self.core.spawn(each.load)
                 return
             case protocol.Replaced():
-                self.core.cache_writer.forget(node)
+                self.core.cache_writer.forget(component.node)
                 return
             case protocol.Lost(silence=silence):
                 self._events.push(events.Lost(component, silence))
@@ -482,36 +477,13 @@ class ParamClient:
             component.ext.watch.doubt()
         self.core.link_task.notify()
 
-    async def _join_vehicle(self, node: Node) -> None:
-        """Load the cached tables of a component whose vehicle is identified already, or never was."""
-        await anyio.sleep_until(node.since + HEARTBEAT_WAIT)  # for the heartbeat of its autopilot
-        if self.core.cache_writer.may_load(
-            node, selection.vehicle_of(self.core.station.nodes.values(), node)
-        ):
-            await self._load(node)
-
-    async def _load(self, node: Node) -> None:
-        """Load the cached tables of a component of an identified vehicle."""
-        nodes = self.core.station.nodes.values()
-        vehicle = selection.vehicle_of(nodes, node)
-        is_young = anyio.current_time() < node.since + HEARTBEAT_WAIT
-        if vehicle is node and is_young and not node.identification.is_autopilot:
-            return  # it may have an autopilot: `_join_vehicle` waits for its heartbeat
-        await self.core.cache_writer.load(node, vehicle)
-        self._by_node[node].cache_is_read.set()
-        self._by_node[node].ext.cache_is_read.set()
-
     def _end_streams(self) -> None:
         error: ParamClientError | None = None if self.core.is_over else self.core.station.gate.error
-        for component in self._by_node.values():
+        for component in self._components.values():
             for each in (component, component.ext):
                 each.subscribers.end(error)
                 each.cache_is_read.set()
         self._events.end(error)
-
-    async def _activity(self) -> None:
-        await self.core.link_task.activity.wait()
-        self.core.station.gate.check()
 
     async def _wait_for(
         self,
@@ -543,12 +515,12 @@ class ParamClient:
                     station.probe(system, component)
                     probe_at = now + PROBE_INTERVAL
                 with anyio.move_on_after(min(probe_at, math.inf if found is None else found) - now):
-                    await self._activity()
+                    await self.core.link_task.wait_for_activity()
                 found = choose()
             if isinstance(found, Node):
-                await self._by_node[found].wait_for_cache()
+                await self._components[found.address].wait_for_cache()
         if isinstance(found, Node):
-            return self._by_node[found]
+            return self._components[found.address]
         refused = refused_in_words(self.signing_report())
         hint = "" if refused else selection.hint_of_link(station, self.bytes_received)
         if found is not None:

@@ -30,9 +30,10 @@ from paramclient.model.values import (
     check_value,
 )
 from paramclient.protocol import commands
-from paramclient.protocol.addresses import Address, PeerAddress, peer_in_words
+from paramclient.protocol.addresses import Address, peer_in_words
 from paramclient.protocol.events import Change, Resynced
 from paramclient.protocol.fetch import FetchResult, FetchSource, Policy, Progress, fetch_all, result_of
+from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.protocol.node import Node
 from paramclient.protocol.reads import read_param
 from paramclient.protocol.selection import hint_of_node, node_in_words, vehicle_of
@@ -101,6 +102,7 @@ class Component:
 
     Attributes:
         system, component: MAVLink ids of the component.
+        is_extended: whether these are the extended parameters: the `ext` of another component.
         params: the known parameters by name: live, verified or cached, see `Trust`. The mapping is read-only
             and follows the received messages.
     """
@@ -112,6 +114,7 @@ class Component:
         self.session = session
         self.system = node.system
         self.component = node.component
+        self.is_extended = session.dialect.has_ack
         self.params = ParamMap(session.table.params)
         self.subscribers: Subscribers[Change] = Subscribers()
         listens_only = self.core.station.listens_only
@@ -137,11 +140,6 @@ class Component:
         return self._ext
 
     @property
-    def is_extended(self) -> bool:
-        """Whether these are the extended parameters: whether the component is the `ext` of another one."""
-        return self.session.dialect.has_ack
-
-    @property
     def autopilot(self) -> str:
         """Autopilot of its heartbeat: px4, ardupilot, generic, …; "unknown" before the first heartbeat."""
         number = self.node.identification.autopilot
@@ -150,10 +148,11 @@ class Component:
     @property
     def identity(self) -> Identity:
         """Identity of the vehicle from AUTOPILOT_VERSION: hardware id, firmware, capabilities, if known."""
-        return self._vehicle.identification.identity
+        return self.vehicle.identification.identity
 
     @property
-    def _vehicle(self) -> Node:
+    def vehicle(self) -> Node:
+        """The autopilot of its vehicle, whose identity is the vehicle's; without one, its own node."""
         return vehicle_of(self.core.station.nodes.values(), self.node)
 
     @property
@@ -198,9 +197,7 @@ class Component:
     @property
     def address(self) -> Address:
         """Its key in `ParamClient.components`: (system, component), with `split_peers` also the peer."""
-        if self.node.is_split:
-            return PeerAddress(self.system, self.component, self.node.peer)
-        return (self.system, self.component)
+        return self.node.address
 
     @property
     def peer(self) -> str:
@@ -433,8 +430,7 @@ class Component:
         """Wait until the table is complete by what other stations request, or until a log has ended."""
         table = self.session.table
         while not self.core.is_over and not (self._waits_for_others and self._is_heard()):
-            await self.core.link_task.activity.wait()
-            self.core.station.gate.check()
+            await self.core.link_task.wait_for_activity()
         if not table.params:
             raise self._nothing(began)
         is_cached = self._is_heard() and _has(table.params, Trust.CACHED)
@@ -549,10 +545,26 @@ class Component:
         self.subscribers.add(changes := Changes())
         return changes
 
+    async def join_vehicle(self) -> None:
+        """Load the cached tables of a component whose vehicle is identified already, or never was."""
+        await anyio.sleep_until(self.node.since + HEARTBEAT_WAIT)  # for the heartbeat of its autopilot
+        if self.core.cache_writer.may_load(self.node, self.vehicle):
+            await self.load()
+
+    async def load(self) -> None:
+        """Load the cached tables of a component of an identified vehicle."""
+        node, vehicle = self.node, self.vehicle
+        is_young = anyio.current_time() < node.since + HEARTBEAT_WAIT
+        if vehicle is node and is_young and not node.identification.is_autopilot:
+            return  # it may have an autopilot: `join_vehicle` waits for its heartbeat
+        await self.core.cache_writer.load(node, vehicle)
+        self.cache_is_read.set()
+        self.ext.cache_is_read.set()
+
     async def wait_until_identified(self, timeout: float) -> None:
         """Wait at most `timeout` seconds until the vehicle is identified, as its cache key requires."""
         with anyio.move_on_after(timeout):
-            await self._vehicle.identification.settled()
+            await self.vehicle.identification.settled()
 
     async def wait_for_cache(self) -> None:
         """Wait until the cached table, if there is one, is in the table; 1.5 s at most.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Final, TypeAlias
@@ -216,16 +217,14 @@ def write_file(
     return chosen
 
 
-def writable(params: ParamSet, file_format: FileFormat) -> tuple[ParamSet, dict[str, str]]:
-    """Return the parameters of a set that a format can express, and for the others the reason by name."""
-    kept, reasons = {}, {}
+def writable(params: ParamSet, file_format: FileFormat) -> tuple[ParamSet, list[str]]:
+    """Return the parameters of a set that a format can hold, and the names of the others."""
+    kept = {}
     for name, param in params.items():
-        try:
+        with suppress(UsageError):
             _FORMATS[file_format].express(params, param)
             kept[name] = param
-        except UsageError as error:
-            reasons[name] = str(error)
-    return replace(params, params=kept), reasons
+    return replace(params, params=kept), [name for name in params if name not in kept]
 
 
 def _as_file(content: ParamSet | Iterable[ParamSet], file_format: FileFormat) -> ParamFile:

@@ -16,6 +16,7 @@ from paramclient.model.wording import first_of
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.digest import Answer, ask, request_digest
 from paramclient.protocol.file_download import FileUnavailable, download_file
+from paramclient.protocol.ftp import SILENT_LOST
 from paramclient.protocol.list_download import ListResult, download_list
 from paramclient.protocol.reads import read_many
 from paramclient.protocol.session import Session
@@ -242,11 +243,13 @@ class _Fetch:
                     self.notes.append(f"Downloaded as a list: {error.reason}.")
                     self._is_silent = error.is_silent
         self.listed = await download_list(session)
-        if self._is_silent and not self.listed.missing and not self.listed.lost:  # loss does not explain it
+        by_loss = session.channel.timing.attempts_for(SILENT_LOST) if self.listed.lost else 0
+        if self._is_silent and not self.listed.missing and session.ftp_unanswered >= by_loss:
             session.serves_file = False
         with session.channel.gate.until_closed(or_failed=True):
             await session.identification.encoding_certain()
-        self.table.complete()
+        if not self.listed.missing:
+            self.table.complete()
         return "stream"
 
     async def _settle(self, before: Digest | None) -> bool:

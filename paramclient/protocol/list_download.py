@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import chain
-from typing import Final, NamedTuple
+from typing import Final
 
 import anyio
 
-from paramclient.protocol.channel import LATE_GRACE, LATE_WAKE_UP, UNANSWERED_MAX, Inbox
+from paramclient.errors import NoReply, ParamErrorCode
+from paramclient.protocol.channel import ATTEMPTS_MAX, LATE_GRACE, LATE_WAKE_UP, UNANSWERED_MAX, Inbox
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.session import Session
-from paramclient.wire.messages import HASH_CHECK, Message
+from paramclient.wire.messages import HASH_CHECK, Message, ParamError
 
 __all__ = ["ListResult", "download_list"]
 
@@ -26,6 +25,8 @@ PAUSE_OTHERS: Final = 0.6
 """The same for other components: ArduPilot's list pauses for up to 0.5 s while it serves reads."""
 PAUSE_TAIL: Final = 0.06
 """The same at the last values of a list, where a pause is rare."""
+PAUSE_GROWING: Final = 2.0
+"""The same for a component that counts what it has sent: only the pause tells the end of its list."""
 PAUSE_INTERVALS: Final = 8
 """Mean intervals between two values after which a slow list has ended: PX4 sends 8 values a second in its
 low-bandwidth mode."""
@@ -81,16 +82,6 @@ async def download_list(session: Session) -> ListResult:
     return download.result
 
 
-class _Read(NamedTuple):
-    attempts: int
-    sent: float
-    due: float
-    """When the last attempt counts as lost."""
-
-
-_NO_READ: Final = _Read(0, 0.0, 0.0)
-
-
 class _Download:
     """The state of one download, while it runs: what was received when, and which reads are in flight."""
 
@@ -105,8 +96,12 @@ class _Download:
         self._count: int | None = None
         self._began = self._last = 0.0
         self._reached = -1  # the highest index
+        self._listed = 0  # values of this pass
+        self._rate_before = 0.0  # values per second of the quickest pass before it
+        self._listed_at = 0.0  # when the last value arrived that no read had asked for
         self._skipped: set[int] = set()  # missing indices below the highest one
-        self._reads: dict[int, _Read] = {}
+        self._reading: set[int] = set()  # indices whose reads are in flight
+        self._tried: dict[int, int] = {}  # attempts in vain by index that was ever read
         self._has_answer = False  # to a read
 
     async def begin(self) -> None:
@@ -148,89 +143,115 @@ class _Download:
             while (missing := self._missing()) and not self._is_silent():
                 seconds_left = len(self.table.names) / self._rate() + PASS_OVERHEAD
                 is_slower = len(missing) / READS_PER_SECOND_ARDUPILOT > seconds_left
-                if not is_slower or fruitless >= FRUITLESS_PASSES_MAX:
+                has_begun = len(self._received) > self.channel.window_size  # others may answer earlier reads
+                if (
+                    (has_begun and not is_slower)
+                    or len(missing) < self.channel.window_size
+                    or fruitless >= FRUITLESS_PASSES_MAX
+                ):
                     await self._read_gaps()
-                    if not self._has_answer and self._missing() and not self._is_silent():
-                        await self._next_pass(seconds_left)  # some firmware serves no reads
+                    is_short = self._missing() and self._count != 1  # a count of one may be right
+                    if is_short and not self._has_answer and not self._is_silent():
+                        await self._next_pass()  # some firmware serves no reads
                     break
                 self.result.lost += len(missing)
-                await self._next_pass(seconds_left)
+                await self._next_pass()
                 fruitless = fruitless + 1 if self._missing() == missing else 0
-        self.result.missing = self._missing()
+        self.result.missing = missing = self._missing()
+        if self.table.is_growing and not self._is_silent():
+            missing.pop()  # it has no more
 
-    async def _next_pass(self, seconds: float) -> None:
+    async def _next_pass(self) -> None:
         """Request the list once more, where that is quicker than reads, and receive it."""
         await self.channel.gate.wait()
         self.channel.send(self.session.dialect.request_list(self.channel.reads_from))
-        self._reached = -1
+        before, self._reached = self._reached, -1
         self._skipped.clear()
-        self._last = anyio.current_time()
-        with anyio.move_on_after(seconds + self.channel.timing.timeout(0)):
-            while len(self._received) < (self._count or 0) and not self._is_over():
-                await self._take_for(GAPS_INTERVAL)
+        self._rate_before, self._listed = self._rate(), 0
+        self._began = self._listed_at = anyio.current_time()
+        while self._missing() and not self._is_over():
+            await self._take_for(GAPS_INTERVAL)
+        self._reached = max(self._reached, before)
 
     async def _read_gaps(self) -> None:
-        """Read what is missing, each index again when its time is over; several copies of the last ones.
+        """Read what is missing, several copies of the last ones.
 
         Where no value arrives for seconds, and a window of reads is given up, the count is false: the
         component has none of the others.
         """
-        channel, timing = self.channel, self.channel.timing
-        while True:
-            now = anyio.current_time()
-            given_up = sum(self._is_given_up(index, now) for index in self._reads)
-            for index in [index for index in self._reads if index in self._received]:
-                read = self._reads.pop(index)
+        try:
+            async with anyio.create_task_group() as tasks:
+                while not self._is_read() and not self._is_silent():
+                    self.channel.is_streaming = not self._is_over()
+                    for index in self._gaps():
+                        if len(self._reading) >= self.channel.window_size:
+                            break
+                        if index not in self._reading and not self._is_given_up(index):
+                            self._reading.add(index)
+                            self._tried.setdefault(index, 0)
+                            self.result.lost += 1
+                            tasks.start_soon(self._read, index)
+                    await self.channel.gate.wait()
+                    await self._take_for(GAPS_INTERVAL)
+                tasks.cancel_scope.cancel()
+        except ExceptionGroup as group:
+            raise group.exceptions[0] from None
+
+    def _is_read(self) -> bool:
+        """Return whether the list has ended, and nothing more of it can be read."""
+        now = anyio.current_time()
+        if not self._is_over() or (self.table.is_growing and now - self._listed_at < PAUSE_GROWING):
+            return False
+        missing = self._missing()
+        given_up = sum(map(self._is_given_up, missing))
+        is_fruitless = now - self._last >= UNANSWERED_MAX and given_up >= self.channel.window_size
+        return is_fruitless or given_up == len(missing)
+
+    def _is_given_up(self, index: int) -> bool:
+        return self._tried.get(index, 0) >= self._attempts_max()
+
+    def _attempts_max(self) -> int:
+        return 1 if self.session.reads_indices is False else self.channel.timing.attempts_max
+
+    async def _read(self, index: int) -> None:
+        """Read one index, or give it up."""
+        channel, timing, dialect = self.channel, self.channel.timing, self.session.dialect
+
+        def accept(message: Message) -> Message | None:
+            is_other = isinstance(message, ParamError) and message.error != ParamErrorCode.DOES_NOT_EXIST
+            return None if is_other else message
+
+        def copies(attempt: int) -> int:
+            return timing.copies if self._is_over() and len(self._missing()) <= channel.window_size else 1
+
+        request = dialect.request_read(channel.reads_from, index)
+        what = f"index {index} of {channel.system}/{channel.component}"
+        attempts = ATTEMPTS_MAX
+        with channel.inbox((dialect.value, index)) as inbox:
+            try:
+                await channel.exchange(
+                    request, inbox, accept, what=what, attempts=self._attempts_max, copies=copies
+                )
                 self._has_answer = True
-                timing.answered(read.attempts)
-                if read.attempts == 1 and self._is_over():
-                    timing.measure(now - read.sent)
-            missing = (self._count or 0) - len(self._received)
-            is_fruitless = now - self._last >= UNANSWERED_MAX and given_up >= channel.window_size
-            is_ended = given_up >= missing or is_fruitless
-            if (is_ended and self._is_over()) or self._is_silent():
-                return
-            self._request(now)
-            await channel.gate.wait()
-            await self._take_for(GAPS_INTERVAL)
-
-    def _request(self, now: float) -> None:
-        """Send the reads that are due, as many as the window holds."""
-        timing, window = self.channel.timing, self.channel.window_size
-        in_flight = sum(read.due > now for read in self._reads.values())
-        is_tail = (self._count or 0) - len(self._received) <= window and self._is_over()
-        copies = timing.copies if is_tail else 1
-        for index in self._gaps():
-            attempts, _, due = self._reads.get(index, _NO_READ)
-            if due > now or attempts >= timing.attempts_max:
-                continue
-            if in_flight >= window:
-                return
-            self.result.lost += attempts == 0
-            for _ in range(copies):
-                self.channel.send(self.session.dialect.request_read(self.channel.reads_from, index))
-            self._reads[index] = _Read(attempts + 1, now, now + timing.timeout(attempts))
-            in_flight += 1
-
-    def _is_given_up(self, index: int, now: float) -> bool:
-        attempts, _, due = self._reads.get(index, _NO_READ)
-        return attempts >= self.channel.timing.attempts_max and due <= now
+            except NoReply as error:
+                attempts = error.attempts
+        await self._take_received()
+        self._reading.discard(index)
+        if index not in self._received:
+            self._tried[index] = attempts
 
     def _missing(self) -> list[int]:
-        """Return the indices that are missing."""
-        return [index for index in self._indices() if index not in self._received]
-
-    def _indices(self) -> range:
-        """Return the indices of the list: they begin at 1 if the count itself is one, and 0 is none."""
+        """Return the indices that are missing. They begin at 1 if the count itself is one, and 0 is none;
+        where the count grows with the index, the vehicle may have one more."""
         count = self._count or 0
         first = int(count in self._received and 0 not in self._received)
-        return range(first, first + count)
+        indices = range(first, first + count + self.table.is_growing)
+        return [index for index in indices if index not in self._received]
 
-    def _gaps(self) -> Iterable[int]:
+    def _gaps(self) -> list[int]:
         """Return the indices that are missing, below the end of the list so far."""
         if self._is_over():
-            rest = range(self._reached + 1, self._count or 0)
-            return chain(sorted(self._skipped), (each for each in rest if each not in self._received))
+            return self._missing()
         return sorted(index for index in self._skipped if index <= self._reached - TAIL)
 
     def _is_over(self) -> bool:
@@ -241,17 +262,16 @@ class _Download:
         pause = PAUSE_PX4 if self.reads_beside else PAUSE_OTHERS
         if count is not None and self._reached >= count - TAIL:
             pause = PAUSE_TAIL
-        if self._received:
-            pause = max(pause, PAUSE_INTERVALS * (self._last - self._began) / len(self._received))
-        return anyio.current_time() - self._last > pause or self._is_silent()
+        pause = max(pause, PAUSE_INTERVALS / self._rate() if self._listed else self.channel.timing.timeout(0))
+        return anyio.current_time() - self._listed_at > pause or self._is_silent()
 
     def _is_silent(self) -> bool:
         """Return whether the component is silent for so long that it counts as lost."""
         return self.channel.is_silent(self._began)
 
     def _rate(self) -> float:
-        """Return the values per second of the list so far."""
-        return len(self._received) / max(self._last - self._began, 0.01)
+        """Return the values per second of this list so far, or of an earlier pass."""
+        return max(self._rate_before, self._listed / max(self._listed_at - self._began, 0.01))
 
     async def _take_for(self, seconds: float) -> None:
         """Take the values that arrive, at most for some seconds without one."""
@@ -259,9 +279,12 @@ class _Download:
             self._take(await self._inbox.next())
         if anyio.current_time() > scope.deadline + LATE_WAKE_UP:
             await anyio.sleep(LATE_GRACE)
+        await self._take_received()
+        self.session.report(len(self._received), self._count)
+
+    async def _take_received(self) -> None:
         while self._inbox:
             self._take(await self._inbox.next())
-        self.session.report(len(self._received), self._count)
 
     def _take(self, message: Message) -> None:
         """Take one value."""
@@ -278,8 +301,11 @@ class _Download:
             self._count = count
             self._received = {each for each in self._received if each in self.table.names}
             self._skipped.clear()
-            self._reads.clear()
+            self._tried.clear()
             self._reached = -1
+        if index > self._reached or index not in self._tried:
+            self._listed_at = self._last
+            self._listed += 1
         self.result.repeated += index in self._received
         self._received.add(index)
         self._skipped.discard(index)

@@ -9,7 +9,7 @@ import anyio
 
 from paramclient.model.identity import hardware_id
 from paramclient.model.values import Encoding
-from paramclient.protocol.addresses import Peer
+from paramclient.protocol.addresses import Address, Peer, PeerAddress
 from paramclient.protocol.channel import WINDOW_PX4, Channel, Gate
 from paramclient.protocol.dialect import EXTENDED, PLAIN, Digest
 from paramclient.protocol.events import (
@@ -57,11 +57,10 @@ class Node:
     """One component on the link, as its messages show it.
 
     Args:
-        system, component: its address.
+        address: its address, with the peer where equal ids at other peers are other components.
         link: the link's name, part of an identity without a hardware id.
         peer: from which its messages arrive.
         since: when it was heard first.
-        is_split: whether components with equal ids at other peers are other components.
         transmit: queues a message for the component.
         gate: whether the link carries messages.
         encoding: chosen by the user, or None.
@@ -72,7 +71,8 @@ class Node:
         channel, presence, identification: the parts.
         plain, extended: the parameters.
         emit: called with each event.
-        peer, since, is_split: as given; a vehicle may move to another peer.
+        address, peer, since: as given; a vehicle may move to another peer.
+        system, component, is_split: what the address has.
         rival: another live peer that uses the same ids, and when it was heard; None without one.
         told_rival: the one of which the user was warned.
         version: of MAVLink, 1 or 2, by its last message.
@@ -82,24 +82,22 @@ class Node:
 
     def __init__(
         self,
-        system: int,
-        component: int,
+        address: Address,
         *,
         link: str,
         peer: Peer,
         since: float,
-        is_split: bool,
         transmit: Callable[[Message], None],
         gate: Gate,
         encoding: Encoding | None,
         listens_only: bool,
         spawn: Spawn,
     ) -> None:
-        self.system = system
-        self.component = component
+        self.address = address
+        self.system, self.component = system, component = address
         self.peer = peer
         self.since = since
-        self.is_split = is_split
+        self.is_split = isinstance(address, PeerAddress)
         self.rival: tuple[Peer, float] | None = None
         self.told_rival: Peer | None = None
         self.presence = Presence()

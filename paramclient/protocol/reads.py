@@ -252,10 +252,10 @@ def _miss(session: Session, which: str | int) -> None:
 
 
 async def _read_list(session: Session, inbox: Inbox, which: str | int) -> ReportedValue | None:
-    """Take a parameter from the list of a component that answers no reads; None if that is not complete.
+    """Take a parameter from the list of a component that answers no reads; None if values of it were lost.
 
     Raises:
-        UnknownParameter: it is not in the list.
+        UnknownParameter: it is not in the list. Some components count parameters that they never send.
         LinkError: the link is closed for good.
     """
     for _ in range(1 + session.listing.is_running):  # one that runs may have passed the parameter
@@ -267,9 +267,12 @@ async def _read_list(session: Session, inbox: Inbox, which: str | int) -> Report
             message = await inbox.next()
             if isinstance(message, session.dialect.value):
                 return message
-    if session.table.is_complete:
-        raise _unknown(session, which)
-    return None
+    names = session.table.names
+    if not names or max(names) - min(names) >= len(names) or session.channel.is_lost(anyio.current_time()):
+        return None
+    is_short = not session.table.is_complete
+    sent = f": its list has {len(names)} of {session.table.count} parameters, and it answers no reads"
+    raise _unknown(session, which, sent * is_short)
 
 
 def _unknown(session: Session, which: str | int, reason: str = "") -> UnknownParameter:

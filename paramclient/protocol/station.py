@@ -347,12 +347,10 @@ class Station:
             self.transmit(message, None if is_reopened else node.peer, node.version)
 
         node = Node(
-            address[0],
-            address[1],
+            address,
             link=f"{self.link}#{peer_in_words(peer)}" if self._splits_peers else self.link,
             peer=peer,
             since=now,
-            is_split=self._splits_peers,
             transmit=transmit,
             gate=self.gate,
             encoding=self._encoding,

@@ -28,8 +28,10 @@ from paramclient.wire.messages import (
     CAPABILITY_PARAM_ENCODE_BYTEWISE,
     AutopilotVersion,
     Heartbeat,
+    ParamRequestList,
     ParamRequestRead,
     ParamSet,
+    ParamValue,
 )
 from tests.conversations.partial import EVERYTHING, TABLE, Partial
 from tests.conversations.virtual import QUIET, Puppet, Tap, converse, virtual
@@ -129,6 +131,42 @@ async def test_odd_indices_and_counts_make_a_complete_table(options: dict[str, A
         }
 
 
+@pytest.mark.parametrize("serves", [EVERYTHING, ("list",)], ids=["reads", "list only"])
+@pytest.mark.parametrize("loss", [0.1, 0.2])
+@virtual
+async def test_a_list_whose_count_grows_is_never_complete_without_its_end(
+    loss: float, serves: tuple[str, ...]
+) -> None:
+    table = {f"P{number:02}": (number, ParamType.INT32) for number in range(40)}
+    for seed in range(12):
+        vehicle = Partial(table, serves=serves, count=lambda index: index + 1)
+        async with converse(Air.symmetric([vehicle], loss=loss, seed=seed)) as conversation:
+            result = await fetch_all((await conversation.node()).plain)
+            assert not result.complete or len(result.params) == 40
+
+
+@pytest.mark.parametrize("interval", [0.3, 0.7, 1.0])
+@pytest.mark.parametrize("heartbeat", [QUIET, PX4], ids=["generic", "PX4"])
+@virtual
+async def test_a_slow_list_whose_count_grows_is_received_to_its_end(
+    interval: float, heartbeat: Heartbeat
+) -> None:
+    async with converse(Puppet(lambda message: (), heartbeat=heartbeat)) as conversation:
+        node = await conversation.node()
+
+        async def send_list() -> None:
+            while not conversation.sent_of(ParamRequestList):  # noqa: ASYNC110 - in virtual time
+                await anyio.sleep(0.01)
+            for index in range(12):
+                conversation.hear(ParamValue(f"P{index}", bytes(4), ParamType.REAL32, index + 1, index))
+                await anyio.sleep(interval)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(send_list)
+            result = await fetch_all(node.plain)
+            assert (result.complete, len(result.params)) == (True, 12)
+
+
 @pytest.mark.parametrize("too_many", [1, 3_000])
 @virtual
 async def test_a_count_that_is_too_large_costs_seconds_and_no_value(too_many: int) -> None:
@@ -160,6 +198,24 @@ async def test_a_name_that_no_file_can_hold_is_noted_and_not_missed(name: str) -
         result = await fetch_all((await conversation.node()).plain)
         assert (result.missing, set(result.params)) == ((), set(TABLE))
         assert any(repr(name) in note for note in result.notes)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("too_many", [0, 2])
+@virtual
+async def test_a_name_that_is_not_in_the_list_of_an_ardupilot_without_reads_is_unknown(
+    first: int, too_many: int
+) -> None:
+    table = {"abc_def": (5.0, ParamType.REAL32), "ghi": (1.0, ParamType.REAL32)}
+    vehicle = Partial(
+        table, serves=("list",), first=first, count=lambda index: 2 + too_many, heartbeat=ARDUPILOT
+    )
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        with pytest.raises(UnknownParameter, match=r"1/1 has no ABC_DEF.*Did you mean abc_def"):
+            await read(session, "ABC_DEF")
+        assert (await read(session, "abc_def")).param_id == "abc_def"
+        assert anyio.current_time() < 20.0
 
 
 # the encoding
