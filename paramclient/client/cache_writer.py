@@ -18,6 +18,7 @@ import anyio.to_thread
 from paramclient.cache import BY_VEHICLE, ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.errors import CacheError, UsageError
 from paramclient.model.identity import Identity
+from paramclient.model.values import Param
 from paramclient.protocol.events import Change
 from paramclient.protocol.node import Node
 from paramclient.protocol.selection import vehicle_of
@@ -313,10 +314,18 @@ class CacheWriter:
         identity, heard = self._identities[node], vehicle.identification
         if heard.autopilot is not None:
             identity = replace(identity, autopilot=heard.autopilot, vehicle_type=heard.vehicle_type or 0)
-        observations = [(each.new, at, each.by) for each, at in record.changes if each.new is not None]
-        if record.is_whole:
-            observations += [(param, table.moments[name], BY_VEHICLE) for name, param in table.params.items()]
         ahead = self._seconds_ahead()
+
+        def observed(param: Param, at: float, by: str = BY_VEHICLE) -> StoredParam:
+            is_volatile = param.name in table.volatile if table.volatile or table.volatile_is_known else None
+            return StoredParam.of(table.with_default(param), at + ahead, is_volatile, by)
+
+        params = [
+            StoredParam.gone(each.name, at + ahead) if each.new is None else observed(each.new, at, each.by)
+            for each, at in record.changes
+        ]
+        if record.is_whole:
+            params += [observed(param, table.moments[name]) for name, param in table.params.items()]
         is_extended = session is node.extended
         state = TableState(
             hash=table.hash if table.is_complete else None,
@@ -332,16 +341,7 @@ class CacheWriter:
             autopilot=identity.autopilot if node is vehicle else node.identification.autopilot or 0,
             at=time.time(),
             table=state,
-            params=[
-                StoredParam.of(
-                    table.with_default(param),
-                    at + ahead,
-                    param.name in table.volatile if table.volatile or table.volatile_is_known else None,
-                    by,
-                )
-                for param, at, by in observations
-            ],
-            removed={each.name: at + ahead for each, at in record.changes if each.new is None},
+            params=params,
             replace=record.is_whole and table.is_complete,
             extended=is_extended,
         )

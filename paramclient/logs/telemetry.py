@@ -83,7 +83,6 @@ class _Import:
         self._cache = cache
         self._at = 0.0
         self._observed: dict[Session, list[StoredParam]] = {}
-        self._removed: dict[Session, dict[str, float]] = {}
         self._complete_at: dict[Session, float] = {}
         self._station = Station(
             link=name,
@@ -120,12 +119,11 @@ class _Import:
     def _take_change(self, session: Session, change: Change) -> None:
         if session.table.is_complete:
             self._complete_at.setdefault(session, self._at)
-        if change.new is None:
-            self._removed.setdefault(session, {})[change.name] = self._at
-        else:
-            self._observed.setdefault(session, []).append(
-                StoredParam.of(change.new, self._at, None, change.by)
-            )
+        self._observed.setdefault(session, []).append(
+            StoredParam.gone(change.name, self._at)
+            if change.new is None
+            else StoredParam.of(change.new, self._at, None, change.by)
+        )
 
     def _sighting(self, node: Node) -> TableUpdate:
         """Return that the vehicle was there at the beginning."""
@@ -159,7 +157,6 @@ class _Import:
                 synced_at=self._complete_at.get(session) if table.is_complete else None,
             ),
             params=[*observed, *last],
-            removed=self._removed.get(session, {}),
             extended=session is node.extended,
         )
 
