@@ -10,13 +10,7 @@ from typing import Final
 from paramclient.errors import MetadataError
 from paramclient.metadata.info import Metadata
 
-__all__ = [
-    "PACKED_SIZE_MAX",
-    "json_of",
-    "read_content",
-    "read_metadata",
-    "unpacked",
-]
+__all__ = ["PACKED_SIZE_MAX", "json_of", "read_bytes", "read_content", "read_metadata", "unpacked"]
 
 PACKED_SIZE_MAX: Final = 4 << 20
 """Bytes of a packed file, or of a file from a vehicle; PX4's has about 0.1 million."""
@@ -38,13 +32,21 @@ def read_metadata(path: str | os.PathLike[str]) -> Metadata:
     Raises:
         MetadataError: the file cannot be read, is too large, or has another format.
     """
-    source = os.fspath(path)
+    return read_content(read_bytes(path), source=os.fspath(path))
+
+
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """Return the bytes of a metadata file, at most one more than it may have.
+
+    Raises:
+        MetadataError: the file cannot be read.
+    """
     try:
         with Path(path).open("rb") as file:
-            content = file.read(CONTENT_SIZE_MAX + 1)
+            return file.read(CONTENT_SIZE_MAX + 1)
     except OSError as error:
-        raise MetadataError(f"{source}: cannot be read: {error.strerror or error}", source=source) from error
-    return read_content(content, source=source)
+        text = f"{os.fspath(path)}: cannot be read: {error.strerror or error}"
+        raise MetadataError(text, source=os.fspath(path)) from error
 
 
 def read_content(content: bytes, *, source: str) -> Metadata:
