@@ -392,7 +392,7 @@ class ParamClient:
 
         The fetches run in parallel. Components that appear within 1.2 s after the client was opened are
         included. A component that does not respond is given up; it may have no parameters. Where another
-        component responds, that takes 1.75 s.
+        component responds, that takes 3 s.
 
         Args:
             system: fetch only this system; None for all.
@@ -415,6 +415,7 @@ class ParamClient:
             "a component" if system is None else f"a component of system {system}",
             COMPONENT_TIMEOUT if timeout is None else timeout,
         )
+        began = anyio.current_time()
         await anyio.sleep_until(self.core.station.listening_since + LISTENING_TIME)
         chosen = {
             address: each
@@ -422,7 +423,7 @@ class ParamClient:
             if system in (None, each.system) and each.node.identification.has_parameters
         }
         left = None if timeout is None else deadline - anyio.current_time()
-        return await fetch_components(chosen, refresh=refresh, timeout=left)
+        return await fetch_components(chosen, began, refresh=refresh, timeout=left)
 
     def traffic_report(self) -> TrafficReport:
         """Return the traffic statistics of the link: components, message rates, packet loss.

@@ -38,6 +38,9 @@ PASS_OVERHEAD: Final = 0.15
 """Seconds that another pass of the list takes beside its values."""
 FRUITLESS_PASSES_MAX: Final = 5
 """Passes in a row without a new value, after which the count may be false: a request can be lost."""
+QUEUE_TIME: Final = 1.0
+"""Seconds without a missing value after which no answer to a read waits behind others in the queue of a slow
+radio: PX4 fills that with its list within a second, at 57600 baud for 6 s, and answers reads behind it."""
 GAPS_INTERVAL: Final = 0.02
 """Seconds after which gaps are looked at again without a new value."""
 
@@ -102,6 +105,7 @@ class _Download:
         self._skipped: set[int] = set()  # missing indices below the highest one
         self._reading: set[int] = set()  # indices whose reads are in flight
         self._tried: dict[int, int] = {}  # attempts in vain by index that was ever read
+        self._gained_at = 0.0  # when the last value arrived that was missing
         self._has_answer = False  # to a read
 
     async def begin(self) -> None:
@@ -203,6 +207,8 @@ class _Download:
         if not self._is_over() or (self.table.is_growing and now - self._listed_at < PAUSE_GROWING):
             return False
         missing = self._missing()
+        if missing and now - self._gained_at < QUEUE_TIME:
+            return False
         given_up = sum(map(self._is_given_up, missing))
         is_fruitless = now - self._last >= UNANSWERED_MAX and given_up >= self.channel.window_size
         return is_fruitless or given_up == len(missing)
@@ -306,7 +312,10 @@ class _Download:
         if index > self._reached or index not in self._tried:
             self._listed_at = self._last
             self._listed += 1
-        self.result.repeated += index in self._received
+        if index in self._received:
+            self.result.repeated += 1
+        else:
+            self._gained_at = self._last
         self._received.add(index)
         self._skipped.discard(index)
         if index > self._reached:

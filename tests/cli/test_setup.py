@@ -17,11 +17,12 @@ from typing import Any
 
 import pytest
 
-from paramclient import ParamCache, ParamType, read_file
+from paramclient import Encoding, ParamCache, ParamType, read_file
 from paramclient.model.values import WireValue
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle
 from paramclient.wire import frames, messages
 from tests.commands import Command, Put, behind, in_process, leaping
+from tests.conversations.partial import Partial
 
 TABLE: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "RTL_ALT": 1500,
@@ -590,3 +591,26 @@ def test_metadata_gives_ranges_and_reboots(
     outcome = command("apply", put(vehicle), file(), *options)
     assert outcome.code == 0
     assert "takes effect after a reboot: WPNAV_SPEED" in outcome.err
+
+
+def test_nothing_is_compared_or_written_in_a_doubtful_encoding(
+    command: Command, put: Put, tmp_path: Path
+) -> None:
+    vehicle = Partial(encoding=Encoding.C_CAST)
+    url, saved = put(vehicle), tmp_path / "quad.param"
+    assert command("save", url, saved).code == 0
+    assert "(The encoding of 1/1 is probably wrong: " in saved.read_text()
+    before = dict(vehicle.values)
+    for words in (
+        ["apply", url, saved, "--yes"],
+        ["apply", url, saved, "--dry-run"],
+        ["restore", url, saved],
+    ):
+        done = command(*words)
+        assert done.code == 2
+        assert "--encoding c-cast" in done.err
+    assert command("set", url, "GAIN_1", "7.5").code == 0
+    assert command("save", url, saved, "--encoding", "c-cast").code == 0
+    restored = command("restore", url, saved, "--encoding", "c-cast")
+    assert (restored.code, "8 unchanged" in restored.err) == (0, True)
+    assert vehicle.values == before | {"GAIN_1": vehicle.values["GAIN_1"]}

@@ -34,7 +34,7 @@ from paramclient.wire.messages import (
     ParamValue,
 )
 from tests.conversations.partial import EVERYTHING, TABLE, Partial
-from tests.conversations.virtual import QUIET, Puppet, Tap, converse, virtual
+from tests.conversations.virtual import QUIET, Puppet, Tap, converse, virtual, virtual_on_both
 
 ARDUPILOT = Heartbeat(2, 3, system_status=4)
 PX4 = Heartbeat(2, 12, system_status=4)
@@ -216,6 +216,37 @@ async def test_a_name_that_is_not_in_the_list_of_an_ardupilot_without_reads_is_u
             await read(session, "ABC_DEF")
         assert (await read(session, "abc_def")).param_id == "abc_def"
         assert anyio.current_time() < 20.0
+
+
+@pytest.mark.parametrize("serves", [EVERYTHING, ("list", "indices")], ids=["all reads", "by index"])
+@virtual
+async def test_an_unknown_name_of_a_px4_without_hash_is_told_as_what_it_is(serves: tuple[str, ...]) -> None:
+    vehicle = Partial(serves=serves, heartbeat=PX4, count=lambda index: len(TABLE) + 2)
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        with pytest.raises(UnknownParameter) as caught:
+            await read(session, "NOPE")
+        assert "answers no reads" not in str(caught.value)
+        assert vehicle.number_of(ParamRequestList) == (serves is not EVERYTHING)
+        assert anyio.current_time() < 15.0
+
+
+@pytest.mark.parametrize("heartbeat", [ARDUPILOT, QUIET, PX4], ids=["AP", "generic", "PX4"])
+@pytest.mark.parametrize("parts", [("list", "sets"), ("list", "sets", "acks")], ids="+".join)
+@virtual_on_both
+async def test_a_value_of_a_list_is_taken_without_its_end(
+    heartbeat: Heartbeat, parts: tuple[str, ...]
+) -> None:
+    count = len(TABLE) + 3_000
+    table = {name: (value, ParamType.REAL32) for name, (value, _) in TABLE.items()}
+    vehicle = Partial(table, serves=parts, heartbeat=heartbeat, count=lambda index: count)
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        await read(session, "OFFSET")
+        assert anyio.current_time() < 8.5
+        assert (await write(session, "MODE", 4)).status == "accepted"
+        assert anyio.current_time() < 12.0
+        assert not session.listing.is_running
 
 
 # the encoding
