@@ -15,8 +15,7 @@ from paramclient.files import json_format, lists, packed
 from paramclient.files.disk import LARGEST_FILE, read_bytes, replace_file
 from paramclient.files.formats import AUTOPILOT, ENDINGS, FileFormat, ParamFile, address, format_of_name
 from paramclient.files.other_files import kind_of
-from paramclient.files.reading import Reading
-from paramclient.files.text import time_of
+from paramclient.files.reading import Reading, time_of
 from paramclient.model.identity import autopilot_name, version_text
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import check_name

@@ -23,8 +23,8 @@ from typing import Final, TypeAlias
 from paramclient.errors import UsageError
 from paramclient.files.disk import LARGEST_FILE, read_bytes
 from paramclient.files.formats import AUTOPILOT, FileFormat, ParamFile
-from paramclient.files.reading import Reading
-from paramclient.files.text import (
+from paramclient.files.reading import (
+    Reading,
     TextLine,
     as_type,
     comment_lines,
