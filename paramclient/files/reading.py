@@ -143,11 +143,14 @@ class Reading:
             system, component: the ids of the set.
         """
         params = self._sets.setdefault((system, component), {})
-        if (before := params.get(param.name)) is not None:
-            used, ignored, at = _value(param), _value(before[0]), before[1]
-            same = f"with the same value, in {at} and {place}"
-            other = f": {used} in {place} is used, not {ignored} in {at}"
-            self._repetitions.append(f"{param.name} occurs twice{f' {same}' if used == ignored else other}.")
+        if param.name in params:
+            before, at = params[param.name]
+            used, ignored = _value(param), _value(before)
+            same = (param.value, param.type_number, used[0]) == (before.value, before.type_number, ignored[0])
+            what = f": {used} in {place} is used, not {ignored} in {at}"
+            if same or used == ignored:  # 1 and 1.0 are the same value, −0.0 and 0.0 are not
+                what = f" with the same value, in {at} and {place}"
+            self._repetitions.append(f"{param.name} occurs twice{what}.")
         params[param.name] = param, place
 
     def check(self) -> None:
