@@ -77,7 +77,7 @@ class Reading:
         self._partial = partial
         self._faults: list[tuple[str, int | None, str, str | None]] = []
         self._sets: dict[tuple[int | None, int | None], dict[str, tuple[WrittenParam, str]]] = {}
-        self._repetitions: list[str] = []
+        self._repeated = 0
         self.foreign: list[str] = []  # places of comments that are not UTF-8
 
     @cached_property
@@ -144,13 +144,9 @@ class Reading:
         """
         params = self._sets.setdefault((system, component), {})
         if param.name in params:
-            before, at = params[param.name]
-            used, ignored = _value(param), _value(before)
-            same = (param.value, param.type_number, used[0]) == (before.value, before.type_number, ignored[0])
-            what = f": {used} in {place} is used, not {ignored} in {at}"
-            if same or used == ignored:  # 1 and 1.0 are the same value, −0.0 and 0.0 are not
-                what = f" with the same value, in {at} and {place}"
-            self._repetitions.append(f"{param.name} occurs twice{what}.")
+            self._repeated += 1
+            if self._repeated <= FAULTS_MAX:
+                self.notes.append(_repetition(*params[param.name], param, place))
         params[param.name] = param, place
 
     def check(self) -> None:
@@ -183,8 +179,8 @@ class Reading:
             )
         if not any(sets):
             raise FileError("the file contains no parameters", source=self.source)
-        notes = [*self.notes, *self._repetitions[:FAULTS_MAX]]
-        if (more := len(self._repetitions) - FAULTS_MAX) > 0:
+        notes = self.notes
+        if (more := self._repeated - FAULTS_MAX) > 0:
             notes.append(f"{more} more {'line repeats' if more == 1 else 'lines repeat'} a name.")
         if self.foreign:
             places = first_of(self.foreign, FAULTS_MAX)
@@ -198,9 +194,17 @@ def _place(source: str, line: int | None) -> str:
     return f"{source}:{line}" if source else f"line {line}"
 
 
-def _value(param: WrittenParam) -> str:
-    kind = "" if param.type_number is None else f" ({type_name(param.type_number)})"
-    return format_value(param.settable, ParamType.REAL64) + kind
+def _repetition(before: WrittenParam, at: str, param: WrittenParam, place: str) -> str:
+    """Return the note on a name that occurs twice. 1 and 1.0 are the same value, −0.0 and 0.0 are not."""
+    ignored, used = (
+        format_value(each.settable, ParamType.REAL64)
+        + ("" if each.type_number is None else f" ({type_name(each.type_number)})")
+        for each in (before, param)
+    )
+    same = (before.value, before.type_number, ignored[0]) == (param.value, param.type_number, used[0])
+    if same or ignored == used:
+        return f"{param.name} occurs twice with the same value, in {at} and {place}."
+    return f"{param.name} occurs twice: {used} in {place} is used, not {ignored} in {at}."
 
 
 # Text
