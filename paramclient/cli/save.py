@@ -32,6 +32,7 @@ from paramclient.cli.sources import (
     is_pattern_name,
     names_vehicle,
     open_file,
+    source_of,
     whole_table,
 )
 from paramclient.errors import UsageError, VehicleError
@@ -99,6 +100,7 @@ async def save(
     if metadata is not None and not changed:
         raise UsageError("--metadata gives the defaults for --changed")
     written = format_of_name(str(file)) if file_format is None else FileFormat(file_format)
+    where = source_of(where)
     is_offline = is_file(where) or names_vehicle(where)
     if is_offline and refresh:
         raise UsageError(f"--refresh needs a link; {where!r} is a file or a vehicle in the cache")

@@ -58,11 +58,9 @@ async def metadata_of(
         NoReply: no response in time.
         LinkError: the link failed, or the client was closed.
     """
-    if isinstance(store, bool):
-        cache = component.core.cache
-        kept = MetadataStore.beside(cache.path) if store and cache is not None else None
-    else:
-        kept = store
+    kept = None if isinstance(store, bool) else store
+    if store is True and component.core.cache is not None:
+        kept = MetadataStore.beside(component.core.cache.path)
     files = _Files(component, kept, progress)
     with component.limited(timeout, f"the metadata of {files.label}"):
         before = component.identity

@@ -8,7 +8,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Final, Literal, TypeAlias, get_args
@@ -148,16 +148,9 @@ class MetadataStore:
         """Return the file that names a firmware's metadata; None for a firmware without a commit."""
         if not identity.git_hash:
             return None
-        what = (
-            identity.autopilot,
-            identity.firmware,
-            identity.git_hash,
-            identity.board,
-            identity.vendor_id,
-            identity.product_id,
-            component,
-        )
-        return self.folder / f"{hashlib.sha256(repr(what).encode()).hexdigest()[:16]}{_NOTES}"
+        firmware = replace(identity, system=0, link="", uid=None, vehicle_type=0, capabilities=0)
+        name = hashlib.sha256(repr((firmware, component)).encode()).hexdigest()[:16]
+        return self.folder / f"{name}{_NOTES}"
 
     def _files(self) -> Iterator[Path]:
         with suppress(OSError):
