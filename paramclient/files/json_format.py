@@ -85,12 +85,12 @@ def read_json_text(text: str, source: str) -> Any:
         FileError: invalid JSON, or a repeated key.
     """
     if (byte := undecoded_byte(text)) is not None:
-        raise FileError(byte[1], source=source, line=text.count("\n", 0, byte[0]) + 1, expected="UTF-8 text")
+        raise FileError(byte[1], source=source, line=text.count("\n", 0, byte[0]) + 1)
     try:
         return json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant)
     except json.JSONDecodeError as error:
         message = f"expected JSON: {error.msg} (column {error.colno})"
-        raise FileError(message, source=source, line=error.lineno, expected="JSON") from None
+        raise FileError(message, source=source, line=error.lineno) from None
     except RecursionError:
         raise FileError("the document is nested too deep", source=source) from None
     except ValueError as error:

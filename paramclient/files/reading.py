@@ -75,9 +75,9 @@ class Reading:
         self.fault_count = 0
         self.notes: list[str] = []
         self._partial = partial
-        self._faults: list[tuple[str, int | None, str, str | None]] = []
+        self._faults: list[tuple[str, int | None, str]] = []
         self._sets: dict[tuple[int | None, int | None], dict[str, tuple[WrittenParam, str]]] = {}
-        self._repeated = 0
+        self._repeated = self._left_out = 0
         self.foreign: list[str] = []  # places of comments that are not UTF-8
 
     @cached_property
@@ -90,47 +90,39 @@ class Reading:
         """The first line with content, without comments; FileError if there is none."""
         if self.text.lstrip().startswith("{"):  # it may be one line of megabytes, with `#` in its texts
             return "{"
-        for line in lines_of(self.text):
-            if line.text:
-                return line.text
-        raise FileError("the file contains no parameters", source=self.source)
+        first = next((line.text for line in lines_of(self.text) if line.text), None)
+        if first is None:
+            raise FileError("the file contains no parameters", source=self.source)
+        return first
 
     @property
     def is_full(self) -> bool:
         """Whether further faults are only counted."""
         return self.fault_count >= FAULTS_MAX
 
-    def fault(
-        self,
-        line: int | None,
-        what: str,
-        expected: str | None = None,
-        source: str = "",
-        *,
-        is_name: bool = False,
-    ) -> None:
+    def fault(self, line: int | None, what: str, source: str = "", *, is_name: bool = False) -> None:
         """Add a fault.
 
         Args:
             line: the bad line; None for an unknown one.
             what: the fault, as the end of a sentence.
-            expected: the expected content of the line, if it has a description.
             source: the file, if it is another one.
             is_name: whether only the name of a parameter is bad.
         """
         if is_name and self._partial:
             place = _place("" if source == self.source else source, line)
             self.notes.append(f"{place + ': ' if place else ''}{what}; left out.")
+            self._left_out += 1
             return
         if not self.is_full:
-            self._faults.append((source or self.source, line, what, expected))
+            self._faults.append((source or self.source, line, what))
         self.fault_count += 1
 
     def bad_line(self, line: TextLine, expected: str, source: str = "", *, is_name: bool = False) -> None:
         """Add a line that has other content than expected."""
         byte = undecoded_byte(line.text)
         what = f"expected {expected}, found {excerpt(line.text)}" if byte is None else byte[1]
-        self.fault(line.number, what, expected, source, is_name=is_name)
+        self.fault(line.number, what, source, is_name=is_name)
 
     def add(
         self, param: WrittenParam, place: str, system: int | None = None, component: int | None = None
@@ -153,11 +145,11 @@ class Reading:
         """Raise one FileError for all faults, if there are any."""
         if not self._faults:
             return
-        more = [": ".join(filter(None, (_place(of, at), what))) for of, at, what, _ in self._faults[1:]]
+        more = [": ".join(filter(None, (_place(of, at), what))) for of, at, what in self._faults[1:]]
         if self.fault_count > len(self._faults):
             more.append(f"and {self.fault_count - len(self._faults)} more")
-        source, line, what, expected = self._faults[0]
-        raise FileError(what, source=source, line=line, expected=expected, more=tuple(more))
+        source, line, what = self._faults[0]
+        raise FileError(what, source=source, line=line, more=tuple(more))
 
     def file(
         self,
@@ -185,7 +177,7 @@ class Reading:
         if self.foreign:
             places = first_of(self.foreign, FAULTS_MAX)
             notes.append(f"Comments that are not UTF-8 were read as Windows-1252: {places}.")
-        return ParamFile(sets, file_format, self.source, header, footer, tuple(notes))
+        return ParamFile(sets, file_format, self.source, header, footer, tuple(notes), self._left_out)
 
 
 def _place(source: str, line: int | None) -> str:
@@ -235,12 +227,12 @@ def decode_text(data: bytes, source: str) -> str:
         text = data.decode("utf-16") if is_utf16 else data.decode("utf-8-sig", "surrogateescape")
     except UnicodeDecodeError as error:
         found = f"the byte 0x{data[error.start]:02x}"
-        raise FileError(f"expected UTF-16 text, found {found}", source=source, expected="text") from None
+        raise FileError(f"expected UTF-16 text, found {found}", source=source) from None
     if control := _control.search(text):
         line = text.count("\n", 0, control.start()) + 1
         found = f"the character 0x{ord(control[0]):02x}"
         message = f"expected text, found {found}: unknown file format"
-        raise FileError(message, source=source, line=line, expected="text")
+        raise FileError(message, source=source, line=line)
     return text
 
 

@@ -383,7 +383,7 @@ def test_an_error_lists_at_most_twenty_bad_lines() -> None:
         "quad.x:3: expected NAME VALUE, found 'bad'",
     ]
     assert str(error).splitlines()[20:] == ["and 30 more"]
-    assert (error.source, error.line, error.expected) == ("quad.x", 2, "NAME VALUE")
+    assert (error.source, error.line) == ("quad.x", 2)
     long = "x" * 10_000
     assert len(str(failed(f"A 1\n{long}"))) < 300
     value = f'{{"paramclient": 1, "sets": [{{"params": {{"A": {{"value": "{long}"}}}}}}]}}'
