@@ -16,70 +16,68 @@ from xml.etree.ElementTree import Element, ParseError, iterparse
 
 from pydantic import AfterValidator, BaseModel, Field
 
-from paramclient.errors import MetadataError, UsageError
+from paramclient.errors import UsageError
 from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo, finite, names_of, number_of
 from paramclient.metadata.px4 import PARAMS_MAX, VALUE_NAMES_MAX, validated
 
 __all__ = ["read_json", "read_xml"]
 
 
-def read_xml(content: bytes, *, source: str) -> Metadata:
+def read_xml(content: bytes) -> Metadata:
     """Read an apm.pdef.xml.
 
     Rejects document type declarations, and with them entities: the files have none.
 
     Raises:
-        MetadataError: the file is invalid.
+        UsageError: the file is invalid.
     """
     if b"<!DOCTYPE" in content:
-        text = "has a document type (<!DOCTYPE …>), which ArduPilot's files do not have"
-        raise MetadataError(f"{source}: {text}", source=source)
+        raise UsageError("has a document type (<!DOCTYPE …>), which ArduPilot's files do not have")
     try:
-        return _gathered(_infos_of_xml(content, source), source)
-    except MetadataError:
+        return _gathered(_infos_of_xml(content))
+    except UsageError:
         raise
     except (ParseError, ValueError, LookupError) as error:
-        raise MetadataError(f"{source}: not XML: {error}", source=source) from None
+        raise UsageError(f"not XML: {error}") from None
 
 
-def read_json(document: dict[str, object], *, source: str) -> Metadata:
+def read_json(document: dict[str, object]) -> Metadata:
     """Read an apm.pdef.json that has been parsed as JSON.
 
     Raises:
-        MetadataError: the document is invalid.
+        UsageError: the document is invalid.
     """
     if document.get("json") is None:
-        raise MetadataError(f'{source}: has no "json" member, which ArduPilot\'s files have', source=source)
-    return _gathered(_infos_of_json(document, source), source)
+        raise UsageError('has no "json" member, which ArduPilot\'s files have')
+    return _gathered(_infos_of_json(document))
 
 
-def _infos_of_json(document: dict[str, object], source: str) -> Iterator[ParamInfo]:
+def _infos_of_json(document: dict[str, object]) -> Iterator[ParamInfo]:
     for group, described in document.items():
         if group == "json":
             continue
         if not isinstance(described, dict):
-            raise MetadataError(f"{source}, {group:.40}: Input should be a valid dictionary", source=source)
+            raise UsageError(f"{group:.40}: Input should be a valid dictionary")
         for name, each in described.items():
-            yield validated(_Described, each, source, (group, name)).info(name, group)
+            yield validated(_Described, each, (group, name)).info(name, group)
 
 
-def _infos_of_xml(content: bytes, source: str) -> Iterator[ParamInfo]:
+def _infos_of_xml(content: bytes) -> Iterator[ParamInfo]:
     """Generate the parameters; each element is freed once it has been read."""
     group, param = "", None
     for number, (event, element) in enumerate(iterparse(io.BytesIO(content), ["start", "end"])):
         if not number and element.tag != "paramfile":
-            text = f"begins with <{element.tag}>, not with <paramfile> as ArduPilot's files"
-            raise MetadataError(f"{source}: {text}", source=source)
+            raise UsageError(f"begins with <{element.tag}>, not with <paramfile> as ArduPilot's files")
         if event == "start" and element.tag == "parameters":
             group = element.get("name", "")
         elif event == "start" and element.tag == "param":
             if param is not None:
-                raise MetadataError(f"{source}: has a parameter inside {param}", source=source)
+                raise UsageError(f"has a parameter inside {param}")
             param = element.get("name", "")
             if not param.rpartition(":")[2]:
-                raise MetadataError(f"{source}: has a parameter without a name", source=source)
+                raise UsageError("has a parameter without a name")
         elif event == "end" and element.tag == "param" and param is not None:
-            yield validated(_Described, _fields_of_xml(element), source, (group, param)).info(param, group)
+            yield validated(_Described, _fields_of_xml(element), (group, param)).info(param, group)
             param = None
             element.clear()
 
@@ -165,16 +163,16 @@ class _Described(BaseModel):
         return ParamInfo(name.rpartition(":")[2], minimum=low, maximum=high, group=group, **fields)
 
 
-def _gathered(found: Iterable[ParamInfo], source: str) -> Metadata:
+def _gathered(found: Iterable[ParamInfo]) -> Metadata:
     """Return the parameters of all groups. Leaves out those that two vehicles describe differently."""
     infos: dict[str, ParamInfo] = {}
     doubtful = set()
     for count, info in enumerate(found):
         if count >= PARAMS_MAX:
-            raise MetadataError(f"{source}: describes more than {PARAMS_MAX} parameters", source=source)
+            raise UsageError(f"describes more than {PARAMS_MAX} parameters")
         before = infos.setdefault(info.name, info)
         if replace(before, group="") != replace(info, group=""):
             doubtful.add(info.name)
     if not infos:
-        raise MetadataError(f"{source}: describes no parameters", source=source)
-    return Metadata.of((info for info in infos.values() if info.name not in doubtful), source=source)
+        raise UsageError("describes no parameters")
+    return Metadata.of(info for info in infos.values() if info.name not in doubtful)

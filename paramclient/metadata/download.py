@@ -17,7 +17,7 @@ import anyio.to_thread
 from paramclient.client.component import Component
 from paramclient.client.files import Ftp
 from paramclient.errors import MetadataError, UsageError
-from paramclient.metadata.formats import PACKED_SIZE_MAX, json_of, read_content, unpacked
+from paramclient.metadata.formats import PACKED_SIZE_MAX, json_of, naming, read_content, unpacked
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.store import MetadataStore, has_checksum
 from paramclient.protocol.commands import request_message
@@ -151,7 +151,8 @@ def _places_of_parameters(general: bytes, source: str) -> list[tuple[str, int | 
     """Return the addresses and checksums of the parameter metadata in a general file."""
     from paramclient.metadata.px4 import read_general  # imported here: loads pydantic
 
-    files = read_general(json_of(unpacked(general, source=source), source=source), source=source)
+    with naming(source):
+        files = read_general(json_of(unpacked(general)))
     return [
         (uri, crc)
         for file in files

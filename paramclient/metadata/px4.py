@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final, NotRequired, TypeAlias, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, with_config
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
-from paramclient.errors import MetadataError
+from paramclient.errors import UsageError
 from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo, finite, names_of, whole
 from paramclient.model.values import ParamType
 
@@ -117,36 +117,34 @@ class _General(_Strict):
     files: list[MetadataFile] = Field(alias="metadataTypes", max_length=METADATA_FILES_MAX)
 
 
-def read_parameters(document: object, *, source: str) -> Metadata:
+def read_parameters(document: object) -> Metadata:
     """Read a parameters.json that has been parsed as JSON.
 
     Raises:
-        MetadataError: the document does not follow the schema.
+        UsageError: the document does not follow the schema.
     """
-    read = validated(_Parameters, document, source)
-    return Metadata.of((each.info() for each in read.parameters), source=source)
+    return Metadata.of(each.info() for each in validated(_Parameters, document).parameters)
 
 
-def read_general(document: object, *, source: str) -> tuple[MetadataFile, ...]:
+def read_general(document: object) -> tuple[MetadataFile, ...]:
     """Read a general metadata file that has been parsed as JSON: kinds of metadata and their addresses.
 
     Raises:
-        MetadataError: the document does not follow the schema.
+        UsageError: the document does not follow the schema.
     """
-    return tuple(validated(_General, document, source).files)
+    return tuple(validated(_General, document).files)
 
 
-def validated(model: type[Model], document: object, source: str, within: tuple[int | str, ...] = ()) -> Model:
+def validated(model: type[Model], document: object, within: tuple[int | str, ...] = ()) -> Model:
     """Return a part of a document as an instance of a model.
 
     Args:
         model: the model.
         document: the part.
-        source: the file, for errors.
         within: the place of the part in the file.
 
     Raises:
-        MetadataError: the part is invalid, with the place of the first problem.
+        UsageError: the part is invalid, with the place of the first problem.
     """
     try:
         return model.model_validate(document)
@@ -154,8 +152,7 @@ def validated(model: type[Model], document: object, source: str, within: tuple[i
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         steps = (*within, *first["loc"])
         place = "".join(f"[{each}]" if isinstance(each, int) else f".{each}" for each in steps)
-        comma = ", " if place else ""
-        raise MetadataError(f"{source}{comma}{place.lstrip('.')}: {first['msg']}", source=source) from None
+        raise UsageError(f"{place.lstrip('.')}{': ' if place else ''}{first['msg']}") from None
 
 
 _TYPES: Final = {

@@ -190,8 +190,8 @@ def has_checksum(content: bytes, crc: int) -> bool:
     if crc32_px4(content) == crc:
         return True
     try:
-        return crc32_px4(unpacked(content, source="")) == crc
-    except MetadataError:
+        return crc32_px4(unpacked(content)) == crc
+    except UsageError:
         return False
 
 
