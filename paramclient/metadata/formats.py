@@ -13,15 +13,7 @@ from typing import Final
 from paramclient.errors import MetadataError, UsageError
 from paramclient.metadata.info import Metadata
 
-__all__ = [
-    "PACKED_SIZE_MAX",
-    "json_of",
-    "naming",
-    "read_bytes",
-    "read_content",
-    "read_metadata",
-    "unpacked",
-]
+__all__ = ["PACKED_SIZE_MAX", "json_of", "naming", "read_bytes", "read_content", "read_metadata", "unpacked"]
 
 PACKED_SIZE_MAX: Final = 4 << 20
 """Bytes of a packed file, or of a file from a vehicle; PX4's has about 0.1 million."""

@@ -182,11 +182,10 @@ class ParamInfo:
 
     def _as_typed(self, mask: int) -> int:
         """Return the number with these bits in a signed type."""
-        if self.type is not None and self.type.is_integer:
-            low, high = self.type.bounds
-            if low < 0 and high < mask <= high - low:
-                return mask - (high - low + 1)
-        return mask
+        if self.type is None or not self.type.is_integer:
+            return mask
+        over = 1 << 8 * self.type.size
+        return mask - over if self.type.bounds[1] < mask < over else mask
 
     def _only(self, named: Mapping[Key, str], text: str) -> Key | None:
         """Return the number with this name; None if there is none.

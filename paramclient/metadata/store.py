@@ -197,11 +197,10 @@ def has_checksum(content: bytes, crc: int) -> bool:
 
 def _parsed(path: Path) -> Metadata:
     """Return the content of a metadata file; that of an unchanged file is parsed once."""
-    try:
+    with suppress(OSError):
         found = path.stat()
-    except OSError:
-        return read_metadata(path)  # raises the error
-    return _parsed_once(path, (found.st_mtime_ns, found.st_size, found.st_ino))
+        return _parsed_once(path, (found.st_mtime_ns, found.st_size, found.st_ino))
+    return read_metadata(path)  # raises the error
 
 
 @lru_cache(maxsize=PARSED_FILES_MAX)
