@@ -138,7 +138,7 @@ class _Pairs:
         if line.text.startswith("@"):
             problem = " (an unknown instruction for ArduPilot's tools)"
         elif _decimal_comma(line.text) and len(words) == 3:
-            problem = " with a decimal point (1.5, not 1,5)"
+            problem = " with a decimal point (1.5, not 1,5) and no third column"
         elif len(words) == 3 and value is not None:
             problem = " and nothing after it (no unit, no further column)"
         elif len(words) == 2 and value is not None:
