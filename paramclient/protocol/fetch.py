@@ -283,7 +283,7 @@ class _Fetch:
         return replace(self._result("cache"), hash=None)
 
     def _result(self, source: FetchSource) -> FetchResult:
-        self.notes += [LEFT_OUT.format(repr(name)) for name in self.table.left_out]
+        self.notes += [LEFT_OUT.format(repr(name)) for name in sorted(self.table.left_out)]
         if doubt := self.session.encoding_doubt:
             self.notes.append(doubt)
         result = result_of(
@@ -313,7 +313,7 @@ def result_of(
         channel.component,
         ParamMap(table.view()),
         source,
-        table.count or 0,
+        table.count or len(table.params) + len(missing),  # none where it cannot be one
         tuple(sorted(missing)),
         table.hash if is_confirmed else None,
         anyio.current_time() - began,

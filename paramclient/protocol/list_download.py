@@ -11,12 +11,14 @@ from paramclient.errors import NoReply, ParamErrorCode
 from paramclient.protocol.channel import ATTEMPTS_MAX, LATE_GRACE, LATE_WAKE_UP, UNANSWERED_MAX, Inbox
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.session import Session
-from paramclient.wire.messages import HASH_CHECK, Message, ParamError
+from paramclient.wire.messages import HASH_CHECK, PARAMETERS_MAX, Message, ParamError
 
 __all__ = ["ListResult", "download_list"]
 
 LIST_REQUESTS_MAX: Final = 12
 """Requests for a list that does not begin: an ArduPilot ignores them early after its start."""
+LIST_REQUESTS_ALONE: Final = 3
+"""The first of them; reads of a value take turns with the others, for firmware without a list."""
 LIST_TIMEOUT_MIN: Final = 0.2
 """Seconds to wait for the first value of a list, at least: a second request makes the list begin again."""
 PAUSE_PX4: Final = 0.12
@@ -109,13 +111,18 @@ class _Download:
         self._has_answer = False  # to a read
 
     async def begin(self) -> None:
-        """Request the list until its first value arrives."""
+        """Request the list until its first value arrives; later a value too, where no list is served."""
         channel = self.channel
         self._began = anyio.current_time()
 
+        is_read = False
+
         def request(attempt: int) -> Message:
+            nonlocal is_read
             self.session.report(0, self.table.count)
-            return self.session.dialect.request_list(channel.reads_from)
+            is_read = attempt >= LIST_REQUESTS_ALONE and bool(attempt % 2)
+            dialect, target = self.session.dialect, channel.reads_from
+            return dialect.request_read(target, 0) if is_read else dialect.request_list(target)
 
         first: Message = await channel.exchange(
             request,
@@ -126,6 +133,8 @@ class _Download:
             timeout_min=LIST_TIMEOUT_MIN,
         )
         channel.is_streaming = True
+        if is_read:
+            self._began = anyio.current_time()  # of the list, if there is one
         self._take(first)
 
     def _first(self, message: Message) -> Message | None:
@@ -210,8 +219,8 @@ class _Download:
         if missing and now - self._gained_at < QUEUE_TIME:
             return False
         given_up = sum(map(self._is_given_up, missing))
-        is_fruitless = now - self._last >= UNANSWERED_MAX and given_up >= self.channel.window_size
-        return is_fruitless or given_up == len(missing)
+        is_fruitless = self.table.is_growing or given_up >= self.channel.window_size
+        return given_up == len(missing) or (is_fruitless and now - self._last >= UNANSWERED_MAX)
 
     def _is_given_up(self, index: int) -> bool:
         return self._tried.get(index, 0) >= self._attempts_max()
@@ -295,7 +304,7 @@ class _Download:
     def _take(self, message: Message) -> None:
         """Take one value."""
         assert isinstance(message, self.session.dialect.value)
-        count, index = message.param_count, message.param_index
+        count, index = min(message.param_count, PARAMETERS_MAX), message.param_index
         self._last = anyio.current_time()
         if message.param_id == HASH_CHECK:
             self.result.digest = Digest.of(message)

@@ -284,14 +284,11 @@ async def test_names_that_no_file_can_hold_leave_the_others_whole() -> None:
 
 
 @virtual
-async def test_a_component_without_a_list_is_no_reply_and_its_reads_still_work() -> None:
+async def test_a_component_without_a_list_is_read_by_its_indices() -> None:
     async with converse(component(["A", "B"], answers_list=False)) as conversation:
-        session = (await conversation.node()).plain
-        with pytest.raises(NoReply, match="list of 1/1"):
-            await fetch_all(session)
+        result = await fetch_all((await conversation.node()).plain)
+        assert (result.complete, set(result.params)) == (True, {"A", "B"})
         assert anyio.current_time() < 30.0
-        await read(session, "B")
-        assert session.table.params["B"].value == 1
 
 
 @virtual

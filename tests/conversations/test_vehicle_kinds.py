@@ -167,6 +167,45 @@ async def test_a_slow_list_whose_count_grows_is_received_to_its_end(
             assert (result.complete, len(result.params)) == (True, 12)
 
 
+@pytest.mark.parametrize("heartbeat", [ARDUPILOT, QUIET, PX4], ids=["AP", "generic", "PX4"])
+@pytest.mark.parametrize(
+    "serves", [("indices", "sets", "acks", "commands"), ("indices", "sets")], ids="+".join
+)
+@virtual_on_both
+async def test_a_vehicle_without_list_is_read_by_its_indices(
+    heartbeat: Heartbeat, serves: tuple[str, ...]
+) -> None:
+    table = {f"P{number:02}": (number / 2, ParamType.REAL32) for number in range(60)}
+    async with converse(Partial(table, serves=serves, heartbeat=heartbeat)) as conversation:
+        session = (await conversation.node()).plain
+        began = anyio.current_time()
+        assert (await write(session, "P50", 7.5)).actual == 7.5
+        assert anyio.current_time() - began < 15.0
+        result = await fetch_all(session)
+        assert (result.complete, len(result.params)) == (True, 60)
+
+
+@pytest.mark.parametrize("size", [1, 8])
+@pytest.mark.parametrize("delay", [0.5, 1.25])
+@virtual
+async def test_the_end_of_a_list_without_a_count_is_not_sought_for_long(delay: float, size: int) -> None:
+    table = {f"P{number}": (number, ParamType.REAL32) for number in range(size)}
+    vehicle = Partial(table, count=lambda index: index + 1)
+    async with converse(Air.symmetric([vehicle], delay=delay)) as conversation:
+        session = (await conversation.node()).plain
+        began = anyio.current_time()
+        result = await fetch_all(session)
+        assert (result.complete, len(result.params)) == (True, size)
+        assert anyio.current_time() - began < 15.0
+
+
+@virtual
+async def test_a_count_of_more_than_can_be_requested_is_told_as_what_can() -> None:
+    async with converse(Partial(count=lambda index: 65_535)) as conversation:
+        result = await fetch_all((await conversation.node()).plain)
+        assert (set(result.params), result.received, result.count) == (set(TABLE), len(TABLE), 32_768)
+
+
 @pytest.mark.parametrize("too_many", [1, 3_000])
 @virtual
 async def test_a_count_that_is_too_large_costs_seconds_and_no_value(too_many: int) -> None:
