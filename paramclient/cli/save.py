@@ -115,7 +115,7 @@ async def save(
     for fault in selection.faults:
         report(fault)
     sets = _chosen(selection.sets, only) if only else selection.sets
-    sets = [each if each.is_extended else _writable(each, written) for each in sets]
+    sets = [_writable(each, written) for each in sets]
     files = _by_file(str(file), sets) if is_pattern_name(str(file)) else {file: sets}
     if sets:
         for path, each in files.items():
@@ -234,13 +234,12 @@ def _add_offline(
 
 
 def _writable(params: ParamSet, file_format: FileFormat) -> ParamSet:
-    """Return a set without what the format cannot hold; the source names that."""
+    """Return a set without what the format cannot hold."""
     kept, left_out = writable(params, file_format)
-    if not left_out or not kept:  # what is wrong with all of them is the error of writing
-        return params
-    names = first_of(left_out, NAMES_SHOWN_MAX)
-    report(f"{address(params)}: left out, as only a .json file can hold them: {names}")
-    return replace(kept, source=f"{kept.source}, without {names}")
+    if left_out:
+        names = first_of(left_out, NAMES_SHOWN_MAX)
+        report(f"{address(params)}: left out, as only a .json file can hold them: {names}")
+    return kept
 
 
 def _chosen(sets: Sequence[ParamSet], only: Sequence[str]) -> list[ParamSet]:

@@ -321,7 +321,10 @@ def test_the_last_value_of_a_repeated_name_is_used(text: str, value: float, note
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("A,1,5", "expected NAME,VALUE with a decimal point (1.5, not 1,5) and no third column, found 'A,1,5'"),
+        (
+            "A,1,5",
+            "expected NAME,VALUE with a decimal point (1.5, not 1,5) and no third column, found 'A,1,5'",
+        ),
         ("A 1,5", "with a decimal point"),
         ("A 1.5 m/s", "and nothing after it (no unit, no further column)"),
         ("A 1.5m", "with a number"),
