@@ -32,7 +32,7 @@ FUNCTIONS: list[Callable[..., object]] = [
 STREAMS = {"Changes": "Change", "Events": "Event"}
 OWN = {name for names in CLASSES.values() for name in names} | {each.__name__ for each in FUNCTIONS}
 ATTRIBUTES = {
-    "Component": ("system: int", "component: int", "params: ParamMap"),
+    "Component": ("system: int", "component: int", "is_extended: bool", "params: ParamMap"),
     "ParamClient": ("link: Link", "cache: ParamCache | None", "listens_only: bool"),
 }
 """The public attributes that `__init__` sets."""

@@ -32,6 +32,7 @@ from paramclient.cli.sources import (
     is_pattern_name,
     names_vehicle,
     open_file,
+    source_of,
     whole_table,
 )
 from paramclient.errors import UsageError, VehicleError
@@ -90,8 +91,7 @@ async def save(
             those of its metadata.
         only: Write only this name or pattern, such as "MC_*". May be given several times.
         refresh: Download all parameters even if the cache is up to date.
-        incomplete: Write the parameters that were received and that the file format can hold, where others
-            were not; the file names these.
+        incomplete: Write the parameters that were received where others were not; the file names these.
         metadata: With --changed, a file with the firmware's defaults; or vehicle, to download the vehicle's
             own metadata. Default: the stored metadata of the firmware; else that of the vehicle if it can be
             downloaded in 2 s.
@@ -100,6 +100,7 @@ async def save(
     if metadata is not None and not changed:
         raise UsageError("--metadata gives the defaults for --changed")
     written = format_of_name(str(file)) if file_format is None else FileFormat(file_format)
+    where = source_of(where)
     is_offline = is_file(where) or names_vehicle(where)
     if is_offline and refresh:
         raise UsageError(f"--refresh needs a link; {where!r} is a file or a vehicle in the cache")
@@ -114,8 +115,7 @@ async def save(
     for fault in selection.faults:
         report(fault)
     sets = _chosen(selection.sets, only) if only else selection.sets
-    if incomplete:
-        sets = [_writable(each, written) for each in sets]
+    sets = [_writable(each, written) for each in sets]
     files = _by_file(str(file), sets) if is_pattern_name(str(file)) else {file: sets}
     if sets:
         for path, each in files.items():
@@ -234,13 +234,12 @@ def _add_offline(
 
 
 def _writable(params: ParamSet, file_format: FileFormat) -> ParamSet:
-    """Return a set without what the format cannot express, and report that; the source names it."""
-    kept, reasons = writable(params, file_format)
-    if not reasons or not kept:  # what is wrong with all of them is the error of writing
-        return params
-    for reason in reasons.values():
-        report(f"left out: {reason}")
-    return replace(kept, source=f"{kept.source}, without {first_of([*reasons], NAMES_SHOWN_MAX)}")
+    """Return a set without what the format cannot hold."""
+    kept, left_out = writable(params, file_format)
+    if left_out:
+        names = first_of(left_out, NAMES_SHOWN_MAX)
+        report(f"{address(params)}: left out, as only a .json file can hold them: {names}")
+    return kept
 
 
 def _chosen(sets: Sequence[ParamSet], only: Sequence[str]) -> list[ParamSet]:

@@ -309,6 +309,12 @@ async def report_others(found: Sequence[CommandSession]) -> None:
     """
     first = found[0]
     if first.choice.is_all:
+        own = [each.component.node for each in found]
+        parts = [each for each in first.client.components.values() if each.node not in own]
+        parts = [each for each in parts if each.node.identification.has_parameters]
+        if parts:
+            listed = first_of([vehicle_in_words(each) for each in parts], OTHERS_SHOWN_MAX)
+            report(f"--vehicle all chooses autopilots. Also heard, and not asked: {listed}")
         for sentence in await _unheard_in_words(first):
             report(sentence)
     if first.choice.is_named:

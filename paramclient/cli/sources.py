@@ -1,6 +1,6 @@
 """Sources of parameters that an argument can name: a file, a vehicle in the cache, or a link.
 
-1. A file that exists, independent of its name, or `-` for the standard input;
+1. A file that exists, independent of its name, or `-` for the standard input; a telemetry log is a link;
 2. `cache:VEHICLE`, or a text that can only name a vehicle in the cache (see `paramclient.cache.lookup`);
 3. any other text: a link.
 
@@ -54,12 +54,13 @@ __all__ = [
     "read_rules",
     "resolve",
     "resolve_all",
+    "source_of",
     "tables_in",
     "whole_table",
 ]
 
 SOURCES: Final = f"""\
-  FILE                a parameter file, or an on-board log (.bin, .ulg), that exists; - for the input
+  FILE                a parameter file or a log (.bin, .ulg, .tlog) that exists; - for the standard input
   cache:VEHICLE       the cached table of a vehicle: 4 or 4/1, px4 or ardupilot, its hardware id (in full,
                       or uid: and at least 6 digits), or its key; cache: may be left out
 {FORMS}"""
@@ -105,6 +106,7 @@ async def resolve_all(
     A text that is given twice is resolved once. The first error ends all. If one of the files has extended
     parameters, those of the vehicles are meant too.
     """
+    texts = [*map(source_of, texts)]
     choice = ChosenVehicle.parse(options.vehicle)
     found = {
         text: choose(open_file(text, partial=not writes), choice.component, choice.system)
@@ -182,6 +184,12 @@ def is_file(text: str) -> bool:
         path = Path(text)
         return path.is_file() or path.is_fifo()
     return False
+
+
+def source_of(text: str) -> str:
+    """Return the source that an argument names: `replay:FILE` for a telemetry log, else the argument."""
+    is_telemetry = PurePath(text).suffix.lower() == ".tlog" and is_file(text)
+    return f"replay:{text}" if is_telemetry else text
 
 
 def names_vehicle(text: str) -> bool:

@@ -296,12 +296,11 @@ class ParamClient:
             raise UsageError(f"expect must be a number of vehicles from 1 up, not {expect}")
         began = anyio.current_time()
         await self.component(timeout=timeout)
-        wait = VEHICLES_LISTENING_TIME
-        if expect is not None:
-            wait = math.inf if timeout is None else began + timeout - anyio.current_time()
-        with anyio.move_on_after(wait):
+        if expect is None:
+            timeout = anyio.current_time() - began + VEHICLES_LISTENING_TIME
+        with anyio.CancelScope(deadline=math.inf if timeout is None else began + timeout):
             while expect is None or len(self.autopilots) < expect:
-                await self._activity()
+                await self.core.link_task.wait_for_activity()
         if expect is not None and len(self.autopilots) < expect:
             heard = ", ".join(selection.node_in_words(each.node) for each in self.autopilots)
             waited = anyio.current_time() - began
@@ -393,7 +392,7 @@ class ParamClient:
 
         The fetches run in parallel. Components that appear within 1.2 s after the client was opened are
         included. A component that does not respond is given up; it may have no parameters. Where another
-        component responds, that takes 1.75 s.
+        component responds, that takes 3 s.
 
         Args:
             system: fetch only this system; None for all.
@@ -416,6 +415,7 @@ class ParamClient:
             "a component" if system is None else f"a component of system {system}",
             COMPONENT_TIMEOUT if timeout is None else timeout,
         )
+        began = anyio.current_time()
         await anyio.sleep_until(self.core.station.listening_since + LISTENING_TIME)
         chosen = {
             address: each
@@ -423,7 +423,7 @@ class ParamClient:
             if system in (None, each.system) and each.node.identification.has_parameters
         }
         left = None if timeout is None else deadline - anyio.current_time()
-        return await fetch_components(chosen, refresh=refresh, timeout=left)
+        return await fetch_components(chosen, began, refresh=refresh, timeout=left)
 
     def traffic_report(self) -> TrafficReport:
         """Return the traffic statistics of the link: components, message rates, packet loss.
@@ -486,10 +486,6 @@ class ParamClient:
                 each.cache_is_read.set()
         self._events.end(error)
 
-    async def _activity(self) -> None:
-        await self.core.link_task.activity.wait()
-        self.core.station.gate.check()
-
     async def _wait_for(
         self,
         choose: Callable[[], Node | float | None],
@@ -520,7 +516,7 @@ class ParamClient:
                     station.probe(system, component)
                     probe_at = now + PROBE_INTERVAL
                 with anyio.move_on_after(min(probe_at, math.inf if found is None else found) - now):
-                    await self._activity()
+                    await self.core.link_task.wait_for_activity()
                 found = choose()
             if isinstance(found, Node):
                 await self._components[found.address].wait_for_cache()

@@ -102,6 +102,7 @@ class Component:
 
     Attributes:
         system, component: MAVLink ids of the component.
+        is_extended: whether these are the extended parameters: the `ext` of another component.
         params: the known parameters by name: live, verified or cached, see `Trust`. The mapping is read-only
             and follows the received messages.
     """
@@ -113,6 +114,7 @@ class Component:
         self.session = session
         self.system = node.system
         self.component = node.component
+        self.is_extended = session.dialect.has_ack
         self.params = ParamMap(session.table.params)
         self.subscribers: Subscribers[Change] = Subscribers()
         listens_only = self.core.station.listens_only
@@ -136,11 +138,6 @@ class Component:
         if self._ext is None:
             raise UsageError("extended parameters have no extended parameters")
         return self._ext
-
-    @property
-    def is_extended(self) -> bool:
-        """Whether these are the extended parameters: whether the component is the `ext` of another one."""
-        return self.session.dialect.has_ack
 
     @property
     def autopilot(self) -> str:
@@ -433,8 +430,7 @@ class Component:
         """Wait until the table is complete by what other stations request, or until a log has ended."""
         table = self.session.table
         while not self.core.is_over and not (self._waits_for_others and self._is_heard()):
-            await self.core.link_task.activity.wait()
-            self.core.station.gate.check()
+            await self.core.link_task.wait_for_activity()
         if not table.params:
             raise self._nothing(began)
         is_cached = self._is_heard() and _has(table.params, Trust.CACHED)

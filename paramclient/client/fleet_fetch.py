@@ -16,8 +16,9 @@ from paramclient.protocol.fetch import FetchResult
 __all__ = ["FetchedAll", "fetch_components"]
 
 
-SILENT_TIME: Final = 1.75
-"""Seconds for a component that has never answered a request, where another one on the link answers."""
+SILENT_TIME: Final = 2.95
+"""Seconds from the begin for a component that has never answered a request, where another one on the link
+answers: it costs no more than 3 s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +41,9 @@ class FetchedAll:
 
 
 async def fetch_components(
-    components: Mapping[Address, Component], *, refresh: bool, timeout: float | None
+    components: Mapping[Address, Component], began: float, *, refresh: bool, timeout: float | None
 ) -> FetchedAll:
-    """Fetch the tables of components in parallel; see `ParamClient.fetch_all`.
+    """Fetch the tables of components in parallel; see `ParamClient.fetch_all`, which began at `began`.
 
     Raises:
         NoReply: none responded.
@@ -66,10 +67,11 @@ async def fetch_components(
             fetches.cancel_scope.cancel()
 
     async def give_up_silent() -> None:
-        await anyio.sleep(SILENT_TIME)
-        if any(each.round_trip is not None for each in components.values()):
+        await anyio.sleep_until(began + SILENT_TIME)
+        has_answered = {at: each.node.channel.answered.is_set() for at, each in components.items()}
+        if any(has_answered.values()):
             for address, each in components.items():
-                if each.round_trip is None and each.count is None:
+                if not has_answered[address] and each.count is None:
                     scopes[address].cancel()
 
     async with anyio.create_task_group() as tasks:

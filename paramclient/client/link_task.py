@@ -54,7 +54,6 @@ class LinkTask:
     Attributes:
         station: takes the received data; set before `read`.
         is_disconnected: whether the link is disconnected and being reopened.
-        activity: set, and replaced, when data was received, and when the link drops or has failed.
         bytes_received, bytes_sent: on this link.
         cutter: cuts the received data for the taps.
     """
@@ -63,7 +62,7 @@ class LinkTask:
 
     def __init__(self, link: Link, *, taps: Sequence[Tap], ended: Callable[[], None]) -> None:
         self.is_disconnected = False
-        self.activity = anyio.Event()
+        self._activity = anyio.Event()
         self.bytes_received = self.bytes_sent = 0
         self.cutter = FrameCutter(stream=link.is_stream)
         self._link = link
@@ -87,9 +86,18 @@ class LinkTask:
             self._something_to_send.set()
 
     def notify(self) -> None:
-        """Wake the tasks that wait for `activity`."""
-        activity, self.activity = self.activity, anyio.Event()
-        activity.set()
+        """Wake the tasks that wait for activity."""
+        self._activity.set()
+        self._activity = anyio.Event()
+
+    async def wait_for_activity(self) -> None:
+        """Wait until data was received, or the link has dropped.
+
+        Raises:
+            LinkError: it has failed.
+        """
+        await self._activity.wait()
+        self.station.gate.check()
 
     async def read(self) -> None:
         """Receive data and reconnect, until the link fails for good or its log has ended."""

@@ -3,8 +3,7 @@
 - `formats`: the known formats, and the content of a file.
 - `conversion`: the table of formats: recognizing, reading and writing. `disk`: reading and replacing files.
 - `lists`, `packed`, `json_format`: lists of ground stations, packed files, JSON.
-- `reading`: one file while it is read: its parameters, its notes and its faults.
-- `text`, `json_reader`: lines, comments and numbers; fields of JSON.
+- `reading`: one file while it is read: its text, its parameters, its notes and its faults.
 - `other_files`: files that are mistaken for parameter files.
 - `rename_file`: files of names that firmware versions have changed.
 """

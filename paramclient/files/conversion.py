@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Final, TypeAlias
@@ -14,15 +15,17 @@ from paramclient.files import json_format, lists, packed
 from paramclient.files.disk import LARGEST_FILE, read_bytes, replace_file
 from paramclient.files.formats import AUTOPILOT, ENDINGS, FileFormat, ParamFile, address, format_of_name
 from paramclient.files.other_files import kind_of
-from paramclient.files.reading import Reading
-from paramclient.files.text import time_of
+from paramclient.files.reading import Reading, time_of
 from paramclient.model.identity import autopilot_name, version_text
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import check_name
-from paramclient.model.wording import counted
+from paramclient.model.wording import counted, first_of
 from paramclient.protocol.param_pck import MAGICS
 
 __all__ = ["Content", "dumps", "loads", "read_file", "writable", "write_file"]
+
+LEFT_OUT_SHOWN_MAX: Final = 20
+"""Names that the header of a file shows, of those that are left out."""
 
 Content: TypeAlias = ParamFile | ParamSet | Iterable[ParamSet]
 """Content to write: a file as read, the parameters of one component, or of several."""
@@ -216,16 +219,21 @@ def write_file(
     return chosen
 
 
-def writable(params: ParamSet, file_format: FileFormat) -> tuple[ParamSet, dict[str, str]]:
-    """Return the parameters of a set that a format can express, and for the others the reason by name."""
-    kept, reasons = {}, {}
+def writable(params: ParamSet, file_format: FileFormat) -> tuple[ParamSet, list[str]]:
+    """Return a set without what a format cannot hold, which its source names, and these names.
+
+    If the format can hold none of the parameters, the set is returned unchanged: writing it gives the reason.
+    """
+    kept = {}
     for name, param in params.items():
-        try:
+        with suppress(UsageError):
             _FORMATS[file_format].express(params, param)
             kept[name] = param
-        except UsageError as error:
-            reasons[name] = str(error)
-    return replace(params, params=kept), reasons
+    left_out = [name for name in params if name not in kept]
+    if not left_out or not kept or params.is_extended:
+        return params, []
+    source = f"{params.source}, without {first_of(left_out, LEFT_OUT_SHOWN_MAX)}"
+    return replace(params, params=kept, source=source), left_out
 
 
 def _as_file(content: ParamSet | Iterable[ParamSet], file_format: FileFormat) -> ParamFile:

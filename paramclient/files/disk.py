@@ -43,10 +43,15 @@ def read_bytes(source: str) -> bytes:
             os.close(descriptor)
 
 
-def replace_file(source: str, data: bytes) -> None:
+def replace_file(source: str, data: bytes, new_mode: int = 0o666) -> None:
     """Replace a file atomically by one with this content; on failure, leave the old file unchanged.
 
     The mode is kept. If the path is a symbolic link, the link stays and its target is replaced.
+
+    Args:
+        source: the file.
+        data: the content.
+        new_mode: the mode of a file that did not exist, which the user's umask restricts.
 
     Raises:
         FileError: writing failed.
@@ -59,8 +64,7 @@ def replace_file(source: str, data: bytes) -> None:
         if mode is not None and not stat.S_ISREG(mode):
             raise FileError("cannot be written: not a regular file", source=source)
         temporary = target.with_name(f".{target.name[:200]}.{secrets.token_hex(8)}.tmp")
-        # 0o666: the user's umask restricts it
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _OPEN_FLAGS, 0o666)
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _OPEN_FLAGS, new_mode)
         try:
             with os.fdopen(descriptor, "wb") as file:
                 if mode is not None and sys.platform != "win32":

@@ -20,16 +20,15 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import asdict
 from datetime import datetime
-from typing import Final
+from typing import Any, Final, NoReturn, TypeAlias
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import FileFormat, ParamFile
-from paramclient.files.json_reader import Checks, Document, Place, between, found, read_json_text, typed
-from paramclient.files.reading import Reading
-from paramclient.files.text import as_type, is_plain, time_of
+from paramclient.files.reading import Reading, as_type, excerpt, is_plain, time_of, undecoded_byte
 from paramclient.model.ext_values import (
     EXT_VALUE_SIZE,
     check_ext_value,
@@ -51,8 +50,15 @@ from paramclient.model.values import (
     type_name,
 )
 
-__all__ = ["json_fields", "read_json", "write_json"]
+__all__ = ["json_fields", "read_json", "read_json_text", "write_json"]
 
+FAULT_LENGTH_MAX: Final = 300
+"""Characters of one fault in an error, so that a long field does not make the error unreadable."""
+
+Place: TypeAlias = tuple[str | int, ...]
+"""Position in a document: keys and list indices from the top."""
+Checks: TypeAlias = Mapping[str, Callable[[Any], Any]]
+"""By the name of a field, a function that returns the field's content, or raises UsageError."""
 VERSION: Final = 1
 """Version of both kinds of documents, written and required."""
 _KEY: Final = "paramclient"
@@ -69,6 +75,96 @@ _type_number: Final = re.compile(r"TYPE_([0-9]{1,3})").fullmatch
 _bits: Final = re.compile(r"[0-9a-fA-F]{8}(?:[0-9a-fA-F]{8})?").fullmatch
 
 
+# Documents
+
+
+def read_json_text(text: str, source: str) -> Any:
+    """Return the content of a JSON text without repeated keys.
+
+    Raises:
+        FileError: invalid JSON, or a repeated key.
+    """
+    if (byte := undecoded_byte(text)) is not None:
+        raise FileError(byte[1], source=source, line=text.count("\n", 0, byte[0]) + 1)
+    try:
+        return json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant)
+    except json.JSONDecodeError as error:
+        message = f"expected JSON: {error.msg} (column {error.colno})"
+        raise FileError(message, source=source, line=error.lineno) from None
+    except RecursionError:
+        raise FileError("the document is nested too deep", source=source) from None
+    except ValueError as error:
+        line = _line_of(text, error.args[1], last=True) if len(error.args) > 1 else None
+        raise FileError(str(error.args[0]), source=source, line=line) from None
+
+
+def _fault(reading: Reading, place: Place, what: str, *, is_name: bool = False) -> None:
+    """Add a fault at a position of the document."""
+    line = None
+    if "params" in place[:-1] and not reading.is_full:
+        line = _line_of(reading.text, str(place[place.index("params") + 1]))
+    described = f"{'.'.join(map(str, place)) or 'the document'}: {what}"
+    if len(described) > FAULT_LENGTH_MAX:
+        described = f"{described[:FAULT_LENGTH_MAX]}…"
+    reading.fault(line, described, is_name=is_name)
+
+
+def _checked(
+    reading: Reading, content: object, place: Place, checks: Checks, required: AbstractSet[str]
+) -> dict[str, Any]:
+    """Return the valid fields of an object without nulls; add a fault for each other field."""
+    if not isinstance(content, dict):
+        _fault(reading, place, f"it should be an object{_found(content)}")
+        return {}
+    valid = {}
+    for key, each in content.items():
+        if key not in checks:
+            _fault(reading, (*place, key), "unknown field")
+        elif each is not None or key in required:
+            try:
+                valid[key] = checks[key](each)
+            except UsageError as error:
+                _fault(reading, (*place, key), str(error))
+    for key in sorted(required - content.keys()):
+        _fault(reading, (*place, key), "the field is missing")
+    return valid
+
+
+def _found(content: object) -> str:
+    """Return the end of a fault that shows a wrong value; "" for an object or a list."""
+    return "" if isinstance(content, dict | list) else f", found {content!r}"
+
+
+def _expected(is_valid: Callable[[Any], bool], words: str) -> Callable[[Any], Any]:
+    """Return the check of a field."""
+
+    def check(content: Any) -> Any:
+        if not is_valid(content):
+            raise UsageError(f"it should be {words}{_found(content)}")
+        return content
+
+    return check
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in content:
+            raise ValueError(f"{excerpt(key)} occurs twice", key)
+        content[key] = value
+    return content
+
+
+def _no_constant(word: str) -> NoReturn:
+    raise ValueError(f"{word} is not valid JSON; write it as text: {json.dumps(word)}")
+
+
+def _line_of(text: str, key: str, *, last: bool = False) -> int | None:
+    """Return the line of a key, if the key occurs once or the last occurrence is meant."""
+    places = [match.start() for match in re.finditer(rf'"{re.escape(key)}"[ \t]*:', text)]
+    return text.count("\n", 0, places[-1]) + 1 if places and (last or len(places) == 1) else None
+
+
 # Reading
 
 
@@ -79,21 +175,20 @@ def read_json(reading: Reading, file_format: FileFormat) -> ParamFile:
         FileError: invalid JSON, a repeated key, or not a valid document. The error names up to 20 faults.
     """
     content = read_json_text(reading.text, reading.source)
-    document = Document(reading)
     if not isinstance(content, dict) or not content.keys() & {_KEY, _EXT_KEY}:
         raise FileError("not a parameter file of paramclient (JSON)", source=reading.source)
     if _EXT_KEY in content:
         known = {key: each for key, each in content.items() if key in _EXT_DOCUMENT}
-        return reading.file(file_format, sets=(_set(document, known, ()),))
-    fields = document.fields(content, (), _DOCUMENT, {_KEY, "sets"})
-    sets = [_set(document, each, ("sets", place)) for place, each in enumerate(fields.get("sets", []))]
+        return reading.file(file_format, sets=(_set(reading, known, ()),))
+    fields = _checked(reading, content, (), _DOCUMENT, {_KEY, "sets"})
+    sets = [_set(reading, each, ("sets", place)) for place, each in enumerate(fields.get("sets", []))]
     return reading.file(file_format, tuple(fields.get("header", [])), sets=tuple(sets))
 
 
-def _set(document: Document, content: object, place: Place) -> ParamSet:
+def _set(reading: Reading, content: object, place: Place) -> ParamSet:
     """Return the set at a position, without invalid fields; at the top, that of extended parameters."""
     is_extended = not place
-    fields = document.fields(content, place, _EXT_DOCUMENT if is_extended else _SET, {"params"})
+    fields = _checked(reading, content, place, _EXT_DOCUMENT if is_extended else _SET, {"params"})
     params = {}
     for name, each in fields.get("params", {}).items():
         at = (*place, "params", name)
@@ -101,32 +196,32 @@ def _set(document: Document, content: object, place: Place) -> ParamSet:
             if not is_portable_name(check_name(name)) and is_extended:
                 raise UsageError("no name of a parameter")
         except UsageError as error:
-            document.fault(at, str(error), is_name=True)
+            _fault(reading, at, str(error), is_name=True)
             continue
         try:
-            param = _ext_param(name, each) if is_extended else _param(document, name, each, at)
+            param = _ext_param(name, each) if is_extended else _param(reading, name, each, at)
         except ValueError as error:
-            document.fault(at, str(error))
+            _fault(reading, at, str(error))
             continue
         if param is not None:
             params[name] = param
     identity = None
     if "identity" in fields:
-        known = document.fields(fields["identity"], (*place, "identity"), _IDENTITY, {"system"})
+        known = _checked(reading, fields["identity"], (*place, "identity"), _IDENTITY, {"system"})
         identity = Identity(**known) if "system" in known else None
     ids = fields.get("component"), fields.get("system")
-    return ParamSet(params, *ids, identity, fields.get("at"), document.reading.source, is_extended)
+    return ParamSet(params, *ids, identity, fields.get("at"), reading.source, is_extended)
 
 
-def _param(document: Document, name: str, content: object, place: Place) -> WrittenParam | None:
+def _param(reading: Reading, name: str, content: object, place: Place) -> WrittenParam | None:
     """Return a plain parameter; None, with faults, if a field is not valid.
 
     Raises:
         UsageError: the fields contradict each other.
     """
-    before = document.reading.fault_count
-    fields = document.fields(content, place, _PARAM, {"value"})
-    if document.reading.fault_count > before:
+    before = reading.fault_count
+    fields = _checked(reading, content, place, _PARAM, {"value"})
+    if reading.fault_count > before:
         return None
     value, kind, default = fields["value"], fields.get("type"), fields.get("default")
     if kind is not None:
@@ -164,13 +259,17 @@ def _ext_param(name: str, fields: object) -> WrittenParam:
     return WrittenParam.of(ext_param(name, encode_ext_value(check_ext_value(value), number), number))
 
 
-_text: Final = typed(str, "text")
-_list: Final = typed(list, "a list")
-_object: Final = typed(dict, "an object")
-_count: Final = between(0, math.inf, "a whole number from 0")
-_id: Final = between(1, 255, "an id from 1 to 255")
-_component: Final = between(0, 255, "an id from 0 to 255")
-_version: Final = between(VERSION, VERSION, f"{VERSION}, the version of the format")
+def _whole(low: int, high: float, words: str) -> Callable[[Any], Any]:
+    return _expected(lambda content: type(content) is int and low <= content <= high, words)
+
+
+_text: Final = _expected(lambda content: isinstance(content, str), "text")
+_list: Final = _expected(lambda content: isinstance(content, list), "a list")
+_object: Final = _expected(lambda content: isinstance(content, dict), "an object")
+_count: Final = _whole(0, math.inf, "a whole number from 0")
+_id: Final = _whole(1, 255, "an id from 1 to 255")
+_component: Final = _whole(0, 255, "an id from 0 to 255")
+_version: Final = _whole(VERSION, VERSION, f"{VERSION}, the version of the format")
 
 
 def _texts(content: object) -> list[str]:
@@ -181,7 +280,7 @@ def _time(content: object) -> float:
     try:
         moment = datetime.fromisoformat(_text(content).upper())
     except ValueError:  # a number could be seconds or milliseconds
-        raise UsageError(f"a time is written as 2026-01-31T12:00:00Z{found(content)}") from None
+        raise UsageError(f"a time is written as 2026-01-31T12:00:00Z{_found(content)}") from None
     if moment.tzinfo is None:
         raise UsageError("the time needs its zone, as in 2026-01-31T12:00:00Z")
     return moment.timestamp()
@@ -208,7 +307,7 @@ def _number(content: object) -> WireValue:
         if not math.isinf(content):
             return content
         raise UsageError("the number is beyond the range of a double")
-    raise UsageError(f"{_NUMBER_EXPECTED}{found(content)}")
+    raise UsageError(f"{_NUMBER_EXPECTED}{_found(content)}")
 
 
 def _with_bits(value: WireValue, kind: ParamType | int | None, text: str) -> WireValue:

@@ -23,8 +23,8 @@ from typing import Final, TypeAlias
 from paramclient.errors import UsageError
 from paramclient.files.disk import LARGEST_FILE, read_bytes
 from paramclient.files.formats import AUTOPILOT, FileFormat, ParamFile
-from paramclient.files.reading import Reading
-from paramclient.files.text import (
+from paramclient.files.reading import (
+    Reading,
     TextLine,
     as_type,
     comment_lines,
@@ -138,7 +138,7 @@ class _Pairs:
         if line.text.startswith("@"):
             problem = " (an unknown instruction for ArduPilot's tools)"
         elif _decimal_comma(line.text) and len(words) == 3:
-            problem = " with a decimal point (1.5, not 1,5)"
+            problem = " with a decimal point (1.5, not 1,5) and no third column"
         elif len(words) == 3 and value is not None:
             problem = " and nothing after it (no unit, no further column)"
         elif len(words) == 2 and value is not None:

@@ -34,7 +34,7 @@ _TEXTS: Final = tuple(
         ),
         (r'"fileType"\s*:\s*"Plan"', "a plan of QGroundControl (JSON): a mission, without parameters"),
         (
-            r"^\s*Symbols: x = used|^[x ] *[+*]? *\w+ \[[0-9]+,[0-9]+\] : ",
+            r"^Symbols: x = used|^[x ] [ +*] \w+ \[[0-9]+,[0-9]+\] : ",
             "the output of `param show` of PX4's console; save the parameters with a ground station",
         ),
         (
@@ -42,10 +42,10 @@ _TEXTS: Final = tuple(
             "a list with four columns, of an old QGroundControl: it has no type column",
         ),
         (
-            r"^\s*param\s+(?:set|set-default|greater|compare)\s",
+            r"^[ \t]*param[ \t]+(?:set|set-default|greater|compare)\s",
             "a start script of PX4, whose values depend on the vehicle",
         ),
-        (r"\A#!.*sh\b|^\s*\.\s+\$\{R\}", "a script that sets no parameter; it may call another script"),
+        (r"\A#!.*sh\b|^[ \t]*\.[ \t]+\$\{R\}", "a script that sets no parameter; it may call another script"),
         (
             rf"{_TOP}(?:\w+[ \t,]+{_NUMBER}(?:[ \t]+[-+.0-9]|,[-+0-9]*\.).*\n){{2}}",
             "a list with a third column, perhaps of defaults; remove it",

@@ -14,8 +14,8 @@ from typing import Any, Final
 
 from paramclient.errors import FileError
 from paramclient.files.disk import read_bytes
-from paramclient.files.json_reader import read_json_text
-from paramclient.files.text import decode_text, excerpt
+from paramclient.files.json_format import read_json_text
+from paramclient.files.reading import decode_text, excerpt
 from paramclient.model.renames import Rename, Renames
 
 __all__ = ["loads_renames", "read_renames"]

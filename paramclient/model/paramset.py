@@ -73,7 +73,7 @@ class WrittenParam:
         if isinstance(value, bytes) and (is_raw or number != ParamType.CUSTOM):
             value, is_raw = int.from_bytes(value, "little"), True
         is_known = isinstance(number, ParamType) and not (is_raw and number == ParamType.CUSTOM)
-        kind = ParamType(number) if number is not None and is_known else number and ParamType.UNKNOWN
+        kind = None if number is None else ParamType(number) if is_known else ParamType.UNKNOWN
         default = None if isinstance(default, bytes) else default
         given = (name, value, kind, default, comment, line, is_raw, number)
         for attribute, each in zip(self.__slots__, given, strict=True):

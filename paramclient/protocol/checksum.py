@@ -20,7 +20,7 @@ import anyio
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, VehicleError
 from paramclient.model.px4_hash import crc32_px4, crc32_px4_before
 from paramclient.model.values import Encoding, ParamType, as_reported, bits_of, bits_of_wire, from_bits
-from paramclient.protocol.ftp import SILENT_LOST, checksum
+from paramclient.protocol.ftp import BUSY, attempts_unproven, checksum, is_free
 from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
@@ -93,6 +93,8 @@ async def prove(session: Session) -> tuple[str, ...]:
         TableDiffers: its table is too different.
         LinkError: the link is closed for good.
     """
+    if not await is_free(session.channel):
+        raise ChecksumUnavailable(BUSY)
     async with session.channel.ftp:
         try:
             for _ in range(PROOFS_MAX):
@@ -106,7 +108,8 @@ async def prove(session: Session) -> tuple[str, ...]:
             if error.code == FileErrorCode.UNKNOWN_COMMAND:
                 session.serves_checksum = False
             raise ChecksumUnavailable(f"the checksum was refused: {error.reason}") from None
-        except NoReply:
+        except NoReply as error:
+            session.ftp_unanswered += error.attempts
             is_silent = session.serves_checksum is None
             raise ChecksumUnavailable("MAVFTP did not answer", is_silent=is_silent) from None
     raise ChecksumUnavailable("the parameters change all the time")
@@ -213,9 +216,7 @@ class _Proof:
         session, began = self._session, anyio.current_time()
         answers: dict[int, int] = {}
         errors: list[FileTransferError | NoReply] = []
-        attempts = (
-            session.channel.timing.attempts_for(SILENT_LOST) if session.serves_checksum is None else None
-        )
+        attempts = attempts_unproven(session.channel) if session.serves_checksum is None else None
 
         async def request(number: int, place: range | None) -> None:
             query = "" if place is None else f"?start={place.start}&count={len(place)}"

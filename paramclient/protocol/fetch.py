@@ -16,6 +16,7 @@ from paramclient.model.wording import first_of
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.digest import Answer, ask, request_digest
 from paramclient.protocol.file_download import FileUnavailable, download_file
+from paramclient.protocol.ftp import SILENT_LOST
 from paramclient.protocol.list_download import ListResult, download_list
 from paramclient.protocol.reads import read_many
 from paramclient.protocol.session import Session
@@ -242,7 +243,8 @@ class _Fetch:
                     self.notes.append(f"Downloaded as a list: {error.reason}.")
                     self._is_silent = error.is_silent
         self.listed = await download_list(session)
-        if self._is_silent and not self.listed.missing and not self.listed.lost:  # loss does not explain it
+        by_loss = session.channel.timing.attempts_for(SILENT_LOST) if self.listed.lost else 0
+        if self._is_silent and not self.listed.missing and session.ftp_unanswered >= by_loss:
             session.serves_file = False
         with session.channel.gate.until_closed(or_failed=True):
             await session.identification.encoding_certain()
@@ -281,7 +283,7 @@ class _Fetch:
         return replace(self._result("cache"), hash=None)
 
     def _result(self, source: FetchSource) -> FetchResult:
-        self.notes += [LEFT_OUT.format(repr(name)) for name in self.table.left_out]
+        self.notes += [LEFT_OUT.format(repr(name)) for name in sorted(self.table.left_out)]
         if doubt := self.session.encoding_doubt:
             self.notes.append(doubt)
         result = result_of(
@@ -311,7 +313,7 @@ def result_of(
         channel.component,
         ParamMap(table.view()),
         source,
-        table.count or 0,
+        table.count or len(table.params) + len(missing),  # none where it cannot be one
         tuple(sorted(missing)),
         table.hash if is_confirmed else None,
         anyio.current_time() - began,

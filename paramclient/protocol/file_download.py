@@ -8,7 +8,7 @@ from typing import Final
 import anyio
 
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError, VehicleError
-from paramclient.protocol.ftp import SILENT_LOST, FileCutOff, read_file
+from paramclient.protocol.ftp import BUSY, FTP_SILENT_TIME, FileCutOff, attempts_unproven, is_free, read_file
 from paramclient.protocol.param_pck import PACK_SIZE_MAX, PARAM_FILE, Pack, decode, decode_prefix
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
@@ -19,7 +19,6 @@ WITH_DEFAULTS: Final = "?withdefaults=1"
 """Requests the defaults too; a server that does not know it may report that there is no such file."""
 ARDUPILOT_WITH_DEFAULTS: Final = 0x04040000
 """flight_sw_version of the first ArduPilot of which every build adds the defaults: 4.4."""
-OPEN_ATTEMPTS_MIN: Final = 3
 DOWNLOADS_MAX: Final = 2
 """Downloads of the file: one can be a mixture, if the table changes meanwhile."""
 
@@ -45,9 +44,13 @@ async def download_file(session: Session) -> int:
     file on board.
 
     Raises:
-        FileUnavailable: there is no such file, or it is not valid.
+        FileUnavailable: there is no such file, it is not valid, or the list is quicker.
         LinkError: the link is closed for good.
     """
+    if session.serves_file is None and session.channel.timing.timeout(0) > FTP_SILENT_TIME:
+        raise FileUnavailable("the round trip is too long to find out whether MAVFTP is served")
+    if not await is_free(session.channel):
+        raise FileUnavailable(BUSY)
     identification = session.identification
     query = WITH_DEFAULTS
     attempts = 0
@@ -71,6 +74,7 @@ async def download_file(session: Session) -> int:
             if isinstance(error, FileCutOff):
                 _store_beginning(session, error.prefix, requested_at)
             is_silent = not isinstance(error, FileCutOff)
+            session.ftp_unanswered += error.attempts * is_silent
             raise FileUnavailable("MAVFTP did not answer", is_silent=is_silent) from None
         except PackError as error:
             reason = f"the parameter file is not valid: {error}"
@@ -81,20 +85,24 @@ async def download_file(session: Session) -> int:
             attempts += 1
             continue
         known = session.table.count
-        if known not in (None, pack.total) and await _count(session) == known:
-            reason = f"the parameter file has {pack.total} parameters, and the vehicle {known}"
+        if known not in (None, pack.total) and await _count(session) != pack.total:
+            reason = f"the parameter file has {pack.total} parameters, and the cached table {known}"
             attempts += 1
             continue
-        session.serves_file = True
+        session.serves_file, session.ftp_unanswered = True, 0
         _store(session, pack, requested_at)
         return pack.total
     raise FileUnavailable(reason)
 
 
 async def _count(session: Session) -> int | None:
-    """Return the number of parameters by another message than the file; None if it is not answered."""
+    """Return the number of parameters by another message than the file; None if it is not answered.
+
+    It reads a parameter of the table by its name: indices may begin at 1.
+    """
+    names = (param.name for param in session.table.params.values() if param.index is not None)
     with suppress(NoReply, VehicleError):
-        return (await read(session, 0)).param_count
+        return (await read(session, next(names, 0))).param_count
     return None
 
 
@@ -111,7 +119,7 @@ async def _read(session: Session, path: str) -> bytes:
         if size and total:
             session.report(min(received * total // size, total), total)
 
-    attempts = max(channel.timing.attempts_for(SILENT_LOST), OPEN_ATTEMPTS_MIN)
+    attempts = None if session.serves_file else attempts_unproven(channel)
     return await read_file(
         channel, path, size_max=PACK_SIZE_MAX, open_attempts=attempts, progress=report, begun=begun
     )
@@ -123,7 +131,7 @@ def _store_beginning(session: Session, prefix: bytes, requested_at: float) -> No
         pack, number = decode_prefix(prefix)
     except PackError:
         return
-    if pack.entries and number == pack.total:
+    if pack.entries and number == pack.total and session.table.count in (None, number):
         _store(session, pack, requested_at)
 
 

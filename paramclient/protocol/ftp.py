@@ -21,11 +21,15 @@ from paramclient.wire.messages import FileTransfer, Message
 
 __all__ = [
     "DATA_SIZE_MAX",
+    "BUSY",
     "SILENT_LOST",
+    "FTP_SILENT_TIME",
     "DirectoryEntry",
     "Opcode",
     "Packet",
+    "attempts_unproven",
     "checksum",
+    "is_free",
     "list_directory",
     "read_file",
 ]
@@ -38,6 +42,11 @@ PATH_SIZE_MAX: Final = DATA_SIZE_MAX - 1
 """Bytes of a path, at most: it fills one message, with a NUL."""
 SILENT_LOST: Final = 1e-3
 """Probability that all requests are lost, at which MAVFTP counts as silent where there is another way."""
+FTP_SILENT_TIME: Final = 1.4
+"""Seconds after which MAVFTP counts as silent where it was never answered and there is another way."""
+BUSY: Final = "MAVFTP is in use for another file"
+LOCK_TIME: Final = 2.0
+"""Seconds to wait for another use of MAVFTP: longer than a checksum takes, shorter than a log."""
 BUSY_TIME: Final = 3.3
 """Seconds after which ArduPilot ends the silent session of another station (measured)."""
 BUSY_ATTEMPTS: Final = 2
@@ -149,7 +158,7 @@ async def read_file(
     *,
     read_size: int = DATA_SIZE_MAX,
     size_max: int = FILE_SIZE_MAX,
-    open_attempts: int | None = None,
+    open_attempts: Callable[[], int] | None = None,
     progress: Callable[[int, int | None], None] | None = None,
     begun: Callable[[bytes], None] = lambda head: None,
 ) -> bytes:
@@ -160,8 +169,8 @@ async def read_file(
         path: of the file, as the component names it.
         read_size: bytes of each read, 1 to 239.
         size_max: bytes, at most.
-        open_attempts: to open the file, where there is another way without it; None for as many as loss
-            explains.
+        open_attempts: returns those to open the file, where there is another way without it; None for as many
+            as loss explains.
         progress: called with the bytes received and the size, which is an estimate for generated files.
         begun: called with the first bytes of the file.
 
@@ -180,13 +189,32 @@ async def read_file(
             raise FileCutOff(error, reader.prefix) from None
 
 
-async def checksum(channel: Channel, path: str, *, attempts: int | None = None) -> int:
+async def is_free(channel: Channel) -> bool:
+    """Return whether MAVFTP can be used, after waiting for the end of a short use."""
+    with anyio.move_on_after(LOCK_TIME):
+        async with channel.ftp:
+            return True
+    return False
+
+
+def attempts_unproven(channel: Channel) -> Callable[[], int]:
+    """Return the function for the attempts of a request that begins now, where MAVFTP was never answered."""
+    began = anyio.current_time()
+
+    def attempts() -> int:
+        is_late = anyio.current_time() - began + channel.timing.timeout(0) > FTP_SILENT_TIME
+        return 0 if is_late else channel.timing.attempts_for(SILENT_LOST)
+
+    return attempts
+
+
+async def checksum(channel: Channel, path: str, *, attempts: Callable[[], int] | None = None) -> int:
     """Return the CRC-32 of a file, computed by the component: PX4's, see `crc32_px4`. Opens no session.
 
     Args:
         channel: the component's.
         path: of the file.
-        attempts: at most; None for as many as loss explains.
+        attempts: returns the number at most; None for as many as loss explains.
 
     Raises:
         FileTransferError: the component does not compute it, or refused the file.
@@ -254,7 +282,7 @@ async def _request(
     session: int = 0,
     offset: int = 0,
     size: int = 0,
-    attempts: int | None = None,
+    attempts: Callable[[], int] | None = None,
     copies: Callable[[int], int] | None = None,
     sequence: int | None = None,
 ) -> Packet:
@@ -286,7 +314,9 @@ async def _request(
 
 
 @asynccontextmanager
-async def _opened(channel: Channel, path: str, attempts: int | None) -> AsyncIterator[tuple[int, int | None]]:
+async def _opened(
+    channel: Channel, path: str, attempts: Callable[[], int] | None
+) -> AsyncIterator[tuple[int, int | None]]:
     """Open a file, and close its session at the end, also if opening is cancelled half-way."""
     data = path_bytes(path)
     session: int | None = None

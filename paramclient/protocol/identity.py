@@ -287,9 +287,9 @@ def kind_in_words(autopilot: int | None, kind: int | None) -> str:
     """
     words = []
     if autopilot not in (None, MAV_AUTOPILOT_GENERIC, MAV_AUTOPILOT_INVALID):
-        words.append(_AUTOPILOTS.get(autopilot) or _name_or_number("MAV_AUTOPILOT", "autopilot", autopilot))
+        words.append(_AUTOPILOTS.get(autopilot) or enum_word("MAV_AUTOPILOT", autopilot))
     if kind is not None and (kind != MAV_TYPE_GENERIC or not words):
-        words.append(_VEHICLES.get(kind) or _name_or_number("MAV_TYPE", "type", kind))
+        words.append(_VEHICLES.get(kind) or enum_word("MAV_TYPE", kind))
     return " ".join(words)
 
 
@@ -301,9 +301,3 @@ def expects_extended(vehicle_type: int | None, component: int) -> bool:
         component: its component id.
     """
     return vehicle_type in _EXTENDED_TYPES or component in _EXTENDED_COMPONENTS
-
-
-def _name_or_number(enum: str, what: str, number: int) -> str:
-    """Return the name of a number, or the number with the kind of number."""
-    word = enum_word(enum, number)
-    return f"{what} {word}" if word.isdecimal() else word

@@ -11,12 +11,14 @@ from paramclient.errors import NoReply, ParamErrorCode
 from paramclient.protocol.channel import ATTEMPTS_MAX, LATE_GRACE, LATE_WAKE_UP, UNANSWERED_MAX, Inbox
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.session import Session
-from paramclient.wire.messages import HASH_CHECK, Message, ParamError
+from paramclient.wire.messages import HASH_CHECK, PARAMETERS_MAX, Message, ParamError
 
 __all__ = ["ListResult", "download_list"]
 
 LIST_REQUESTS_MAX: Final = 12
 """Requests for a list that does not begin: an ArduPilot ignores them early after its start."""
+LIST_REQUESTS_ALONE: Final = 3
+"""The first of them; reads of a value take turns with the others, for firmware without a list."""
 LIST_TIMEOUT_MIN: Final = 0.2
 """Seconds to wait for the first value of a list, at least: a second request makes the list begin again."""
 PAUSE_PX4: Final = 0.12
@@ -38,6 +40,9 @@ PASS_OVERHEAD: Final = 0.15
 """Seconds that another pass of the list takes beside its values."""
 FRUITLESS_PASSES_MAX: Final = 5
 """Passes in a row without a new value, after which the count may be false: a request can be lost."""
+QUEUE_TIME: Final = 1.0
+"""Seconds without a missing value after which no answer to a read waits behind others in the queue of a slow
+radio: PX4 fills that with its list within a second, at 57600 baud for 6 s, and answers reads behind it."""
 GAPS_INTERVAL: Final = 0.02
 """Seconds after which gaps are looked at again without a new value."""
 
@@ -96,20 +101,28 @@ class _Download:
         self._count: int | None = None
         self._began = self._last = 0.0
         self._reached = -1  # the highest index
-        self._advanced = 0.0  # when the highest index rose
+        self._listed = 0  # values of this pass
+        self._rate_before = 0.0  # values per second of the quickest pass before it
+        self._listed_at = 0.0  # when the last value arrived that no read had asked for
         self._skipped: set[int] = set()  # missing indices below the highest one
         self._reading: set[int] = set()  # indices whose reads are in flight
-        self._given_up: dict[int, int] = {}  # attempts by index
+        self._tried: dict[int, int] = {}  # attempts in vain by index that was ever read
+        self._gained_at = 0.0  # when the last value arrived that was missing
         self._has_answer = False  # to a read
 
     async def begin(self) -> None:
-        """Request the list until its first value arrives."""
+        """Request the list until its first value arrives; later a value too, where no list is served."""
         channel = self.channel
         self._began = anyio.current_time()
 
+        is_read = False
+
         def request(attempt: int) -> Message:
+            nonlocal is_read
             self.session.report(0, self.table.count)
-            return self.session.dialect.request_list(channel.reads_from)
+            is_read = attempt >= LIST_REQUESTS_ALONE and bool(attempt % 2)
+            dialect, target = self.session.dialect, channel.reads_from
+            return dialect.request_read(target, 0) if is_read else dialect.request_list(target)
 
         first: Message = await channel.exchange(
             request,
@@ -120,6 +133,8 @@ class _Download:
             timeout_min=LIST_TIMEOUT_MIN,
         )
         channel.is_streaming = True
+        if is_read:
+            self._began = anyio.current_time()  # of the list, if there is one
         self._take(first)
 
     def _first(self, message: Message) -> Message | None:
@@ -141,29 +156,34 @@ class _Download:
             while (missing := self._missing()) and not self._is_silent():
                 seconds_left = len(self.table.names) / self._rate() + PASS_OVERHEAD
                 is_slower = len(missing) / READS_PER_SECOND_ARDUPILOT > seconds_left
-                if not is_slower or fruitless >= FRUITLESS_PASSES_MAX:
+                has_begun = len(self._received) > self.channel.window_size  # others may answer earlier reads
+                if (
+                    (has_begun and not is_slower)
+                    or len(missing) < self.channel.window_size
+                    or fruitless >= FRUITLESS_PASSES_MAX
+                ):
                     await self._read_gaps()
                     is_short = self._missing() and self._count != 1  # a count of one may be right
                     if is_short and not self._has_answer and not self._is_silent():
-                        await self._next_pass(seconds_left)  # some firmware serves no reads
+                        await self._next_pass()  # some firmware serves no reads
                     break
                 self.result.lost += len(missing)
-                await self._next_pass(seconds_left)
+                await self._next_pass()
                 fruitless = fruitless + 1 if self._missing() == missing else 0
         self.result.missing = missing = self._missing()
         if self.table.is_growing and not self._is_silent():
             missing.pop()  # it has no more
 
-    async def _next_pass(self, seconds: float) -> None:
+    async def _next_pass(self) -> None:
         """Request the list once more, where that is quicker than reads, and receive it."""
         await self.channel.gate.wait()
         self.channel.send(self.session.dialect.request_list(self.channel.reads_from))
         before, self._reached = self._reached, -1
         self._skipped.clear()
-        self._advanced = anyio.current_time()
-        with anyio.move_on_after(seconds + self.channel.timing.timeout(0)):
-            while self._missing() and not self._is_over():
-                await self._take_for(GAPS_INTERVAL)
+        self._rate_before, self._listed = self._rate(), 0
+        self._began = self._listed_at = anyio.current_time()
+        while self._missing() and not self._is_over():
+            await self._take_for(GAPS_INTERVAL)
         self._reached = max(self._reached, before)
 
     async def _read_gaps(self) -> None:
@@ -181,6 +201,7 @@ class _Download:
                             break
                         if index not in self._reading and not self._is_given_up(index):
                             self._reading.add(index)
+                            self._tried.setdefault(index, 0)
                             self.result.lost += 1
                             tasks.start_soon(self._read, index)
                     await self.channel.gate.wait()
@@ -192,13 +213,17 @@ class _Download:
     def _is_read(self) -> bool:
         """Return whether the list has ended, and nothing more of it can be read."""
         now = anyio.current_time()
-        if not self._is_over() or (self.table.is_growing and now - self._advanced < PAUSE_GROWING):
+        if not self._is_over() or (self.table.is_growing and now - self._listed_at < PAUSE_GROWING):
             return False
-        is_fruitless = now - self._last >= UNANSWERED_MAX and len(self._given_up) >= self.channel.window_size
-        return is_fruitless or all(map(self._is_given_up, self._missing()))
+        missing = self._missing()
+        if missing and now - self._gained_at < QUEUE_TIME:
+            return False
+        given_up = sum(map(self._is_given_up, missing))
+        is_fruitless = self.table.is_growing or given_up >= self.channel.window_size
+        return given_up == len(missing) or (is_fruitless and now - self._last >= UNANSWERED_MAX)
 
     def _is_given_up(self, index: int) -> bool:
-        return self._given_up.get(index, 0) >= self._attempts_max()
+        return self._tried.get(index, 0) >= self._attempts_max()
 
     def _attempts_max(self) -> int:
         return 1 if self.session.reads_indices is False else self.channel.timing.attempts_max
@@ -228,7 +253,7 @@ class _Download:
         await self._take_received()
         self._reading.discard(index)
         if index not in self._received:
-            self._given_up[index] = attempts
+            self._tried[index] = attempts
 
     def _missing(self) -> list[int]:
         """Return the indices that are missing. They begin at 1 if the count itself is one, and 0 is none;
@@ -252,17 +277,16 @@ class _Download:
         pause = PAUSE_PX4 if self.reads_beside else PAUSE_OTHERS
         if count is not None and self._reached >= count - TAIL:
             pause = PAUSE_TAIL
-        if self._received:
-            pause = max(pause, PAUSE_INTERVALS / self._rate())
-        return anyio.current_time() - self._advanced > pause or self._is_silent()
+        pause = max(pause, PAUSE_INTERVALS / self._rate() if self._listed else self.channel.timing.timeout(0))
+        return anyio.current_time() - self._listed_at > pause or self._is_silent()
 
     def _is_silent(self) -> bool:
         """Return whether the component is silent for so long that it counts as lost."""
         return self.channel.is_silent(self._began)
 
     def _rate(self) -> float:
-        """Return the values per second of the list so far."""
-        return len(self._received) / max(self._advanced - self._began, 0.01)
+        """Return the values per second of this list so far, or of an earlier pass."""
+        return max(self._rate_before, self._listed / max(self._listed_at - self._began, 0.01))
 
     async def _take_for(self, seconds: float) -> None:
         """Take the values that arrive, at most for some seconds without one."""
@@ -280,7 +304,7 @@ class _Download:
     def _take(self, message: Message) -> None:
         """Take one value."""
         assert isinstance(message, self.session.dialect.value)
-        count, index = message.param_count, message.param_index
+        count, index = min(message.param_count, PARAMETERS_MAX), message.param_index
         self._last = anyio.current_time()
         if message.param_id == HASH_CHECK:
             self.result.digest = Digest.of(message)
@@ -292,13 +316,19 @@ class _Download:
             self._count = count
             self._received = {each for each in self._received if each in self.table.names}
             self._skipped.clear()
-            self._given_up.clear()
+            self._tried.clear()
             self._reached = -1
-        self.result.repeated += index in self._received
+        if index > self._reached or index not in self._tried:
+            self._listed_at = self._last
+            self._listed += 1
+        if index in self._received:
+            self.result.repeated += 1
+        else:
+            self._gained_at = self._last
         self._received.add(index)
         self._skipped.discard(index)
         if index > self._reached:
             self._skipped.update(
                 each for each in range(self._reached + 1, index) if each not in self._received
             )
-            self._reached, self._advanced = index, self._last
+            self._reached = index

@@ -222,9 +222,10 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
     px4 = session.identification.is_px4
     live = {name: param.index for name, param in session.table.params.items() if param.trust is Trust.LIVE}
     same = live.pop(which, None) if isinstance(which, str) else None
-    control = await _try(session, HASH_CHECK if px4 else next(iter(live), 0) if same is None else same)
-    if control is None and px4 and same is not None:
-        control = await _try(session, same)
+    other = next(iter(live), 0) if same is None else same
+    control = await _try(session, HASH_CHECK if px4 else other)
+    if control is None and px4 and session.channel.answered.is_set():  # it may only call itself a PX4
+        control = await _try(session, other)
     if control is None or not isinstance(which, str) or session.reads_names or control.param_id == which:
         return control
     return await _try(session, control.param_id)
@@ -252,24 +253,43 @@ def _miss(session: Session, which: str | int) -> None:
 
 
 async def _read_list(session: Session, inbox: Inbox, which: str | int) -> ReportedValue | None:
-    """Take a parameter from the list of a component that answers no reads; None if that is not complete.
+    """Take a parameter from the list of a component that answers no reads; None if values of it were lost.
+
+    The rest of the list is not awaited.
 
     Raises:
-        UnknownParameter: it is not in the list.
+        UnknownParameter: it is not in the list. Some components count parameters that they never send.
         LinkError: the link is closed for good.
     """
-    for _ in range(1 + session.listing.is_running):  # one that runs may have passed the parameter
-        try:
-            await session.listing.join(lambda: download_list(session))
-        except NoReply:
-            return None
-        while inbox:
+    answers: list[ReportedValue] = []
+    failures: list[ParamClientError] = []
+
+    async def take() -> None:
+        while not answers:
             message = await inbox.next()
             if isinstance(message, session.dialect.value):
-                return message
-    if session.table.is_complete:
-        raise _unknown(session, which)
-    return None
+                answers.append(message)
+        tasks.cancel_scope.cancel()
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(take)
+        try:
+            for _ in range(1 + session.listing.is_running):  # one that runs may have passed the parameter
+                await session.listing.join(lambda: download_list(session))
+        except ParamClientError as error:
+            failures.append(error)
+        tasks.cancel_scope.cancel()
+    if answers:
+        return answers[0]
+    if failures and not isinstance(failures[0], NoReply):
+        raise failures[0]
+    names = session.table.names
+    is_lost = bool(failures) or session.channel.is_lost(anyio.current_time())
+    if is_lost or not names or max(names) - min(names) >= len(names):
+        return None
+    is_short = not session.table.is_complete
+    sent = f": its list has {len(names)} of {session.table.count} parameters"
+    raise _unknown(session, which, sent * is_short)
 
 
 def _unknown(session: Session, which: str | int, reason: str = "") -> UnknownParameter:

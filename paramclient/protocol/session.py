@@ -143,6 +143,7 @@ class Session:
         writing: the authors of the writes in progress, by name.
         serves_file: whether the parameter file was served on this link; None while unknown.
         serves_checksum: likewise, whether its checksum is computed.
+        ftp_unanswered: attempts of MAVFTP requests in vain, since the last file.
         announced: the last PX4 hash that was received, also in another station's list, or None.
         written_at: when the last write ended; minus infinity before the first.
         replaced: by name, the values before writes that have just ended.
@@ -173,6 +174,7 @@ class Session:
         self.writing: dict[str, str] = {}
         self.serves_file: bool | None = None
         self.serves_checksum: bool | None = None
+        self.ftp_unanswered = 0
         self.announced: Digest | None = None
         self.written_at = -math.inf
         self.replaced: defaultdict[str, list[ReplacedValue]] = defaultdict(list)

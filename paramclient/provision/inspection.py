@@ -99,11 +99,14 @@ async def inspect(
         whole: read all unconfirmed parameters, not only the wanted ones.
 
     Raises:
+        UsageError: the vehicle's integers contradict the encoding, so that none of them is known.
         NoReply: the vehicle did not answer.
         LinkError: the link failed, or the client was closed.
     """
     before = {name for name, param in component.params.items() if param.trust is Trust.LIVE}
     fetched = await component.fetch_all()
+    if doubt := component.session.encoding_doubt:
+        raise UsageError(doubt)
     params = dict(component.params)
     listed = [name for name, param in params.items() if param.index is not None]
     table = {name: params[name] for name in listed if params[name].trust is not Trust.CACHED}

@@ -93,11 +93,13 @@ async def collect_set(
     Args:
         component: the component.
         result: the result of its fetch.
-        source: the origin of the set, in words.
+        source: the origin of the set, in words; a doubt of the encoding is added.
 
     Raises:
         LinkError: the link failed.
     """
+    if doubt := component.session.encoding_doubt:
+        source = f"{source} ({doubt})"
     cached = set(result.cached)
     known = [param for name, param in result.params.items() if name not in cached]
     indices = {name: result.params[name].index for name in cached}

@@ -155,8 +155,8 @@ class UploadedFile(Body):
             raise ValueError("a file needs either `text` or `base64`")
         return self
 
-    def read(self) -> ParamFile:
-        """Parse the file. Blocks for up to seconds.
+    def read(self, *, partial: bool = False) -> ParamFile:
+        """Parse the file; see `files.loads`. Blocks for up to seconds.
 
         Raises:
             FileError: the file is invalid.
@@ -169,7 +169,7 @@ class UploadedFile(Body):
                 data = base64.b64decode(self.base64 or "", validate=True)
             except (binascii.Error, ValueError) as error:
                 raise UsageError(f"{self.name or 'the file'} is not valid base64: {error}") from None
-        return loads(data, source=self.name, file_format=self.format)
+        return loads(data, source=self.name, file_format=self.format, partial=partial)
 
     def read_set(self, target: Target) -> ParamSet:
         """Parse the file, and return its set for a component; see `read`."""

@@ -15,7 +15,7 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import JSONResponse, Response
 
 from paramclient.errors import UsageError
-from paramclient.files import FileFormat, dumps
+from paramclient.files import FileFormat, dumps, writable
 from paramclient.files.formats import ENDINGS
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
@@ -64,8 +64,8 @@ ROUTERS: Final = (reading, writing)
 
 @reading.post("/api/files")
 async def read_file(body: UploadedFile) -> Response:
-    """Parse a parameter file of any format. It is not stored."""
-    return await anyio.to_thread.run_sync(lambda: JSONResponse(documents.param_file(body.read())))
+    """Parse a parameter file of any format, without names that no vehicle can have. It is not stored."""
+    return await anyio.to_thread.run_sync(lambda: JSONResponse(documents.param_file(body.read(partial=True))))
 
 
 @reading.get(f"{VEHICLE}/file", response_class=Response)
@@ -92,6 +92,7 @@ async def file(
         found = select_non_defaults(found, described)
     ending = next((ending for ending, each in ENDINGS.items() if each is file_format), ".txt")
     name = f"{_stem(found)}{ending}"
+    found, _ = writable(found, file_format)
     data = await anyio.to_thread.run_sync(lambda: dumps(found, file_format=file_format, target=name))
     headers = {"content-disposition": f'attachment; filename="{name}"'}
     return Response(data, media_type="application/octet-stream", headers=headers)

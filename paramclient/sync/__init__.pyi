@@ -13,7 +13,7 @@ from paramclient.client.signing import Signing
 from paramclient.client.traffic import TrafficReport
 from paramclient.links import Link
 from paramclient.metadata.info import Metadata
-from paramclient.metadata.metadata_cache import MetadataStore
+from paramclient.metadata.store import MetadataStore
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet
@@ -74,13 +74,11 @@ class Component:
 
     system: int
     component: int
+    is_extended: bool
     params: ParamMap
     @property
     def ext(self) -> Component:
         """The extended parameters of the component (PARAM_EXT_*), whose values are also text and bytes."""
-    @property
-    def is_extended(self) -> bool:
-        """Whether these are the extended parameters: whether the component is the `ext` of another one."""
     @property
     def autopilot(self) -> str:
         """Autopilot of its heartbeat: px4, ardupilot, generic, …; "unknown" before the first heartbeat."""

@@ -15,7 +15,7 @@ from dataclasses import replace
 from functools import partial, wraps
 from queue import Empty, SimpleQueue
 from types import MappingProxyType
-from typing import Any, Final, Self
+from typing import Any, ClassVar, Final, Self
 
 import anyio
 from anyio.from_thread import BlockingPortal, start_blocking_portal
@@ -107,7 +107,7 @@ class _Session:
 
     def shown(self, value: Any) -> Any:
         """Return a value of the client as the caller is to see it."""
-        kind = _PROXIES.get(type(value))
+        kind = Proxy._kinds.get(type(value))
         if kind is not None:
             found = self.proxies.get(value)
             if found is None:
@@ -146,8 +146,12 @@ _sessions: weakref.WeakSet[_Session] = weakref.WeakSet()
 class Proxy:
     """An object of the client. Its methods block, and its attributes are those of the object."""
 
+    _kinds: ClassVar[dict[type | None, type[Proxy]]] = {}  # by the class of the client's objects
     _session: _Session
     _target: Any
+
+    def __init_subclass__(cls, of: type | None = None) -> None:
+        cls._kinds[of] = cls
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
@@ -169,7 +173,7 @@ class Proxy:
         return shown
 
 
-class ParamClient(Proxy):
+class ParamClient(Proxy, of=asynchronous.ParamClient):
     """See `paramclient.ParamClient`: the same arguments and calls, without `await`."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -198,11 +202,11 @@ class ParamClient(Proxy):
         self.close()
 
 
-class Component(Proxy):
+class Component(Proxy, of=component.Component):
     """See `paramclient.Component`."""
 
 
-class Ftp(Proxy):
+class Ftp(Proxy, of=files.Ftp):
     """See `paramclient.Ftp`."""
 
 
@@ -237,21 +241,12 @@ class Stream(Proxy, Iterator[Any]):
             taken.append(await anext(self._target))
 
 
-class Changes(Stream):
+class Changes(Stream, of=streams.Changes):
     """See `paramclient.Changes`."""
 
 
-class Events(Stream):
+class Events(Stream, of=events.Events):
     """See `paramclient.Events`."""
-
-
-_PROXIES: dict[type, type[Proxy]] = {
-    asynchronous.ParamClient: ParamClient,
-    component.Component: Component,
-    files.Ftp: Ftp,
-    streams.Changes: Changes,
-    events.Events: Events,
-}
 
 
 def blocking(function: Callable[..., Any]) -> Callable[..., Any]:

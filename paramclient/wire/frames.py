@@ -276,11 +276,11 @@ def message_name(message_id: int) -> str:
 
 
 def enum_word(enum: str, number: int) -> str:
-    """Return a value of an enum of the dialect as text, `fixed wing` for 1 of MAV_TYPE; else the number."""
+    """Return a value of an enum of the dialect as text: of MAV_TYPE, `fixed wing` for 1, and `type 250`."""
     entry = dialect.enums[enum].get(number)
-    return (
-        str(number) if entry is None else str(entry.name.removeprefix(f"{enum}_").lower().replace("_", " "))
-    )
+    if entry is None or entry.name == f"{enum}_ENUM_END":  # which is no value
+        return f"{enum.removeprefix('MAV_').lower()} {number}"
+    return str(entry.name.removeprefix(f"{enum}_").lower().replace("_", " "))
 
 
 def _by_id_bytes(ids: Collection[int]) -> dict[bytes, int]:

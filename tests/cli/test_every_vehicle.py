@@ -10,7 +10,7 @@ import pytest
 from paramclient import read_file
 from paramclient.cli import set_command
 from paramclient.metadata import Metadata, ParamInfo
-from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, Camera, PX4Vehicle
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import Tap
 
@@ -88,6 +88,15 @@ def test_one_vehicle_that_fails_stops_no_other(
     assert read.code == 3
     assert [line[:2] for line in read.words[1:]] == [["1/1", "GAIN"]]
     assert "3/1 px4: " in read.err
+
+
+def test_parts_of_a_vehicle_are_named_and_not_asked(
+    command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle]
+) -> None:
+    camera = Camera()
+    fetched = command("fetch", put(Air([*vehicles, camera])), "--vehicle", "all")
+    assert fetched.code == 0
+    assert "Also heard, and not asked: 1/100 camera" in fetched.err
 
 
 def test_set_writes_to_every_vehicle(

@@ -128,6 +128,24 @@ def test_what_was_received_is_written_with_incomplete_and_the_file_names_the_oth
     assert "without index 9, 'RC MAP'" in path.read_text()
 
 
+@pytest.mark.parametrize("ending", ["params", "param", "json"])
+def test_values_that_are_no_numbers_are_left_out_of_a_file_that_cannot_hold_them(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path, ending: str
+) -> None:
+    raw = {"WIDE": (b"\1\0\0\0", ParamType.INT64), "ODD": (b"\2\0\0\0", ParamType.UNKNOWN)}
+    path = tmp_path / f"quad.{ending}"
+    saved = command("save", put(Partial({**TABLE, **raw})), path, "--no-cache")
+    assert saved.code == 0
+    params = read_file(path).choose()
+    if ending == "json":
+        assert set(params) == {*TABLE, *raw}
+        assert (params["WIDE"].type_number, params["ODD"].type_number) == (ParamType.INT64, 0)
+    else:
+        assert set(params) == set(TABLE)
+        assert "1/1: left out, as only a .json file can hold them: WIDE, ODD" in saved.err
+        assert "without WIDE, ODD" in path.read_text()
+
+
 @pytest.mark.parametrize("ending", ["params", "json"])
 def test_a_vehicle_with_component_0_is_written_and_read(
     command: Command, put: Callable[[Endpoint], str], tmp_path: Path, ending: str
@@ -140,19 +158,12 @@ def test_a_vehicle_with_component_0_is_written_and_read(
     assert (params.system, params.component, set(params)) == (1, 0, set(TABLE))
 
 
-def test_a_value_that_the_format_cannot_hold_is_left_out_with_incomplete(
-    command: Command, tmp_path: Path
-) -> None:
+def test_a_name_that_the_format_cannot_hold_is_left_out(command: Command, tmp_path: Path) -> None:
     source, path = tmp_path / "quad.json", tmp_path / "quad.param"
-    params = {"A": WrittenParam("A", 1, ParamType.INT32), "RAW": WrittenParam("RAW", b"\1\0\0\0", 77)}
-    write_file(source, ParamSet(params, 1, 1))
-    refused = command("save", source, path)
-    assert (refused.code, "RAW is 0x00000001, which is not a number" in refused.err) == (2, True)
-    assert not path.exists()
-    saved = command("save", source, path, "--incomplete")
-    assert (saved.code, "left out: RAW is 0x00000001" in saved.err) == (0, True)
+    write_file(source, ParamSet({"A": WrittenParam("A", 1), "A B": WrittenParam("A B", 2)}, 1, 1))
+    saved = command("save", source, path)
+    assert (saved.code, "left out, as only a .json file can hold them: A B" in saved.err) == (0, True)
     assert list(read_file(path).choose()) == ["A"]
-    assert "without RAW" in path.read_text()
 
 
 def test_an_incomplete_table_is_not_written(

@@ -17,11 +17,12 @@ from typing import Any
 
 import pytest
 
-from paramclient import ParamCache, ParamType, read_file
+from paramclient import Encoding, ParamCache, ParamType, read_file
 from paramclient.model.values import WireValue
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle
 from paramclient.wire import frames, messages
 from tests.commands import Command, Put, behind, in_process, leaping
+from tests.conversations.partial import Partial
 
 TABLE: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "RTL_ALT": 1500,
@@ -114,6 +115,18 @@ def test_apply_sets_and_verifies_values_that_differ(
     assert again.code == 0
     assert again.rows[1:] == [["COMPASS_OFS_X", "5.0", "12.5", "5.0", "skipped", left_out]]
     assert vehicle.requests["PARAM_SET"] == 2
+
+
+def test_a_name_that_no_vehicle_can_have_is_invalid_too(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    vehicle = copter()
+    wrong = file("RTL_ALT,2500\nSIM_GPS1_BYTELOSS,0\n")
+    assert command("apply", put(vehicle), wrong).code == 2
+    assert vehicle.requests["PARAM_SET"] == 0
+    outcome = command("apply", put(vehicle), wrong, "--skip-invalid")
+    assert (outcome.code, vehicle.values["RTL_ALT"]) == (1, 2500)
+    assert "line 2: " in outcome.err
 
 
 def test_invalid_values_are_reported_before_anything_is_sent(
@@ -590,3 +603,26 @@ def test_metadata_gives_ranges_and_reboots(
     outcome = command("apply", put(vehicle), file(), *options)
     assert outcome.code == 0
     assert "takes effect after a reboot: WPNAV_SPEED" in outcome.err
+
+
+def test_nothing_is_compared_or_written_in_a_doubtful_encoding(
+    command: Command, put: Put, tmp_path: Path
+) -> None:
+    vehicle = Partial(encoding=Encoding.C_CAST)
+    url, saved = put(vehicle), tmp_path / "quad.param"
+    assert command("save", url, saved).code == 0
+    assert "(The encoding of 1/1 is probably wrong: " in saved.read_text()
+    before = dict(vehicle.values)
+    for words in (
+        ["apply", url, saved, "--yes"],
+        ["apply", url, saved, "--dry-run"],
+        ["restore", url, saved],
+    ):
+        done = command(*words)
+        assert done.code == 2
+        assert "--encoding c-cast" in done.err
+    assert command("set", url, "GAIN_1", "7.5").code == 0
+    assert command("save", url, saved, "--encoding", "c-cast").code == 0
+    restored = command("restore", url, saved, "--encoding", "c-cast")
+    assert (restored.code, "8 unchanged" in restored.err) == (0, True)
+    assert vehicle.values == before | {"GAIN_1": vehicle.values["GAIN_1"]}

@@ -592,6 +592,15 @@ async def test_a_silent_component_delays_no_other_component(autopilot: int) -> N
 
 
 @in_simulated_time
+async def test_fetch_all_waits_for_a_vehicle_at_a_long_round_trip() -> None:
+    far = Air.symmetric([generic(system=2)], delay=1.25)
+    async with a_client(Air([generic(), far])) as client:
+        while (2, 1) not in client.components:  # noqa: ASYNC110 - in simulated time
+            await anyio.sleep(0.1)
+        assert (await client.fetch_all()).results.keys() == {(1, 1), (2, 1)}
+
+
+@in_simulated_time
 async def test_fetch_all_includes_a_vehicle_that_is_heard_late() -> None:
     late = generic(system=2)
     late.reboot(1000.0, down=0.9)

@@ -14,7 +14,7 @@ from paramclient.cli.json_setup import ApplyJson
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType
 from paramclient.provision import ApplyStatus, apply
-from paramclient.sim import Air, Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from tests.conversations.test_fetch import new_vehicle
 from tests.conversations.virtual import Silence
 from tests.shell import in_simulated_time
@@ -99,6 +99,7 @@ async def test_a_refresh_of_a_cached_table(kind: str, tmp_path: Path) -> None:
     with ParamCache(cache) as opened:
         synced_at = opened.component(system=1).synced_at
     received = [0]
+    assert isinstance(world.vehicle, PX4Vehicle | ArduPilotVehicle)
     world.vehicle.load(world.wanted)
     async with ParamClient(world.endpoint, cache=cache) as client:
         component = await client.component()

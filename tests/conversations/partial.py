@@ -46,7 +46,7 @@ class Partial(Puppet):
 
     def __init__(
         self,
-        table: Mapping[str, tuple[float, ParamType]] = TABLE,
+        table: Mapping[str, tuple[float | bytes, ParamType]] = TABLE,
         *,
         serves: Iterable[str] = EVERYTHING,
         first: int = 0,

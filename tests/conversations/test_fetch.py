@@ -12,7 +12,7 @@ from paramclient.errors import NoReply, ParamErrorCode
 from paramclient.model.values import Trust
 from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle, px4_table
-from paramclient.wire.messages import HASH_CHECK, Message, ParamError, ParamRequestRead
+from paramclient.wire.messages import HASH_CHECK, FileTransfer, Message, ParamError, ParamRequestRead
 from tests.conversations.virtual import Silence, Tap, converse, run
 
 BACKENDS = pytest.mark.parametrize("backend", ["trio", "asyncio"])
@@ -182,17 +182,37 @@ def test_a_list_that_stops_is_completed() -> None:
     run(main)
 
 
-def test_silent_mavftp_costs_at_most_one_and_a_half_seconds() -> None:
-    async def elapsed(loss: float, *, asks: bool) -> float:
-        vehicle = ArduPilotVehicle(ftp=False)
-        async with converse(Air.symmetric([vehicle], loss=loss, delay=0.05, seed=2)) as conversation:
+def is_no_file(message: Message) -> bool:
+    """Return whether a link that drops MAVFTP passes a message."""
+    return not isinstance(message, FileTransfer)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.05, 0.15, 0.25, 0.5, 1.25])
+def test_silent_mavftp_costs_at_most_one_and_a_half_seconds(delay: float) -> None:
+    async def elapsed(*, asks: bool) -> float:
+        tap = Tap(ArduPilotVehicle(), up=is_no_file)
+        async with converse(Air.symmetric([tap], delay=delay)) as conversation:
             node = await conversation.node()
             await node.identification.settled()
+            await anyio.sleep(4 * delay)
             node.plain.serves_file = None if asks else False
-            node.identification.capabilities = (node.identification.capabilities or 0) | 32
             return (await fetch_all(node.plain)).elapsed
 
-    assert run(lambda: elapsed(0.0, asks=True)) - run(lambda: elapsed(0.0, asks=False)) < 1.5
+    assert run(lambda: elapsed(asks=True)) - run(lambda: elapsed(asks=False)) < 1.5
+
+
+def test_silent_mavftp_is_learnt_on_a_lossy_link() -> None:
+    async def main() -> None:
+        tap = Tap(ArduPilotVehicle(), up=is_no_file)
+        async with converse(Air.symmetric([tap], loss=0.2, delay=0.05, seed=2)) as conversation:
+            node = await conversation.node()
+            for _ in range(3):
+                assert (await fetch_all(node.plain, refresh=True)).complete
+            requests = len(conversation.sent_of(FileTransfer))
+            assert (await fetch_all(node.plain)).source == "stream"
+            assert len(conversation.sent_of(FileTransfer)) == requests > 0
+
+    run(main)
 
 
 @pytest.mark.parametrize("code", ParamErrorCode)

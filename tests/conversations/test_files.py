@@ -26,7 +26,7 @@ from paramclient.protocol.ftp import (
 )
 from paramclient.protocol.param_pck import PackedParam, encode
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
-from paramclient.wire.messages import FileTransfer, Message, ParamRequestList, ParamValue
+from paramclient.wire.messages import FileTransfer, Message, ParamRequestList, ParamRequestRead, ParamValue
 from tests.conversations.virtual import Silence, Tap, converse, virtual, virtual_on_both
 
 BOTH = pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
@@ -334,6 +334,38 @@ async def test_a_file_that_is_not_valid_leads_to_the_list_and_drops_nothing(cont
         assert not second.missing
         assert any("Downloaded as a list" in note for note in second.notes)
         assert not [each for each in conversation.changes if each.kind == "removed"]
+
+
+@virtual
+async def test_a_short_file_replaces_no_table_where_the_indices_begin_at_1() -> None:
+    vehicle = ArduPilotVehicle()
+    tap = Tap(
+        vehicle, up=lambda message: not (isinstance(message, ParamRequestRead) and message.param_index == 0)
+    )
+    async with converse(tap) as conversation:
+        session = (await conversation.node()).plain
+        first = await fetch_all(session)
+        short = pack_of(vehicle, 10)
+        vehicle.files.update(dict.fromkeys(("@PARAM/param.pck", "@PARAM/param.pck?withdefaults=1"), short))
+        second = await fetch_all(session, refresh=True)
+        assert (second.source, second.count, second.complete) == ("stream", first.count, True)
+        assert second.params.keys() == first.params.keys()
+
+
+@pytest.mark.parametrize("is_cached", [False, True])
+@virtual
+async def test_a_fetch_does_not_wait_for_another_file(is_cached: bool) -> None:
+    vehicle = ArduPilotVehicle()
+    async with converse(vehicle) as conversation:
+        node = await conversation.node()
+        if is_cached:
+            await fetch_all(node.plain)
+        async with node.channel.ftp:  # as while a log is downloaded
+            result = await fetch_all(node.plain)
+        assert (result.source, result.complete) == ("stream", True)
+        assert result.elapsed < 6.0
+        assert any("in use for another file" in note for note in result.notes)
+        assert (await fetch_all(node.plain)).source in ("ftp", "cache")
 
 
 @virtual

@@ -34,7 +34,7 @@ from paramclient.wire.messages import (
     ParamValue,
 )
 from tests.conversations.partial import EVERYTHING, TABLE, Partial
-from tests.conversations.virtual import QUIET, Puppet, Tap, converse, virtual
+from tests.conversations.virtual import QUIET, Puppet, Tap, converse, virtual, virtual_on_both
 
 ARDUPILOT = Heartbeat(2, 3, system_status=4)
 PX4 = Heartbeat(2, 12, system_status=4)
@@ -167,6 +167,45 @@ async def test_a_slow_list_whose_count_grows_is_received_to_its_end(
             assert (result.complete, len(result.params)) == (True, 12)
 
 
+@pytest.mark.parametrize("heartbeat", [ARDUPILOT, QUIET, PX4], ids=["AP", "generic", "PX4"])
+@pytest.mark.parametrize(
+    "serves", [("indices", "sets", "acks", "commands"), ("indices", "sets")], ids="+".join
+)
+@virtual_on_both
+async def test_a_vehicle_without_list_is_read_by_its_indices(
+    heartbeat: Heartbeat, serves: tuple[str, ...]
+) -> None:
+    table = {f"P{number:02}": (number / 2, ParamType.REAL32) for number in range(60)}
+    async with converse(Partial(table, serves=serves, heartbeat=heartbeat)) as conversation:
+        session = (await conversation.node()).plain
+        began = anyio.current_time()
+        assert (await write(session, "P50", 7.5)).actual == 7.5
+        assert anyio.current_time() - began < 15.0
+        result = await fetch_all(session)
+        assert (result.complete, len(result.params)) == (True, 60)
+
+
+@pytest.mark.parametrize("size", [1, 8])
+@pytest.mark.parametrize("delay", [0.5, 1.25])
+@virtual
+async def test_the_end_of_a_list_without_a_count_is_not_sought_for_long(delay: float, size: int) -> None:
+    table = {f"P{number}": (number, ParamType.REAL32) for number in range(size)}
+    vehicle = Partial(table, count=lambda index: index + 1)
+    async with converse(Air.symmetric([vehicle], delay=delay)) as conversation:
+        session = (await conversation.node()).plain
+        began = anyio.current_time()
+        result = await fetch_all(session)
+        assert (result.complete, len(result.params)) == (True, size)
+        assert anyio.current_time() - began < 15.0
+
+
+@virtual
+async def test_a_count_of_more_than_can_be_requested_is_told_as_what_can() -> None:
+    async with converse(Partial(count=lambda index: 65_535)) as conversation:
+        result = await fetch_all((await conversation.node()).plain)
+        assert (set(result.params), result.received, result.count) == (set(TABLE), len(TABLE), 32_768)
+
+
 @pytest.mark.parametrize("too_many", [1, 3_000])
 @virtual
 async def test_a_count_that_is_too_large_costs_seconds_and_no_value(too_many: int) -> None:
@@ -198,6 +237,55 @@ async def test_a_name_that_no_file_can_hold_is_noted_and_not_missed(name: str) -
         result = await fetch_all((await conversation.node()).plain)
         assert (result.missing, set(result.params)) == ((), set(TABLE))
         assert any(repr(name) in note for note in result.notes)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("too_many", [0, 2])
+@virtual
+async def test_a_name_that_is_not_in_the_list_of_an_ardupilot_without_reads_is_unknown(
+    first: int, too_many: int
+) -> None:
+    table = {"abc_def": (5.0, ParamType.REAL32), "ghi": (1.0, ParamType.REAL32)}
+    vehicle = Partial(
+        table, serves=("list",), first=first, count=lambda index: 2 + too_many, heartbeat=ARDUPILOT
+    )
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        with pytest.raises(UnknownParameter, match=r"1/1 has no ABC_DEF.*Did you mean abc_def"):
+            await read(session, "ABC_DEF")
+        assert (await read(session, "abc_def")).param_id == "abc_def"
+        assert anyio.current_time() < 20.0
+
+
+@pytest.mark.parametrize("serves", [EVERYTHING, ("list", "indices")], ids=["all reads", "by index"])
+@virtual
+async def test_an_unknown_name_of_a_px4_without_hash_is_told_as_what_it_is(serves: tuple[str, ...]) -> None:
+    vehicle = Partial(serves=serves, heartbeat=PX4, count=lambda index: len(TABLE) + 2)
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        with pytest.raises(UnknownParameter) as caught:
+            await read(session, "NOPE")
+        assert "answers no reads" not in str(caught.value)
+        assert vehicle.number_of(ParamRequestList) == (serves is not EVERYTHING)
+        assert anyio.current_time() < 15.0
+
+
+@pytest.mark.parametrize("heartbeat", [ARDUPILOT, QUIET, PX4], ids=["AP", "generic", "PX4"])
+@pytest.mark.parametrize("parts", [("list", "sets"), ("list", "sets", "acks")], ids="+".join)
+@virtual_on_both
+async def test_a_value_of_a_list_is_taken_without_its_end(
+    heartbeat: Heartbeat, parts: tuple[str, ...]
+) -> None:
+    count = len(TABLE) + 3_000
+    table = {name: (value, ParamType.REAL32) for name, (value, _) in TABLE.items()}
+    vehicle = Partial(table, serves=parts, heartbeat=heartbeat, count=lambda index: count)
+    async with converse(vehicle) as conversation:
+        session = (await conversation.node()).plain
+        await read(session, "OFFSET")
+        assert anyio.current_time() < 8.5
+        assert (await write(session, "MODE", 4)).status == "accepted"
+        assert anyio.current_time() < 12.0
+        assert not session.listing.is_running
 
 
 # the encoding

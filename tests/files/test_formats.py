@@ -321,7 +321,10 @@ def test_the_last_value_of_a_repeated_name_is_used(text: str, value: float, note
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("A,1,5", "expected NAME,VALUE with a decimal point (1.5, not 1,5), found 'A,1,5'"),
+        (
+            "A,1,5",
+            "expected NAME,VALUE with a decimal point (1.5, not 1,5) and no third column, found 'A,1,5'",
+        ),
         ("A 1,5", "with a decimal point"),
         ("A 1.5 m/s", "and nothing after it (no unit, no further column)"),
         ("A 1.5m", "with a number"),
@@ -383,7 +386,7 @@ def test_an_error_lists_at_most_twenty_bad_lines() -> None:
         "quad.x:3: expected NAME VALUE, found 'bad'",
     ]
     assert str(error).splitlines()[20:] == ["and 30 more"]
-    assert (error.source, error.line, error.expected) == ("quad.x", 2, "NAME VALUE")
+    assert (error.source, error.line) == ("quad.x", 2)
     long = "x" * 10_000
     assert len(str(failed(f"A 1\n{long}"))) < 300
     value = f'{{"paramclient": 1, "sets": [{{"params": {{"A": {{"value": "{long}"}}}}}}]}}'
