@@ -224,14 +224,17 @@ class Timing:
 
     Attributes:
         round_trip: smoothed, in seconds; None before the first measurement.
+        slowest: the longest time in seconds from a first request to its answer: so long may an answer wait in
+            the queue of a slow link.
         loss: share of attempts without an answer, counted when the exchange was answered at last: an
             unsupported request is no loss.
     """
 
-    __slots__ = ("_is_bound", "_lost", "_sent", "_variation", "round_trip")
+    __slots__ = ("_is_bound", "_lost", "_sent", "_variation", "round_trip", "slowest")
 
     def __init__(self) -> None:
         self.round_trip: float | None = None
+        self.slowest = 0.0
         self._variation = 0.0
         self._is_bound = False  # the round trip is only an upper bound
         self._lost = FIRST_LOST
@@ -523,6 +526,7 @@ class Channel:
         """Take the times of an answered exchange; it shortens the waits that are open."""
         timing = self.timing
         self.answered.set()
+        timing.slowest = max(timing.slowest, whole)
         if self.is_streaming:
             return
         timing.answered(attempts)

@@ -19,7 +19,7 @@ from paramclient.errors import (
 )
 from paramclient.model.names import did_you_mean, nearest_names
 from paramclient.model.values import Param, Trust
-from paramclient.protocol.channel import Inbox
+from paramclient.protocol.channel import ATTEMPTS_MAX, Inbox
 from paramclient.protocol.dialect import ReportedValue
 from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.protocol.list_download import download_list
@@ -112,7 +112,11 @@ async def _ask(
         return message if isinstance(message, dialect.value) else None
 
     def attempts_max() -> int:
-        return channel.timing.attempts_max  # of this moment: the loss is better known with each answer
+        if channel.is_streaming:  # on a slow link, the answer is queued behind the list
+            return ATTEMPTS_MAX
+        return (
+            attempts or channel.timing.attempts_max
+        )  # of this moment: loss is better known with each answer
 
     wait = queue_time(session)
     if is_served is False:
@@ -125,7 +129,7 @@ async def _ask(
             return answer
     request, what = dialect.request_read(channel.reads_from, which), _what(session, which)
     received: ReportedValue = await channel.exchange(
-        request, inbox, accept, what=what, attempts=attempts or attempts_max, timeout_min=wait
+        request, inbox, accept, what=what, attempts=attempts_max, timeout_min=wait
     )
     if isinstance(which, str):
         session.reads_names = True

@@ -49,6 +49,8 @@ SETS_MIN: Final = 5
 SETS_MAX: Final = 12
 SETS_LOST: Final = 1e-4
 """Probability that all sets are lost, at which a vehicle that keeps the old value has not applied them."""
+QUEUE_WAITS: Final = 3
+"""Waits for the wanted value, each as long as an answer ever took, while older ones still arrive."""
 EVIDENCE_READS: Final = 8
 """Indices that are read for evidence of the encoding: few components begin with more zeros and floats."""
 EXT_PROGRESS_TIMEOUT: Final = 60.0
@@ -283,7 +285,7 @@ class _Write:
                 elif answer.same_value(self.before):
                     sets_max = min(max(self.channel.timing.attempts_for(SETS_LOST), SETS_MIN), SETS_MAX)
                     if self.attempts >= sets_max:
-                        raise self._not_applied(answer)
+                        return await self._last_answer(inbox)
                 elif adjusted is not None and (adjusted.same_value(answer) or self.attempts >= SETS_MAX):
                     return self._result(answer)
                 else:
@@ -318,6 +320,20 @@ class _Write:
             with suppress(NoReply):
                 return await self._read(inbox)
         raise NoReply(what, attempts=self.attempts, waited=anyio.current_time() - self._began)
+
+    async def _last_answer(self, inbox: Inbox) -> SetResult:
+        """Wait for the wanted value behind the answers to earlier reads, which a slow link has queued."""
+        answer: Param | ParamExtAck | None = None
+        for _ in range(QUEUE_WAITS):
+            self._has_other_value, now = False, anyio.current_time()
+            answer = await self.channel.wait_for(inbox, self._accept, now, 0, self.channel.timing.slowest)
+            if answer is not None or not self._has_other_value:
+                break
+        if not isinstance(answer, Param):
+            answer = await self._read(inbox)
+        if not self._is_wanted(answer):
+            raise self._not_applied(answer)
+        return self._result(answer)
 
     async def _confirm(self) -> None:
         await self.session.confirm(self._vehicle)

@@ -39,7 +39,7 @@ from paramclient.wire.messages import (
     ParamSet,
     ParamValue,
 )
-from tests.conversations.virtual import Puppet, Silence, Tap, converse, virtual, virtual_on_both
+from tests.conversations.virtual import Puppet, Silence, Tap, converse, run, virtual, virtual_on_both
 
 EVERY_TYPE = {
     ParamType.UINT8: 255,
@@ -646,3 +646,21 @@ async def test_a_link_that_fails_ends_a_batch_and_the_others_are_not_tried() -> 
             conversation.station.fail(LinkError("gone", link="x"), for_good=True)
         assert isinstance(results[0].error, LinkError)
         assert {each.status for each in results[0].outcomes} >= {SetStatus.UNKNOWN, SetStatus.NOT_TRIED}
+
+
+@pytest.mark.parametrize(("rate", "after"), [(2_000, 1.0), (4_000, 0.3), (8_000, 0.3)])
+def test_sets_behind_a_list_that_fills_a_slow_link(rate: int, after: float) -> None:
+    """Answers to reads from before the set arrive for seconds after it, and are no proof against it."""
+
+    async def session() -> None:
+        vehicle = PX4Vehicle()
+        async with converse(Air.symmetric([vehicle], rate=rate)) as conversation:
+            node = await conversation.node()
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(fetch_all, node.plain)
+                await anyio.sleep(after)
+                for name, value in (("MC_ROLL_P", 6.5), ("BAT1_N_CELLS", 6)):
+                    tasks.start_soon(write, node.plain, name, value)
+            assert vehicle.values["MC_ROLL_P"] == node.plain.table.params["MC_ROLL_P"].value == 6.5
+
+    run(session)
