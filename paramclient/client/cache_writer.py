@@ -34,6 +34,9 @@ PENDING_MAX: Final = 4_096
 """Observations of one table that wait for the cache: above it, the whole table is written later."""
 CLOCK_STEP: Final = 1.0
 """Seconds by which the computer's clock must differ to count as set, or as suspended."""
+CLOSE_RETRY_INTERVAL: Final = 0.3
+"""Seconds until `close` tries once more to write: a database may have been restarted, and the cache fails at
+once for 0.25 s after a failed connection."""
 CLOSE_WAIT_MAX: Final = 6.0
 """Seconds for which `close` waits for the cache: longer than another process may lock a file."""
 
@@ -119,10 +122,13 @@ class CacheWriter:
                 is_known = node.identification.is_settled
                 if is_known or any(each.table.is_complete for each in node.sessions):
                     await self.load(node, vehicle_of(nodes, node))
-            with suppress(CacheError):
-                await self.write_all()
-                await self.write_all()  # after a replaced file
-                is_written = True
+            for delay in (CLOSE_RETRY_INTERVAL, 0.0):
+                with suppress(CacheError):
+                    await self.write_all()
+                    await self.write_all()  # after a replaced file
+                    is_written = True
+                    break
+                await anyio.sleep(delay)
         if not is_written and not was_warned:
             self._warn_of_lost()
         if self._owned:
