@@ -189,7 +189,6 @@ class FileError(UsageError):
     Attributes:
         source: the file's name as given; "" for bytes without a name.
         line: the first bad line, from 1; None if the error concerns no single line.
-        expected: the expected content of the line, in words; None if the error concerns no single line.
         reason: the first line of the text, without the file's name and line number.
     """
 
@@ -199,7 +198,6 @@ class FileError(UsageError):
         *,
         source: str = "",
         line: int | None = None,
-        expected: str | None = None,
         more: tuple[str, ...] = (),
     ) -> None:
         if line is not None:
@@ -209,14 +207,7 @@ class FileError(UsageError):
         super().__init__("\n".join((f"{place}{message}", *more)))
         self.source = source
         self.line = line
-        self.expected = expected
         self.reason = message
-        self._more = more
-
-    def with_more(self, text: str) -> FileError:
-        """Return a copy of the error with another line of text."""
-        more = (*self._more, text)
-        return FileError(self.reason, source=self.source, line=self.line, expected=self.expected, more=more)
 
 
 class MetadataError(UsageError):

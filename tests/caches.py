@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import paramclient
@@ -68,10 +69,17 @@ def stored(
     return StoredParam.of(param, at, volatile, by)
 
 
-def update(*params: StoredParam, identity: Identity = PX4, component: int = 1, **more: Any) -> TableUpdate:
+def update(
+    *params: StoredParam,
+    identity: Identity = PX4,
+    component: int = 1,
+    removed: Mapping[str, float] = MappingProxyType({}),
+    **more: Any,
+) -> TableUpdate:
     """What was learnt at NOW."""
     more = {"autopilot": 12, "at": NOW} | more
-    return TableUpdate(identity=identity, component=component, params=params, **more)
+    gone = [StoredParam.gone(name, at) for name, at in removed.items()]
+    return TableUpdate(identity=identity, component=component, params=[*params, *gone], **more)
 
 
 def whole_table(count: int, identity: Identity = PX4, component: int = 1, first: int = 0) -> TableUpdate:

@@ -31,7 +31,7 @@ MAY_IMPORT = {
     "links": MODEL | {"wire", "sim"},
     "cache": MODEL,
     "files": PROTOCOL,
-    "metadata": SHELL,
+    "metadata": SHELL | {"files"},
     "client": SHELL | {"sim"},
     "provision": SHELL | {"files"},
     "logs": SHELL | {"files"},

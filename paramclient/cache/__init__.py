@@ -2,16 +2,15 @@
 
 - `store`: `ParamCache`, the public class, and the default path of the file.
 - `records`: records that the cache stores and returns.
-- `sqlite`: the one SQL text of the tables, and a file that stores them; `postgres`: a database.
-- `tables`: reads and updates of tables.
-- `history`: lines of changes, earlier states, insertion by time.
+- `database`: the tables in one SQL text, and the store; `sqlite`, `postgres`: its two kinds of place.
+- `tables`: reads of tables; `updates`: updates of tables, import by time.
+- `history`: lines of changes, values at an earlier time.
 - `snapshots`: snapshots, and tables at an earlier time.
 - `lookup`: vehicles by system id, address, kind, hardware id or key.
 """
 
 from __future__ import annotations
 
-from paramclient.cache.history import HISTORY_ENTRIES_MAX
 from paramclient.cache.records import (
     BY_US,
     BY_VEHICLE,
@@ -27,14 +26,11 @@ from paramclient.cache.records import (
 )
 from paramclient.cache.snapshots import SNAPSHOTS
 from paramclient.cache.store import ParamCache, default_path, is_database_url
-from paramclient.cache.tables import YEAR_10000
 
 __all__ = [
     "BY_US",
     "BY_VEHICLE",
-    "HISTORY_ENTRIES_MAX",
     "SNAPSHOTS",
-    "YEAR_10000",
     "CachedComponent",
     "CachedSummary",
     "CachedVehicle",

@@ -12,17 +12,23 @@ from collections.abc import Iterable, Mapping, Sequence
 from operator import attrgetter, itemgetter
 from typing import Any, Final, NamedTuple
 
-from paramclient.cache.records import BY_VEHICLE, HistoryEntry, StoredParam, StoredValue
-from paramclient.cache.sqlite import Transaction
+from paramclient.cache.database import Transaction
+from paramclient.cache.records import (
+    BY_VEHICLE,
+    HistoryEntry,
+    StoredParam,
+    StoredValue,
+    is_same_value,
+    stored_value,
+)
 
 __all__ = [
     "HISTORY_ENTRIES_MAX",
     "Line",
     "add_lines",
-    "insert_observations",
-    "last_removal",
     "load_history",
     "load_lines",
+    "merged_lines",
     "values_at",
 ]
 
@@ -78,14 +84,13 @@ def add_lines(tx: Transaction, owner: int, lines: Iterable[Line]) -> None:
         )
 
 
-def load_lines(tx: Transaction, owner: int, name: str | None = None) -> list[Line]:
-    """Return the history lines of a table, or of one of its parameters, in the order of their times."""
-    where, values = ("", (owner,)) if name is None else (" AND name = ?", (owner, name))
-    found = tx.all(
-        f"SELECT {_LINE} FROM history WHERE owner = ?{where} ORDER BY at, id",
-        values,
-    )
-    return [_line(row) for row in found]
+def load_lines(tx: Transaction, owner: int) -> dict[str, list[Line]]:
+    """Return the history lines of a table by parameter, in the order of their times."""
+    lines: dict[str, list[Line]] = {}
+    for row in tx.all(f"SELECT {_LINE} FROM history WHERE owner = ? ORDER BY at, id", (owner,)):
+        line = _line(row)
+        lines.setdefault(line.name, []).append(line)
+    return lines
 
 
 def load_history(
@@ -96,8 +101,8 @@ def load_history(
     limit: int | None,
     since: float | None,
     extended: bool,
-) -> list[tuple[int, Line]]:
-    """Return the changes of a vehicle's values with their component ids, newest last."""
+) -> list[HistoryEntry]:
+    """Return the changes of a vehicle's values, newest last."""
     given = {"c.component = ?": component, "h.name = ?": name, "h.at >= ?": since}
     conditions = {condition: value for condition, value in given.items() if value is not None}
     found = tx.all(
@@ -108,67 +113,27 @@ def load_history(
         f" ORDER BY h.at DESC, h.id DESC{'' if limit is None or limit < 0 else f' LIMIT {int(limit)}'}",
         (key, int(extended), *conditions.values()),
     )
-    return [(component, _line(row)) for *row, component in reversed(found)]
-
-
-def entry_of(component: int, line: Line) -> HistoryEntry:
-    """Return a line as users see it."""
-    assert line.old is not None
-    new = None if line.new is None else line.new.param(line.name)
-    return HistoryEntry(line.at, component, line.name, line.old.param(line.name), new, line.by)
-
-
-def last_removal(tx: Transaction, owner: int, name: str) -> float:
-    """Return the time of the last removal of a parameter; minus infinity if it was never removed."""
-    [(at,)] = tx.all(
-        "SELECT max(at) FROM history WHERE owner = ? AND name = ? AND new_type IS NULL", (owner, name)
-    )
-    return -math.inf if at is None else float(at)
+    return [
+        HistoryEntry(at, number, name, old.param(name), new and new.param(name), by)
+        for *row, number in reversed(found)
+        for at, name, by, _, old, new in [_line(row)]
+        if old is not None
+    ]
 
 
 def values_at(
     tx: Transaction, owner: int, rows: Mapping[str, StoredParam], when: float
 ) -> dict[str, StoredValue]:
     """Return the values that a table had at a time since which its states are known."""
-    values = {name: row.stored for name, row in rows.items()}
+    values = {name: row.stored for name, row in rows.items() if row.stored is not None}
     later = f"SELECT name, {_OLD} FROM history WHERE owner = ? AND at > ? ORDER BY at DESC, id DESC"
     for name, *old in tx.all(later, (owner, when)):
-        value = _value(old)
+        value = stored_value(old)
         if value is None:
             values.pop(name, None)
         else:
             values[name] = value
     return values
-
-
-def insert_observations(
-    tx: Transaction, owner: int, rows: Mapping[str, StoredParam], earlier: Sequence[StoredParam]
-) -> None:
-    """Insert observations that are earlier than the stored ones into the history, by time.
-
-    The lines of each parameter are computed anew from all of its observations: those of its lines, the stored
-    one, and these. Repeating the call changes nothing.
-
-    Args:
-        tx: the transaction.
-        owner: id of the table.
-        rows: its parameters.
-        earlier: the observations.
-    """
-    [(known_since,)] = tx.all("SELECT known_since FROM component WHERE id = ?", (owner,))
-    by_name: dict[str, list[StoredParam]] = {}
-    for item in earlier:
-        by_name.setdefault(item.name, []).append(item)
-    new_lines: list[Line] = []
-    for name, items in by_name.items():
-        lines, row = load_lines(tx, owner, name), rows.get(name)
-        if row is None and not lines:  # a name that the vehicle no longer had when its table was stored
-            continue
-        merged = _merged(name, lines, row, items, math.inf if known_since is None else known_since)
-        if merged != lines:
-            tx.do("DELETE FROM history WHERE owner = ? AND name = ?", (owner, name))
-            new_lines += merged
-    add_lines(tx, owner, new_lines)
 
 
 class _Point(NamedTuple):
@@ -179,18 +144,29 @@ class _Point(NamedTuple):
     by: str
 
 
-def _merged(
+def merged_lines(
     name: str,
     lines: Sequence[Line],
     row: StoredParam | None,
-    items: Sequence[StoredParam],
-    known_since: float,
+    items: Iterable[StoredParam],
+    known_since: float | None,
+    confirmed_at: float,
 ) -> list[Line]:
-    """Return the lines of one parameter with further observations."""
+    """Return the lines of a parameter anew, from its stored observations and those that are inserted.
+
+    Args:
+        name: the parameter.
+        lines: its lines so far.
+        row: its stored value.
+        items: the observations to insert.
+        known_since: time since which the states of the table are known, or None.
+        confirmed_at: time at which the stored value was last confirmed by the hash; minus infinity if never.
+    """
     points: list[_Point] = []
     known: list[tuple[_Point, float]] = []  # and within how many seconds an observation is the same
     first_value = lines[0].old if lines else row and row.stored
-    if first_value is not None and known_since < (lines[0].at if lines else math.inf):
+    begin = lines[0].at if lines else math.inf
+    if first_value is not None and known_since is not None and known_since < begin:
         points.append(_Point(known_since, first_value, BY_VEHICLE))  # the table was complete with it
     for line in lines:
         if line.old is not None and line.old_at is not None:
@@ -198,40 +174,33 @@ def _merged(
             known.append((points[-1], 0.0))
         points.append(_Point(line.at, line.new, line.by))
         known.append((points[-1], SAME_CHANGE_MAX))
-    if row is not None:
-        points.append(_Point(row.heard_at, row.stored, BY_VEHICLE))
     points += [
         _Point(item.heard_at, item.stored, item.by)
         for item in items
         if not any(
-            _is_same(point.value, item.stored) and abs(point.at - item.heard_at) <= tolerance
+            is_same_value(point.value, item.stored) and abs(point.at - item.heard_at) <= tolerance
             for point, tolerance in known
         )
     ]
+    if row is not None:
+        moments = (row.heard_at, max(row.heard_at, confirmed_at))
+        points += [_Point(at, row.stored, BY_VEHICLE) for at in moments]
     points.sort(key=itemgetter(0))
-    has_appeared = bool(lines) and lines[0].old is None
+    has_appeared = lines[0].old is None if lines else row is None and known_since is not None
     first, *later = points
     merged = [Line(first.at, name, first.by, None, None, first.value)] if has_appeared else []
     last = first
     for point in later:
-        if not _is_same(last.value, point.value):
+        if not is_same_value(last.value, point.value):
             old_at = None if last.value is None else last.at
             merged.append(Line(point.at, name, point.by, old_at, last.value, point.value))
         last = point
     return merged
 
 
-def _is_same(one: StoredValue | None, other: StoredValue | None) -> bool:
-    return one is other or (one is not None and other is not None and one.is_same(other))
-
-
 def _line(cells: Sequence[Any]) -> Line:
     at, name, author, old_at, *values = cells
-    return Line(at, name, author, old_at, _value(values[:3]), _value(values[3:]))
-
-
-def _value(cells: Sequence[Any]) -> StoredValue | None:
-    return None if cells[0] is None else StoredValue(*cells)
+    return Line(at, name, author, old_at, stored_value(values[:3]), stored_value(values[3:]))
 
 
 _NO_VALUE: Final = (None, None, None)

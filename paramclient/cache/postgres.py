@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from typing import Any, Final, TypeVar
 from urllib.parse import quote
 
 import psycopg
 from psycopg.conninfo import conninfo_to_dict
 
-from paramclient.cache.sqlite import SCHEMA_VERSION, TABLES, Transaction
+from paramclient.cache.database import SCHEMA_VERSION, TABLES, Store, Transaction
 from paramclient.errors import CacheError, UsageError
 
 __all__ = ["PostgresStore"]
@@ -40,10 +38,9 @@ _SECRETS: Final = ("password", "sslpassword")
 T = TypeVar("T")
 
 
-class PostgresStore:
-    """A cache in a database, with the methods and attributes of `SqliteStore`.
-
-    It has one connection, opened by the first call, and again after a loss.
+class PostgresStore(Store):
+    """A cache in a database, over one connection, which is opened again after a loss. Each transaction is
+    durable.
 
     The tables are in a schema of their own, which the first station creates; its role needs the privilege
     CREATE on the database.
@@ -63,42 +60,15 @@ class PostgresStore:
                 "the URL of the database is not valid; its form is postgresql://USER@HOST:PORT/DATABASE, and"
                 " characters of a password other than letters and digits are percent-encoded"
             ) from None
-        self.place = _place(given)
-        self.notes: list[str] = []
-        self.replacements = 0
+        super().__init__(_place(given))
         self._options: dict[str, Any] = _OPTIONS | given
         self._secrets = [str(given[name]) for name in _SECRETS if name in given]
-        self._lock = threading.Lock()
-        self._connection: psycopg.Connection | None = None
         self._failure: tuple[float, str] | None = None
-        self._is_closed = False
+        self._is_new = False  # whether the last attempt has opened the connection
 
-    def run(self, work: Callable[[Transaction], T], *, writing: bool, durable: bool = False) -> T:
-        """See `SqliteStore.run`. Each committed transaction is durable."""
-        with self._lock:
-            if self._is_closed:
-                raise CacheError(f"the cache {self.place} is closed")
-            while True:
-                was_connected = self._connection is not None
-                try:
-                    return self._transact(work, writing=writing)
-                except psycopg.Error as error:
-                    self._drop()
-                    # the server may have been restarted since the last call
-                    if not (was_connected and isinstance(error, psycopg.OperationalError)):
-                        raise self._error(error) from None
-                except BaseException:
-                    self._drop()
-                    raise
-
-    def close(self) -> None:
-        """Close it; later calls raise CacheError."""
-        with self._lock:
-            self._is_closed = True
-            self._drop()
-
-    def _transact(self, work: Callable[[Transaction], T], *, writing: bool) -> T:
-        if self._connection is None:
+    def _transact(self, work: Callable[[Transaction], T], *, writing: bool, durable: bool) -> T:
+        self._is_new = self._connection is None
+        if self._is_new:
             self._connection = self._connect()
         connection = self._connection
         with connection.transaction():
@@ -106,7 +76,14 @@ class PostgresStore:
                 connection.execute("SELECT pg_advisory_xact_lock(%s)", (_WRITE_LOCK,))
             else:
                 connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
-            return work(Transaction(connection, "%s"))
+            return work(_Transaction(connection))
+
+    def _recover(self, error: BaseException, *, writing: bool) -> None:
+        if not isinstance(error, psycopg.Error):
+            raise error
+        if self._is_new or not isinstance(error, psycopg.OperationalError):
+            raise self._error(error) from None
+        # else the server may have been restarted since the last call
 
     def _connect(self) -> psycopg.Connection:
         if self._failure is not None and time.monotonic() < self._failure[0]:
@@ -142,17 +119,30 @@ class PostgresStore:
 
     def _error(self, error: psycopg.Error) -> CacheError:
         """Return the error without the password."""
-        text = " ".join(str(error).split())
+        lines = str(error).splitlines()
+        text = " ".join(line.strip() for line in lines if "Is the server running" not in line)
         for secret in self._secrets:
             for each in {secret, quote(secret), quote(secret, safe="")}:
                 text = text.replace(each, "***")
         return CacheError(f"the cache {self.place} cannot be used: {text}")
 
-    def _drop(self) -> None:
-        connection, self._connection = self._connection, None
-        if connection is not None:
-            with suppress(psycopg.Error):
-                connection.close()
+
+class _Transaction(Transaction):
+    """A transaction of psycopg, which marks values by `%s`."""
+
+    def __init__(self, connection: psycopg.Connection) -> None:
+        super().__init__(connection, "%s")
+        self._cursor = connection.cursor()
+
+    def many(self, sql: str, rows: Sequence[Sequence[object]]) -> list[int]:
+        """See `Transaction.many`. The rows are sent at once: each round trip would take time."""
+        counts: list[int] = []
+        if rows:
+            self._cursor.executemany(self._marked(sql).encode(), rows, returning=True)
+            counts.append(self._cursor.rowcount)
+            while self._cursor.nextset():
+                counts.append(self._cursor.rowcount)
+        return counts
 
 
 def _place(options: dict[str, Any]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from paramclient.errors import UsageError
 from paramclient.model.identity import Identity, autopilot_name
@@ -99,7 +99,7 @@ class StoredParam(NamedTuple):
 
     Attributes:
         name: param_id.
-        stored: the value.
+        stored: the value; None if the vehicle no longer has the parameter.
         param_index: index, or None. None does not change a stored index, except in a whole table.
         volatile: 1 if the vehicle's hash excludes the parameter; None does not change the stored flag.
         heard_at: time of the observation. The later of two observations of a parameter counts.
@@ -108,7 +108,7 @@ class StoredParam(NamedTuple):
     """
 
     name: str
-    stored: StoredValue
+    stored: StoredValue | None
     param_index: int | None
     volatile: int | None
     heard_at: float
@@ -130,6 +130,11 @@ class StoredParam(NamedTuple):
             None if param.default is None else _bits_cell(bits_of(param.default, number)),
             by,
         )
+
+    @classmethod
+    def gone(cls, name: str, at: float) -> StoredParam:
+        """Return the observation that the vehicle no longer has a parameter."""
+        return cls(name, None, None, None, at)
 
     @property
     def hashed(self) -> StoredValue | None:
@@ -158,31 +163,6 @@ class TableState:
     file_works: bool | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class StoredTable:
-    """A stored table without its parameters.
-
-    Attributes:
-        owner: its id in this cache.
-        key: key of the vehicle.
-        component: component id.
-        autopilot: MAV_AUTOPILOT of the component's heartbeat.
-        size: number of parameters.
-        updated_at: time of the last update.
-        known_since: time since which its states are known, or None.
-        state: its state.
-    """
-
-    owner: int
-    key: str
-    component: int
-    autopilot: int
-    size: int
-    updated_at: float
-    known_since: float | None
-    state: TableState
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TableUpdate:
     """Update of the table of one component.
@@ -194,10 +174,8 @@ class TableUpdate:
         at: time of the update.
         table: the state of the table after this update. None does not change it, with one exception: a change
             of a value that the hash covers removes the hash.
-        params: parameters to insert or change, in the order of reception.
-        removed: names that the vehicle no longer has, with the times at which they were found missing.
+        params: observations of parameters, in the order of reception.
         replace: whether `params` are the whole table: other names are removed.
-        whole_at: time at which the vehicle was found to have no other names; None for `at`.
         extended: whether these are the extended parameters of the component.
     """
 
@@ -207,9 +185,7 @@ class TableUpdate:
     at: float
     table: TableState | None = None
     params: Sequence[StoredParam] = ()
-    removed: Mapping[str, float] = field(default_factory=dict)
     replace: bool = False
-    whole_at: float | None = None
     extended: bool = False
 
 
@@ -292,8 +268,8 @@ class CachedVehicle:
         )
 
 
-@dataclass(frozen=True, slots=True, repr=False)
-class CachedSummary:
+@dataclass(frozen=True, slots=True, repr=False, kw_only=True)
+class CachedSummary(TableState):
     """The cached table of one component, without its parameters.
 
     Attributes:
@@ -302,7 +278,6 @@ class CachedSummary:
         component: component id.
         autopilot: MAV_AUTOPILOT of this component's heartbeat.
         size: number of cached parameters.
-        hash, count, complete, volatile_known, synced_at, file_works: as in `TableState`.
         updated_at: time of the last write to the table.
     """
 
@@ -311,13 +286,7 @@ class CachedSummary:
     component: int
     autopilot: int
     size: int
-    hash: int | None
-    count: int | None
-    complete: bool
-    volatile_known: bool
-    synced_at: float | None
     updated_at: float
-    file_works: bool | None
 
     @property
     def system(self) -> int:
@@ -346,9 +315,37 @@ class CachedComponent(CachedSummary):
     heard_at: Mapping[str, float] = field(hash=False)
 
 
+class StoredTable(NamedTuple):
+    """A stored table without its parameters.
+
+    Attributes:
+        owner: its id in this cache.
+        known_since: time since which its states are known, or None.
+        summary: its description for users.
+    """
+
+    owner: int
+    known_since: float | None
+    summary: CachedSummary
+
+
 def stored_params(rows: Mapping[str, StoredParam]) -> dict[str, Param]:
-    """Return stored parameters, with trust CACHED."""
-    return {name: row.stored.param(name, row.param_index, row.default) for name, row in rows.items()}
+    """Return the stored parameters that the vehicle has, with trust CACHED."""
+    return {
+        name: row.stored.param(name, row.param_index, row.default)
+        for name, row in rows.items()
+        if row.stored is not None
+    }
+
+
+def stored_value(cells: Sequence[Any]) -> StoredValue | None:
+    """Return the value of its three cells, which are all None where there is none."""
+    return None if cells[0] is None else StoredValue(*cells)
+
+
+def is_same_value(one: StoredValue | None, other: StoredValue | None) -> bool:
+    """Return whether two values, or missing ones, are the same."""
+    return one is other or (one is not None and other is not None and one.is_same(other))
 
 
 def default_value(default: bytes | None, number: int) -> WireValue | None:

@@ -3,36 +3,33 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Final, TypeAlias
 
+from paramclient.cache.database import Transaction
 from paramclient.cache.history import values_at
 from paramclient.cache.records import (
     SnapshotSummary,
     StoredParam,
     StoredTable,
     StoredValue,
-    default_value,
     written_value,
 )
-from paramclient.cache.sqlite import Transaction
 from paramclient.cache.tables import (
     identity_cells,
     load_rows,
-    load_vehicles,
     read_identity,
     time_cell,
 )
 from paramclient.errors import NotInCache, UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import bits_of, from_bits
+from paramclient.model.values import bits_of
 
 __all__ = [
     "SNAPSHOTS",
-    "EarlierState",
     "SnapshotRow",
     "end_operation",
     "load_snapshots",
@@ -48,34 +45,6 @@ cover weeks of work on one vehicle."""
 
 SnapshotRow: TypeAlias = tuple[str, StoredValue, bytes | None]
 """Name, value and default of a parameter."""
-
-
-class EarlierState(NamedTuple):
-    """An earlier state of a table.
-
-    Attributes:
-        rows: its parameters.
-        component: component id.
-        identity: the vehicle. Only a snapshot has its firmware of that time.
-        at: the time.
-        source: the source, for messages.
-    """
-
-    rows: Sequence[SnapshotRow]
-    component: int
-    identity: Identity
-    at: float
-    source: str
-
-    @property
-    def params(self) -> ParamSet:
-        """The state as a set."""
-        params = {}
-        for name, (number, bits, is_raw), default in self.rows:
-            value = from_bits(int.from_bytes(bits, "little"), number, is_raw=bool(is_raw))
-            given = default_value(default, number)
-            params[name] = WrittenParam(name, value, number, given, is_raw=bool(is_raw))
-        return ParamSet(params, self.component, self.identity.system, self.identity, self.at, self.source)
 
 
 def store_snapshot(
@@ -133,14 +102,14 @@ def load_snapshots(tx: Transaction, table: StoredTable) -> list[SnapshotSummary]
     )
     return [
         SnapshotSummary(
-            *(number, table.key, table.component, at, reason, size, hash_, bool(complete)),
+            *(number, table.summary.key, table.summary.component, at, reason, size, hash_, bool(complete)),
             None if ended is None else bool(ended),
         )
         for number, at, reason, size, hash_, complete, ended in found
     ]
 
 
-def load_state(tx: Transaction, table: StoredTable, when: float) -> EarlierState:
+def load_state(tx: Transaction, table: StoredTable, when: float) -> ParamSet:
     """Return an earlier state of a table.
 
     Args:
@@ -159,24 +128,23 @@ def load_state(tx: Transaction, table: StoredTable, when: float) -> EarlierState
     for each in snapshots:
         if each.at == when:
             return _of_snapshot(tx, table, each.id)
-    since = table.known_since
+    since, known = table.known_since, table.summary
     if since is None or when < since:
         reach = "its table was never complete" if since is None else f"the history begins at {_second(since)}"
         kept = ", ".join(f"{each.id} of {_second(each.at)}" for each in snapshots) or "none"
         raise NotInCache(
-            f"the state of {table.key}, component {table.component}, at {_second(when)} is not known:"
+            f"the state of {known.key}, component {known.component}, at {_second(when)} is not known:"
             f" {reach}; snapshots: {kept}"
         )
-    [vehicle] = load_vehicles(tx, table.key)
-    identity = replace(vehicle.identity, firmware=0, git_hash="", capabilities=0)
+    identity = replace(known.identity, firmware=0, git_hash="", capabilities=0)
     values = values_at(tx, table.owner, load_rows(tx, table.owner), when)
     rows: list[SnapshotRow] = [(name, value, None) for name, value in values.items()]
-    return EarlierState(rows, table.component, identity, when, f"history of {table.key}")
+    return _param_set(rows, table, identity, when, f"history of {known.key}")
 
 
 def rows_of_table(rows: Mapping[str, StoredParam]) -> list[SnapshotRow]:
     """Return the parameters of a stored table as those of a snapshot."""
-    return [(name, row.stored, row.default) for name, row in rows.items()]
+    return [(name, row.stored, row.default) for name, row in rows.items() if row.stored is not None]
 
 
 def rows_of(params: ParamSet) -> list[SnapshotRow]:
@@ -198,29 +166,34 @@ def rows_of(params: ParamSet) -> list[SnapshotRow]:
     return rows
 
 
-def _of_snapshot(tx: Transaction, table: StoredTable, number: int) -> EarlierState:
-    kept: dict[int, Any] = {
-        each: (at, described)
-        for each, at, described in tx.all(
-            "SELECT id, at, identity FROM snapshot WHERE owner = ? ORDER BY id", (table.owner,)
-        )
-    }
-    if number not in kept:
-        listed = f"those kept are {', '.join(map(str, kept))}" if kept else "none is kept"
-        raise NotInCache(
-            f"there is no snapshot {number} of {table.key}, component {table.component}: {listed}"
-        )
-    at, described = kept[number]
+def _of_snapshot(tx: Transaction, table: StoredTable, number: int) -> ParamSet:
+    key, component = table.summary.key, table.summary.component
+    found = tx.all("SELECT at, identity FROM snapshot WHERE owner = ? AND id = ?", (table.owner, number))
+    if not found:
+        kept = [str(each.id) for each in load_snapshots(tx, table)]
+        listed = f"those kept are {', '.join(kept)}" if kept else "none is kept"
+        raise NotInCache(f"there is no snapshot {number} of {key}, component {component}: {listed}")
+    [(at, described)] = found
     rows: list[SnapshotRow] = [
-        (name, StoredValue(kind, value, is_raw), default)
-        for name, kind, value, is_raw, default in tx.all(
-            "SELECT name, type, value, is_raw, default_value FROM snapshot_parameter"
+        (name, StoredValue(*value), default)
+        for name, default, *value in tx.all(
+            "SELECT name, default_value, type, value, is_raw FROM snapshot_parameter"
             " WHERE snapshot = ? ORDER BY position",
             (number,),
         )
     ]
-    identity = read_identity(json.loads(described))
-    return EarlierState(rows, table.component, identity, at, f"snapshot {number} of {table.key}")
+    return _param_set(rows, table, read_identity(json.loads(described)), at, f"snapshot {number} of {key}")
+
+
+def _param_set(
+    rows: Iterable[SnapshotRow], table: StoredTable, identity: Identity, at: float, source: str
+) -> ParamSet:
+    params = {}
+    for name, stored, default in rows:
+        each = stored.param(name, None, default)
+        params[name] = WrittenParam(name, each.value, stored.type, each.default, is_raw=each.is_raw)
+    known = table.summary
+    return ParamSet(params, known.component, known.identity.system, identity, at, source)
 
 
 def _second(at: float) -> str:

@@ -1,7 +1,4 @@
-"""The tables of the cache, in the one SQL text for SQLite and PostgreSQL, and the cache in a SQLite file.
-
-A new column or another meaning needs another `SCHEMA_VERSION`: a file of another version is set aside, and a
-database keeps each version in a schema of its own. Values are marked by `?`.
+"""The cache in a SQLite file.
 
 Several processes may use the file. SQLite runs in WAL mode with synchronous=NORMAL: committed transactions
 survive a killed process; a power loss may lose the last ones, but does not damage the file. A durable
@@ -15,121 +12,21 @@ import itertools
 import logging
 import os
 import sqlite3
-import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
+from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
+from paramclient.cache.database import SCHEMA_VERSION, TABLES, Store, Transaction
 from paramclient.errors import CacheError, ParamClientError
 
-__all__ = ["IDENTITY", "SCHEMA_VERSION", "TABLES", "SqliteStore", "Transaction"]
-
-SCHEMA_VERSION: Final = 20
-"""Version of the tables. Unreleased versions had lower numbers."""
-IDENTITY: Final = (
-    "system, link, uid, autopilot, vehicle_type, firmware, git_hash,"
-    " board, vendor_id, product_id, capabilities"
-)
-"""Columns of a vehicle's identity, in the order of the attributes of `Identity`."""
-
-TABLES: Final = (
-    """CREATE TABLE vehicle (
-        key TEXT NOT NULL PRIMARY KEY,
-        system INTEGER NOT NULL,
-        link TEXT NOT NULL,
-        uid TEXT,
-        autopilot INTEGER NOT NULL,
-        vehicle_type INTEGER NOT NULL,
-        firmware BIGINT NOT NULL,
-        git_hash TEXT NOT NULL,
-        board BIGINT NOT NULL,
-        vendor_id INTEGER NOT NULL,
-        product_id INTEGER NOT NULL,
-        capabilities TEXT NOT NULL,
-        first_seen DOUBLE PRECISION NOT NULL,
-        last_seen DOUBLE PRECISION NOT NULL
-    )""",
-    # a table of parameters: the plain or the extended ones of a component
-    """CREATE TABLE component (
-        id {id},
-        vehicle TEXT NOT NULL REFERENCES vehicle (key) ON DELETE CASCADE,
-        component INTEGER NOT NULL,
-        extended INTEGER NOT NULL,
-        autopilot INTEGER NOT NULL,
-        hash BIGINT,
-        param_count INTEGER,
-        complete INTEGER NOT NULL DEFAULT 0,
-        volatile_known INTEGER NOT NULL DEFAULT 0,
-        synced_at DOUBLE PRECISION,
-        updated_at DOUBLE PRECISION NOT NULL,
-        file_works INTEGER,
-        known_since DOUBLE PRECISION,
-        UNIQUE (vehicle, component, extended)
-    )""",
-    """CREATE TABLE parameter (
-        owner BIGINT NOT NULL REFERENCES component (id) ON DELETE CASCADE,
-        name TEXT NOT NULL,
-        type INTEGER NOT NULL,
-        value BYTEA NOT NULL,
-        is_raw INTEGER NOT NULL,
-        param_index INTEGER,
-        volatile INTEGER NOT NULL,
-        heard_at DOUBLE PRECISION NOT NULL,
-        default_value BYTEA,
-        PRIMARY KEY (owner, name)
-    ){clustered}""",
-    # old_at: when the old value was last observed; no old value: the name appeared in a complete table;
-    # no new value: the vehicle no longer has the parameter
-    """CREATE TABLE history (
-        id {id},
-        owner BIGINT NOT NULL REFERENCES component (id) ON DELETE CASCADE,
-        at DOUBLE PRECISION NOT NULL,
-        name TEXT NOT NULL,
-        author TEXT NOT NULL,
-        old_at DOUBLE PRECISION,
-        old_type INTEGER,
-        old_value BYTEA,
-        old_is_raw INTEGER,
-        new_type INTEGER,
-        new_value BYTEA,
-        new_is_raw INTEGER
-    )""",
-    "CREATE INDEX history_by_time ON history (owner, at)",
-    "CREATE INDEX history_by_name ON history (owner, name)",
-    # ended: of the apply or restore that has stored the snapshot; NULL for others
-    """CREATE TABLE snapshot (
-        id {id},
-        owner BIGINT NOT NULL REFERENCES component (id) ON DELETE CASCADE,
-        at DOUBLE PRECISION NOT NULL,
-        reason TEXT NOT NULL,
-        identity TEXT NOT NULL,
-        hash BIGINT,
-        complete INTEGER NOT NULL,
-        ended INTEGER
-    )""",
-    "CREATE INDEX snapshot_of_component ON snapshot (owner)",
-    """CREATE TABLE snapshot_parameter (
-        snapshot BIGINT NOT NULL REFERENCES snapshot (id) ON DELETE CASCADE,
-        position INTEGER NOT NULL,
-        name TEXT NOT NULL,
-        type INTEGER NOT NULL,
-        value BYTEA NOT NULL,
-        is_raw INTEGER NOT NULL,
-        default_value BYTEA,
-        PRIMARY KEY (snapshot, position)
-    ){clustered}""",
-)
-"""Statements that create the tables. `{id}` is a number that is never used again, `{clustered}` stores the
-rows in the order of the primary key."""
+__all__ = ["SqliteStore"]
 
 APPLICATION_ID: Final = 0x5041524D
 """Application id of paramclient in the header of the file: `PARM`."""
 LOCK_WAIT_MAX: Final = 5.0
 """Seconds for which a call waits while another process writes. Transactions take milliseconds."""
-CALL_ATTEMPTS_MAX: Final = 3
-"""Attempts of one call: the file may be set aside, and another process may replace it, once each."""
 WAL_SWITCH_INTERVAL: Final = 0.01
 """Seconds between two attempts to switch a new file to WAL mode: SQLite does not wait for other processes."""
 
@@ -149,36 +46,6 @@ logger = logging.getLogger("paramclient.cache")
 T = TypeVar("T")
 
 
-class Transaction:
-    """Runs the statements of one transaction. A write transaction excludes all others.
-
-    Args:
-        connection: a connection of `sqlite3` or psycopg.
-        mark: the placeholder of a value in its statements.
-    """
-
-    def __init__(self, connection: Any, mark: str = "?") -> None:
-        self._connection = connection
-        self._mark = mark
-
-    def all(self, sql: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
-        """Run a statement and return its rows."""
-        rows: list[tuple[Any, ...]] = self._connection.execute(self._marked(sql), values).fetchall()
-        return rows
-
-    def do(self, sql: str, values: Sequence[object] = ()) -> int:
-        """Run a statement and return the number of rows that it changed."""
-        return int(self._connection.execute(self._marked(sql), values).rowcount)
-
-    def many(self, sql: str, rows: Sequence[Sequence[object]]) -> None:
-        """Run a statement once for each row of values."""
-        if rows:
-            self._connection.cursor().executemany(self._marked(sql), rows)
-
-    def _marked(self, sql: str) -> str:
-        return sql.replace("?", self._mark)
-
-
 class _Unusable(Exception):
     """The file is no cache of this version. Its argument is the kind of file, a part of its new name."""
 
@@ -187,92 +54,29 @@ class _Replaced(Exception):
     """The open file is no longer the one under the path."""
 
 
-class SqliteStore:
-    """A cache in a file, opened by the first call. Thread-safe. Reading creates no file.
+class SqliteStore(Store):
+    """A cache in a file. Reading creates no file.
 
     A file that is damaged, of another version of paramclient or no cache is renamed, with a warning in the
     log, and a new one is created. No file is deleted.
 
     Args:
         path: the file, absolute.
-
-    Attributes:
-        place: the file, for messages.
-        notes: one text for each file that was set aside.
-        replacements: number of times that another file has taken the place of one that was used.
     """
 
     def __init__(self, path: Path) -> None:
-        self.place = str(path)
-        self.notes: list[str] = []
-        self.replacements = 0
+        super().__init__(str(path))
         self._path = path
-        self._lock = threading.Lock()
-        self._connection: sqlite3.Connection | None = None
         self._file: tuple[int, int] | None = None  # device and inode of the open file
         self._is_read_only = False  # whether the file is opened as one that nobody writes
-        self._is_closed = False
-
-    def run(self, work: Callable[[Transaction], T], *, writing: bool, durable: bool = False) -> T:
-        """Run a function in one transaction and return its result: either all or nothing is written.
-
-        Args:
-            work: the function. It may run again from the start.
-            writing: whether it writes.
-            durable: return only when this and all earlier transactions are safe from power loss.
-
-        Raises:
-            CacheError: the file cannot be used. Nothing was written.
-        """
-        with self._lock:
-            if self._is_closed:
-                raise CacheError(f"the cache {self.place} is closed")
-            for _ in range(CALL_ATTEMPTS_MAX):
-                if self._file is not None and self._which() != self._file:  # deleted, renamed or replaced
-                    self._drop()
-                    self._file = None
-                    self.replacements += 1
-                try:
-                    if not writing and not self._path.exists():
-                        return _read_nothing(work)
-                    return self._transact(work, writing=writing, durable=durable)
-                except _Replaced:
-                    self._drop()
-                except _Unusable as error:
-                    self._set_aside(str(error))
-                except sqlite3.DatabaseError as error:
-                    self._drop()
-                    if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGE:
-                        self._set_aside("damaged")
-                        continue
-                    is_unwritable = getattr(error, "sqlite_errorcode", 0) in _UNWRITABLE
-                    if is_unwritable and not writing and not self._is_read_only:
-                        self._is_read_only = True
-                        continue
-                    raise CacheError(f"the cache {self.place} cannot be used: {error}") from error
-                except OSError as error:
-                    self._drop()
-                    raise CacheError(f"the cache {self.place} cannot be used: {error}") from error
-                except ParamClientError:
-                    self._drop()
-                    raise
-                except Exception as error:  # a value that this program cannot have written, or cannot write
-                    if self._is_sound():
-                        raise CacheError(f"the cache {self.place} cannot be used: {error!r}") from error
-                    self._set_aside("damaged")
-                except BaseException:
-                    self._drop()
-                    raise
-            raise CacheError(f"the cache {self.place} was replaced {CALL_ATTEMPTS_MAX} times during one call")
-
-    def close(self) -> None:
-        """Close it; later calls raise CacheError."""
-        with self._lock:
-            self._is_closed = True
-            self._drop()
 
     def _transact(self, work: Callable[[Transaction], T], *, writing: bool, durable: bool) -> T:
-        """Run one attempt. After an error, closing the connection rolls the transaction back."""
+        if self._file is not None and self._which() != self._file:  # deleted, renamed or replaced
+            self._drop()
+            self._file = None
+            self.replacements += 1
+        if not writing and not self._path.exists():
+            return _read_nothing(work)
         if writing and self._is_read_only:
             self._drop()
             self._is_read_only = False
@@ -298,6 +102,27 @@ class SqliteStore:
             raise _Replaced
         return result
 
+    def _recover(self, error: BaseException, *, writing: bool) -> None:
+        code = getattr(error, "sqlite_errorcode", 0)
+        match error:
+            case _Replaced():
+                return
+            case _Unusable():
+                self._set_aside(str(error))
+            case sqlite3.DatabaseError() if code & 0xFF in _DAMAGE:
+                self._set_aside("damaged")
+            case sqlite3.DatabaseError() if code in _UNWRITABLE and not writing and not self._is_read_only:
+                self._is_read_only = True
+            case sqlite3.DatabaseError() | OSError():
+                raise CacheError(f"the cache {self.place} cannot be used: {error}") from error
+            case Exception() if not isinstance(error, ParamClientError):
+                # a value that this program cannot have written, or cannot write
+                if self._is_sound():
+                    raise CacheError(f"the cache {self.place} cannot be used: {error!r}") from error
+                self._set_aside("damaged")
+            case _:
+                raise error
+
     def _open(self, *, writing: bool) -> sqlite3.Connection:
         if writing:
             self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -316,15 +141,12 @@ class SqliteStore:
         return connection
 
     def _is_sound(self) -> bool:
-        """Return whether SQLite finds the open file undamaged, and close it."""
+        """Return whether SQLite finds the file undamaged."""
         try:
-            return self._connection is None or self._connection.execute(
-                "PRAGMA quick_check(1)"
-            ).fetchall() == [("ok",)]
-        except sqlite3.Error:
+            with closing(self._open(writing=False)) as connection:
+                return connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
+        except (sqlite3.Error, OSError):
             return False
-        finally:
-            self._drop()
 
     def _which(self) -> tuple[int, int] | None:
         """Return device and inode of the file under the path; None if there is none."""
@@ -338,7 +160,6 @@ class SqliteStore:
 
     def _set_aside(self, kind: str) -> None:
         """Rename the file that was open, with its -wal and -shm; unless another process has done so."""
-        self._drop()
         if self._which() != self._file:
             return
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
@@ -352,12 +173,6 @@ class SqliteStore:
             raise CacheError(f"the cache {self.place} is {kind}, and cannot be renamed: {error}") from error
         self.notes.append(f"the cache {self.place} is {_KINDS[kind]}. It is kept as {name}; a new one begins")
         logger.warning("%s", self.notes[-1])
-
-    def _drop(self) -> None:
-        connection, self._connection = self._connection, None
-        if connection is not None:
-            with suppress(sqlite3.Error):
-                connection.close()
 
 
 _KINDS: Final = {

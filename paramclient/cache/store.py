@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import platformdirs
 
 from paramclient.cache import history, snapshots, tables
+from paramclient.cache.database import Store, Transaction
 from paramclient.cache.lookup import find_vehicle
 from paramclient.cache.records import (
     CachedComponent,
@@ -21,20 +21,16 @@ from paramclient.cache.records import (
     CachedVehicle,
     HistoryEntry,
     SnapshotSummary,
-    StoredParam,
     StoredTable,
     TableUpdate,
 )
-from paramclient.cache.sqlite import SqliteStore, Transaction
-from paramclient.cache.tables import ensure_table, save_table
+from paramclient.cache.sqlite import SqliteStore
+from paramclient.cache.updates import ensure_table, import_tables, save_table
 from paramclient.errors import NotInCache, UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 
 __all__ = ["ParamCache", "default_path", "is_database_url"]
-
-if TYPE_CHECKING:
-    from paramclient.cache.postgres import PostgresStore
 
 T = TypeVar("T")
 
@@ -75,7 +71,7 @@ class ParamCache:
     """
 
     def __init__(self, path: str | os.PathLike[str] | None = None) -> None:
-        self._store: SqliteStore | PostgresStore
+        self._store: Store
         if is_database_url(path):
             try:
                 from paramclient.cache.postgres import PostgresStore  # psycopg is an extra
@@ -141,44 +137,19 @@ class ParamCache:
         if updates or durable:
             self._store.run(work, writing=True, durable=durable)
 
-    def merge(
-        self, updates: Sequence[TableUpdate], *, based_on: Mapping[tuple[str, int], float] | None = None
-    ) -> None:
-        """Write earlier observations, such as those of a log, in one transaction.
+    def merge(self, updates: Sequence[TableUpdate]) -> None:
+        """Insert earlier observations, such as those of a log, by their times, in one transaction.
 
-        As `save`, but changes before the stored observations are inserted into the history by their times.
-        Repeating a merge changes nothing.
+        Later observations in the cache stay. Repeating a merge changes nothing.
 
         Args:
             updates: as for `save`, in the order of their times.
-            based_on: by key and component, `updated_at` of the stored tables on which the updates are based;
-                all other updates are independent of the stored tables.
 
         Raises:
             UsageError: a time is not in unix seconds.
         """
-        known = based_on or {}
-
-        def work(tx: Transaction) -> None:
-            earlier: dict[int, list[StoredParam]] = {}
-            stored: dict[tuple[str, int, bool], float | None] = {}  # `updated_at`, unless continued
-            for each in updates:
-                place = (each.identity.key, each.component, each.extended)
-                if place not in stored:
-                    before = tables.find_table(tx, each.identity.key, each.component, extended=each.extended)
-                    at = None if before is None else before.updated_at
-                    stored[place] = None if at == known.get(place[:2]) else at
-                last = stored[place]
-                is_apart = last is not None and each.at <= last
-                if each.replace and not is_apart:
-                    stored[place] = last = None
-                owner, found = save_table(tx, each, math.inf, keeps_state=last is not None, is_apart=is_apart)
-                earlier.setdefault(owner, []).extend(found)
-            for owner, items in earlier.items():
-                history.insert_observations(tx, owner, tables.load_rows(tx, owner), items)
-
         if updates:
-            self._store.run(work, writing=True)
+            self._store.run(lambda tx: import_tables(tx, updates), writing=True)
 
     def load(self, key: str, component: int, *, extended: bool = False) -> CachedComponent | None:
         """Return the table of a vehicle's component; None if there is none.
@@ -187,7 +158,12 @@ class ParamCache:
             key: `Identity.key`.
             component: component id.
         """
-        return self._read(lambda tx: tables.load_component(tx, key, component, extended=extended))
+
+        def work(tx: Transaction) -> CachedComponent | None:
+            table = tables.find_table(tx, key, component, extended=extended)
+            return None if table is None else tables.load_component(tx, table)
+
+        return self._read(work)
 
     def vehicles(self) -> list[CachedVehicle]:
         """Return all vehicles, the last seen first."""
@@ -205,9 +181,12 @@ class ParamCache:
             UnknownVehicle: no vehicle in the cache has this name.
             AmbiguousVehicle: several vehicles have this name.
         """
-        return self._read(
-            lambda tx: tables.load_summaries(tx, None if vehicle is None else self._choose(tx, vehicle))
-        )
+
+        def work(tx: Transaction) -> list[CachedSummary]:
+            found = tables.load_tables(tx, None if vehicle is None else self._choose(tx, vehicle))
+            return [each.summary for each in found]
+
+        return self._read(work)
 
     def component(
         self,
@@ -232,11 +211,8 @@ class ParamCache:
         """
 
         def work(tx: Transaction) -> CachedComponent:
-            key = self._choose(tx, vehicle, system=system, component=component)
-            found = tables.load_component(tx, key, component, extended=extended)
-            if found is None:  # only of extended parameters: a component has a plain table
-                raise NotInCache(f"{key}, component {component}, has no extended parameters in the cache")
-            return found
+            table = self._table(tx, vehicle, component, system=system, extended=extended)
+            return tables.load_component(tx, table)
 
         return self._read(work)
 
@@ -245,7 +221,7 @@ class ParamCache:
         return self._read(
             lambda tx: {
                 (each.key, each.component): each.size
-                for each in tables.load_tables(tx, extended=True)
+                for _, _, each in tables.load_tables(tx, extended=True)
                 if each.size
             }
         )
@@ -293,8 +269,7 @@ class ParamCache:
             AmbiguousVehicle: several vehicles have this name.
         """
         which = (component, name, limit, since, extended)
-        found = self._read(lambda tx: history.load_history(tx, self._choose(tx, vehicle), *which))
-        return [history.entry_of(number, line) for number, line in found]
+        return self._read(lambda tx: history.load_history(tx, self._choose(tx, vehicle), *which))
 
     def store_snapshot(
         self,
@@ -338,21 +313,20 @@ class ParamCache:
         def work(tx: Transaction) -> SnapshotSummary:
             if isinstance(vehicle, str):
                 table = self._table(tx, vehicle, component, extended=extended)
-                [known] = tables.load_vehicles(tx, table.key)
-                identity = known.identity
+                identity = table.summary.identity
             else:
+                table = ensure_table(tx, vehicle, component, moment, extended=extended)
                 identity = vehicle
-                table = ensure_table(tx, identity, component, moment, extended=extended)
-            kept = snapshots.rows_of_table(tables.load_rows(tx, table.owner)) if rows is None else rows
+            known = rows is None
             return snapshots.store_snapshot(
                 tx,
                 table,
                 identity,
-                kept,
+                snapshots.rows_of_table(tables.load_rows(tx, table.owner)) if rows is None else rows,
                 at=moment,
                 reason=reason,
-                hash=table.state.hash if rows is None else hash,
-                complete=table.state.complete if rows is None else complete,
+                hash=table.summary.hash if known else hash,
+                complete=table.summary.complete if known else complete,
                 is_of_operation=is_of_operation,
             )
 
@@ -412,16 +386,24 @@ class ParamCache:
 
         def work(tx: Transaction) -> ParamSet:
             table = self._table(tx, vehicle, component, extended=extended)
-            return replace(snapshots.load_state(tx, table, when).params, is_extended=extended)
+            return replace(snapshots.load_state(tx, table, when), is_extended=extended)
 
         return self._read(work)
 
     def _read(self, work: Callable[[Transaction], T]) -> T:
         return self._store.run(work, writing=False)
 
-    def _table(self, tx: Transaction, vehicle: str, component: int, *, extended: bool = False) -> StoredTable:
-        """Return the table of the only vehicle with this name."""
-        key = self._choose(tx, vehicle, component=component)
+    def _table(
+        self,
+        tx: Transaction,
+        vehicle: str | None,
+        component: int,
+        *,
+        system: int | None = None,
+        extended: bool = False,
+    ) -> StoredTable:
+        """Return the table of the only vehicle that matches."""
+        key = self._choose(tx, vehicle, system=system, component=component)
         table = tables.find_table(tx, key, component, extended=extended)
         if table is None:  # only of extended parameters: a component has a plain table
             raise NotInCache(f"{key}, component {component}, has no extended parameters in the cache")

@@ -17,7 +17,7 @@ import anyio
 from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, UnknownOptionError
 
 from paramclient.cli.exit_codes import ExitCode, code_of, text_of
-from paramclient.cli.output import in_local_time, printable, report, say
+from paramclient.cli.output import STDIN, in_local_time, printable, report, say
 from paramclient.errors import CacheError, ParamClientError
 from paramclient.version import __version__
 
@@ -38,7 +38,8 @@ def run(arguments: Sequence[str]) -> int:
         _load(_app)
     with _warnings_shown() as printer:
         try:
-            command, bound, _ = _app.parse_args(arguments, exit_on_error=False, print_error=False)
+            words = [STDIN if word == "-" else word for word in arguments]
+            command, bound, _ = _app.parse_args(words, exit_on_error=False, print_error=False)
             if _is_verbose(bound.arguments):
                 printer.show_steps()
             call = partial(command, *bound.args, **bound.kwargs)

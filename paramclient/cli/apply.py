@@ -94,7 +94,7 @@ async def apply(
     check_pattern("the file of --overlay", over, options)
     check_pattern("the file of --backup", backup, options)
     given, rules = from_file(metadata), read_rules(renames)
-    opened = open_file(file) if is_file(file) else None
+    opened = open_file(file, partial=skip_invalid) if is_file(file) else None
     params = await resolve(file, options, writes=True, extended=extended) if opened is None else None
     extended = extended or (opened is not None and opened.is_extended)
     async with sessions(url, options, writes=True, extended=extended) as found:
@@ -144,7 +144,8 @@ async def apply(
         if options.no_cache and backup is None and not url.startswith("sim:"):
             say("the state before is not stored: --no-cache is given, and --backup is not")
         done = await set_up(found, show, plans, write, verb="setting", reboot=reboot, yes=yes)
-        return ExitCode.INCOMPLETE if done is None else show.applied(done)
+        code = ExitCode.INCOMPLETE if done is None else show.applied(done)
+        return max(code, ExitCode.INCOMPLETE) if opened is not None and opened.left_out else code
 
 
 async def _with_overlay(base: ParamSet, pattern: str, session: CommandSession) -> ParamSet:

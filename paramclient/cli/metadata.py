@@ -35,8 +35,8 @@ from paramclient.metadata import (
     metadata_of,
     read_metadata,
 )
-from paramclient.metadata.added_files import AddedFiles, file_address
 from paramclient.metadata.info import number_of
+from paramclient.metadata.store import AddedFiles, file_address
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, WireValue, check_name, format_value

@@ -33,7 +33,7 @@ from paramclient.cli.output import (
     say,
 )
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
-from paramclient.cli.sources import component_of, is_file, open_file, tables_in
+from paramclient.cli.sources import component_of, is_file, open_file, source_of, tables_in
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.metadata import Metadata, MetadataStore
 from paramclient.model.defaults import add_default, default_of
@@ -69,9 +69,9 @@ def show(
     With --changed, exit code 1: the firmware's defaults are not known.
 
     Args:
-        vehicle: A parameter file; a vehicle in the cache: 4 or 4/1, px4 or ardupilot, its hardware id (in
-            full, or uid: and at least 6 digits) or its key, also with the prefix cache:; or replay:FILE, a
-            telemetry log.
+        vehicle: A parameter file, or - for the standard input; a log (.bin, .ulg, .tlog); a vehicle in the
+            cache: 4 or 4/1, px4 or ardupilot, its hardware id (in full, or uid: and at least 6 digits) or its
+            key, also with the prefix cache:.
         changed: Print only parameters that differ from the firmware's defaults: those of the vehicle, else
             those of its metadata.
         names: Print only these parameters of a vehicle, with their metadata: names in upper or lower case, or
@@ -80,6 +80,7 @@ def show(
             With a parameter file only for --changed.
         extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
+    vehicle = None if vehicle is None else source_of(vehicle)
     if vehicle is not None and is_file(vehicle):
         if names or (metadata is not None and not changed):
             raise UsageError(
@@ -92,7 +93,7 @@ def show(
             store = MetadataStore.beside(ParamCache(options.cache).path)
             return store.known_of_sets(sets) if given is None else [given] * len(sets)
 
-        return show_file(open_file(vehicle), known, changed=changed, json=options.json)
+        return show_file(open_file(vehicle, partial=True), known, changed=changed, json=options.json)
     name_patterns = tuple(check_given(names))
     described = from_file(metadata, offline=True)
     is_log = vehicle is not None and vehicle.lower().startswith("replay:")

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 __all__ = [
+    "STDIN",
     "Coloured",
     "Draw",
     "StatusLine",
@@ -47,6 +48,9 @@ __all__ = [
     "while_waiting",
     "wrapped",
 ]
+
+STDIN: Final = "stdin:"
+"""What `-` among the arguments becomes, which cyclopts would take for an option: the standard input."""
 
 Draw: TypeAlias = Callable[[Sequence[str], Iterable[Sequence[object]], Iterable[str]], None]
 """Draws columns, rows and lines."""

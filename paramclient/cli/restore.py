@@ -30,6 +30,7 @@ from paramclient.cli.time_arguments import parse_when
 from paramclient.client.component import Component
 from paramclient.errors import (
     AlreadyRestored,
+    CacheError,
     FileError,
     NotInCache,
     ParamClientError,
@@ -269,6 +270,11 @@ class _Loader:
             raise NotInCache(f"{error}, such as '2h ago', or a backup file") from None
         except AlreadyRestored as error:
             raise _choices_error(error, self.url, session) from None
+        except CacheError as error:
+            raise CacheError(
+                f"nothing was sent, as the state before the last apply cannot be read: {error}. A backup file"
+                " can be restored without the cache (--no-cache)"
+            ) from error
         return _State.before_apply(point)
 
 

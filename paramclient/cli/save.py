@@ -32,10 +32,11 @@ from paramclient.cli.sources import (
     is_pattern_name,
     names_vehicle,
     open_file,
+    source_of,
     whole_table,
 )
 from paramclient.errors import UsageError, VehicleError
-from paramclient.files import FileFormat, write_file
+from paramclient.files import FileFormat, writable, write_file
 from paramclient.files.formats import AUTOPILOT, address, format_of_name
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import default_of
@@ -99,6 +100,7 @@ async def save(
     if metadata is not None and not changed:
         raise UsageError("--metadata gives the defaults for --changed")
     written = format_of_name(str(file)) if file_format is None else FileFormat(file_format)
+    where = source_of(where)
     is_offline = is_file(where) or names_vehicle(where)
     if is_offline and refresh:
         raise UsageError(f"--refresh needs a link; {where!r} is a file or a vehicle in the cache")
@@ -113,8 +115,7 @@ async def save(
     for fault in selection.faults:
         report(fault)
     sets = _chosen(selection.sets, only) if only else selection.sets
-    if written is not FileFormat.JSON:
-        sets = [each if each.is_extended else _numbers(each) for each in sets]
+    sets = [_writable(each, written) for each in sets]
     files = _by_file(str(file), sets) if is_pattern_name(str(file)) else {file: sets}
     if sets:
         for path, each in files.items():
@@ -203,7 +204,7 @@ def _add_offline(
     """Add the parameters of a file, of an on-board log, or of a vehicle in the cache."""
     choice = ChosenVehicle.parse(options.vehicle)
     if is_file(where):
-        file = open_file(where)
+        file = open_file(where, partial=incomplete)
         sets = list(file.sets) if choice.is_all else [choose(file, choice.component, choice.system)]
     else:
         if options.place is False:
@@ -232,6 +233,15 @@ def _add_offline(
         selection.add(each, defaults_in(known_of_set, each))
 
 
+def _writable(params: ParamSet, file_format: FileFormat) -> ParamSet:
+    """Return a set without what the format cannot hold."""
+    kept, left_out = writable(params, file_format)
+    if left_out:
+        names = first_of(left_out, NAMES_SHOWN_MAX)
+        report(f"{address(params)}: left out, as only a .json file can hold them: {names}")
+    return kept
+
+
 def _chosen(sets: Sequence[ParamSet], only: Sequence[str]) -> list[ParamSet]:
     """Return the sets with only the parameters that names and patterns choose, without empty sets.
 
@@ -243,17 +253,6 @@ def _chosen(sets: Sequence[ParamSet], only: Sequence[str]) -> list[ParamSet]:
         raise UsageError(f"no parameter is called {unmatched}")
     parts = [replace(each, params={n: param for n, param in each.items() if n in names}) for each in sets]
     return [each for each in parts if each]
-
-
-def _numbers(params: ParamSet) -> ParamSet:
-    """Return the set without values that are no numbers, as 64 bits in a PARAM_VALUE or an unknown type."""
-    raw = [name for name, param in params.items() if param.is_raw]
-    if not raw:
-        return params
-    names = first_of(raw, NAMES_SHOWN_MAX)
-    report(f"{address(params)}: left out, as only a .json file can hold them: {names}")
-    numbers = {name: param for name, param in params.items() if not param.is_raw}
-    return replace(params, params=numbers, source=f"{params.source}, without {names}")
 
 
 def _by_file(pattern: str, sets: Sequence[ParamSet]) -> dict[Path, list[ParamSet]]:

@@ -1,6 +1,6 @@
 """Sources of parameters that an argument can name: a file, a vehicle in the cache, or a link.
 
-1. A file that exists, independent of its name;
+1. A file that exists, independent of its name, or `-` for the standard input; a telemetry log is a link;
 2. `cache:VEHICLE`, or a text that can only name a vehicle in the cache (see `paramclient.cache.lookup`);
 3. any other text: a link.
 
@@ -10,6 +10,7 @@ If both exist, `./1` is the file and `cache:1` the vehicle.
 from __future__ import annotations
 
 import difflib
+import sys
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
@@ -21,10 +22,10 @@ import anyio
 from paramclient.cache import CachedSummary, ParamCache
 from paramclient.cache.lookup import address_of, is_vehicle_name
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import progress_bar, report
+from paramclient.cli.output import STDIN, progress_bar, report
 from paramclient.cli.session import ChosenVehicle, CommandSession, report_others, sessions
 from paramclient.errors import FileError, NotInCache, UnknownVehicle, UsageError
-from paramclient.files import ParamFile, read_file, read_renames
+from paramclient.files import LARGEST_FILE, ParamFile, loads, read_file, read_renames
 from paramclient.files.formats import AUTOPILOT, ENDINGS
 from paramclient.links import FORMS, parse_link
 from paramclient.logs.onboard import is_onboard_log, read_onboard_log
@@ -53,12 +54,13 @@ __all__ = [
     "read_rules",
     "resolve",
     "resolve_all",
+    "source_of",
     "tables_in",
     "whole_table",
 ]
 
 SOURCES: Final = f"""\
-  FILE                a parameter file, or an on-board log (.bin, .ulg), that exists
+  FILE                a parameter file or a log (.bin, .ulg, .tlog) that exists; - for the standard input
   cache:VEHICLE       the cached table of a vehicle: 4 or 4/1, px4 or ardupilot, its hardware id (in full,
                       or uid: and at least 6 digits), or its key; cache: may be left out
 {FORMS}"""
@@ -104,9 +106,10 @@ async def resolve_all(
     A text that is given twice is resolved once. The first error ends all. If one of the files has extended
     parameters, those of the vehicles are meant too.
     """
+    texts = [*map(source_of, texts)]
     choice = ChosenVehicle.parse(options.vehicle)
     found = {
-        text: choose(open_file(text), choice.component, choice.system)
+        text: choose(open_file(text, partial=not writes), choice.component, choice.system)
         for text in dict.fromkeys(texts)
         if is_file(text)
     }
@@ -171,11 +174,22 @@ async def whole_table(
 
 
 def is_file(text: str) -> bool:
-    """Return whether an argument names an existing file. A device is not a file: it may be a link."""
+    """Return whether an argument names an existing file or the standard input.
+
+    A device is not a file: it may be a link.
+    """
+    if text == STDIN:
+        return True
     with suppress(OSError, ValueError):  # a text that is too long or has a NUL is not a file name
         path = Path(text)
         return path.is_file() or path.is_fifo()
     return False
+
+
+def source_of(text: str) -> str:
+    """Return the source that an argument names: `replay:FILE` for a telemetry log, else the argument."""
+    is_telemetry = PurePath(text).suffix.lower() == ".tlog" and is_file(text)
+    return f"replay:{text}" if is_telemetry else text
 
 
 def names_vehicle(text: str) -> bool:
@@ -214,20 +228,26 @@ def _nearest_file(text: str) -> str:
     return f" (did you mean {folder / similar[0]}?)" if similar else ""
 
 
-def open_file(path: str) -> ParamFile:
-    """Read a parameter file or the values at the end of an on-board log, and report the notes on stderr.
+def open_file(path: str, *, partial: bool = False) -> ParamFile:
+    """Read a parameter file, or the values at the end of an on-board log; report the notes on stderr.
+
+    Args:
+        path: the file.
+        partial: leave out parameters with a name that no vehicle can have, and report their lines.
 
     Raises:
         FileError: the file cannot be read.
         UsageError: the log needs a library that is not installed.
     """
-    if is_onboard_log(path):
+    if path == STDIN:
+        file = loads(sys.stdin.buffer.read(LARGEST_FILE + 1), source="standard input", partial=partial)
+    elif is_onboard_log(path):
         log = read_onboard_log(path)
         file = ParamFile((log.at_end(),), log.file_format, path, notes=log.notes)
     else:
-        file = read_file(path)
+        file = read_file(path, partial=partial)
     for note in file.notes:
-        report(f"{path}: {note}")
+        report(f"{file.source}: {note}")
     return file
 
 

@@ -18,6 +18,7 @@ import anyio.to_thread
 from paramclient.cache import BY_VEHICLE, ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.errors import CacheError, UsageError
 from paramclient.model.identity import Identity
+from paramclient.model.values import Param
 from paramclient.protocol.events import Change
 from paramclient.protocol.node import Node
 from paramclient.protocol.selection import vehicle_of
@@ -33,6 +34,9 @@ PENDING_MAX: Final = 4_096
 """Observations of one table that wait for the cache: above it, the whole table is written later."""
 CLOCK_STEP: Final = 1.0
 """Seconds by which the computer's clock must differ to count as set, or as suspended."""
+CLOSE_RETRY_INTERVAL: Final = 0.3
+"""Seconds until `close` tries once more to write: a database may have been restarted, and the cache fails at
+once for 0.25 s after a failed connection."""
 CLOSE_WAIT_MAX: Final = 6.0
 """Seconds for which `close` waits for the cache: longer than another process may lock a file."""
 
@@ -118,10 +122,13 @@ class CacheWriter:
                 is_known = node.identification.is_settled
                 if is_known or any(each.table.is_complete for each in node.sessions):
                     await self.load(node, vehicle_of(nodes, node))
-            with suppress(CacheError):
-                await self.write_all()
-                await self.write_all()  # after a replaced file
-                is_written = True
+            for delay in (CLOSE_RETRY_INTERVAL, 0.0):
+                with suppress(CacheError):
+                    await self.write_all()
+                    await self.write_all()  # after a replaced file
+                    is_written = True
+                    break
+                await anyio.sleep(delay)
         if not is_written and not was_warned:
             self._warn_of_lost()
         if self._owned:
@@ -259,8 +266,8 @@ class CacheWriter:
             certain = [node for node in self._identities if self._is_certain(node)]
             records = [(node, each, self._record(node, each)) for node in certain for each in node.sessions]
             taken = [each for each in records if each[2].is_unwritten]
-            if durable and self._is_synced and not taken:
-                return
+            if not taken and (self._is_synced or not durable):
+                return  # which says nothing of the cache
             updates = [self._update(*each) for each in taken]
             before = [(record, len(record.changes), record.is_whole) for _, _, record in taken]
             for _, _, record in taken:
@@ -313,10 +320,18 @@ class CacheWriter:
         identity, heard = self._identities[node], vehicle.identification
         if heard.autopilot is not None:
             identity = replace(identity, autopilot=heard.autopilot, vehicle_type=heard.vehicle_type or 0)
-        observations = [(each.new, at, each.by) for each, at in record.changes if each.new is not None]
-        if record.is_whole:
-            observations += [(param, table.moments[name], BY_VEHICLE) for name, param in table.params.items()]
         ahead = self._seconds_ahead()
+
+        def observed(param: Param, at: float, by: str = BY_VEHICLE) -> StoredParam:
+            is_volatile = param.name in table.volatile if table.volatile or table.volatile_is_known else None
+            return StoredParam.of(table.with_default(param), at + ahead, is_volatile, by)
+
+        params = [
+            StoredParam.gone(each.name, at + ahead) if each.new is None else observed(each.new, at, each.by)
+            for each, at in record.changes
+        ]
+        if record.is_whole:
+            params += [observed(param, table.moments[name]) for name, param in table.params.items()]
         is_extended = session is node.extended
         state = TableState(
             hash=table.hash if table.is_complete else None,
@@ -332,16 +347,7 @@ class CacheWriter:
             autopilot=identity.autopilot if node is vehicle else node.identification.autopilot or 0,
             at=time.time(),
             table=state,
-            params=[
-                StoredParam.of(
-                    table.with_default(param),
-                    at + ahead,
-                    param.name in table.volatile if table.volatile or table.volatile_is_known else None,
-                    by,
-                )
-                for param, at, by in observations
-            ],
-            removed={each.name: at + ahead for each, at in record.changes if each.new is None},
+            params=params,
             replace=record.is_whole and table.is_complete,
             extended=is_extended,
         )
@@ -375,7 +381,7 @@ class CacheWriter:
             if self.failure is None and not self._is_closing:
                 logger.warning("continuing without the cache: %s", error)
             self.failure = error
-            raise CacheError(f"the last received values could not be written: {error}") from error
+            raise CacheError(str(error)) from error
 
 
 def choose_cache(

@@ -1,14 +1,15 @@
 """Parameter files: formats of QGroundControl, MAVProxy and Mission Planner, packed files, JSON.
 
 - `formats`: the known formats, and the content of a file.
-- `conversion`, `disk`: from and to bytes, reading and replacing a file.
-- `line_formats`, `param_pck`, `json_format`: lists of ground stations, packed files, JSON.
+- `conversion`: the table of formats: recognizing, reading and writing. `disk`: reading and replacing files.
+- `lists`, `packed`, `json_format`: lists of ground stations, packed files, JSON.
+- `reading`: one file while it is read: its text, its parameters, its notes and its faults.
+- `other_files`: files that are mistaken for parameter files.
 - `rename_file`: files of names that firmware versions have changed.
-- `text`, `includes`, `json_reader`: lines and bad lines, `@include` lines, fields of JSON.
 """
 
-from paramclient.files.conversion import LARGEST_FILE, dumps, loads
-from paramclient.files.disk import read_file, write_file
+from paramclient.files.conversion import dumps, loads, read_file, writable, write_file
+from paramclient.files.disk import LARGEST_FILE
 from paramclient.files.formats import FileFormat, ParamFile
 from paramclient.files.rename_file import loads_renames, read_renames
 
@@ -21,5 +22,6 @@ __all__ = [
     "loads_renames",
     "read_file",
     "read_renames",
+    "writable",
     "write_file",
 ]

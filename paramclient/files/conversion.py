@@ -1,29 +1,85 @@
-"""Format detection, and conversion of parameter files from and to bytes."""
+"""The table of formats: recognition, reading and writing of parameter files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import functools
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Final, TypeAlias
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files import json_format, line_formats, param_pck
-from paramclient.files.formats import AUTOPILOT, ENDINGS, FileFormat, ParamFile, address, parse_format
-from paramclient.files.includes import Includes
-from paramclient.files.text import decode_text, lines_of, time_of
+from paramclient.files import json_format, lists, packed
+from paramclient.files.disk import LARGEST_FILE, read_bytes, replace_file
+from paramclient.files.formats import AUTOPILOT, ENDINGS, FileFormat, ParamFile, address, format_of_name
+from paramclient.files.other_files import kind_of
+from paramclient.files.reading import Reading, time_of
 from paramclient.model.identity import autopilot_name, version_text
-from paramclient.model.paramset import ParamSet
+from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import check_name
-from paramclient.model.wording import counted
+from paramclient.model.wording import counted, first_of
+from paramclient.protocol.param_pck import MAGICS
 
-__all__ = ["LARGEST_FILE", "Content", "dumps", "loads"]
+__all__ = ["Content", "dumps", "loads", "read_file", "writable", "write_file"]
 
-LARGEST_FILE: Final = 16 * 1024 * 1024
-"""Largest parameter file, in bytes. 65,535 parameters, the most that an index can count, with names, bits,
-defaults and comments take less in the longest format."""
+LEFT_OUT_SHOWN_MAX: Final = 20
+"""Names that the header of a file shows, of those that are left out."""
 
 Content: TypeAlias = ParamFile | ParamSet | Iterable[ParamSet]
 """Content to write: a file as read, the parameters of one component, or of several."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Format:
+    """How a format is recognized, read and written.
+
+    Attributes:
+        is_seen_in: whether the content has this format and no other; the lists of pairs are left.
+        read: returns the content, or raises FileError.
+        write: returns the lines or bytes of sets, or raises UsageError.
+        express: returns what is written of one parameter, or raises UsageError.
+        holds_several: whether the format holds several components.
+    """
+
+    is_seen_in: Callable[[Reading], bool]
+    read: Callable[[Reading, FileFormat], ParamFile]
+    write: Callable[[Sequence[ParamSet], ParamFile], Iterator[str] | bytes]
+    express: Callable[[ParamSet, WrittenParam], object]
+    holds_several: bool = False
+
+
+def _pairs(separator: str) -> _Format:
+    line = functools.partial(lists.pair_line, separator)
+    return _Format(lambda _: False, lists.read_pairs, functools.partial(lists.write_list, line), line)
+
+
+_FORMATS: Final = {
+    FileFormat.PCK: _Format(
+        lambda reading: reading.data.startswith(MAGICS),
+        packed.read_packed,
+        lambda sets, _: packed.write_packed(sets[0]),
+        packed.pack_entry,
+    ),
+    FileFormat.JSON: _Format(
+        lambda reading: reading.first.startswith("{"),
+        json_format.read_json,
+        json_format.write_json,
+        json_format.json_fields,
+        holds_several=True,
+    ),
+    FileFormat.QGC: _Format(
+        lambda reading: lists.is_qgc_row(reading.first),
+        lists.read_qgc,
+        lists.write_qgc,
+        lists.qgc_line,
+        holds_several=True,
+    ),
+    FileFormat.PARM: _pairs(" "),
+    FileFormat.MISSION_PLANNER: _pairs(","),
+}
+"""The formats, in the order in which they are looked for."""
 
 
 def loads(
@@ -31,8 +87,7 @@ def loads(
     *,
     source: str = "",
     file_format: FileFormat | str | None = None,
-    includes: Includes | None = None,
-    params_max: int | None = None,
+    partial: bool = False,
 ) -> ParamFile:
     """Parse a parameter file.
 
@@ -41,33 +96,70 @@ def loads(
     Planner. If the first line matches no format, the extension decides which format the error describes.
 
     Args:
-        data: the complete file.
+        data: the complete file. It includes no others, as bytes have no folder.
         source: the file's name, for errors and `ParamSet.source`.
         file_format: the format; None to detect it.
-        includes: reads the files of `@include` lines; None rejects such lines, as bytes have no folder.
-        params_max: maximum number of parameters; None for any. A longer file is not read to its end.
+        partial: leave out parameters with a name that no vehicle can have, and note their lines.
 
     Raises:
-        TooManyParams: the file has more parameters than `params_max`.
-        FileError: unknown format, damaged, or without parameters. The error names up to 20 bad lines.
+        FileError: unknown format, damaged, or without parameters. The error names up to 20 bad lines; for a
+            file of another program, it names that.
         UsageError: unknown format name.
     """
-    file_format = None if file_format is None else parse_format(file_format)
-    if len(data) > LARGEST_FILE:
-        raise FileError(f"a parameter file has at most {LARGEST_FILE} bytes", source=source)
-    if not data:
-        raise FileError("the file is empty", source=source)
-    if file_format is FileFormat.PCK or (file_format is None and param_pck.is_packed(data)):
-        return param_pck.read_packed(data, source)
-    text = decode_text(data, source)
-    file_format = file_format or _format_of(text, source)
-    match file_format:
-        case FileFormat.QGC:
-            return line_formats.read_qgc(text, source, params_max)
-        case FileFormat.JSON:
-            return json_format.read_json(text, source, params_max)
-        case _:
-            return line_formats.read_pairs(text, file_format, source, includes, params_max)
+    return _read(Reading(data, source, partial=partial), file_format)
+
+
+def read_file(
+    path: str | os.PathLike[str],
+    *,
+    file_format: FileFormat | str | None = None,
+    partial: bool = False,
+) -> ParamFile:
+    """Read a parameter file of any supported format. Blocks until the disk has delivered it.
+
+    A list in MAVProxy's or Mission Planner's format may include others with `@include FILE`. The path is
+    relative to the file's folder, and the included file must be in that folder, beside it, or below either.
+    Its lines replace the `@include` line.
+
+    Args:
+        path: the file.
+        file_format, partial: as for `loads`.
+
+    Raises:
+        FileError: the file cannot be read, is too large, has no known format or is damaged. Nothing is
+            returned then; the error names up to 20 bad lines.
+        UsageError: unknown format.
+    """
+    source = os.fspath(path)
+    return _read(Reading(read_bytes(source), source, partial=partial, is_on_disk=True), file_format)
+
+
+def _read(reading: Reading, file_format: FileFormat | str | None) -> ParamFile:
+    given = None if file_format is None else FileFormat(file_format)
+    if len(reading.data) > LARGEST_FILE:
+        raise FileError(f"a parameter file has at most {LARGEST_FILE} bytes", source=reading.source)
+    if not reading.data:
+        raise FileError("the file is empty", source=reading.source)
+    try:
+        chosen = given or _format_of(reading)
+        return _FORMATS[chosen].read(reading, chosen)
+    except FileError as error:
+        kind = kind_of(reading.data)
+        if kind is None:
+            raise
+        raise FileError(f"not a parameter file: {kind}", source=reading.source) from error
+
+
+def _format_of(reading: Reading) -> FileFormat:
+    for each, known in _FORMATS.items():
+        if known.is_seen_in(reading):
+            return each
+    named = ENDINGS.get(PurePath(reading.source).suffix.lower(), FileFormat.PCK)
+    if named in (FileFormat.PARM, FileFormat.MISSION_PLANNER):
+        return named
+    if named is not FileFormat.PCK and not lists.is_pair(reading.first):
+        return named  # no other format is possible, and reading gives the error for this one
+    return FileFormat.MISSION_PLANNER if "," in reading.first else FileFormat.PARM
 
 
 def dumps(content: Content, *, file_format: FileFormat | str | None = None, target: str = "") -> bytes:
@@ -88,67 +180,63 @@ def dumps(content: Content, *, file_format: FileFormat | str | None = None, targ
         file_format = content.file_format
     if file_format is None:
         raise UsageError("give the format in which to write the parameters")
-    file_format = parse_format(file_format)
+    chosen = FileFormat(file_format)
     try:
-        around = _as_file(content, file_format)
+        around = content if isinstance(content, ParamFile) else _as_file(content, chosen)
         sets = [each for each in around.sets if each]
-        return _bytes(sets, file_format, around)
+        _check(sets, chosen)
+        written = _FORMATS[chosen].write(sets, around)
+        if isinstance(written, bytes):
+            return written
+        return "".join(f"{line}\n" for line in written).encode("utf-8", "backslashreplace")
     except UsageError as error:
         raise FileError(str(error), source=target) from error
 
 
-def _bytes(sets: list[ParamSet], file_format: FileFormat, around: ParamFile) -> bytes:
-    if not sets:
-        raise UsageError("there are no parameters to write")
-    if len(sets) > 1 and file_format in (FileFormat.PARM, FileFormat.MISSION_PLANNER, FileFormat.PCK):
-        components = ", ".join(map(address, sets))
-        raise UsageError(
-            f"the format {file_format} holds one component, and there are {components}; choose one"
-        )
-    _check(sets)
-    if any(each.is_extended for each in sets):
-        if file_format is not FileFormat.JSON:
-            raise UsageError(f"the format {file_format} cannot hold extended parameters; write .json")
-        if len(sets) > 1:
-            raise UsageError("a file of extended parameters holds one component, and no plain parameters")
-    match file_format:
-        case FileFormat.PCK:
-            return param_pck.write_packed(sets[0])
-        case FileFormat.QGC:
-            lines = line_formats.write_qgc(sets, around)
-        case FileFormat.JSON:
-            lines = json_format.write_json(sets, around)
-        case _:
-            lines = line_formats.write_pairs(sets, file_format, around)
-    return "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")
+def write_file(
+    path: str | os.PathLike[str], content: Content, *, file_format: FileFormat | str | None = None
+) -> FileFormat:
+    """Write a parameter file, and replace an existing one atomically. Blocks until the file is on disk.
 
+    The old file stays unchanged until the new one is completely on disk, and also if writing fails. The mode
+    is kept. If the path is a symbolic link, the link stays and its target is replaced.
 
-def _format_of(text: str, source: str) -> FileFormat:
-    """Return the format of a text.
+    Args:
+        path: the file.
+        content: a file as read, the parameters of one component, or of several.
+        file_format: the format; None to choose it by the file extension.
+
+    Returns:
+        The format of the written file.
 
     Raises:
-        FileError: the text has no line with content.
+        FileError: the format cannot express the content, the extension is unknown, or writing failed.
+        UsageError: unknown format.
     """
-    if text.lstrip().startswith("{"):  # it may be one line of megabytes, in which no comment is sought
-        return FileFormat.JSON
-    first = next((line for line in lines_of(text) if line.text), None)
-    if first is None:
-        raise FileError("the file contains no parameters", source=source)
-    if first.text.startswith("{"):
-        return FileFormat.JSON  # behind comments
-    if line_formats.is_qgc_row(first.text):
-        return FileFormat.QGC
-    named = ENDINGS.get(PurePath(source).suffix.lower())
-    if named in (FileFormat.PARM, FileFormat.MISSION_PLANNER):
-        return named
-    if named in (FileFormat.QGC, FileFormat.JSON) and not line_formats.is_pair(first.text):
-        return named  # no other format is possible, and reading gives the error for this one
-    return FileFormat.MISSION_PLANNER if "," in first.text else FileFormat.PARM
+    source = os.fspath(path)
+    chosen = format_of_name(source) if file_format is None else FileFormat(file_format)
+    replace_file(source, dumps(content, file_format=chosen, target=source))
+    return chosen
 
 
-def _as_file(content: Content, file_format: FileFormat) -> ParamFile:
-    if isinstance(content, ParamFile):
-        return content
+def writable(params: ParamSet, file_format: FileFormat) -> tuple[ParamSet, list[str]]:
+    """Return a set without what a format cannot hold, which its source names, and these names.
+
+    If the format can hold none of the parameters, the set is returned unchanged: writing it gives the reason.
+    """
+    kept = {}
+    for name, param in params.items():
+        with suppress(UsageError):
+            _FORMATS[file_format].express(params, param)
+            kept[name] = param
+    left_out = [name for name in params if name not in kept]
+    if not left_out or not kept or params.is_extended:
+        return params, []
+    source = f"{params.source}, without {first_of(left_out, LEFT_OUT_SHOWN_MAX)}"
+    return replace(params, params=kept, source=source), left_out
+
+
+def _as_file(content: ParamSet | Iterable[ParamSet], file_format: FileFormat) -> ParamFile:
     sets = (content,) if isinstance(content, ParamSet) else tuple(content)
     if file_format is FileFormat.JSON:
         return ParamFile(sets, file_format)  # the document has fields for the header's facts
@@ -170,9 +258,15 @@ def _header_lines(params: ParamSet) -> Iterator[str]:
         yield f"from {params.source}"
 
 
-def _check(sets: list[ParamSet]) -> None:
-    """Raise UsageError for invalid names or ids, or two sets of one component: nothing
-    distinguishes them."""
+def _check(sets: Sequence[ParamSet], file_format: FileFormat) -> None:
+    """Raise UsageError for sets that are not valid, or that a format cannot hold together."""
+    if not sets:
+        raise UsageError("there are no parameters to write")
+    if len(sets) > 1 and not _FORMATS[file_format].holds_several:
+        components = ", ".join(map(address, sets))
+        raise UsageError(
+            f"the format {file_format} holds one component, and there are {components}; choose one"
+        )
     seen = set()
     for each in sets:
         for number, least in ((each.system, 1), (each.component, 0)):
@@ -181,6 +275,11 @@ def _check(sets: list[ParamSet]) -> None:
         for param in each.values():
             check_name(param.name)
         ids = (each.system, AUTOPILOT if each.component is None else each.component)
-        if ids in seen:
+        if ids in seen:  # nothing distinguishes the two
             raise UsageError(f"two sets have the same component, {address(each)}")
         seen.add(ids)
+    if any(each.is_extended for each in sets):
+        if file_format is not FileFormat.JSON:
+            raise UsageError(f"the format {file_format} cannot hold extended parameters; write .json")
+        if len(sets) > 1:
+            raise UsageError("a file of extended parameters holds one component, and no plain parameters")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import PurePath
-from typing import Final
+from typing import Final, NoReturn
 
 from paramclient.errors import FileError, UsageError
 from paramclient.model.paramset import ParamSet
@@ -17,10 +16,8 @@ __all__ = [
     "FileFormat",
     "LogFormat",
     "ParamFile",
-    "TooManyParams",
     "address",
     "format_of_name",
-    "parse_format",
 ]
 
 AUTOPILOT: Final = 1
@@ -40,6 +37,10 @@ class FileFormat(StrEnum):
     """`param.pck`, the packed file that vehicles serve over MAVFTP."""
     JSON = "json"
     """paramclient's own format: all fields of every parameter, exactly."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> NoReturn:
+        raise UsageError(f"unknown file format {value!r}; the formats are {', '.join(cls)}")
 
 
 class LogFormat(StrEnum):
@@ -61,20 +62,6 @@ ENDINGS: Final = {
 """Formats by file extension, in lower case."""
 
 
-def parse_format(file_format: FileFormat | str) -> FileFormat:
-    """Return the format with this name.
-
-    Raises:
-        UsageError: there is no such format.
-    """
-    try:
-        return FileFormat(file_format)
-    except ValueError:
-        raise UsageError(
-            f"unknown file format {file_format!r}; the formats are {_listed(FileFormat)}"
-        ) from None
-
-
 def format_of_name(name: str) -> FileFormat:
     """Return the format for the extension of a file's name.
 
@@ -85,15 +72,11 @@ def format_of_name(name: str) -> FileFormat:
     file_format = ENDINGS.get(ending)
     if file_format is None:
         raise FileError(
-            f"unknown file extension {ending!r}. Choose a format ({_listed(FileFormat)}), or one of the "
-            f"extensions {_listed(ENDINGS)}",
+            f"unknown file extension {ending!r}. Choose a format ({', '.join(FileFormat)}), or one of the "
+            f"extensions {', '.join(ENDINGS)}",
             source=name,
         )
     return file_format
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(names)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +90,7 @@ class ParamFile:
         header: the comment lines at the top, without comment characters.
         footer: the comment lines after the last parameter. All others belong to the parameter below them.
         notes: remarks for the user, in sentences: repeated lines, parts left out.
+        left_out: number of parameters whose name no vehicle can have, see `partial` of `read_file`.
     """
 
     sets: tuple[ParamSet, ...]
@@ -115,6 +99,7 @@ class ParamFile:
     header: tuple[str, ...] = ()
     footer: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    left_out: int = 0
 
     @property
     def is_extended(self) -> bool:
@@ -149,16 +134,6 @@ class ParamFile:
     def __repr__(self) -> str:
         description = ", ".join(f"{address(each)}: {len(each)}" for each in self.sets)
         return f"<ParamFile {self.source or 'unnamed'} {self.file_format} {description}>"
-
-
-class TooManyParams(FileError):
-    """A file holds more parameters than its reader takes. The rest of the file was not read."""
-
-    @classmethod
-    def check(cls, count: int, params_max: int | None, source: str) -> None:
-        """Raise it if there are more than `params_max`; None is no limit."""
-        if params_max is not None and count > params_max:
-            raise cls(f"the file holds more than {params_max:,} parameters", source=source)
 
 
 def address(params: ParamSet) -> str:

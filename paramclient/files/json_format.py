@@ -20,15 +20,15 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import asdict
 from datetime import datetime
-from typing import Final
+from typing import Any, Final, NoReturn, TypeAlias
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.formats import FileFormat, ParamFile, TooManyParams
-from paramclient.files.json_reader import Checks, Place, Reader, between, found, read_json_text, typed
-from paramclient.files.text import as_type, is_plain, time_of
+from paramclient.files.formats import FileFormat, ParamFile
+from paramclient.files.reading import Reading, as_type, excerpt, is_plain, time_of, undecoded_byte
 from paramclient.model.ext_values import (
     EXT_VALUE_SIZE,
     check_ext_value,
@@ -37,10 +37,11 @@ from paramclient.model.ext_values import (
     own_bytes,
 )
 from paramclient.model.identity import Identity
-from paramclient.model.notation import value_json, value_written
+from paramclient.model.notation import bits_written, value_json, value_written
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import (
     TYPES_BY_NAME,
+    WIRE_SIZE,
     ParamType,
     WireValue,
     check_name,
@@ -49,11 +50,15 @@ from paramclient.model.values import (
     type_name,
 )
 
-__all__ = [
-    "read_json",
-    "write_json",
-]
+__all__ = ["json_fields", "read_json", "read_json_text", "write_json"]
 
+FAULT_LENGTH_MAX: Final = 300
+"""Characters of one fault in an error, so that a long field does not make the error unreadable."""
+
+Place: TypeAlias = tuple[str | int, ...]
+"""Position in a document: keys and list indices from the top."""
+Checks: TypeAlias = Mapping[str, Callable[[Any], Any]]
+"""By the name of a field, a function that returns the field's content, or raises UsageError."""
 VERSION: Final = 1
 """Version of both kinds of documents, written and required."""
 _KEY: Final = "paramclient"
@@ -67,97 +72,174 @@ _EXT_PREFIX: Final = "EXT_"
 _WORDS: Final = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 _raw: Final = re.compile(r"0x([0-9a-fA-F]{8})").fullmatch
 _type_number: Final = re.compile(r"TYPE_([0-9]{1,3})").fullmatch
-_date: Final = re.compile(r"[0-9]{4}-[0-9]{2}-").match
 _bits: Final = re.compile(r"[0-9a-fA-F]{8}(?:[0-9a-fA-F]{8})?").fullmatch
+
+
+# Documents
+
+
+def read_json_text(text: str, source: str) -> Any:
+    """Return the content of a JSON text without repeated keys.
+
+    Raises:
+        FileError: invalid JSON, or a repeated key.
+    """
+    if (byte := undecoded_byte(text)) is not None:
+        raise FileError(byte[1], source=source, line=text.count("\n", 0, byte[0]) + 1)
+    try:
+        return json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant)
+    except json.JSONDecodeError as error:
+        message = f"expected JSON: {error.msg} (column {error.colno})"
+        raise FileError(message, source=source, line=error.lineno) from None
+    except RecursionError:
+        raise FileError("the document is nested too deep", source=source) from None
+    except ValueError as error:
+        line = _line_of(text, error.args[1], last=True) if len(error.args) > 1 else None
+        raise FileError(str(error.args[0]), source=source, line=line) from None
+
+
+def _fault(reading: Reading, place: Place, what: str, *, is_name: bool = False) -> None:
+    """Add a fault at a position of the document."""
+    line = None
+    if "params" in place[:-1] and not reading.is_full:
+        line = _line_of(reading.text, str(place[place.index("params") + 1]))
+    described = f"{'.'.join(map(str, place)) or 'the document'}: {what}"
+    if len(described) > FAULT_LENGTH_MAX:
+        described = f"{described[:FAULT_LENGTH_MAX]}…"
+    reading.fault(line, described, is_name=is_name)
+
+
+def _checked(
+    reading: Reading, content: object, place: Place, checks: Checks, required: AbstractSet[str]
+) -> dict[str, Any]:
+    """Return the valid fields of an object without nulls; add a fault for each other field."""
+    if not isinstance(content, dict):
+        _fault(reading, place, f"it should be an object{_found(content)}")
+        return {}
+    valid = {}
+    for key, each in content.items():
+        if key not in checks:
+            _fault(reading, (*place, key), "unknown field")
+        elif each is not None or key in required:
+            try:
+                valid[key] = checks[key](each)
+            except UsageError as error:
+                _fault(reading, (*place, key), str(error))
+    for key in sorted(required - content.keys()):
+        _fault(reading, (*place, key), "the field is missing")
+    return valid
+
+
+def _found(content: object) -> str:
+    """Return the end of a fault that shows a wrong value; "" for an object or a list."""
+    return "" if isinstance(content, dict | list) else f", found {content!r}"
+
+
+def _expected(is_valid: Callable[[Any], bool], words: str) -> Callable[[Any], Any]:
+    """Return the check of a field."""
+
+    def check(content: Any) -> Any:
+        if not is_valid(content):
+            raise UsageError(f"it should be {words}{_found(content)}")
+        return content
+
+    return check
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in content:
+            raise ValueError(f"{excerpt(key)} occurs twice", key)
+        content[key] = value
+    return content
+
+
+def _no_constant(word: str) -> NoReturn:
+    raise ValueError(f"{word} is not valid JSON; write it as text: {json.dumps(word)}")
+
+
+def _line_of(text: str, key: str, *, last: bool = False) -> int | None:
+    """Return the line of a key, if the key occurs once or the last occurrence is meant."""
+    places = [match.start() for match in re.finditer(rf'"{re.escape(key)}"[ \t]*:', text)]
+    return text.count("\n", 0, places[-1]) + 1 if places and (last or len(places) == 1) else None
 
 
 # Reading
 
 
-def read_json(text: str, source: str, params_max: int | None = None) -> ParamFile:
+def read_json(reading: Reading, file_format: FileFormat) -> ParamFile:
     """Read a document of plain or of extended parameters.
 
     Raises:
-        TooManyParams: the document has more parameters than `params_max`.
-        FileError: invalid JSON, a repeated key, or not a valid document. The error names up to 20 problems.
+        FileError: invalid JSON, a repeated key, or not a valid document. The error names up to 20 faults.
     """
-    content = read_json_text(text, source)
-    reader = Reader(text, source)
-    if isinstance(content, dict) and _EXT_KEY in content:
-        return ParamFile((_ext_set(reader, content, params_max),), FileFormat.JSON, source)
-    document = reader.fields(content, (), _DOCUMENT, {_KEY, "sets"})
-    raw_sets = document.get("sets", [])
-    named = [each.get("params") for each in raw_sets if isinstance(each, dict)]
-    TooManyParams.check(sum(len(each) for each in named if isinstance(each, dict)), params_max, source)
-    sets = tuple(_set(reader, each, ("sets", place)) for place, each in enumerate(raw_sets))
-    reader.problems.raise_if_any()
-    if not any(sets):
-        raise FileError("the file contains no parameters", source=source)
-    return ParamFile(sets, FileFormat.JSON, source, tuple(document.get("header", [])))
+    content = read_json_text(reading.text, reading.source)
+    if not isinstance(content, dict) or not content.keys() & {_KEY, _EXT_KEY}:
+        raise FileError("not a parameter file of paramclient (JSON)", source=reading.source)
+    if _EXT_KEY in content:
+        known = {key: each for key, each in content.items() if key in _EXT_DOCUMENT}
+        return reading.file(file_format, sets=(_set(reading, known, ()),))
+    fields = _checked(reading, content, (), _DOCUMENT, {_KEY, "sets"})
+    sets = [_set(reading, each, ("sets", place)) for place, each in enumerate(fields.get("sets", []))]
+    return reading.file(file_format, tuple(fields.get("header", [])), sets=tuple(sets))
 
 
-def _ext_set(reader: Reader, content: Mapping[str, object], params_max: int | None) -> ParamSet:
-    """Return the set of a document of extended parameters."""
-    source = reader.problems.source
-    known = {key: each for key, each in content.items() if key in _EXT_DOCUMENT}
-    head = reader.fields(known, (), _EXT_DOCUMENT, {"params"})
-    TooManyParams.check(len(head.get("params", {})), params_max, source)
-    params = {}
-    for name, fields in head.get("params", {}).items():
-        try:
-            params[name] = _ext_param(name, fields)
-        except ValueError as error:
-            reader.problem(("params", name), str(error))
-    reader.problems.raise_if_any()
-    if not params:
-        raise FileError("the file contains no parameters", source=source)
-    ids = head.get("component"), head.get("system")
-    return ParamSet(params, *ids, None, head.get("at"), source, is_extended=True)
-
-
-def _set(reader: Reader, content: object, place: Place) -> ParamSet:
-    """Return the set at a position, without invalid fields."""
-    fields = reader.fields(content, place, _SET, {"params"})
+def _set(reading: Reading, content: object, place: Place) -> ParamSet:
+    """Return the set at a position, without invalid fields; at the top, that of extended parameters."""
+    is_extended = not place
+    fields = _checked(reading, content, place, _EXT_DOCUMENT if is_extended else _SET, {"params"})
     params = {}
     for name, each in fields.get("params", {}).items():
-        param = _param(reader, name, each, (*place, "params", name))
+        at = (*place, "params", name)
+        try:
+            if not is_portable_name(check_name(name)) and is_extended:
+                raise UsageError("no name of a parameter")
+        except UsageError as error:
+            _fault(reading, at, str(error), is_name=True)
+            continue
+        try:
+            param = _ext_param(name, each) if is_extended else _param(reading, name, each, at)
+        except ValueError as error:
+            _fault(reading, at, str(error))
+            continue
         if param is not None:
             params[name] = param
     identity = None
     if "identity" in fields:
-        known = reader.fields(fields["identity"], (*place, "identity"), _IDENTITY, {"system"})
+        known = _checked(reading, fields["identity"], (*place, "identity"), _IDENTITY, {"system"})
         identity = Identity(**known) if "system" in known else None
-    system, component = fields.get("system"), fields.get("component")
-    return ParamSet(params, component, system, identity, fields.get("at"), reader.problems.source)
+    ids = fields.get("component"), fields.get("system")
+    return ParamSet(params, *ids, identity, fields.get("at"), reading.source, is_extended)
 
 
-def _param(reader: Reader, name: str, content: object, place: Place) -> WrittenParam | None:
-    before = reader.problems.count
-    fields = reader.fields(content, place, _PARAM, {"value"})
-    if reader.problems.count > before:
+def _param(reading: Reading, name: str, content: object, place: Place) -> WrittenParam | None:
+    """Return a plain parameter; None, with faults, if a field is not valid.
+
+    Raises:
+        UsageError: the fields contradict each other.
+    """
+    before = reading.fault_count
+    fields = _checked(reading, content, place, _PARAM, {"value"})
+    if reading.fault_count > before:
         return None
     value, kind, default = fields["value"], fields.get("type"), fields.get("default")
-    try:
-        if kind is not None:
-            value = as_type(value, kind)
-            default = None if default is None else as_type(default, kind)
-        if "bits" in fields:
-            value = _with_bits(value, kind, fields["bits"])
-        comment, is_raw = fields.get("comment", ""), isinstance(value, bytes)
-        return WrittenParam(check_name(name), value, kind, default, comment, is_raw=is_raw)
-    except UsageError as error:
-        reader.problem(place, str(error))
-        return None
+    if kind is not None:
+        value = as_type(value, kind)
+        default = None if default is None else as_type(default, kind)
+    if "bits" in fields:
+        value = _with_bits(value, kind, fields["bits"])
+    return WrittenParam(
+        name, value, kind, default, fields.get("comment", ""), is_raw=isinstance(value, bytes)
+    )
 
 
 def _ext_param(name: str, fields: object) -> WrittenParam:
-    """Return the parameter that a document has under a name: `value` or `hex`, and `type`.
+    """Return an extended parameter: `value` or `hex`, and `type`.
 
     Raises:
         ValueError: a field is not valid.
     """
-    if not isinstance(name, str) or not is_portable_name(name):
-        raise ValueError(f"{name!r:.40} is no name of a parameter")
     if not isinstance(fields, dict) or not {"type"} <= fields.keys() <= {"value", "hex", "type"}:
         raise ValueError("expected value or hex, and type")
     written = fields.get("type")
@@ -177,13 +259,17 @@ def _ext_param(name: str, fields: object) -> WrittenParam:
     return WrittenParam.of(ext_param(name, encode_ext_value(check_ext_value(value), number), number))
 
 
-_text: Final = typed(str, "text")
-_list: Final = typed(list, "a list")
-_object: Final = typed(dict, "an object")
-_count: Final = between(0, math.inf, "a whole number from 0")
-_id: Final = between(1, 255, "an id from 1 to 255")
-_component: Final = between(0, 255, "an id from 0 to 255")
-_version: Final = between(VERSION, VERSION, f"{VERSION}, the version of the format")
+def _whole(low: int, high: float, words: str) -> Callable[[Any], Any]:
+    return _expected(lambda content: type(content) is int and low <= content <= high, words)
+
+
+_text: Final = _expected(lambda content: isinstance(content, str), "text")
+_list: Final = _expected(lambda content: isinstance(content, list), "a list")
+_object: Final = _expected(lambda content: isinstance(content, dict), "an object")
+_count: Final = _whole(0, math.inf, "a whole number from 0")
+_id: Final = _whole(1, 255, "an id from 1 to 255")
+_component: Final = _whole(0, 255, "an id from 0 to 255")
+_version: Final = _whole(VERSION, VERSION, f"{VERSION}, the version of the format")
 
 
 def _texts(content: object) -> list[str]:
@@ -191,12 +277,10 @@ def _texts(content: object) -> list[str]:
 
 
 def _time(content: object) -> float:
-    if not isinstance(content, str) or not _date(content):  # a number could be seconds or milliseconds
-        raise UsageError(f"a time is written as 2026-01-31T12:00:00Z{found(content)}")
     try:
-        moment = datetime.fromisoformat(content.upper())
-    except ValueError as error:
-        raise UsageError(f"{error}{found(content)}") from None
+        moment = datetime.fromisoformat(_text(content).upper())
+    except ValueError:  # a number could be seconds or milliseconds
+        raise UsageError(f"a time is written as 2026-01-31T12:00:00Z{_found(content)}") from None
     if moment.tzinfo is None:
         raise UsageError("the time needs its zone, as in 2026-01-31T12:00:00Z")
     return moment.timestamp()
@@ -214,14 +298,16 @@ def _type(content: object, prefix: str = "") -> ParamType | int:
 
 
 def _number(content: object) -> WireValue:
-    if isinstance(content, int | float) and not isinstance(content, bool):
-        return content
     if isinstance(content, str):
         if content in _WORDS:
             return _WORDS[content]
         if match := _raw(content):
             return int(match[1], 16).to_bytes(4, "little")
-    raise UsageError(f"{_NUMBER_EXPECTED}{found(content)}")
+    elif isinstance(content, int | float) and not isinstance(content, bool):
+        if not math.isinf(content):
+            return content
+        raise UsageError("the number is beyond the range of a double")
+    raise UsageError(f"{_NUMBER_EXPECTED}{_found(content)}")
 
 
 def _with_bits(value: WireValue, kind: ParamType | int | None, text: str) -> WireValue:
@@ -230,13 +316,12 @@ def _with_bits(value: WireValue, kind: ParamType | int | None, text: str) -> Wir
         raise UsageError("bits need a type")
     if not _bits(text):
         raise UsageError(f"bits are 8 or 16 hexadecimal digits, not {text!r}")
-    bits = int(text, 16)
-    size = kind.size if isinstance(kind, ParamType) and not isinstance(value, bytes) else 4
-    if bits >= 1 << 8 * size:
+    bits, is_raw = int(text, 16), isinstance(value, bytes)
+    size = kind.size if isinstance(kind, ParamType) and not is_raw else WIRE_SIZE
+    if bits >> 8 * size:
         raise UsageError(f"bits {text} exceed the size of the type")
-    exact = from_bits(bits, kind, is_raw=isinstance(value, bytes))
-    both_nan = value != value and exact != exact
-    if exact != value and not both_nan:
+    exact = from_bits(bits, kind, is_raw=is_raw)
+    if exact != value and (exact == exact or value == value):  # two NaNs may differ in their payload
         raise UsageError(f"value {value!r} and bits {text} ({exact!r}) contradict each other; leave out one")
     return exact
 
@@ -266,13 +351,7 @@ _PARAM: Final[Checks] = {
     "default": _number,
     "comment": _text,
 }
-_EXT_DOCUMENT: Final[Checks] = {
-    _EXT_KEY: _version,
-    "system": _id,
-    "component": _component,
-    "at": _time,
-    "params": _object,
-}
+_EXT_DOCUMENT: Final[Checks] = {_EXT_KEY: _version, **_SET}
 
 
 # Writing
@@ -285,7 +364,7 @@ def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
         UsageError: a NaN with payload bits has no type.
     """
     if sets[0].is_extended:
-        yield from _ext_lines(sets[0])
+        yield from _set_lines(sets[0], {_EXT_KEY: VERSION}, "")
         return
     header = [_encodable(line) for line in (*around.header, *around.footer)]
     yield "{"
@@ -293,53 +372,46 @@ def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
     if header:
         yield f'  "header": {_json(header)},'
     yield '  "sets": ['
-    for place, each in enumerate(sets):
-        yield "    {"
-        identity = None if each.identity is None else asdict(each.identity)
-        for key, content in {**_about(each), "identity": identity}.items():
-            if content is not None:
-                yield f"      {_json(key)}: {_json(content)},"
-        yield '      "params": {'
-        yield from _rows({param.name: _fields(param) for param in each.values()}, "        ")
-        yield "      }"
-        yield "    }," if place < len(sets) - 1 else "    }"
+    for number, each in enumerate(sets, start=1):
+        *lines, last = _set_lines(each, {}, "    ")
+        yield from (*lines, f"{last}," if number < len(sets) else last)
     yield "  ]"
     yield "}"
 
 
-def _ext_lines(content: ParamSet) -> Iterator[str]:
-    """Generate the lines of a document of extended parameters."""
-    yield "{"
-    for key, each in {_EXT_KEY: VERSION, **_about(content)}.items():
-        if each is not None:
-            yield f"  {_json(key)}: {_json(each)},"
-    yield '  "params": {'
-    yield from _rows({param.name: _ext_fields(param) for param in content.values()}, "    ")
-    yield "  }"
-    yield "}"
-
-
-def _about(params: ParamSet) -> dict[str, object]:
-    return {
+def _set_lines(params: ParamSet, first: Mapping[str, object], indent: str) -> Iterator[str]:
+    """Generate the lines of the object of a set."""
+    fields = {
+        **first,
         "system": params.system,
         "component": params.component,
         "at": None if params.at is None else time_of(params.at),
         "source": _encodable(params.source) or None,
+        "identity": None if params.identity is None else asdict(params.identity),
     }
+    yield f"{indent}{{"
+    for key, content in fields.items():
+        if content is not None:
+            yield f"{indent}  {_json(key)}: {_json(content)},"
+    yield f'{indent}  "params": {{'
+    for number, param in enumerate(params.values(), start=1):
+        comma = "," if number < len(params) else ""
+        yield f"{indent}    {_json(param.name)}: {_json(json_fields(params, param))}{comma}"
+    yield f"{indent}  }}"
+    yield f"{indent}}}"
 
 
-def _rows(params: Mapping[str, Mapping[str, object]], indent: str) -> Iterator[str]:
-    last = len(params) - 1
-    for number, (name, fields) in enumerate(params.items()):
-        yield f"{indent}{_json(name)}: {_json(fields)}{',' if number < last else ''}"
+def json_fields(params: ParamSet, param: WrittenParam) -> dict[str, object]:
+    """Return the fields of a parameter, or raise UsageError if the format cannot express it."""
+    return _ext_fields(param) if params.is_extended else _fields(param)
 
 
 def _fields(param: WrittenParam) -> dict[str, object]:
     fields: dict[str, object] = {"value": value_written(param.settable, param)}
     if param.type_number is not None:
-        is_wide = param.type is not None and param.type.size == 8
+        param.bits_as(param.type_number)  # raises UsageError if the value does not fit
         fields["type"] = _type_text(param)
-        fields["bits"] = f"{param.bits_as(param.type_number):0{16 if is_wide else 8}x}"
+        fields["bits"] = bits_written(param)
     elif isinstance(param.value, float) and not is_plain(param.value):
         raise UsageError(f"{param.name} is a NaN with payload bits, and has no type for them")
     if param.default is not None:

@@ -14,8 +14,8 @@ from typing import Any, Final
 
 from paramclient.errors import FileError
 from paramclient.files.disk import read_bytes
-from paramclient.files.json_reader import read_json_text
-from paramclient.files.text import decode_text, excerpt
+from paramclient.files.json_format import read_json_text
+from paramclient.files.reading import decode_text, excerpt
 from paramclient.model.renames import Rename, Renames
 
 __all__ = ["loads_renames", "read_renames"]
@@ -24,7 +24,7 @@ SIZE_MAX: Final = 1024 * 1024
 """Largest file, in bytes: some 20,000 entries, more than an autopilot has parameters."""
 MEMBERS: Final = ("old", "new", "factor")
 """The members of an entry; `factor` is optional."""
-_between_entries: Final = re.compile(r"[\s,]*").match
+_between_entries: Final = re.compile(r"[\s,]*")
 
 
 def read_renames(path: str | os.PathLike[str]) -> Renames:
@@ -53,38 +53,31 @@ def loads_renames(data: bytes, *, source: str = "") -> Renames:
     content = read_json_text(text, source)
     if not isinstance(content, list) or not content:
         raise FileError("expected a list of entries with `old` and `new`", source=source, line=1)
-    entries = zip(content, _lines_of_entries(text), strict=True)
-    return Renames((_entry(each, line, source) for each, line in entries), source)
+    return Renames((_entry(each, line, source) for each, line in _with_lines(content, text)), source)
 
 
-def _lines_of_entries(text: str) -> Iterator[int]:
-    """Generate the line on which each entry of a valid JSON list begins."""
+def _with_lines(content: list[Any], text: str) -> Iterator[tuple[Any, int]]:
+    """Generate the entries of a list, each with the line on which it begins."""
     decoder = json.JSONDecoder()
     at, line, end = text.index("[") + 1, 1, 0
-    while True:
-        found = _between_entries(text, at)
-        assert found is not None, "it may be empty"
-        begin = found.end()
+    for each in content:
+        found = _between_entries.match(text, at)
+        begin = at if found is None else found.end()
         line += text.count("\n", end, begin)
-        if text[begin] == "]":
-            return
-        yield line
+        yield each, line
         _, at = decoder.raw_decode(text, begin)
         end = begin
 
 
 def _entry(content: Any, line: int, source: str) -> Rename:
     """Return an entry of the list; `Renames` checks its names and its factor."""
-
-    def error(message: str) -> FileError:
-        return FileError(message, source=source, line=line)
-
+    problem = None
     if not isinstance(content, dict):
-        raise error("expected an entry with `old` and `new`")
-    for member in content:
-        if member not in MEMBERS:
-            raise error(f"unknown member {excerpt(member)}; the members are {', '.join(MEMBERS)}")
-    for member in ("old", "new"):
-        if member not in content:
-            raise error(f"the entry has no `{member}`")
+        problem = "expected an entry with `old` and `new`"
+    elif unknown := [member for member in content if member not in MEMBERS]:
+        problem = f"unknown member {excerpt(unknown[0])}; the members are {', '.join(MEMBERS)}"
+    elif missing := [member for member in MEMBERS[:2] if member not in content]:
+        problem = f"the entry has no `{missing[0]}`"
+    if problem is not None:
+        raise FileError(problem, source=source, line=line)
     return Rename(content["old"], content["new"], content.get("factor", 1), line)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
 from contextlib import closing
 from typing import Any, Final
 
@@ -68,14 +67,13 @@ def read_dataflash(path: str) -> OnboardLog:
     Raises:
         FileError: the file cannot be read, or has no PARM messages.
     """
+    log = _Messages()
     with closing(_Reader(path)) as reader:
-        boot_time = _boot_time(reader)
-        log = _Messages()
-        for message in _messages(reader, {"PARM", "VER", "MSG"}):
-            log.receive(message)
+        while (message := reader.recv_match(type={"PARM", "GPS", "VER", "MSG"}, strict=True)) is not None:
+            log.receive(message.get_type(), message.to_dict())
     if not log.initial:
         raise FileError("the log has no PARM messages", source=path)
-    return log.finish(path, boot_time)
+    return log.finish(path)
 
 
 class _Reader(DFReader_binary):  # type: ignore[misc]  # pymavlink has no types
@@ -91,24 +89,6 @@ class _Reader(DFReader_binary):  # type: ignore[misc]  # pymavlink has no types
             raise
 
 
-def _messages(reader: Any, types: set[str]) -> Iterator[Any]:
-    """Generate the messages of these types, in the order of the file."""
-    reader.rewind()
-    while (message := reader.recv_match(type=types, strict=True)) is not None:
-        yield message
-
-
-def _boot_time(reader: Any) -> float | None:
-    """Return the Unix time of the boot, by the first GPS message with a fix; None without one."""
-    for message in _messages(reader, {"GPS"}):
-        fields = message.to_dict()
-        week, time, micros = (fields.get(name) for name in ("GWk", "GMS", "TimeUS"))
-        if week and time is not None and micros is not None and fields.get("Status", 0) >= GPS_FIX_MIN:
-            at = GPS_EPOCH + week * 604800 + time / 1e3 - GPS_LEAP_SECONDS
-            return float(at - micros / 1e6)
-    return None
-
-
 class _Messages:
     """Collects the messages of one log."""
 
@@ -116,46 +96,40 @@ class _Messages:
         self.initial: dict[str, WrittenParam] = {}
         self._changes: list[LoggedChange] = []
         self._values: dict[str, WireValue] = {}  # the latest, by name
-        self._began: float | None = None
-        self._last = 0.0  # time of the last PARM of the initial run
-        self._ended = 0.0
-        self._uid: str | None = None
-        self._firmware = self._vehicle_type = self._refused = 0
-        self._git_hash = ""
+        self._began = self._last = self._ended = 0.0  # of all PARM, and the last one of the initial run
+        self._boot_time: float | None = None
+        self._damaged = 0
+        self._version: dict[str, Any] = {}  # fields of the identity
+        self._texts: dict[str, Any] = {}  # the same, by text; VER counts before it
 
-    def receive(self, message: Any) -> None:
-        fields = message.to_dict()
-        match message.get_type():
+    def receive(self, kind: str, fields: dict[str, Any]) -> None:
+        match kind:
             case "PARM":
                 self._receive_param(fields)
+            case "GPS" if self._boot_time is None:
+                self._boot_time = _boot_time(fields)
             case "VER":
-                self._receive_version(fields)
+                numbers = bytes(fields.get(name, 0) & 0xFF for name in ("Maj", "Min", "Pat", "FWT"))
+                self._version["firmware"] = int.from_bytes(numbers)
+                self._version["git_hash"] = f"{fields.get('GH', 0):08x}"
             case "MSG":
                 self._receive_text(str(fields.get("Message", "")))
 
-    def finish(self, path: str, boot_time: float | None) -> OnboardLog:
-        ids = (self.initial.get(name) for name in SYSTEM_ID_NAMES)
-        system = next((int(each.settable) for each in ids if each is not None and _is_id(each.settable)), 0)
-        refused = self._refused
-        notes = (f"{refused} PARM messages are damaged and left out",) if refused else ()
+    def finish(self, path: str) -> OnboardLog:
+        ids = [each.value for name in SYSTEM_ID_NAMES if (each := self.initial.get(name)) is not None]
+        system = next((each for each in ids if isinstance(each, int) and 0 < each < 256), 0)
+        autopilot = MAV_AUTOPILOT_ARDUPILOTMEGA
+        damaged = f"{self._damaged} PARM messages are damaged and left out"
         return OnboardLog(
             path,
             LogFormat.DATAFLASH,
-            Identity(
-                system=system,
-                link=log_link(path),
-                uid=self._uid,
-                autopilot=MAV_AUTOPILOT_ARDUPILOTMEGA,
-                vehicle_type=self._vehicle_type,
-                firmware=self._firmware,
-                git_hash=self._git_hash,
-            ),
+            Identity(system, log_link(path), autopilot=autopilot, **self._texts | self._version),
             self.initial,
             tuple(self._changes),
-            self._began or 0.0,
+            self._began,
             self._ended,
-            boot_time,
-            notes,
+            self._boot_time,
+            (damaged,) if self._damaged else (),
         )
 
     def _receive_param(self, fields: dict[str, Any]) -> None:
@@ -164,44 +138,41 @@ class _Messages:
             value = _number(fields["Value"])
             time = fields["TimeUS"] / 1e6
         except (UsageError, KeyError, TypeError):
-            self._refused += 1
+            self._damaged += 1
             return
-        self._ended = max(self._ended, time)
-        if self._began is None:
+        if not self._values:
             self._began = self._last = time
+        self._ended = max(self._ended, time)
         known = self._values.get(name)
         default = fields.get("Default", math.nan)
-        is_of_initial_run = not math.isnan(default) or time - self._last <= INITIAL_GAP_MAX
-        if known is None and is_of_initial_run:
-            self.initial[name] = WrittenParam(
-                name, value, default=None if math.isnan(default) else _number(default)
-            )
+        has_default = not math.isnan(default)
+        if known is None and (has_default or time - self._last <= INITIAL_GAP_MAX):
+            self.initial[name] = WrittenParam(name, value, None, _number(default) if has_default else None)
             self._last = time
         elif value != known:
             self._changes.append(LoggedChange(time, name, value))
         self._values[name] = value
 
-    def _receive_version(self, fields: dict[str, Any]) -> None:
-        numbers = [fields.get(name, 0) for name in ("Maj", "Min", "Pat", "FWT")]
-        self._firmware = int.from_bytes(bytes(each & 0xFF for each in numbers))
-        self._git_hash = f"{fields.get('GH', 0):08x}"
-
     def _receive_text(self, text: str) -> None:
         if (found := _FIRMWARE.match(text)) is not None:
             name, *numbers, commit = found.groups()
-            self._vehicle_type = VEHICLE_TYPES.get(name, self._vehicle_type)
-            if not self._firmware:
-                self._firmware = int.from_bytes(bytes(min(int(each), 255) for each in (*numbers, 0)))
-                self._git_hash = commit or ""
+            self._texts["firmware"] = int.from_bytes(bytes(min(int(each), 255) for each in (*numbers, 0)))
+            self._texts["git_hash"] = commit or ""
+            if name in VEHICLE_TYPES:
+                self._texts["vehicle_type"] = VEHICLE_TYPES[name]
         elif (found := _HARDWARE_ID.search(text)) is not None:
             words = (bytes.fromhex(word)[::-1] for word in found.groups())
-            self._uid = b"".join(words).ljust(UID_SIZE, b"\0").hex()
+            self._texts["uid"] = b"".join(words).ljust(UID_SIZE, b"\0").hex()
+
+
+def _boot_time(fields: dict[str, Any]) -> float | None:
+    """Return the Unix time of the boot, by a GPS message; None without a fix."""
+    week, time, micros = (fields.get(name) for name in ("GWk", "GMS", "TimeUS"))
+    if not week or time is None or micros is None or fields.get("Status", 0) < GPS_FIX_MIN:
+        return None
+    return float(GPS_EPOCH + week * 604800 + time / 1e3 - GPS_LEAP_SECONDS - micros / 1e6)
 
 
 def _number(value: float) -> WireValue:
     """Return a float32 as the number that a person would write."""
     return int(value) if value.is_integer() else shortest_float(value)
-
-
-def _is_id(value: WireValue) -> bool:
-    return isinstance(value, int) and 0 < value < 256

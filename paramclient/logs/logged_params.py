@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from paramclient.files.formats import AUTOPILOT, LogFormat
 from paramclient.model.identity import Identity
@@ -57,33 +57,21 @@ class OnboardLog:
 
     def at_start(self) -> ParamSet:
         """Return the parameters at the beginning of the log."""
-        return self._set(self.initial, self.began)
+        ids = AUTOPILOT, self.identity.system or None
+        at = None if self.boot_time is None else self.boot_time + self.began
+        return ParamSet(self.initial, *ids, self.identity, at, self.source)
 
     def at_end(self) -> ParamSet:
         """Return the parameters at the end of the log: the initial ones with all changes."""
-        params = dict(self.initial)
-        for change in self.changes:
-            known = params.get(change.name)
-            params[change.name] = (
-                WrittenParam(change.name, change.value)
-                if known is None
-                else WrittenParam(change.name, change.value, known.type_number, known.default, known.comment)
-            )
-        return self._set(params, self.ended)
+        start = self.at_start()
+        params = dict(self.initial) | {each.name: self.changed(each) for each in self.changes}
+        at = None if self.boot_time is None else self.boot_time + self.ended
+        return replace(start, params=params, at=at)
 
-    def unix_time(self, time: float) -> float | None:
-        """Return the Unix time of a time since boot, in seconds; None if the log has no clock."""
-        return None if self.boot_time is None else self.boot_time + time
-
-    def _set(self, params: Mapping[str, WrittenParam], time: float) -> ParamSet:
-        return ParamSet(
-            params,
-            component=AUTOPILOT,
-            system=self.identity.system or None,
-            identity=self.identity,
-            at=self.unix_time(time),
-            source=self.source,
-        )
+    def changed(self, change: LoggedChange) -> WrittenParam:
+        """Return a changed parameter, with the type and default of the initial one."""
+        known = self.initial.get(change.name, WrittenParam(change.name, change.value))
+        return WrittenParam(change.name, change.value, known.type_number, known.default, known.comment)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +85,7 @@ class ImportedTable:
         params: the number of received parameters, plain and extended.
         complete: whether the plain table is complete; the extended one if there are no plain parameters.
         hash: the PX4 hash that confirms the table at the end of the log, or None.
-        notes: parts that were skipped of files that a ground station read over MAVFTP, in sentences.
+        notes: remarks for the user, in sentences: parts that were skipped, types that are unknown.
     """
 
     key: str
@@ -105,8 +93,8 @@ class ImportedTable:
     component: int
     autopilot: int | None
     params: int
-    complete: bool
-    hash: int | None
+    complete: bool = False
+    hash: int | None = None
     notes: tuple[str, ...] = ()
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import io
 import os
 import stat
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from functools import partial
 from pathlib import Path
@@ -23,10 +22,8 @@ from paramclient.model.values import Param, ParamType, Trust, bits_of, from_bits
 
 __all__ = ["import_onboard_log", "is_onboard_log", "read_onboard_log"]
 
-ULOG_MAGIC: Final = b"ULog\x01\x12\x35"
-"""The first bytes of a ULog file."""
-DATAFLASH_MAGIC: Final = b"\xa3\x95"
-"""The first bytes of each message of a dataflash log."""
+LOG_MAGICS: Final = {b"ULog\x01\x12\x35": LogFormat.ULOG, b"\xa3\x95": LogFormat.DATAFLASH}
+"""The first bytes of a ULog file, and of each message of a dataflash log."""
 
 
 def is_onboard_log(path: str | os.PathLike[str]) -> bool:
@@ -50,17 +47,26 @@ def read_onboard_log(path: str | os.PathLike[str]) -> OnboardLog:
     source = os.fspath(path)
     try:
         file_format = _format_of(Path(source))
-        if file_format is None:
-            raise FileError("neither a dataflash log nor a ULog file", source=source)
-        # Both libraries print remarks on damaged parts, which would mix with the output of a program.
+        # Both libraries print remarks on damaged parts, which would mix with the output of a program. They
+        # take up to 0.3 s to load.
         with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-            return _reader_of(file_format, source)(source)
+            if file_format is LogFormat.DATAFLASH:
+                from paramclient.logs.dataflash import read_dataflash
+
+                return read_dataflash(source)
+            if file_format is LogFormat.ULOG:
+                from paramclient.logs.ulog import read_ulog
+
+                return read_ulog(source)
     except UsageError:
         raise
+    except ImportError:
+        raise UsageError(f"{source}: ULog files need pyulog: pip install 'paramclient[logs]'") from None
     except OSError as error:
         raise FileError(f"cannot be read: {error.strerror}", source=source) from error
     except Exception as error:  # the libraries do not state what they raise for damaged files
         raise FileError(f"the log is damaged: {error}", source=source) from error
+    raise FileError("neither a dataflash log nor a ULog file", source=source)
 
 
 def _format_of(path: Path) -> LogFormat | None:
@@ -68,23 +74,8 @@ def _format_of(path: Path) -> LogFormat | None:
     if not stat.S_ISREG(path.stat().st_mode):
         return None
     with path.open("rb") as file:
-        begin = file.read(len(ULOG_MAGIC))
-    if begin == ULOG_MAGIC:
-        return LogFormat.ULOG
-    return LogFormat.DATAFLASH if begin.startswith(DATAFLASH_MAGIC) else None
-
-
-def _reader_of(file_format: LogFormat, source: str) -> Callable[[str], OnboardLog]:
-    """Return the reader of a format. Loads its library, which takes up to 0.3 s."""
-    if file_format is LogFormat.DATAFLASH:
-        from paramclient.logs.dataflash import read_dataflash
-
-        return read_dataflash
-    try:
-        from paramclient.logs.ulog import read_ulog
-    except ImportError:
-        raise UsageError(f"{source}: ULog files need pyulog: pip install 'paramclient[logs]'") from None
-    return read_ulog
+        begin = file.read(max(map(len, LOG_MAGICS)))
+    return next((each for magic, each in LOG_MAGICS.items() if begin.startswith(magic)), None)
 
 
 async def import_onboard_log(path: str | os.PathLike[str], cache: ParamCache) -> ImportedTable:
@@ -93,7 +84,7 @@ async def import_onboard_log(path: str | os.PathLike[str], cache: ParamCache) ->
     Each value and each change has the time of the log. Later observations in the cache stay unchanged, so
     logs may be imported in any order and repeatedly. A log does not say whether it has all parameters of the
     vehicle: the table is complete only after a fetch. A dataflash log has no types: they are those of the
-    vehicle's cached table, else those that most cached vehicles of the same autopilot have, else REAL32.
+    vehicle's cached table, else those of another cached vehicle of the same autopilot, else REAL32.
 
     Args:
         path: the log.
@@ -104,8 +95,7 @@ async def import_onboard_log(path: str | os.PathLike[str], cache: ParamCache) ->
         UsageError: a ULog file, and pyulog is not installed.
         CacheError: the cache cannot be written.
     """
-    log = await anyio.to_thread.run_sync(read_onboard_log, path)
-    return await anyio.to_thread.run_sync(partial(_store, log, cache))
+    return await anyio.to_thread.run_sync(lambda: _store(read_onboard_log(path), cache))
 
 
 def _store(log: OnboardLog, cache: ParamCache) -> ImportedTable:
@@ -119,49 +109,32 @@ def _store(log: OnboardLog, cache: ParamCache) -> ImportedTable:
     if not identity.system:
         raise FileError("not imported: the log has no system id", source=log.source)
     types = _types(log, cache)
+    observed = [(log.began, written) for written in log.initial.values()]
+    observed += [(change.time, log.changed(change)) for change in log.changes]
     update = partial(TableUpdate, identity=identity, component=AUTOPILOT, autopilot=identity.autopilot)
-    at = log.boot_time + log.began
-    initial = [StoredParam.of(_param(written, types), at) for written in log.initial.values()]
-    updates = [update(at=at, params=initial)]
-    for change in log.changes:
-        first = log.initial.get(change.name, WrittenParam(change.name, change.value))
-        at = log.boot_time + change.time
-        changed = WrittenParam(change.name, change.value, first.type_number, first.default)
-        param = _param(changed, types)
-        updates.append(update(at=at, params=[StoredParam.of(param, at)]))
-    cache.merge(updates)
+    by_time: dict[float, list[StoredParam]] = {}
+    for time, written in observed:
+        at = log.boot_time + time
+        by_time.setdefault(at, []).append(StoredParam.of(_param(written, types), at))
+    cache.merge([update(at=at, params=params) for at, params in by_time.items()])
     notes = log.notes
     if untyped := sum(param.type_number is None and name not in types for name, param in log.initial.items()):
         notes += (f"the log has no types: {untyped} parameters that no cached table has are REAL32",)
-    return ImportedTable(
-        identity.key,
-        identity.system,
-        AUTOPILOT,
-        identity.autopilot,
-        params=len(log.at_end()),
-        complete=False,
-        hash=None,
-        notes=notes,
-    )
+    ids = identity.system, AUTOPILOT, identity.autopilot
+    return ImportedTable(identity.key, *ids, params=len(log.at_end()), notes=notes)
 
 
 def _types(log: OnboardLog, cache: ParamCache) -> Mapping[str, ParamType | int]:
-    """Return types by name: those of the vehicle's cached table, else the most frequent ones."""
-    if all(param.type_number is not None for param in log.initial.values()):
-        return {}
-    own: dict[str, ParamType | int] = {}
-    others: dict[str, Counter[ParamType | int]] = {}
-    for summary in cache.components():
-        if summary.autopilot != log.identity.autopilot:
-            continue
-        table = cache.load(summary.key, summary.component)
-        if table is None:  # another process may have removed it
-            continue
-        if summary.key == log.identity.key and summary.component == AUTOPILOT:
-            own = {name: param.type_number for name, param in table.params.items()}
-        for name, param in table.params.items():
-            others.setdefault(name, Counter())[param.type_number] += 1
-    return {name: types.most_common(1)[0][0] for name, types in others.items()} | own
+    """Return types by name: those of the vehicle's cached table, else of another one."""
+    types: dict[str, ParamType | int] = {}
+    if log.file_format is LogFormat.DATAFLASH:
+        own = log.identity.key, AUTOPILOT
+        same = [each for each in cache.components() if each.autopilot == log.identity.autopilot]
+        for each in sorted(same, key=lambda each: (each.key, each.component) == own):
+            table = cache.load(each.key, each.component)
+            if table is not None:  # another process may have removed it
+                types |= {name: param.type_number for name, param in table.params.items()}
+    return types
 
 
 def _param(written: WrittenParam, types: Mapping[str, ParamType | int]) -> Param:

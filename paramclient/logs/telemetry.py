@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import AsyncIterator, Iterator, Mapping
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from typing import Final
 
@@ -58,12 +59,18 @@ async def _first_introductions(records: Iterator[Record]) -> dict[int, dict[Addr
     """Return the first HEARTBEAT and AUTOPILOT_VERSION of each component, by message, as in the log."""
     found: dict[int, dict[Address, bytes]] = {message_id(Heartbeat): {}, message_id(AutopilotVersion): {}}
     framer = Framer(set(found), stream=False)
-    for number, record in enumerate(records):
+    async for record in _in_turns(records):
         for frame in framer.receive(record.data):
             found[frame.message_id].setdefault((frame.system, frame.component), record.data)
+    return found
+
+
+async def _in_turns(records: Iterator[Record]) -> AsyncIterator[Record]:
+    """Generate records, and let other tasks run between them."""
+    for number, record in enumerate(records):
+        yield record
         if not number % RECORDS_PER_CHECKPOINT:
             await anyio.lowlevel.checkpoint()
-    return found
 
 
 class _Import:
@@ -83,7 +90,6 @@ class _Import:
         self._cache = cache
         self._at = 0.0
         self._observed: dict[Session, list[StoredParam]] = {}
-        self._removed: dict[Session, dict[str, float]] = {}
         self._complete_at: dict[Session, float] = {}
         self._station = Station(
             link=name,
@@ -96,14 +102,13 @@ class _Import:
 
     async def read(self, records: Iterator[Record]) -> tuple[ImportedTable, ...]:
         """Take all frames, and write the tables."""
-        for number, record in enumerate(records):
+        async for record in _in_turns(records):
             self._at = max(self._at, record.at)  # a clock that was set back does not turn back the time
             self._station.receive(record.data, LOG_PEER, self._at)
-            if not number % RECORDS_PER_CHECKPOINT:
-                await anyio.lowlevel.checkpoint()
         nodes = [node for _, node in sorted(self._station.nodes.items())]
         nodes = [node for node in nodes if node.plain.table.params or node.extended.table.params]
-        updates = [self._sighting(node) for node in nodes]
+        # that the vehicle was there at the beginning, and the tables
+        updates = [self._update_of(node, node.since) for node in nodes]
         updates += [self._update(node, session) for node in nodes for session in node.sessions]
         updates = [update for update in updates if update.params or update.table is None]
         await anyio.to_thread.run_sync(partial(self._cache.merge, updates))
@@ -120,23 +125,15 @@ class _Import:
     def _take_change(self, session: Session, change: Change) -> None:
         if session.table.is_complete:
             self._complete_at.setdefault(session, self._at)
-        if change.new is None:
-            self._removed.setdefault(session, {})[change.name] = self._at
-        else:
-            self._observed.setdefault(session, []).append(
-                StoredParam.of(change.new, self._at, None, change.by)
-            )
-
-    def _sighting(self, node: Node) -> TableUpdate:
-        """Return that the vehicle was there at the beginning."""
-        who = node.identification
-        return TableUpdate(
-            identity=self._identity_of(node),
-            component=node.component,
-            autopilot=who.autopilot or 0,
-            at=node.since,
-            params=[],
+        self._observed.setdefault(session, []).append(
+            StoredParam.gone(change.name, self._at)
+            if change.new is None
+            else StoredParam.of(change.new, self._at, None, change.by)
         )
+
+    def _update_of(self, node: Node, at: float) -> TableUpdate:
+        identity, autopilot = self._identity_of(node), node.identification.autopilot or 0
+        return TableUpdate(identity=identity, component=node.component, autopilot=autopilot, at=at)
 
     def _update(self, node: Node, session: Session) -> TableUpdate:
         table, observed = session.table, self._observed.get(session, [])
@@ -146,20 +143,17 @@ class _Import:
             StoredParam.of(param, table.moments[name], None if volatile is None else name in volatile)
             for name, param in table.params.items()
         ]
-        return TableUpdate(
-            identity=self._identity_of(node),
-            component=node.component,
-            autopilot=node.identification.autopilot or 0,
-            at=node.presence.received_at,
-            table=TableState(
-                hash=table.hash if table.is_complete else None,
-                count=table.count,
-                complete=table.is_complete,
-                volatile_known=table.volatile_is_known,
-                synced_at=self._complete_at.get(session) if table.is_complete else None,
-            ),
+        state = TableState(
+            hash=table.hash if table.is_complete else None,
+            count=table.count,
+            complete=table.is_complete,
+            volatile_known=table.volatile_is_known,
+            synced_at=self._complete_at.get(session) if table.is_complete else None,
+        )
+        return replace(
+            self._update_of(node, node.presence.received_at),
+            table=state,
             params=[*observed, *last],
-            removed=self._removed.get(session, {}),
             extended=session is node.extended,
         )
 

@@ -5,29 +5,26 @@ The format is documented in the PX4 guide, "ULog File Format"; pyulog parses it.
 
 from __future__ import annotations
 
-import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from pyulog import ULog
 from pyulog.exceptions import ULogException
 
-from paramclient.errors import FileError, UsageError
+from paramclient.errors import FileError
 from paramclient.files.formats import LogFormat
 from paramclient.logs.logged_params import LoggedChange, OnboardLog, log_link
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam
-from paramclient.model.values import ParamType, check_name
+from paramclient.model.values import ParamType, is_portable_name
 from paramclient.wire.messages import MAV_AUTOPILOT_PX4
 
 __all__ = ["read_ulog"]
 
-SYSTEM_ID_NAME: Final = "MAV_SYS_ID"
-"""The parameter that contains the system id."""
-VEHICLE_TYPE_NAME: Final = "MAV_TYPE"
-"""The parameter that contains the MAV_TYPE of the heartbeat."""
+ID_NAMES: Final = ("MAV_SYS_ID", "MAV_TYPE")
+"""The parameters that contain the system id and the MAV_TYPE of the heartbeat."""
 CURRENT_DEFAULTS: Final = 1
 """Defaults of the airframe that is set up, in pyulog's numbering of the default types."""
 FIRMWARE_DEFAULTS: Final = 0
@@ -38,11 +35,9 @@ GPS_FIX_MIN: Final = 3
 """`fix_type` from which the time is valid: a 3D fix."""
 GPS_TOPICS: Final = ("vehicle_gps_position", "sensor_gps")
 """Topics with the UTC time; the second in newer versions, if the first is not logged."""
-FULLY_READ_SIZE_MAX: Final = 256 << 20
-"""Bytes up to which all topics are read, which takes as much memory. A change has no time of its own in the
-file, and takes that of the last data before it; of a larger file only `CLOCK_TOPICS` are read for that."""
 CLOCK_TOPICS: Final = ("vehicle_attitude", "vehicle_status", "cpuload")
-"""Topics that every flight has; vehicle_attitude is logged at 20 Hz or more."""
+"""Topics that every flight has; vehicle_attitude is logged at 20 Hz or more. A change has no time of its own
+in the file, and takes that of the last data before it. The other topics take as much memory as the file."""
 
 _GUID: Final = re.compile(r"[0-9a-f]{36}")
 
@@ -57,31 +52,27 @@ def read_ulog(path: str) -> OnboardLog:
         FileError: the file cannot be read, or has no parameters.
     """
     try:
-        with Path(path).open("rb") as file:
-            is_small = os.fstat(file.fileno()).st_size <= FULLY_READ_SIZE_MAX
-            log = ULog(file, None if is_small else [*GPS_TOPICS, *CLOCK_TOPICS])
+        with Path(path).open("rb") as file:  # ULog closes none of its own if it fails
+            log = ULog(file, [*GPS_TOPICS, *CLOCK_TOPICS])
     except ULogException as error:
         raise FileError(f"cannot be read as a ULog file: {error}", source=path) from error
-    initial, refused = _initial(log)
+    params, changes = _valid(log.initial_parameters.items()), log.changed_parameters
+    initial = _with_defaults(log, params)
     if not initial:
         raise FileError("the log has no parameters", source=path)
-    changes = []
-    for micros, name, value in log.changed_parameters:
-        if _type_of(value) is None or not _is_name(name):
-            refused += 1
-        else:
-            changes.append(LoggedChange(micros / 1e6, name, value))
+    valid = [change for change in changes if _valid([change[1:]])]
+    damaged = len(log.initial_parameters) - len(params) + len(changes) - len(valid)
     notes = []
     if log.file_corruption:
         notes.append("the log is damaged; values and changes may be missing")
-    if refused:
-        notes.append(f"{refused} parameters are damaged and left out")
+    if damaged:
+        notes.append(f"{damaged} parameters are damaged and left out")
     return OnboardLog(
         path,
         LogFormat.ULOG,
         _identity(log.msg_info_dict, initial, path),
         initial,
-        tuple(changes),
+        tuple(LoggedChange(micros / 1e6, name, value) for micros, name, value in valid),
         log.start_timestamp / 1e6,
         log.last_timestamp / 1e6,
         _boot_time(log),
@@ -89,62 +80,50 @@ def read_ulog(path: str) -> OnboardLog:
     )
 
 
-def _initial(log: Any) -> tuple[dict[str, WrittenParam], int]:
-    """Return the initial parameters with their defaults, and the number of damaged ones.
+def _valid(params: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the parameters that are not damaged. PX4 has int32 and float parameters only."""
+    return {
+        name: value
+        for name, value in params
+        if is_portable_name(name)
+        and (isinstance(value, float) or (isinstance(value, int) and -(1 << 31) <= value < 1 << 31))
+    }
+
+
+def _with_defaults(log: Any, params: Mapping[str, Any]) -> dict[str, WrittenParam]:
+    """Return the initial parameters with their defaults.
 
     PX4 logs a default only where the value differs from it (PX4 guide); for the others, the value is the
     default. A log without that flag has no defaults.
     """
-    defaults = {
-        **log.get_default_parameters(FIRMWARE_DEFAULTS),
-        **log.get_default_parameters(CURRENT_DEFAULTS),
+    defaults: dict[str, Any] = dict.fromkeys(params)
+    if log.has_default_parameters:
+        firmware, current = map(log.get_default_parameters, (FIRMWARE_DEFAULTS, CURRENT_DEFAULTS))
+        defaults = {**params, **firmware, **current}
+    return {
+        name: WrittenParam(
+            name, value, ParamType.REAL32 if isinstance(value, float) else ParamType.INT32, defaults[name]
+        )
+        for name, value in params.items()
     }
-    has_defaults = bool(log.has_default_parameters)
-    params = {}
-    refused = 0
-    for name, value in log.initial_parameters.items():
-        number = _type_of(value)
-        if number is None or not _is_name(name):
-            refused += 1
-            continue
-        default = defaults.get(name, value) if has_defaults else None
-        params[name] = WrittenParam(name, value, number, default)
-    return params, refused
-
-
-def _type_of(value: object) -> ParamType | None:
-    """Return the type of a value: PX4 has int32 and float parameters only. None for anything else."""
-    if isinstance(value, float):
-        return ParamType.REAL32
-    is_int32 = isinstance(value, int) and -(1 << 31) <= value < 1 << 31
-    return ParamType.INT32 if is_int32 else None
-
-
-def _is_name(name: str) -> bool:
-    try:
-        check_name(name)
-    except UsageError:
-        return False
-    return True
 
 
 def _identity(info: Mapping[str, Any], params: Mapping[str, WrittenParam], path: str) -> Identity:
-    system = _integer(params, SYSTEM_ID_NAME)
+    system, kind = (_integer(params[name].value) if name in params else 0 for name in ID_NAMES)
     guid = _text(info, "sys_uuid").lower()
     return Identity(
         system=system if 0 < system < 256 else 0,
         link=log_link(path),
         uid=guid if _GUID.fullmatch(guid) else None,
         autopilot=MAV_AUTOPILOT_PX4,
-        vehicle_type=_integer(params, VEHICLE_TYPE_NAME),
-        firmware=_number(info, "ver_sw_release"),
+        vehicle_type=kind,
+        firmware=_integer(info.get("ver_sw_release")),
         git_hash=_text(info, "ver_sw")[:GIT_HASH_DIGITS],
     )
 
 
-def _integer(params: Mapping[str, WrittenParam], name: str) -> int:
-    param = params.get(name)
-    return param.value if param is not None and isinstance(param.value, int) else 0
+def _integer(value: object) -> int:
+    return value if isinstance(value, int) else 0
 
 
 def _text(info: Mapping[str, Any], name: str) -> str:
@@ -152,21 +131,13 @@ def _text(info: Mapping[str, Any], name: str) -> str:
     return value.rstrip("\0") if isinstance(value, str) else ""
 
 
-def _number(info: Mapping[str, Any], name: str) -> int:
-    value = info.get(name, 0)
-    return value if isinstance(value, int) else 0
-
-
 def _boot_time(log: Any) -> float | None:
     """Return the Unix time of the boot, by the first fix of a GPS receiver; None without one."""
-    for topic in GPS_TOPICS:
-        for dataset in log.data_list:
-            fields = dataset.data
-            if dataset.name != topic or not {"timestamp", "time_utc_usec", "fix_type"} <= fields.keys():
-                continue
-            for micros, utc, fix in zip(
-                fields["timestamp"], fields["time_utc_usec"], fields["fix_type"], strict=True
-            ):
+    for dataset in log.data_list:
+        fields = dataset.data
+        if dataset.name in GPS_TOPICS and {"time_utc_usec", "fix_type"} <= fields.keys():
+            times = zip(fields["timestamp"], fields["time_utc_usec"], fields["fix_type"], strict=True)
+            for micros, utc, fix in times:
                 if utc > 0 and fix >= GPS_FIX_MIN:
                     return float((int(utc) - int(micros)) / 1e6)
     return None

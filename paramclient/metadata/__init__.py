@@ -2,18 +2,17 @@
 
 The metadata is optional. It comes from a file (`read_metadata`) or from the vehicle (`metadata_of`).
 
-- `info`, `metadata_cache`, `download`: the metadata of a firmware, cached files, downloads.
-- `added_files`: files that the user has added for a vehicle type and firmware version.
+- `info`, `download`: the metadata of a firmware, downloads from a vehicle.
+- `store`: cached files, and files that the user has added for a vehicle type and firmware version.
 - `formats`, `ardupilot`, `px4`: detection of the format, and one module for each format.
 """
 
 from __future__ import annotations
 
-from paramclient.metadata.added_files import AddedFiles, AddedMetadata, VehicleKind
 from paramclient.metadata.download import metadata_of
 from paramclient.metadata.formats import read_content, read_metadata
 from paramclient.metadata.info import Metadata, ParamInfo
-from paramclient.metadata.metadata_cache import MetadataStore
+from paramclient.metadata.store import AddedFiles, AddedMetadata, MetadataStore, VehicleKind
 
 __all__ = [
     "AddedFiles",

@@ -7,89 +7,79 @@ structure is rejected.
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from typing import Annotated, Any, Final, cast
-from xml.etree.ElementTree import Element, ParseError, XMLPullParser
+from typing import Annotated, Any, Final, TypeAlias
+from xml.etree.ElementTree import Element, ParseError, iterparse
 
-from pydantic import BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field
 
-from paramclient.errors import MetadataError, UsageError
+from paramclient.errors import UsageError
 from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo, finite, names_of, number_of
 from paramclient.metadata.px4 import PARAMS_MAX, VALUE_NAMES_MAX, validated
 
 __all__ = ["read_json", "read_xml"]
 
-XML_BYTES_PER_CALL: Final = 16_384
-"""Bytes parsed in one call, after which the elements that are complete are read and freed."""
 
-
-def read_xml(content: bytes, *, source: str) -> Metadata:
+def read_xml(content: bytes) -> Metadata:
     """Read an apm.pdef.xml.
 
     Rejects document type declarations, and with them entities: the files have none.
 
     Raises:
-        MetadataError: the file is invalid.
+        UsageError: the file is invalid.
     """
     if b"<!DOCTYPE" in content:
-        text = "has a document type (<!DOCTYPE …>), which ArduPilot's files do not have"
-        raise MetadataError(f"{source}: {text}", source=source)
+        raise UsageError("has a document type (<!DOCTYPE …>), which ArduPilot's files do not have")
     try:
-        return _gathered(_infos_of_xml(content, source), source)
-    except MetadataError:
+        return _gathered(_infos_of_xml(content))
+    except UsageError:
         raise
     except (ParseError, ValueError, LookupError) as error:
-        raise MetadataError(f"{source}: not XML: {error}", source=source) from None
+        raise UsageError(f"not XML: {error}") from None
 
 
-def read_json(document: dict[str, object], *, source: str) -> Metadata:
+def read_json(document: dict[str, object]) -> Metadata:
     """Read an apm.pdef.json that has been parsed as JSON.
 
     Raises:
-        MetadataError: the document is invalid.
+        UsageError: the document is invalid.
     """
     if document.get("json") is None:
-        raise MetadataError(f'{source}: has no "json" member, which ArduPilot\'s files have', source=source)
-    return _gathered(_infos_of_json(document, source), source)
+        raise UsageError('has no "json" member, which ArduPilot\'s files have')
+    return _gathered(_infos_of_json(document))
 
 
-def _infos_of_json(document: dict[str, object], source: str) -> Iterator[ParamInfo]:
+def _infos_of_json(document: dict[str, object]) -> Iterator[ParamInfo]:
     for group, described in document.items():
         if group == "json":
             continue
         if not isinstance(described, dict):
-            raise MetadataError(f"{source}, {group:.40}: Input should be a valid dictionary", source=source)
+            raise UsageError(f"{group:.40}: Input should be a valid dictionary")
         for name, each in described.items():
-            yield validated(_Described, each, source, (group, name)).info(name, group)
+            yield validated(_Described, each, (group, name)).info(name, group)
 
 
-def _infos_of_xml(content: bytes, source: str) -> Iterator[ParamInfo]:
-    parser: XMLPullParser[Any] = XMLPullParser(["start", "end"])
+def _infos_of_xml(content: bytes) -> Iterator[ParamInfo]:
+    """Generate the parameters; each element is freed once it has been read."""
     group, param = "", None
-    is_first = True
-    for start in range(0, len(content) + 1, XML_BYTES_PER_CALL):
-        parser.feed(content[start : start + XML_BYTES_PER_CALL])
-        for event, element in cast(Iterator[tuple[str, Element]], parser.read_events()):
-            if is_first and element.tag != "paramfile":
-                text = f"begins with <{element.tag}>, not with <paramfile> as ArduPilot's files"
-                raise MetadataError(f"{source}: {text}", source=source)
-            is_first = False
-            if event == "start" and element.tag == "parameters":
-                group = element.get("name", "")
-            elif event == "start" and element.tag == "param":
-                if param is not None:
-                    raise MetadataError(f"{source}: has a parameter inside {param}", source=source)
-                param = element.get("name", "")
-                if not param.rpartition(":")[2]:
-                    raise MetadataError(f"{source}: has a parameter without a name", source=source)
-            elif event == "end" and element.tag == "param" and param is not None:
-                fields = _fields_of_xml(element)
-                yield validated(_Described, fields, source, (group, param)).info(param, group)
-                param = None
-                element.clear()
-    parser.close()
+    for number, (event, element) in enumerate(iterparse(io.BytesIO(content), ["start", "end"])):
+        if not number and element.tag != "paramfile":
+            raise UsageError(f"begins with <{element.tag}>, not with <paramfile> as ArduPilot's files")
+        if event == "start" and element.tag == "parameters":
+            group = element.get("name", "")
+        elif event == "start" and element.tag == "param":
+            if param is not None:
+                raise UsageError(f"has a parameter inside {param}")
+            param = element.get("name", "")
+            if not param.rpartition(":")[2]:
+                raise UsageError("has a parameter without a name")
+        elif event == "end" and element.tag == "param" and param is not None:
+            yield validated(_Described, _fields_of_xml(element), (group, param)).info(param, group)
+            param = None
+            element.clear()
 
 
 def _fields_of_xml(element: Element) -> dict[str, object]:
@@ -105,61 +95,6 @@ def _fields_of_xml(element: Element) -> dict[str, object]:
     for name, tag in (("Values", "value"), ("Bitmask", "bit")):
         fields[name] = texts(tag, "code") or fields.get(name, "")
     return fields
-
-
-_Names = Annotated[dict[str, str], Field(max_length=VALUE_NAMES_MAX)]
-
-
-class _Described(BaseModel):
-    """A parameter in the JSON. A field that the build could not parse is one text."""
-
-    short: str = Field("", alias="DisplayName")
-    long: str = Field("", alias="Description")
-    user: str = Field("", alias="User")
-    units: str = Field("", alias="Units")
-    range: _Names | str = Field("", alias="Range")
-    increment: str = Field("", alias="Increment")
-    values: _Names | str = Field("", alias="Values")
-    bits: _Names | str = Field("", alias="Bitmask")
-    reboot_required: str = Field("", alias="RebootRequired")
-    is_read_only: str = Field("", alias="ReadOnly")
-    is_volatile: str = Field("", alias="Volatile")
-
-    def info(self, name: str, group: str) -> ParamInfo:
-        """Return the description; the name may be that of the vehicle, a colon and the parameter's."""
-        low, high = _range(self.range)
-        bits = _named(self.bits)
-        return ParamInfo(
-            name.rpartition(":")[2],
-            short_description=self.short,
-            long_description=self.long,
-            units=self.units,
-            minimum=low,
-            maximum=high,
-            increment=_number(self.increment),
-            values=names_of(_named(self.values)),
-            bits=names_of({b: n for b, n in bits.items() if isinstance(b, int) and 0 <= b < BITS_MAX}),
-            reboot_required=_is_true(self.reboot_required),
-            is_read_only=_is_true(self.is_read_only),
-            is_volatile=_is_true(self.is_volatile),
-            category=self.user,
-            group=group,
-        )
-
-
-def _gathered(found: Iterable[ParamInfo], source: str) -> Metadata:
-    """Return the parameters of all groups. Leaves out those that two vehicles describe differently."""
-    infos: dict[str, ParamInfo] = {}
-    doubtful = set()
-    for count, info in enumerate(found):
-        if count >= PARAMS_MAX:
-            raise MetadataError(f"{source}: describes more than {PARAMS_MAX} parameters", source=source)
-        before = infos.setdefault(info.name, info)
-        if replace(before, group="") != replace(info, group=""):
-            doubtful.add(info.name)
-    if not infos:
-        raise MetadataError(f"{source}: describes no parameters", source=source)
-    return Metadata.of((info for info in infos.values() if info.name not in doubtful), source=source)
 
 
 _ITEM: Final = re.compile(r",(?=\s*[+-]?[0-9.]+\s*:)")
@@ -182,6 +117,15 @@ def _named(items: Mapping[str, str] | str) -> dict[int | float, str]:
     return {code: name for code, name in named.items() if code is not None and name}
 
 
+def _values(items: Mapping[str, str] | str) -> Mapping[int | float, str]:
+    return names_of(_named(items))
+
+
+def _bits(items: Mapping[str, str] | str) -> Mapping[int, str]:
+    named = _named(items).items()
+    return names_of({bit: name for bit, name in named if isinstance(bit, int) and 0 <= bit < BITS_MAX})
+
+
 def _number(text: str) -> int | float | None:
     """Return a finite number, whole numbers as int; None for other text."""
     try:
@@ -190,5 +134,45 @@ def _number(text: str) -> int | float | None:
         return None
 
 
-def _is_true(text: str) -> bool:
-    return text.strip().lower() == "true"
+_Names: TypeAlias = Annotated[dict[str, str], Field(max_length=VALUE_NAMES_MAX)] | str
+_Flag: TypeAlias = Annotated[str, AfterValidator(lambda text: text.strip().lower() == "true")]
+
+
+class _Described(BaseModel):
+    """A parameter in the JSON. A field that the build could not parse is one text.
+
+    The fields that are given are those of a ParamInfo, except for the range.
+    """
+
+    short_description: str = Field("", alias="DisplayName")
+    long_description: str = Field("", alias="Description")
+    category: str = Field("", alias="User")
+    units: str = Field("", alias="Units")
+    range: Annotated[_Names, AfterValidator(_range)] = Field("", alias="Range")
+    increment: Annotated[str, AfterValidator(_number)] = Field("", alias="Increment")
+    values: Annotated[_Names, AfterValidator(_values)] = Field("", alias="Values")
+    bits: Annotated[_Names, AfterValidator(_bits)] = Field("", alias="Bitmask")
+    reboot_required: _Flag = Field("", alias="RebootRequired")
+    is_read_only: _Flag = Field("", alias="ReadOnly")
+    is_volatile: _Flag = Field("", alias="Volatile")
+
+    def info(self, name: str, group: str) -> ParamInfo:
+        """Return the description; the name may be that of the vehicle, a colon and the parameter's."""
+        fields: dict[str, Any] = {each: getattr(self, each) for each in self.model_fields_set}
+        low, high = fields.pop("range", (None, None))
+        return ParamInfo(name.rpartition(":")[2], minimum=low, maximum=high, group=group, **fields)
+
+
+def _gathered(found: Iterable[ParamInfo]) -> Metadata:
+    """Return the parameters of all groups. Leaves out those that two vehicles describe differently."""
+    infos: dict[str, ParamInfo] = {}
+    doubtful = set()
+    for count, info in enumerate(found):
+        if count >= PARAMS_MAX:
+            raise UsageError(f"describes more than {PARAMS_MAX} parameters")
+        before = infos.setdefault(info.name, info)
+        if replace(before, group="") != replace(info, group=""):
+            doubtful.add(info.name)
+    if not infos:
+        raise UsageError("describes no parameters")
+    return Metadata.of(info for info in infos.values() if info.name not in doubtful)

@@ -12,19 +12,18 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final, ParamSpec, TypeVar
 
-import anyio
 import anyio.to_thread
 
 from paramclient.client.component import Component
 from paramclient.client.files import Ftp
-from paramclient.errors import MetadataError, NoReply, UsageError
-from paramclient.metadata.formats import PACKED_SIZE_MAX, json_of, read_content, unpacked
+from paramclient.errors import MetadataError, UsageError
+from paramclient.metadata.formats import PACKED_SIZE_MAX, json_of, naming, read_content, unpacked
 from paramclient.metadata.info import Metadata
-from paramclient.metadata.metadata_cache import MetadataStore, has_checksum
+from paramclient.metadata.store import MetadataStore, has_checksum
 from paramclient.protocol.commands import request_message
 from paramclient.wire.messages import ComponentMetadata
 
-__all__ = ["announced_metadata", "metadata_of"]
+__all__ = ["metadata_of"]
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
@@ -59,28 +58,27 @@ async def metadata_of(
         NoReply: no response in time.
         LinkError: the link failed, or the client was closed.
     """
-    if isinstance(store, bool):
-        cache = component.core.cache
-        kept = MetadataStore.beside(cache.path) if store and cache is not None else None
-    else:
-        kept = store
-    deadline = None if timeout is None else anyio.current_time() + timeout
-    files = _Files(component, kept, deadline, progress)
-    before = component.identity
-    announced = await announced_metadata(component, files.left())
-    if announced is None:
-        return None
-    general = await files.get(announced.uri, announced.file_crc or None)
-    places = await _in_thread(_places_of_parameters, general, f"{announced.uri} of {files.label}")
-    if not places:
-        return None
-    uri, crc = next((place for place in places if place[0].startswith(_SCHEME)), places[0])
-    content = await files.get(uri, crc)
-    read = await _in_thread(read_content, content, source=f"{uri} of {files.label}")
-    now = component.identity
-    if kept is not None and crc is not None and before.uid in (None, now.uid):
-        await _in_thread(kept.remember, now, component.component, crc)
-    return read
+    kept = None if isinstance(store, bool) else store
+    if store is True and component.core.cache is not None:
+        kept = MetadataStore.beside(component.core.cache.path)
+    files = _Files(component, kept, progress)
+    with component.limited(timeout, f"the metadata of {files.label}"):
+        before = component.identity
+        component.core.station.gate.check()
+        announced = await request_message(component.node.channel, ComponentMetadata)
+        if announced is None or not announced.uri:
+            return None
+        general = await files.get(announced.uri, announced.file_crc or None)
+        places = await _in_thread(_places_of_parameters, general, f"{announced.uri} of {files.label}")
+        if not places:
+            return None
+        uri, crc = next((place for place in places if place[0].startswith(_SCHEME)), places[0])
+        content = await files.get(uri, crc)
+        read = await _in_thread(read_content, content, source=f"{uri} of {files.label}")
+        now = component.identity
+        if kept is not None and crc is not None and before.uid in (None, now.uid):
+            await _in_thread(kept.remember, now, component.component, crc)
+        return read
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,22 +88,16 @@ class _Files:
     Attributes:
         component: the component.
         kept: the metadata cache, or None.
-        deadline: the end of the complete operation on the event loop's clock, or None.
         progress: called for each file.
     """
 
     component: Component
     kept: MetadataStore | None
-    deadline: float | None
     progress: Callable[[int, int | None], None] | None
 
     @property
     def label(self) -> str:
         return f"{self.component.system}/{self.component.component}"
-
-    def left(self) -> float | None:
-        """Return the remaining seconds, or None without a deadline."""
-        return None if self.deadline is None else max(self.deadline - anyio.current_time(), 0.0)
 
     async def get(self, uri: str, crc: int | None) -> bytes:
         """Return one file, as stored on board.
@@ -120,9 +112,7 @@ class _Files:
                 return content
         files, path = self._on_board(uri)
         try:
-            content = await files.read(
-                path, timeout=self.left(), progress=self.progress, size_max=PACKED_SIZE_MAX
-            )
+            content = await files.read(path, progress=self.progress, size_max=PACKED_SIZE_MAX)
         except UsageError as error:
             raise MetadataError(
                 f"{self.label} announces its metadata at {uri}: {error}", source=uri
@@ -157,32 +147,12 @@ class _Files:
         return Ftp(other), path
 
 
-async def announced_metadata(component: Component, timeout: float | None) -> ComponentMetadata | None:
-    """Return the announced address of a component's general metadata file; None if it announces none.
-
-    Args:
-        component: from `ParamClient.component`.
-        timeout: seconds; None for the number of attempts.
-
-    Raises:
-        NoReply: no response in time.
-        LinkError: the link failed, or the client was closed.
-    """
-    component.core.station.gate.check()
-    found = None
-    with anyio.move_on_after(timeout) as scope:
-        found = await request_message(component.node.channel, ComponentMetadata)
-    if scope.cancelled_caught:
-        what = f"COMPONENT_METADATA of {component.system}/{component.component}"
-        raise NoReply(what, attempts=0, waited=timeout or 0.0)
-    return found if found is not None and found.uri else None
-
-
 def _places_of_parameters(general: bytes, source: str) -> list[tuple[str, int | None]]:
     """Return the addresses and checksums of the parameter metadata in a general file."""
     from paramclient.metadata.px4 import read_general  # imported here: loads pydantic
 
-    files = read_general(json_of(unpacked(general, source=source), source=source), source=source)
+    with naming(source):
+        files = read_general(json_of(unpacked(general)))
     return [
         (uri, crc)
         for file in files

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import lzma
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from paramclient.errors import MetadataError
+from paramclient.errors import MetadataError, UsageError
 from paramclient.metadata.info import Metadata
 
-__all__ = [
-    "PACKED_SIZE_MAX",
-    "json_of",
-    "read_content",
-    "read_metadata",
-    "unpacked",
-]
+__all__ = ["PACKED_SIZE_MAX", "json_of", "naming", "read_bytes", "read_content", "read_metadata", "unpacked"]
 
 PACKED_SIZE_MAX: Final = 4 << 20
 """Bytes of a packed file, or of a file from a vehicle; PX4's has about 0.1 million."""
@@ -38,13 +35,21 @@ def read_metadata(path: str | os.PathLike[str]) -> Metadata:
     Raises:
         MetadataError: the file cannot be read, is too large, or has another format.
     """
-    source = os.fspath(path)
+    return read_content(read_bytes(path), source=os.fspath(path))
+
+
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """Return the bytes of a metadata file, at most one more than it may have.
+
+    Raises:
+        MetadataError: the file cannot be read.
+    """
     try:
         with Path(path).open("rb") as file:
-            content = file.read(CONTENT_SIZE_MAX + 1)
+            return file.read(CONTENT_SIZE_MAX + 1)
     except OSError as error:
-        raise MetadataError(f"{source}: cannot be read: {error.strerror or error}", source=source) from error
-    return read_content(content, source=source)
+        text = f"{os.fspath(path)}: cannot be read: {error.strerror or error}"
+        raise MetadataError(text, source=os.fspath(path)) from error
 
 
 def read_content(content: bytes, *, source: str) -> Metadata:
@@ -57,79 +62,80 @@ def read_content(content: bytes, *, source: str) -> Metadata:
     Raises:
         MetadataError: as `read_metadata`.
     """
-    metadata = _read_unpacked(unpacked(content, source=source).removeprefix(b"\xef\xbb\xbf"), source)
-    for name, info in metadata.params.items():
-        if info.text_length > TEXT_LENGTH_MAX:
-            text = f"the texts of {name!r:.40} have more than {TEXT_LENGTH_MAX:,} characters"
-            raise MetadataError(f"{source}: {text}", source=source)
-    return metadata
+    with naming(source):
+        metadata = _read_unpacked(unpacked(content).removeprefix(b"\xef\xbb\xbf"))
+        for name, info in metadata.params.items():
+            if info.text_length > TEXT_LENGTH_MAX:
+                raise UsageError(f"the texts of {name!r:.40} have more than {TEXT_LENGTH_MAX:,} characters")
+    return replace(metadata, source=source)
 
 
-def json_of(content: bytes, *, source: str) -> dict[str, object]:
+@contextmanager
+def naming(source: str) -> Iterator[None]:
+    """Turn UsageError into MetadataError with the origin of a file."""
+    try:
+        yield
+    except UsageError as error:
+        raise MetadataError(f"{source}: {error}", source=source) from None
+
+
+def json_of(content: bytes) -> dict[str, object]:
     """Parse a JSON object.
 
     Raises:
-        MetadataError: the text is not a JSON object.
+        UsageError: the text is not a JSON object.
     """
     from pydantic_core import from_json  # imported here: loads pydantic
 
     try:
         document = from_json(content)
     except ValueError as error:
-        raise MetadataError(f"{source}: not JSON: {error}", source=source) from None
+        raise UsageError(f"not JSON: {error}") from None
     if not isinstance(document, dict):
-        raise MetadataError(f"{source}: is JSON, but not an object", source=source)
+        raise UsageError("is JSON, but not an object")
     return document
 
 
-def unpacked(content: bytes, *, source: str) -> bytes:
+def unpacked(content: bytes) -> bytes:
     """Return the content of a file that may be packed with xz.
 
     Raises:
-        MetadataError: the file is damaged, or too large.
+        UsageError: the file is damaged, or too large.
     """
     is_packed = content.startswith(_XZ)
     if len(content) > (PACKED_SIZE_MAX if is_packed else CONTENT_SIZE_MAX):
-        raise _too_large(source)
+        raise UsageError("is too large for a metadata file")
     if not is_packed:
         return content
     unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=UNPACKING_MEMORY_MAX)
     try:
         result = unpacker.decompress(content, CONTENT_SIZE_MAX + 1)
     except lzma.LZMAError as error:
-        raise MetadataError(f"{source}: cannot be unpacked: {error}", source=source) from None
+        raise UsageError(f"cannot be unpacked: {error}") from None
     if len(result) > CONTENT_SIZE_MAX:
-        raise _too_large(source)
+        raise UsageError("is too large for a metadata file")
     if not unpacker.eof:
-        raise MetadataError(f"{source}: cannot be unpacked: the file is truncated", source=source)
+        raise UsageError("cannot be unpacked: the file is truncated")
     return result
 
 
 _XZ: Final = b"\xfd7zXZ\0"
 
 
-def _read_unpacked(content: bytes, source: str) -> Metadata:
-    start = content.lstrip(b" \t\r\n")[:64]
-    if start.startswith(b"<"):
-        from paramclient.metadata import ardupilot  # imported here: loads pydantic
-
-        return ardupilot.read_xml(content, source=source)
-    if not start.startswith(b"{"):
+def _read_unpacked(content: bytes) -> Metadata:
+    start = content.lstrip(b" \t\r\n")[:1]
+    if start not in (b"<", b"{"):
         what = "PX4's parameters.json, ArduPilot's apm.pdef.xml or apm.pdef.json"
-        raise MetadataError(f"{source}: is neither JSON nor XML; expected {what}", source=source)
+        raise UsageError(f"is neither JSON nor XML; expected {what}")
     from paramclient.metadata import ardupilot, px4  # imported here: both load pydantic
 
-    document = json_of(content, source=source)
+    if start == b"<":
+        return ardupilot.read_xml(content)
+    document = json_of(content)
     if "parameters" in document:
-        return px4.read_parameters(document, source=source)
+        return px4.read_parameters(document)
     if "metadataTypes" in document:
-        raise MetadataError(
-            f"{source}: is the general metadata file, which only names other files; "
-            f"use the file with the parameters",
-            source=source,
+        raise UsageError(
+            "is the general metadata file, which only names other files; use the file with the parameters"
         )
-    return ardupilot.read_json(document, source=source)
-
-
-def _too_large(source: str) -> MetadataError:
-    return MetadataError(f"{source}: is too large for a metadata file", source=source)
+    return ardupilot.read_json(document)

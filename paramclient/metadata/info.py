@@ -7,8 +7,8 @@ import functools
 import math
 import operator
 import re
-import struct
 from collections.abc import Iterable, Iterator, Mapping
+from ctypes import c_float
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, Final, TypeVar
@@ -182,11 +182,10 @@ class ParamInfo:
 
     def _as_typed(self, mask: int) -> int:
         """Return the number with these bits in a signed type."""
-        if self.type is not None and self.type.is_integer:
-            low, high = self.type.bounds
-            if low < 0 and high < mask <= high - low:
-                return mask - (high - low + 1)
-        return mask
+        if self.type is None or not self.type.is_integer:
+            return mask
+        over = 1 << 8 * self.type.size
+        return mask - over if self.type.bounds[1] < mask < over else mask
 
     def _only(self, named: Mapping[Key, str], text: str) -> Key | None:
         """Return the number with this name; None if there is none.
@@ -305,7 +304,6 @@ _REAL: Final = re.compile(
     r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(inf|infinity|nan)", re.IGNORECASE
 )
 _DIGITS: Final = re.compile(r"[0-9]+")
-_FLOAT32: Final = struct.Struct("<f")
 
 
 def _folded(name: str) -> str:
@@ -331,12 +329,4 @@ def _choice(sentence: str, named: Mapping[Key, str], text: str) -> str:
 def _is_below(a: int | float, b: int | float) -> bool:
     if isinstance(a, int) and isinstance(b, int):
         return a < b
-    return _as_float32(a) < _as_float32(b)
-
-
-def _as_float32(number: int | float) -> float:
-    try:
-        rounded: float = _FLOAT32.unpack(_FLOAT32.pack(number))[0]
-    except (OverflowError, struct.error):  # struct.error for integers beyond the range of a float
-        return math.inf if number > 0 else -math.inf
-    return rounded
+    return c_float(a).value < c_float(b).value  # infinite beyond the range

@@ -6,12 +6,13 @@ versions only add fields. Unknown fields are ignored, as MAVLink requires.
 
 from __future__ import annotations
 
-from typing import Annotated, Final, NotRequired, TypeVar
+from collections.abc import Mapping
+from typing import Annotated, Any, Final, NotRequired, TypeAlias, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, with_config
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, with_config
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
-from paramclient.errors import MetadataError
+from paramclient.errors import UsageError
 from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo, finite, names_of, whole
 from paramclient.model.values import ParamType
 
@@ -49,19 +50,33 @@ class _Bit(TypedDict):
     description: NotRequired[str]
 
 
+def _values(given: list[_Named]) -> Mapping[int | float, str]:
+    named = {finite(each["value"]): each.get("description") for each in given}
+    return names_of({value: name for value, name in named.items() if name and value is not None})
+
+
+def _bits(given: list[_Bit]) -> Mapping[int, str]:
+    return names_of({each["index"]: name for each in given if (name := each.get("description"))})
+
+
+_Number: TypeAlias = Annotated[float | None, AfterValidator(finite)]
+
+
 class _Parameter(_Strict):
+    """A parameter. The fields that are given are those of a ParamInfo."""
+
     name: str = Field(min_length=1, max_length=16)
-    type: str = ""
-    short: str = Field("", alias="shortDesc")
-    long: str = Field("", alias="longDesc")
+    type: Annotated[str, AfterValidator(lambda name: _TYPES.get(name))] = ""
+    short_description: str = Field("", alias="shortDesc")
+    long_description: str = Field("", alias="longDesc")
     units: str = ""
-    minimum: float | None = Field(None, alias="min")
-    maximum: float | None = Field(None, alias="max")
-    increment: float | None = None
+    minimum: _Number = Field(None, alias="min")
+    maximum: _Number = Field(None, alias="max")
+    increment: _Number = None
     decimals: int | None = Field(None, alias="decimalPlaces", ge=0, le=DECIMALS_MAX)
-    default: float | None = None
-    values: list[_Named] = Field([], max_length=VALUE_NAMES_MAX)
-    bits: list[_Bit] = Field([], alias="bitmask", max_length=BITS_MAX)
+    default: Annotated[float | None, AfterValidator(whole)] = None
+    values: Annotated[list[_Named], AfterValidator(_values)] = Field([], max_length=VALUE_NAMES_MAX)
+    bits: Annotated[list[_Bit], AfterValidator(_bits)] = Field([], alias="bitmask", max_length=BITS_MAX)
     reboot_required: bool = Field(False, alias="rebootRequired")
     is_read_only: bool = Field(False, alias="readOnly")
     is_volatile: bool = Field(False, alias="volatile")
@@ -69,30 +84,10 @@ class _Parameter(_Strict):
     group: str = ""
 
     def info(self) -> ParamInfo:
-        low, high = finite(self.minimum), finite(self.maximum)
-        if low is not None and high is not None and low > high:
-            low = high = None
-        values = {finite(each["value"]): each.get("description") for each in self.values}
-        bits = {each["index"]: each.get("description") for each in self.bits}
-        return ParamInfo(
-            self.name,
-            _TYPES.get(self.type),
-            self.short,
-            self.long,
-            self.units,
-            low,
-            high,
-            finite(self.increment),
-            self.decimals,
-            whole(self.default),
-            names_of({value: name for value, name in values.items() if name and value is not None}),
-            names_of({bit: name for bit, name in bits.items() if name}),
-            self.reboot_required,
-            self.is_read_only,
-            self.is_volatile,
-            self.category,
-            self.group,
-        )
+        fields: dict[str, Any] = {name: getattr(self, name) for name in self.model_fields_set}
+        if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
+            fields |= {"minimum": None, "maximum": None}
+        return ParamInfo(**fields)
 
 
 class _Parameters(_Strict):
@@ -122,36 +117,34 @@ class _General(_Strict):
     files: list[MetadataFile] = Field(alias="metadataTypes", max_length=METADATA_FILES_MAX)
 
 
-def read_parameters(document: object, *, source: str) -> Metadata:
+def read_parameters(document: object) -> Metadata:
     """Read a parameters.json that has been parsed as JSON.
 
     Raises:
-        MetadataError: the document does not follow the schema.
+        UsageError: the document does not follow the schema.
     """
-    read = validated(_Parameters, document, source)
-    return Metadata.of((each.info() for each in read.parameters), source=source)
+    return Metadata.of(each.info() for each in validated(_Parameters, document).parameters)
 
 
-def read_general(document: object, *, source: str) -> tuple[MetadataFile, ...]:
+def read_general(document: object) -> tuple[MetadataFile, ...]:
     """Read a general metadata file that has been parsed as JSON: kinds of metadata and their addresses.
 
     Raises:
-        MetadataError: the document does not follow the schema.
+        UsageError: the document does not follow the schema.
     """
-    return tuple(validated(_General, document, source).files)
+    return tuple(validated(_General, document).files)
 
 
-def validated(model: type[Model], document: object, source: str, within: tuple[int | str, ...] = ()) -> Model:
+def validated(model: type[Model], document: object, within: tuple[int | str, ...] = ()) -> Model:
     """Return a part of a document as an instance of a model.
 
     Args:
         model: the model.
         document: the part.
-        source: the file, for errors.
         within: the place of the part in the file.
 
     Raises:
-        MetadataError: the part is invalid, with the place of the first problem.
+        UsageError: the part is invalid, with the place of the first problem.
     """
     try:
         return model.model_validate(document)
@@ -159,8 +152,7 @@ def validated(model: type[Model], document: object, source: str, within: tuple[i
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         steps = (*within, *first["loc"])
         place = "".join(f"[{each}]" if isinstance(each, int) else f".{each}" for each in steps)
-        comma = ", " if place else ""
-        raise MetadataError(f"{source}{comma}{place.lstrip('.')}: {first['msg']}", source=source) from None
+        raise UsageError(f"{place.lstrip('.')}{': ' if place else ''}{first['msg']}") from None
 
 
 _TYPES: Final = {

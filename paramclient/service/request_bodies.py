@@ -137,14 +137,14 @@ class UploadedFile(Body):
             raise ValueError("a file needs either `text` or `base64`")
         return self
 
-    def read(self) -> ParamFile:
-        """Parse the file. Blocks for up to seconds.
+    def read(self, *, partial: bool = False) -> ParamFile:
+        """Parse the file; see `files.loads`. Blocks for up to seconds.
 
         Raises:
             FileError: the file is invalid.
         """
         data = (self.text or "").encode("utf-8", "surrogatepass") if self.base64 is None else self.base64
-        return loads(data, source=self.name, file_format=self.format, params_max=VALUES_MAX)
+        return loads(data, source=self.name, file_format=self.format, partial=partial)
 
     def read_set(self, target: Target) -> ParamSet:
         """Parse the file, and return its set for a component; see `read`."""

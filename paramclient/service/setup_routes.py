@@ -20,7 +20,7 @@ from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson
 from paramclient.cli.json_output import SetJson, VehicleJson, as_json
 from paramclient.cli.json_setup import ApplyJson, PlanJson
 from paramclient.errors import UsageError
-from paramclient.files import FileFormat, dumps
+from paramclient.files import FileFormat, dumps, writable
 from paramclient.files.formats import ENDINGS
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
@@ -58,8 +58,8 @@ ROUTERS: Final = (reading, writing)
 
 @reading.post("/api/files")
 async def read_file(body: UploadedFile) -> dict[str, Any]:
-    """Parse a parameter file of any format. It is not stored."""
-    file = await anyio.to_thread.run_sync(body.read)
+    """Parse a parameter file of any format, without names that no vehicle can have. It is not stored."""
+    file = await anyio.to_thread.run_sync(partial(body.read, partial=True))
     sets = as_json([SetJson.with_sources(each, {}) for each in file.sets])
     return {"file": file.source, "format": file.file_format, "notes": file.notes, "components": sets}
 
@@ -82,6 +82,7 @@ async def file(
     if changed:
         found = select_non_defaults(found, described)
     name = _file_name(found, file_format)
+    found, _ = writable(found, file_format)
     data = await anyio.to_thread.run_sync(lambda: dumps(found, file_format=file_format, target=name))
     headers = {"content-disposition": f'attachment; filename="{name}"'}
     return Response(data, media_type="application/octet-stream", headers=headers)

@@ -13,7 +13,7 @@ from paramclient.client.signing import Signing
 from paramclient.client.traffic import TrafficReport
 from paramclient.links import Link
 from paramclient.metadata.info import Metadata
-from paramclient.metadata.metadata_cache import MetadataStore
+from paramclient.metadata.store import MetadataStore
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from paramclient.cache import ParamCache
-from paramclient.cache.sqlite import SCHEMA_VERSION
+from paramclient.cache.database import SCHEMA_VERSION
 from tests.postgres import GIVEN, PROGRAMS, WHY_NONE, database_on, server
 
 Open = Callable[[], ParamCache]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import time
 from collections.abc import Callable
@@ -259,6 +260,27 @@ def test_a_damaged_file_is_exit_code_2(command: Command, write: Callable[..., st
     outcome = command("diff", "\x1bquad.param", "\x1bquad.param")
     assert (outcome.code, outcome.out) == (2, "")
     assert outcome.err.startswith("paramclient: \\x1bquad.param:2: ")
+
+
+def test_a_name_that_no_vehicle_has_is_left_out(command: Command, write: Callable[..., str]) -> None:
+    left, right = write("left.param", "A,1", "SIM_GPS1_BYTELOSS,0"), write("right.param", "A,1")
+    for words in (["diff", left, right], ["show", left]):
+        outcome = command(*words)
+        assert outcome.code == 0
+        assert outcome.err.startswith("paramclient: left.param: line 2: ")
+        assert "SIM_GPS1_BYTELOSS" in outcome.err.splitlines()[0]
+    assert command("save", left, "new.param").code == 2
+    assert command("save", left, "new.param", "--incomplete").code == 0
+
+
+def test_a_file_is_read_from_the_standard_input(
+    command: Command, write: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write("quad.param", "A,1", "B,2")
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(b"A 1\nB 3\n")))
+    outcome = command("diff", "quad.param", "-", "--json")
+    assert (outcome.code, list(outcome.json["params"])) == (1, ["B"])
+    assert outcome.json["right"]["source"] == "standard input"
 
 
 def test_show_prints_a_file(command: Command, write: Callable[..., str]) -> None:

@@ -77,3 +77,10 @@ def test_a_damaged_log_is_an_error_without_a_traceback(command: Command, tmp_pat
     assert shown.code == 2
     assert shown.err.startswith(f"paramclient: {path}: ")
     assert "Traceback" not in shown.err
+
+
+def test_a_telemetry_log_is_a_source(command: Command) -> None:
+    log = Path(__file__).parents[1] / "data/px4_full_download.tlog"
+    outcome = command("diff", log, log.with_name("px4_flight.ulg"), "--json")
+    assert (outcome.code, outcome.json["left"]["count"], outcome.json["right"]["count"]) == (1, 903, 850)
+    assert len(command("show", log, "--json").json["components"][0]["params"]) == 903

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from paramclient import ParamCache, ParamType, read_file
+from paramclient import ParamCache, ParamSet, ParamType, WrittenParam, read_file, write_file
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.conversations.partial import TABLE, Partial
@@ -156,6 +156,14 @@ def test_a_vehicle_with_component_0_is_written_and_read(
         assert saved.code == 0
     [params] = read_file(path).sets
     assert (params.system, params.component, set(params)) == (1, 0, set(TABLE))
+
+
+def test_a_name_that_the_format_cannot_hold_is_left_out(command: Command, tmp_path: Path) -> None:
+    source, path = tmp_path / "quad.json", tmp_path / "quad.param"
+    write_file(source, ParamSet({"A": WrittenParam("A", 1), "A B": WrittenParam("A B", 2)}, 1, 1))
+    saved = command("save", source, path)
+    assert (saved.code, "left out, as only a .json file can hold them: A B" in saved.err) == (0, True)
+    assert list(read_file(path).choose()) == ["A"]
 
 
 def test_an_incomplete_table_is_not_written(

@@ -117,6 +117,18 @@ def test_apply_sets_and_verifies_values_that_differ(
     assert vehicle.requests["PARAM_SET"] == 2
 
 
+def test_a_name_that_no_vehicle_can_have_is_invalid_too(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    vehicle = copter()
+    wrong = file("RTL_ALT,2500\nSIM_GPS1_BYTELOSS,0\n")
+    assert command("apply", put(vehicle), wrong).code == 2
+    assert vehicle.requests["PARAM_SET"] == 0
+    outcome = command("apply", put(vehicle), wrong, "--skip-invalid")
+    assert (outcome.code, vehicle.values["RTL_ALT"]) == (1, 2500)
+    assert "line 2: " in outcome.err
+
+
 def test_invalid_values_are_reported_before_anything_is_sent(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:

@@ -50,6 +50,18 @@ def full(path: Path) -> Iterator[None]:
         yield
 
 
+def fails_once(save: Callable[..., None]) -> Callable[..., None]:
+    """A write that succeeds only the second time."""
+    failures = iter([CacheError("the database is starting")])
+
+    def write(*args: object, **kwargs: object) -> None:
+        if (error := next(failures, None)) is not None:
+            raise error
+        save(*args, **kwargs)
+
+    return write
+
+
 Holding = Callable[[Path], AbstractContextManager[None]]
 UNWRITABLE = pytest.mark.parametrize("unwritable", [locked, full], ids=["locked", "full"])
 
@@ -91,6 +103,24 @@ async def test_values_written_late_keep_their_times_and_the_whole_history(
 
 
 @in_simulated_time
+async def test_a_cause_has_one_warning_from_open_to_close(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Also where nothing is to be written for a time: that is no success."""
+    async with ParamClient(small_px4(), cache=f"postgresql://me@/fleet?host={tmp_path}") as client:
+        component = await client.only_component()
+        await client.core.cache_writer.write_all()
+        await component.fetch_all()
+        await anyio.sleep(2 * RETRY_INTERVAL)
+        with pytest.raises(CacheError, match=r"nothing was sent, .*--no-cache"):
+            await apply(component, ParamSet({NAME: WrittenParam(NAME, 5.0)}))
+        assert (await component.set(NAME, 5.0)).actual == 5.0
+    [warning] = warnings(caplog)
+    assert warning.startswith("continuing without the cache: ")
+    assert "\n" not in warning
+
+
+@in_simulated_time
 async def test_after_very_many_changes_the_whole_table_is_written(path: Path) -> None:
     vehicle = small_px4()
     async with ParamClient(vehicle, cache=path) as client:
@@ -125,6 +155,19 @@ async def test_a_client_that_ends_says_what_is_lost(
     finally:
         holding.__exit__(None, None, None)
     assert lost.startswith(f"the last values of 1/1 ({key}) are not in the cache, and lost: ")
+
+
+@in_simulated_time
+async def test_a_client_that_ends_tries_once_more(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A database that was just restarted refuses the first connection."""
+    with ParamCache(path) as cache:
+        async with ParamClient(small_px4(), cache=cache) as client:
+            component = await client.only_component()
+            await component.fetch_all()
+            await anyio.sleep(2.0)
+            await component.set(NAME, 5.0)
+            monkeypatch.setattr(cache, "save", fails_once(cache.save))
+        assert cache.component().params[NAME].value == 5.0
 
 
 @in_simulated_time

@@ -14,7 +14,7 @@ import pytest
 from paramclient import FileError, ParamFile, ParamSet, ParamType, WrittenParam, read_file, write_file
 from paramclient.files import LARGEST_FILE, FileFormat, dumps, loads
 from paramclient.files.formats import ENDINGS
-from paramclient.files.includes import FILES_MAX
+from paramclient.files.lists import FILES_MAX
 
 PARAMS = ParamSet({"A": WrittenParam("A", 5, ParamType.INT32), "B": WrittenParam("B", 0.5)}, 1, 1)
 TYPED = ParamSet({"A": PARAMS["A"]}, 1, 1)
@@ -207,8 +207,8 @@ def test_an_included_file_replaces_its_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "problem"),
     [
-        ("@include gone.parm", "x/y/gone.parm cannot be read: No such file or directory"),
-        ("@include ../y", "x/y/../y cannot be read: not a regular file"),
+        ("@include gone.parm", "x/y/gone.parm: cannot be read: No such file or directory"),
+        ("@include ../y", "x/y/../y: cannot be read: not a regular file"),
         ("@include ../../outside.parm", "lies outside of"),
         ("@include ../z/../../outside.parm", "lies outside of"),
         ("@include /etc/hostname", "absolute paths are not allowed"),

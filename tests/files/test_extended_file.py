@@ -126,7 +126,7 @@ def test_an_invalid_file_is_an_error_with_its_path(tmp_path: Path, fields: objec
             '{"paramclient_extended": 1, "system": 0, "params": {"A": {"hex": "", "type": "CUSTOM"}}}',
             "1 to 255",
         ),
-        ('{"paramclient_extended": 1, "params": {"": {}}}', "is no name"),
+        ('{"paramclient_extended": 1, "params": {"": {}}}', "at least one character"),
         ('{"paramclient_extended": 1, "params": {"A": {}, "A": {}}}', "occurs twice"),
     ],
 )

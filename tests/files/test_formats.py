@@ -321,7 +321,10 @@ def test_the_last_value_of_a_repeated_name_is_used(text: str, value: float, note
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("A,1,5", "expected NAME,VALUE with a decimal point (1.5, not 1,5), found 'A,1,5'"),
+        (
+            "A,1,5",
+            "expected NAME,VALUE with a decimal point (1.5, not 1,5) and no third column, found 'A,1,5'",
+        ),
         ("A 1,5", "with a decimal point"),
         ("A 1.5 m/s", "and nothing after it (no unit, no further column)"),
         ("A 1.5m", "with a number"),
@@ -348,7 +351,6 @@ def test_the_last_value_of_a_repeated_name_is_used(text: str, value: float, note
         ("@include other.parm", "only a file on disk can include another file"),
         ("@include", "an unknown instruction for ArduPilot's tools"),
         ("@delete A", "an unknown instruction for ArduPilot's tools"),
-        ("<html>", "expected"),
         ("hello world", "with a number"),
     ],
 )
@@ -384,7 +386,7 @@ def test_an_error_lists_at_most_twenty_bad_lines() -> None:
         "quad.x:3: expected NAME VALUE, found 'bad'",
     ]
     assert str(error).splitlines()[20:] == ["and 30 more"]
-    assert (error.source, error.line, error.expected) == ("quad.x", 2, "NAME VALUE")
+    assert (error.source, error.line) == ("quad.x", 2)
     long = "x" * 10_000
     assert len(str(failed(f"A 1\n{long}"))) < 300
     value = f'{{"paramclient": 1, "sets": [{{"params": {{"A": {{"value": "{long}"}}}}}}]}}'
@@ -401,7 +403,7 @@ def test_an_error_lists_at_most_twenty_bad_lines() -> None:
         (b"A 1\nB \xff\n", "expected UTF-8 text, found the byte 0xff", 2),
         (b"A 1\n\x00\x01", "found the character 0x00", 2),
         (b"\x7fELF\x02", "found the character 0x7f", 1),
-        (b"\x1f\x8b\x08\x00", "found the byte 0x8b", 1),
+        (b"\x1f\x8b\x08\x00", "not a parameter file: a compressed file (gzip)", None),
         (b"\x1b\x67\x05", "invalid packed parameter file", None),
         ("A 1\n".encode("utf-16-le"), "found the character 0x00", 1),
     ],
@@ -419,6 +421,76 @@ def test_random_bytes_give_an_error_or_parameters(data: bytes, form: FileFormat 
     except FileError:
         return
     assert file.sets
+
+
+# Files of other programs
+
+
+KINDS = {
+    "a page of HTML": "<!DOCTYPE html>\n<html><body>404</body></html>\n",
+    "the output of `param show`": "Symbols: x = used, + = saved\nx + CAL_ACC0_ID [1,2] : 1310988\n",
+    "four columns": "# MAV ID  COMPONENT ID\n1\t1\tACC_OFFS_X\t0.5\n1\t1\tARMING\t1\n",
+    "a plan of QGroundControl": '{"fileType":"Plan","version":1,"mission":{"items":[]}}\n',
+    "not a parameter file of paramclient (JSON)": '{"A": 1}',
+    "a start script of PX4": "#!/bin/sh\n. ${R}etc/init.d/rc.mc_defaults\nparam set-default MC_ROLL_P 6.5\n",
+    "a script that sets no parameter": "#!/bin/sh\n. ${R}etc/init.d-posix/airframes/4001_gz_x500\n",
+    "a list with a third column": "A 1 1\nB 2.5 3\n",
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_file_of_another_program_is_named(kind: str) -> None:
+    error = failed(KINDS[kind])
+    assert (kind in str(error), error.line, len(str(error).splitlines())) == (True, None, 1), str(error)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("parameters.json", "metadata of parameters"),
+        ("apm.pdef.json", "metadata of parameters"),
+        ("apm.pdef.xml", "metadata of parameters"),
+        ("ardupilot_flight.bin", "an on-board log of ArduPilot"),
+        ("px4_flight.ulg", "an on-board log of PX4"),
+        ("px4_get_set.tlog", "a telemetry log"),
+    ],
+)
+def test_a_recorded_file_of_another_kind_is_named(name: str, kind: str) -> None:
+    assert f"quad.x: not a parameter file: {kind}" in str(failed((DATA / name).read_bytes()))
+
+
+def test_the_parameter_storage_of_px4_is_named() -> None:
+    bson = b"\x10MC_ROLL_P\0\1\0\0\0\0"
+    assert "parameter storage of PX4 (BSON)" in str(failed((len(bson) + 4).to_bytes(4, "little") + bson))
+
+
+def test_a_comment_in_another_encoding_is_read() -> None:
+    file = loads("# Höhe\nA,1\nB,2 # für Jo\n".encode("cp1252"), source="quad.param")
+    assert (file.header, file.sets[0]["B"].comment) == (("Höhe",), "für Jo")
+    assert file.notes == ("Comments that are not UTF-8 were read as Windows-1252: line 1, line 3.",)
+    assert "quad.x:2: expected UTF-8 text, found the byte 0xf6" in str(failed("A,1\nHöhe,2".encode("cp1252")))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "A,1\nSIM_GPS1_BYTELOSS,0\nB,2\n",
+        "1\t1\tA\t1\t6\n1\t1\tSIM_GPS1_BYTELOSS\t0\t6\n1\t1\tB\t2\t6\n",
+        '{"paramclient": 1, "sets": [{"params":{"A":{"value":1},\n"SIM_GPS1_BYTELOSS":{},"B":{"value":2}}}]}',
+    ],
+)
+def test_a_name_that_no_vehicle_has_is_left_out_on_request(text: str) -> None:
+    error = failed(text)
+    assert (error.line, "SIM_GPS1_BYTELOSS" in str(error)) == (2, True)
+    file = loads(text.encode(), source="quad.x", partial=True)
+    assert {name: param.value for name, param in file.sets[0].items()} == {"A": 1, "B": 2}
+    (note,) = file.notes
+    assert note.startswith("line 2: ")
+    assert "SIM_GPS1_BYTELOSS" in note
+
+
+def test_a_bad_value_is_an_error_even_then() -> None:
+    assert failed("A,1\nB,one\nTHIS_NAME_IS_TOO_LONG,1\n", partial=True).line == 2
 
 
 # Format detection
@@ -571,7 +643,7 @@ def test_an_invalid_field_is_rejected(fields: str, problem: str) -> None:
     ("text", "problem"),
     [
         ("{", "expected JSON"),
-        ("{}", "paramclient: the field is missing"),
+        ("{}", "not a parameter file of paramclient (JSON)"),
         ('{"paramclient": 2, "sets": []}', "paramclient"),
         ('{"paramclient": 1, "sets": []}', "contains no parameters"),
         ('{"paramclient": 1, "sets": [{"params": {}}]}', "contains no parameters"),
@@ -588,8 +660,7 @@ def test_an_invalid_field_is_rejected(fields: str, problem: str) -> None:
             "'A' occurs twice",
         ),
         ('{"a":' * 100_000, "nested too deep"),
-        ('{"A": %s}' % ("9" * 5000), "9…' is beyond the range of every type"),
-        ('{"A": %s.0}' % ("9" * 5000), "9…' is beyond the range of a double"),
+        ('{"A": %s}' % ("9" * 5000), "Exceeds the limit"),
     ],
 )
 def test_an_invalid_document_is_rejected(text: str, problem: str) -> None:

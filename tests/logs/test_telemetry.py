@@ -307,7 +307,8 @@ def test_a_name_removed_later_is_not_restored(tmp_path: Path) -> None:
     log = whole(A=1, OLD=2).write(tmp_path / "flight.tlog")
     save(cache, NOW + 100.0, known("A", 1), known("OLD", 2))
     who = Identity(1, "udp", UID)
-    gone = TableUpdate(identity=who, component=1, autopilot=12, at=NOW + 200.0, removed={"OLD": NOW + 200.0})
+    at = NOW + 200.0
+    gone = TableUpdate(identity=who, component=1, autopilot=12, at=at, params=[StoredParam.gone("OLD", at)])
     with ParamCache(cache) as kept:
         kept.save(gone)
     before = lines(cache)

@@ -17,7 +17,7 @@ import pytest
 
 from paramclient import ClientClosed, FileTransferError, NoReply
 from paramclient.errors import MetadataError
-from paramclient.metadata import Metadata, MetadataStore, download, metadata_cache, metadata_of
+from paramclient.metadata import Metadata, MetadataStore, download, metadata_of, store
 from paramclient.model.identity import Identity
 from paramclient.model.px4_hash import crc32_px4
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle
@@ -314,7 +314,7 @@ def test_a_damaged_file_is_deleted(damage: bytes, tmp_path: Path, caplog: pytest
 
 
 def test_the_number_of_files_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metadata_cache, "CACHED_FILES_MAX", 4)
+    monkeypatch.setattr(store, "CACHED_FILES_MAX", 4)
     kept = MetadataStore(tmp_path)
     contents = [described(f"P{number}") for number in range(6)]
     for number, content in enumerate(contents):

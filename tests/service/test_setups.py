@@ -50,6 +50,19 @@ async def test_only_what_differs_from_the_defaults_is_saved() -> None:
         assert 0 < len(lines) < len(vehicle.values)
 
 
+@in_simulated_time
+async def test_a_file_with_a_name_that_no_vehicle_can_have_is_shown_and_not_applied() -> None:
+    vehicle = generic()
+    async with service(vehicle) as (_, browser):
+        await synced(browser)
+        file = {"name": "a.parm", "text": "PARAM_04 44\nSIM_GPS1_BYTELOSS 0\n"}
+        read = (await browser.post("/api/files", json=file)).json()
+        assert [list(each["params"]) for each in read["components"]] == [["PARAM_04"]]
+        assert read["notes"][0].startswith("line 2: ")
+        assert (await browser.post(f"{V}/apply", json={"file": file})).status_code == 422
+        assert vehicle.requests["PARAM_SET"] == 0
+
+
 @pytest.mark.parametrize(
     "body",
     [{"text": "not\0a file of parameters"}, {"text": "{", "format": "json"}, {"base64": "###"}],

@@ -4,42 +4,33 @@ from __future__ import annotations
 
 from paramclient.errors import FileError, PackError, UsageError
 from paramclient.files.formats import FileFormat, ParamFile
+from paramclient.files.reading import Reading
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, bits_of, from_bits, same_bits, type_name
 from paramclient.protocol import param_pck
 
-__all__ = ["is_packed", "read_packed", "write_packed"]
+__all__ = ["pack_entry", "read_packed", "write_packed"]
 
 
-def is_packed(data: bytes) -> bool:
-    """Return whether these bytes begin like a packed parameter file."""
-    return data.startswith(param_pck.MAGICS)
-
-
-def read_packed(data: bytes, source: str) -> ParamFile:
+def read_packed(reading: Reading, file_format: FileFormat) -> ParamFile:
     """Read a packed file in the format that a vehicle serves.
 
     Raises:
         FileError: the file is invalid.
     """
     try:
-        pack = param_pck.decode(data)
+        pack = param_pck.decode(reading.data)
     except PackError as error:
-        raise FileError(f"invalid packed parameter file: {error}", source=source) from error
-    entries, with_defaults = pack.entries, pack.with_defaults
-    if not entries:
-        raise FileError("the file contains no parameters", source=source)
-    notes = []
-    if pack.total > len(entries):
-        notes.append(f"The file contains {len(entries)} of the vehicle's {pack.total} parameters.")
-    params = {}
-    for name, kind, bits, default in entries:
-        value = from_bits(bits, kind)
-        given = value if default is None and with_defaults else None
-        if default is not None:
-            given = from_bits(default, kind)
-        params[name] = WrittenParam(name, value, kind, given)
-    return ParamFile((ParamSet(params, source=source),), FileFormat.PCK, source, notes=tuple(notes))
+        raise FileError(f"invalid packed parameter file: {error}", source=reading.source) from error
+    if pack.total > len(pack.entries):
+        reading.notes.append(
+            f"The file contains {len(pack.entries)} of the vehicle's {pack.total} parameters."
+        )
+    for name, kind, bits, default in pack.entries:
+        known = bits if default is None and pack.with_defaults else default
+        value, own = from_bits(bits, kind), None if known is None else from_bits(known, kind)
+        reading.add(WrittenParam(name, value, kind, own), "")
+    return reading.file(file_format)
 
 
 def write_packed(params: ParamSet) -> bytes:
@@ -49,11 +40,12 @@ def write_packed(params: ParamSet) -> bytes:
         UsageError: the format cannot express a parameter: it has four types, and only numbers.
     """
     with_defaults = all(param.default is not None for param in params.values())
-    entries = [_entry(param, with_defaults=with_defaults) for param in params.values()]
+    entries = [pack_entry(params, param) for param in params.values()]
     return param_pck.encode(entries, with_defaults=with_defaults)
 
 
-def _entry(param: WrittenParam, *, with_defaults: bool) -> param_pck.PackedParam:
+def pack_entry(_: ParamSet, param: WrittenParam) -> param_pck.PackedParam:
+    """Return the entry of a parameter, or raise UsageError if the format cannot express it."""
     kind = param.type_number
     if not isinstance(kind, ParamType) or kind not in param_pck.PACKABLE:
         known = ", ".join(each.name for each in sorted(param_pck.PACKABLE))
@@ -62,9 +54,7 @@ def _entry(param: WrittenParam, *, with_defaults: bool) -> param_pck.PackedParam
     if param.is_raw:
         raise UsageError(f"{param.name} is not a number; json can keep it")
     bits = param.bits_as(kind)
-    default = None
-    if with_defaults and param.default is not None:
-        default = bits_of(param.default, kind)
-        if same_bits(kind, bits, default):
-            default = None  # as vehicles write it: an entry without a default has its default value
+    default = None if param.default is None else bits_of(param.default, kind)
+    if default is not None and same_bits(kind, bits, default):
+        default = None  # as vehicles write it: an entry without a default has its default value
     return param_pck.PackedParam(param.name, kind, bits, default)

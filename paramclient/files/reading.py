@@ -1,0 +1,335 @@
+"""One file while it is read, and its text: lines, comments, numbers, notes and faults."""
+
+from __future__ import annotations
+
+import codecs
+import math
+import re
+import struct
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
+from functools import cached_property
+from typing import Final, NamedTuple
+
+from paramclient.errors import FileError, UsageError
+from paramclient.files.formats import FileFormat, ParamFile
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import ParamType, WireValue, bits_of, format_value, from_bits, type_name
+from paramclient.model.wording import first_of
+
+__all__ = [
+    "Reading",
+    "TextLine",
+    "as_type",
+    "comment_lines",
+    "decode_text",
+    "excerpt",
+    "is_plain",
+    "lines_of",
+    "parse_number",
+    "time_of",
+    "undecoded_byte",
+    "value_text",
+]
+
+FAULTS_MAX: Final = 20
+"""Bad lines that an error lists: in a file of another kind, every line is bad."""
+EXCERPT_LENGTH_MAX: Final = 80
+"""Characters of a bad line that an error shows, so that the error stays readable."""
+NUMBER_LENGTH_MAX: Final = 400
+"""Characters of a number: the longest decimal form of a double without padding has fewer."""
+
+_line_end: Final = re.compile(r"\r\n|\n|\r")
+_number: Final = re.compile(
+    r"(?P<whole>[+-]?[0-9]+)|(?P<hexadecimal>0x[0-9a-f]+)"
+    r"|(?P<fraction>[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[+-]?[0-9]+)?)"
+    r"|(?P<word>\+?nan|[+-]?inf(?:inity)?)",  # the bits of a negative NaN are not defined
+    re.IGNORECASE | re.ASCII,
+).fullmatch
+_comment_start: Final = re.compile(r"(?<![0-9]\.)#|#(?!INF|IND|[QS]?NAN)|(?:(?<=[ \t])|^)(?://|;)")
+"""Start of a comment in a parameter list: no name or value can begin with `//` or `;`. The `#` of `1.#INF`
+and `-1.#IND`, which older C libraries of Windows print for infinity and NaN, does not start a comment."""
+_control: Final = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
+_undecoded: Final = re.compile(r"[\udc80-\udcff]")
+"""A byte that is not UTF-8, as `decode_text` returns it."""
+_PLAIN_NAN: Final = struct.pack("<d", math.nan)
+
+
+class Reading:
+    """One file while it is read, with the files that it includes.
+
+    If a name occurs twice, the last value is used, as in ground stations and autopilots, which set one value
+    after the other. A note reports the repetition.
+
+    Args:
+        data: the content.
+        source: the file's name.
+        partial: leave out parameters with a name that no vehicle can have, with a note; else it is a fault.
+        is_on_disk: whether the file can include others: bytes have no folder.
+    """
+
+    def __init__(self, data: bytes, source: str, *, partial: bool = False, is_on_disk: bool = False) -> None:
+        self.data = data
+        self.source = source
+        self.is_on_disk = is_on_disk
+        self.fault_count = 0
+        self.notes: list[str] = []
+        self._partial = partial
+        self._faults: list[tuple[str, int | None, str]] = []
+        self._sets: dict[tuple[int | None, int | None], dict[str, tuple[WrittenParam, str]]] = {}
+        self._repeated = self._left_out = 0
+        self.foreign: list[str] = []  # places of comments that are not UTF-8
+
+    @cached_property
+    def text(self) -> str:
+        """The content as text; FileError if it is none."""
+        return decode_text(self.data, self.source)
+
+    @cached_property
+    def first(self) -> str:
+        """The first line with content, without comments; FileError if there is none."""
+        if self.text.lstrip().startswith("{"):  # it may be one line of megabytes, with `#` in its texts
+            return "{"
+        first = next((line.text for line in lines_of(self.text) if line.text), None)
+        if first is None:
+            raise FileError("the file contains no parameters", source=self.source)
+        return first
+
+    @property
+    def is_full(self) -> bool:
+        """Whether further faults are only counted."""
+        return self.fault_count >= FAULTS_MAX
+
+    def fault(self, line: int | None, what: str, source: str = "", *, is_name: bool = False) -> None:
+        """Add a fault.
+
+        Args:
+            line: the bad line; None for an unknown one.
+            what: the fault, as the end of a sentence.
+            source: the file, if it is another one.
+            is_name: whether only the name of a parameter is bad.
+        """
+        if is_name and self._partial:
+            place = _place("" if source == self.source else source, line)
+            self.notes.append(f"{place + ': ' if place else ''}{what}; left out.")
+            self._left_out += 1
+            return
+        if not self.is_full:
+            self._faults.append((source or self.source, line, what))
+        self.fault_count += 1
+
+    def bad_line(self, line: TextLine, expected: str, source: str = "", *, is_name: bool = False) -> None:
+        """Add a line that has other content than expected."""
+        byte = undecoded_byte(line.text)
+        what = f"expected {expected}, found {excerpt(line.text)}" if byte is None else byte[1]
+        self.fault(line.number, what, source, is_name=is_name)
+
+    def add(
+        self, param: WrittenParam, place: str, system: int | None = None, component: int | None = None
+    ) -> None:
+        """Add a parameter of a component; it replaces an earlier one with the same name.
+
+        Args:
+            param: the parameter.
+            place: its position, for notes.
+            system, component: the ids of the set.
+        """
+        params = self._sets.setdefault((system, component), {})
+        if param.name in params:
+            self._repeated += 1
+            if self._repeated <= FAULTS_MAX:
+                self.notes.append(_repetition(*params[param.name], param, place))
+        params[param.name] = param, place
+
+    def check(self) -> None:
+        """Raise one FileError for all faults, if there are any."""
+        if not self._faults:
+            return
+        more = [": ".join(filter(None, (_place(of, at), what))) for of, at, what in self._faults[1:]]
+        if self.fault_count > len(self._faults):
+            more.append(f"and {self.fault_count - len(self._faults)} more")
+        source, line, what = self._faults[0]
+        raise FileError(what, source=source, line=line, more=tuple(more))
+
+    def file(
+        self,
+        file_format: FileFormat,
+        header: tuple[str, ...] = (),
+        footer: tuple[str, ...] = (),
+        sets: tuple[ParamSet, ...] | None = None,
+    ) -> ParamFile:
+        """Return the content: the added parameters, or `sets`.
+
+        Raises:
+            FileError: the file has faults, or no parameters.
+        """
+        self.check()
+        if sets is None:
+            sets = tuple(
+                ParamSet({name: p for name, (p, _) in each.items()}, component, system, source=self.source)
+                for (system, component), each in self._sets.items()
+            )
+        if not any(sets):
+            raise FileError("the file contains no parameters", source=self.source)
+        notes = self.notes
+        if (more := self._repeated - FAULTS_MAX) > 0:
+            notes.append(f"{more} more {'line repeats' if more == 1 else 'lines repeat'} a name.")
+        if self.foreign:
+            places = first_of(self.foreign, FAULTS_MAX)
+            notes.append(f"Comments that are not UTF-8 were read as Windows-1252: {places}.")
+        return ParamFile(sets, file_format, self.source, header, footer, tuple(notes), self._left_out)
+
+
+def _place(source: str, line: int | None) -> str:
+    if line is None:
+        return source
+    return f"{source}:{line}" if source else f"line {line}"
+
+
+def _repetition(before: WrittenParam, at: str, param: WrittenParam, place: str) -> str:
+    """Return the note on a name that occurs twice. 1 and 1.0 are the same value, −0.0 and 0.0 are not."""
+    ignored, used = (
+        format_value(each.settable, ParamType.REAL64)
+        + ("" if each.type_number is None else f" ({type_name(each.type_number)})")
+        for each in (before, param)
+    )
+    same = (before.value, before.type_number, ignored[0]) == (param.value, param.type_number, used[0])
+    if same or ignored == used:
+        return f"{param.name} occurs twice with the same value, in {at} and {place}."
+    return f"{param.name} occurs twice: {used} in {place} is used, not {ignored} in {at}."
+
+
+# Text
+
+
+class TextLine(NamedTuple):
+    """One line: its content, and its comment without the comment character (None without a comment).
+
+    `is_foreign` is true for a comment that is not UTF-8; it is read as Windows-1252.
+    """
+
+    number: int
+    text: str
+    comment: str | None
+    is_foreign: bool = False
+
+
+def decode_text(data: bytes, source: str) -> str:
+    """Return the text of a file: UTF-8, or UTF-16 with a byte order mark.
+
+    A byte that is not UTF-8 becomes a lone surrogate (PEP 383), as it is harmless in a comment.
+
+    Raises:
+        FileError: the file is not text.
+    """
+    is_utf16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        text = data.decode("utf-16") if is_utf16 else data.decode("utf-8-sig", "surrogateescape")
+    except UnicodeDecodeError as error:
+        found = f"the byte 0x{data[error.start]:02x}"
+        raise FileError(f"expected UTF-16 text, found {found}", source=source) from None
+    if control := _control.search(text):
+        line = text.count("\n", 0, control.start()) + 1
+        found = f"the character 0x{ord(control[0]):02x}"
+        message = f"expected text, found {found}: unknown file format"
+        raise FileError(message, source=source, line=line)
+    return text
+
+
+def undecoded_byte(text: str) -> tuple[int, str] | None:
+    """Return the position of the first byte that is not UTF-8, and a sentence on it; None if all are."""
+    if found := _undecoded.search(text):
+        return found.start(), f"expected UTF-8 text, found the byte 0x{ord(found[0]) - 0xDC00:02x}"
+    return None
+
+
+def lines_of(text: str) -> Iterator[TextLine]:
+    """Generate all lines, empty ones included, with their comments."""
+    start = 0
+    for number, end in enumerate((*_line_end.finditer(text), None), start=1):
+        line = text[start:] if end is None else text[start : end.start()]
+        start = 0 if end is None else end.end()
+        found = _comment_start.search(line)
+        if found is None:
+            yield TextLine(number, line.strip(" \t"), None)
+            continue
+        comment = line[found.end() :].rstrip().removeprefix(" ")
+        known = _undecoded.sub(_from_windows, comment)
+        yield TextLine(number, line[: found.start()].strip(" \t"), known, known != comment)
+
+
+def comment_lines(comments: Iterable[str]) -> Iterator[str]:
+    """Generate the lines of comments, with comment characters. A line break starts another comment line."""
+    for comment in comments:
+        for piece in comment.split("\n"):
+            for line in piece.splitlines() or [""]:
+                clean = _control.sub(" ", line).rstrip()
+                yield f"# {clean}" if clean and not clean.startswith("#") else f"#{clean}"
+
+
+def parse_number(text: str) -> int | float | None:
+    """Return a number in the notation of parameter files, or None: decimal, hexadecimal (`0x1F`), nan, inf.
+
+    A number without point and exponent is an int, all others are floats. Decimal commas, units, non-ASCII
+    digits and numbers beyond the range of a double give None.
+    """
+    found = _number(text) if len(text) <= NUMBER_LENGTH_MAX else None
+    if found is None:
+        return None
+    if found.lastgroup in ("whole", "hexadecimal"):
+        return int(text, 10 if found.lastgroup == "whole" else 16)
+    value = float(text)
+    return value if found.lastgroup == "word" or math.isfinite(value) else None
+
+
+def as_type(value: WireValue, kind: ParamType | int) -> WireValue:
+    """Return the value in a parameter's type: a float32 for REAL32, an int for 6.0 as INT32.
+
+    Raises:
+        UsageError: the value does not fit.
+    """
+    return value if isinstance(value, bytes) else from_bits(bits_of(value, kind), kind)
+
+
+def value_text(param: WrittenParam) -> str:
+    """Return the shortest number that parses to the same value.
+
+    Raises:
+        UsageError: no text expresses the value: raw bytes, or a NaN with payload bits.
+    """
+    value = param.settable
+    if isinstance(value, bytes | str):
+        raw = format_value(value)
+        raise UsageError(f"{param.name} is {raw}, which is not a number; json can keep it")
+    if math.isfinite(value):
+        return format_value(value, ParamType.REAL64 if param.type_number is None else param.type_number)
+    if not is_plain(value):
+        raise UsageError(f"{param.name} is a NaN with payload bits; json can keep them")
+    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+
+
+def time_of(at: float, digits: str = "auto") -> str:
+    """Return a Unix time in ISO 8601, UTC.
+
+    Raises:
+        UsageError: the time is outside the range of the calendar.
+    """
+    try:
+        moment = datetime.fromtimestamp(at, UTC)
+    except (ArithmeticError, OSError, ValueError):
+        raise UsageError(f"{at!r} is not a valid Unix time in seconds") from None
+    return moment.isoformat(timespec=digits).replace("+00:00", "Z")
+
+
+def is_plain(value: float) -> bool:
+    """Return whether the value is not a NaN, or is the NaN without payload bits."""
+    return not math.isnan(value) or struct.pack("<d", value) == _PLAIN_NAN
+
+
+def excerpt(text: str) -> str:
+    """Return a piece of a file for an error: quoted, and shortened if it is long."""
+    return repr(text if len(text) <= EXCERPT_LENGTH_MAX else f"{text[:EXCERPT_LENGTH_MAX]}…")
+
+
+def _from_windows(byte: re.Match[str]) -> str:
+    return bytes((ord(byte[0]) - 0xDC00,)).decode("cp1252", "replace")

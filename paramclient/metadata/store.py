@@ -1,0 +1,365 @@
+"""MetadataStore: metadata files of vehicles, cached on disk, and files that the user has added."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Final, Literal, TypeAlias, get_args
+
+from paramclient.errors import FileError, MetadataError, UsageError
+from paramclient.files.disk import replace_file
+from paramclient.files.formats import AUTOPILOT
+from paramclient.metadata.formats import PACKED_SIZE_MAX, read_bytes, read_content, read_metadata, unpacked
+from paramclient.metadata.info import Metadata
+from paramclient.model.identity import Identity, autopilot_name, version_text
+from paramclient.model.paramset import ParamSet
+from paramclient.model.px4_hash import crc32_px4
+
+__all__ = ["AddedFiles", "AddedMetadata", "MetadataStore", "VehicleKind", "file_address", "has_checksum"]
+
+CACHED_FILES_MAX: Final = 64
+"""Most recently used files that are kept: three for a firmware, with about 0.1 million bytes for PX4."""
+PARSED_FILES_MAX: Final = 2
+"""Most recently used files that are kept parsed: a comparison has mostly one or two firmwares. The largest
+takes 50 MB."""
+_NOTES: Final = ".firmware"
+
+VehicleKind: TypeAlias = Literal["copter", "plane", "rover", "sub", "tracker", "blimp", "px4"]
+"""The firmwares whose metadata can be added: ArduPilot's, one for each vehicle type, and PX4."""
+
+ARDUPILOT: Final[dict[VehicleKind, tuple[str, tuple[int, ...]]]] = {
+    "copter": ("ArduCopter", (2, 3, 4, 13, 14, 15, 29, 35)),
+    "plane": ("ArduPlane", (1, 19, 20, 21, 22, 23, 24, 25)),
+    "rover": ("Rover", (10, 11)),
+    "sub": ("ArduSub", (12,)),
+    "tracker": ("AntennaTracker", (5,)),
+    "blimp": ("Blimp", (7,)),
+}
+"""ArduPilot's firmwares: the name in its metadata files, which is also their folder on the internet; and
+MAV_TYPE of the heartbeat."""
+_OLD_NAMES: Final = {"APMrover2": "Rover", "ArduRover": "Rover"}
+_version: Final = re.compile(r"[0-9]{1,3}(\.[0-9]{1,3}){0,2}").fullmatch
+_kinds: Final[dict[str, VehicleKind]] = {kind: kind for kind in get_args(VehicleKind)}
+_name: Final = re.compile(rf"({'|'.join(_kinds)})(?:-([0-9.]+))?\.added").fullmatch
+
+logger = logging.getLogger(__name__)
+
+
+# Files of vehicles
+
+
+class MetadataStore:
+    """Metadata files by CRC-32, and the file of each firmware.
+
+    A folder of small files, each replaced atomically and readable only by its owner. A file that no longer
+    has its checksum is deleted and treated as missing. Several processes may use the folder at the same time.
+    Disk errors are logged as warnings, and nothing is cached. Every call blocks for a few milliseconds, and
+    `known` for up to half a second if it parses a large file. The last two parsed files are kept.
+
+    Args:
+        folder: the folder; created when the first file is cached.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+        self.added = AddedFiles(self.folder / "added")
+
+    @classmethod
+    def beside(cls, cache: str | os.PathLike[str]) -> MetadataStore:
+        """Return the store of a cache: the folder with the cache's name and the suffix `.metadata`."""
+        return cls(Path(cache).with_suffix(".metadata"))
+
+    def __repr__(self) -> str:
+        return f"<MetadataStore {self.folder}>"
+
+    @property
+    def has_notes(self) -> bool:
+        """Whether metadata of any firmware is cached or was added."""
+        return any(path.suffix == _NOTES for path in self._files()) or any(True for _ in self.added)
+
+    def get(self, crc: int) -> bytes | None:
+        """Return a file as stored on board, or None if it is not cached."""
+        path = self._file(crc)
+        content = self._read(path)
+        if content is not None and not has_checksum(content, crc):
+            logger.warning("%s is damaged and was removed", path)
+            _remove(path)
+            return None
+        with suppress(OSError):
+            os.utime(path)  # marks the file as recently used
+        return content
+
+    def put(self, content: bytes, crc: int) -> None:
+        """Cache a file with this checksum."""
+        self._write(self._file(crc), content)
+
+    def remember(self, identity: Identity, component: int, crc: int) -> None:
+        """Record that the file with this checksum describes a firmware's parameters."""
+        path = self._note(identity, component)
+        if path is not None:
+            self._write(path, f"{crc:08x}\n".encode("ascii"))
+
+    def known(self, identity: Identity, component: int) -> Metadata | None:
+        """Return the metadata of a firmware, or None.
+
+        The cached metadata of a firmware with this version, commit and board, which the vehicle has provided;
+        otherwise a file that was added for its vehicle type and version.
+        """
+        return self._cached(identity, component) or self.added.find(identity, component)
+
+    def known_of_sets(self, sets: Iterable[ParamSet]) -> list[Metadata | None]:
+        """Return the metadata of each set's firmware; for a set without identity, that of another set."""
+        own = [
+            None
+            if each.identity is None
+            else self.known(each.identity, AUTOPILOT if each.component is None else each.component)
+            for each in sets
+        ]
+        first = next(filter(None, own), None)
+        return [first if each is None else each for each in own]
+
+    def _cached(self, identity: Identity, component: int) -> Metadata | None:
+        note = self._note(identity, component)
+        noted = None if note is None else self._read(note)
+        if note is None or noted is None:
+            return None
+        try:
+            crc = int(noted, 16)
+            if self.get(crc) is not None:
+                return _parsed_once(self._file(crc), crc)
+        except MetadataError as error:
+            logger.warning("%s", error)
+        except ValueError:
+            logger.warning("%s is damaged and was removed", note)
+        _remove(note)
+        return None
+
+    def _file(self, crc: int) -> Path:
+        return self.folder / f"{crc:08x}.metadata"
+
+    def _note(self, identity: Identity, component: int) -> Path | None:
+        """Return the file that names a firmware's metadata; None for a firmware without a commit."""
+        if not identity.git_hash:
+            return None
+        firmware = replace(identity, system=0, link="", uid=None, vehicle_type=0, capabilities=0)
+        name = hashlib.sha256(repr((firmware, component)).encode()).hexdigest()[:16]
+        return self.folder / f"{name}{_NOTES}"
+
+    def _files(self) -> Iterator[Path]:
+        with suppress(OSError):
+            yield from self.folder.iterdir()
+
+    def _read(self, path: Path) -> bytes | None:
+        try:
+            with path.open("rb") as file:
+                return file.read(PACKED_SIZE_MAX + 1)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            logger.warning("%s cannot be read: %s", path, error.strerror)
+            return None
+
+    def _write(self, path: Path, content: bytes) -> None:
+        """Replace a file, and delete the least recently used ones and those of killed processes."""
+        try:
+            _replace(path, content)
+        except MetadataError as error:
+            logger.warning("%s", error)
+            return
+        times = {}
+        for each in self._files():
+            with suppress(OSError):
+                times[each] = each.stat().st_mtime
+        for each in sorted(times, key=times.__getitem__, reverse=True)[CACHED_FILES_MAX:]:
+            _remove(each)
+
+
+def has_checksum(content: bytes, crc: int) -> bool:
+    """Return whether a file, packed or unpacked, has a CRC-32.
+
+    The protocol specifies the checksum of the packed file. PX4 follows it for the parameter file, but
+    announces the checksum of the unpacked general file (`src/lib/component_information/CMakeLists.txt`).
+    """
+    if crc32_px4(content) == crc:
+        return True
+    try:
+        return crc32_px4(unpacked(content)) == crc
+    except UsageError:
+        return False
+
+
+def _parsed(path: Path) -> Metadata:
+    """Return the content of a metadata file; that of an unchanged file is parsed once."""
+    with suppress(OSError):
+        found = path.stat()
+        return _parsed_once(path, (found.st_mtime_ns, found.st_size, found.st_ino))
+    return read_metadata(path)  # raises the error
+
+
+@lru_cache(maxsize=PARSED_FILES_MAX)
+def _parsed_once(path: Path, version: object) -> Metadata:
+    return read_metadata(path)
+
+
+def _remove(path: Path) -> None:
+    with suppress(OSError):
+        path.unlink()
+
+
+# Files that the user has added
+
+
+@dataclass(frozen=True, slots=True)
+class AddedMetadata:
+    """An added file.
+
+    Attributes:
+        kind: the vehicle type.
+        firmware: the firmware version, such as 4.6 for all of 4.6.0, 4.6.1, …; None for every version.
+        path: the copy of the file.
+    """
+
+    kind: VehicleKind
+    firmware: str | None
+    path: Path
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.firmware or 'any version'}"
+
+
+class AddedFiles:
+    """The added files: copies in a folder, named after vehicle type and firmware version.
+
+    Every call blocks for a few milliseconds, and for about half a second if it reads a file of ArduPilot.
+
+    Args:
+        folder: the folder; made when the first file is added.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __iter__(self) -> Iterator[AddedMetadata]:
+        found: list[AddedMetadata] = []
+        with suppress(OSError):
+            named = ((_name(path.name), path) for path in self.folder.iterdir())
+            found += [AddedMetadata(_kinds[match[1]], match[2], path) for match, path in named if match]
+        return iter(sorted(found, key=lambda each: (each.kind, _numbers(each.firmware))))
+
+    def add(
+        self, path: str | os.PathLike[str], kind: VehicleKind | None = None, firmware: str | None = None
+    ) -> tuple[AddedMetadata, Metadata]:
+        """Copy a metadata file, in place of one for the same vehicle type and version; return its content.
+
+        Args:
+            path: the file, in any format of `read_metadata`.
+            kind: the vehicle type; None for that which the file names.
+            firmware: the firmware version, see `AddedMetadata`; None for every version.
+
+        Raises:
+            UsageError: the version is not one, or the file names no known vehicle type.
+            MetadataError: the file cannot be read or copied, or has no metadata.
+        """
+        if firmware is not None and not _version(firmware):
+            raise UsageError(f"a firmware version is written as 4.6 or 4.6.1, not {firmware!r}")
+        source, content = os.fspath(path), read_bytes(path)
+        metadata = read_content(content, source=source)
+        chosen = kind or _kind_of_file(metadata)
+        if chosen is None:
+            raise UsageError(f"{source} names no vehicle type that is known; give one of {', '.join(_kinds)}")
+        name = f"{chosen}.added" if firmware is None else f"{chosen}-{firmware}.added"
+        added = AddedMetadata(chosen, firmware, self.folder / name)
+        _replace(added.path, content)
+        return added, metadata
+
+    def remove(self, kind: VehicleKind, firmware: str | None = None) -> AddedMetadata:
+        """Remove the file for a vehicle type and version; return what it was.
+
+        Raises:
+            UsageError: there is none.
+            MetadataError: it cannot be removed.
+        """
+        for each in self:
+            if (each.kind, each.firmware) == (kind, firmware):
+                try:
+                    each.path.unlink(missing_ok=True)
+                except OSError as error:
+                    text = f"{each.path}: cannot be removed: {error.strerror}"
+                    raise MetadataError(text, source=str(each.path)) from error
+                return each
+        known = ", ".join(map(str, self)) or "none"
+        raise UsageError(f"no metadata was added for {kind} {firmware or 'any version'}; added: {known}")
+
+    def find(self, identity: Identity, component: int) -> Metadata | None:
+        """Return the added metadata of a firmware: that with the longest version that fits; None for none.
+
+        A file for a version is not used while the version of the vehicle is unknown. A file that cannot be
+        read is reported as a warning.
+        """
+        kind = _kind_of(identity)
+        if component != AUTOPILOT or kind is None:
+            return None
+        version = None if not identity.firmware else version_text(identity.firmware).partition("-")[0]
+        fitting = [each for each in self if each.kind == kind and _fits(each.firmware, version)]
+        for each in sorted(fitting, key=lambda one: len(_numbers(one.firmware)), reverse=True):
+            try:
+                return _parsed(each.path)
+            except MetadataError as error:
+                logger.warning("%s", error)
+        return None
+
+
+def file_address(identity: Identity) -> str:
+    """Return the internet address of the metadata file of an ArduPilot, or of the folder of all files."""
+    kind = _kind_of(identity)
+    files = "https://autotest.ardupilot.org/Parameters/"
+    return f"{files}{ARDUPILOT[kind][0]}/apm.pdef.xml" if kind in ARDUPILOT else files
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Replace a file atomically by one that only its owner can read; create the folder if needed.
+
+    Raises:
+        MetadataError: writing failed; an existing file is unchanged.
+    """
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        replace_file(str(path), content, new_mode=0o600)
+    except (OSError, FileError) as error:
+        reason = error.reason if isinstance(error, FileError) else f"cannot be written: {error.strerror}"
+        raise MetadataError(f"{path}: {reason}", source=str(path)) from error
+
+
+def _kind_of(identity: Identity) -> VehicleKind | None:
+    name = autopilot_name(identity.autopilot)
+    if name == "px4":
+        return "px4"
+    kinds = (kind for kind, (_, types) in ARDUPILOT.items() if identity.vehicle_type in types)
+    return next(kinds, None) if name == "ardupilot" else None
+
+
+def _kind_of_file(metadata: Metadata) -> VehicleKind | None:
+    """Return the only vehicle type that a file names; PX4's files are recognized by the types of
+    parameters."""
+    names = {_OLD_NAMES.get(info.group, info.group) for info in metadata.values()}
+    kinds = [kind for kind, (name, _) in ARDUPILOT.items() if name in names]
+    if not kinds and all(info.type is not None for info in metadata.values()):
+        return "px4"
+    return kinds[0] if len(kinds) == 1 else None
+
+
+def _fits(required_version: str | None, version: str | None) -> bool:
+    """Return whether a version is one of those that were given: 4.6.1 is one of 4.6."""
+    numbers = _numbers(required_version)
+    return not numbers or (version is not None and _numbers(version)[: len(numbers)] == numbers)
+
+
+def _numbers(version: str | None) -> tuple[int, ...]:
+    return () if version is None else tuple(map(int, version.split(".")))
