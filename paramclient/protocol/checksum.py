@@ -295,8 +295,10 @@ def _checksum_of(rows: Sequence[PackedParam], place: range | None = None) -> int
 
 def _rows(table: Table) -> list[PackedParam]:
     names = [table.names.get(index, "") for index in range(table.count or 0)]
-    if "" in names or len(set(names)) < len(names):
-        raise ChecksumUnavailable("the list of parameters has a gap, or a name twice")
+    if not table.params.keys() >= set(names) or len(set(names)) < len(names):
+        raise ChecksumUnavailable(
+            "the list of parameters has a gap, a name twice, or one that no file can contain"
+        )
     return [_row(table, name) for name in names]
 
 

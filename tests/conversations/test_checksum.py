@@ -361,3 +361,14 @@ async def test_a_watch_finds_a_lost_announcement_for_one_request(is_cached: bool
             assert all(node.plain.table.params[name].value == 3 for name in NAMES[300:700:20])
             assert not conversation.sent_of(ParamRequestList)
             tasks.cancel_scope.cancel()
+
+
+@virtual
+async def test_a_listed_name_that_no_file_can_contain_is_no_proof_and_no_error() -> None:
+    vehicle = ArduPilotVehicle()
+    async with converse(vehicle) as conversation:
+        node = await with_cached_table(conversation, vehicle.params)
+        conversation.hear(ParamValue("RC MAP", bytes(4), ParamType.REAL32, node.plain.table.count or 0, 0))
+        result = await fetch_all(node.plain)
+        assert result.source == "ftp"
+        assert "no file can contain" in result.notes[0]
