@@ -42,6 +42,8 @@ PX4_WITH_FILE: Final = 0x01120000
 """flight_sw_version of the first PX4 that serves the packed parameter file: 1.18."""
 VERSION_ATTEMPTS_MAX: Final = 12
 """Requests for AUTOPILOT_VERSION: cameras and radios often have none."""
+VERSION_COPIES: Final = 2
+"""Copies of each repeated request: without its answer, a cached table cannot be loaded, and is downloaded."""
 VERSION_ATTEMPTS_REFUSED: Final = 4
 """Requests after the first refusal, by both commands in turns: a refusal may concern only one of them."""
 _AUTOPILOTS: Final = {MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot", MAV_AUTOPILOT_PX4: "PX4"}
@@ -263,7 +265,12 @@ class Identification:
             while len(refused) < len(ways):
                 before = len(refused)
                 if await channel.exchange(
-                    request_of, inbox, accept, what="AUTOPILOT_VERSION", attempts=attempts
+                    request_of,
+                    inbox,
+                    accept,
+                    what="AUTOPILOT_VERSION",
+                    attempts=attempts,
+                    copies=lambda attempt: VERSION_COPIES if attempt else 1,
                 ):
                     return
                 if len(refused) == before:  # both refusals are of one command
