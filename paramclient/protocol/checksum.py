@@ -216,7 +216,8 @@ class _Proof:
         session, began = self._session, anyio.current_time()
         answers: dict[int, int] = {}
         errors: list[FileTransferError | NoReply] = []
-        attempts = attempts_unproven(session.channel) if session.serves_checksum is None else None
+        is_proven = session.serves_checksum or session.serves_file
+        attempts = None if is_proven else attempts_unproven(session.channel)
 
         async def request(number: int, place: range | None) -> None:
             query = "" if place is None else f"?start={place.start}&count={len(place)}"
