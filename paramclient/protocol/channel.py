@@ -406,9 +406,10 @@ class Channel:
                 if not self.inboxes[key]:
                     del self.inboxes[key]
 
-    def is_lost(self, now: float) -> bool:
-        """Return whether the component sends heartbeats, and was silent for longer than these explain."""
-        return now - self._presence.received_at >= self._presence.timeout
+    @property
+    def is_lost(self) -> bool:
+        """Whether the component sends heartbeats, and was silent for longer than these explain."""
+        return anyio.current_time() - self._presence.received_at >= self._presence.timeout
 
     def is_silent(self, began: float) -> bool:
         """Return whether a conversation ends that began then: the component is silent for too long.

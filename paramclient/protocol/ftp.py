@@ -345,7 +345,7 @@ async def _opened(
     finally:
         if session is not None or is_requested:
             is_closed = False
-            seconds = 0.0 if channel.is_lost(anyio.current_time()) else CLOSE_TIMEOUT
+            seconds = 0.0 if channel.is_lost else CLOSE_TIMEOUT
             with anyio.CancelScope(shield=True), anyio.move_on_after(seconds), suppress(LinkError):
                 await _close(channel, path, session, sequence)
                 is_closed = True

@@ -65,9 +65,8 @@ async def _read(session: Session, which: str | int) -> ReportedValue:
     channel = session.channel
     began, must_wait = anyio.current_time(), channel.window.value == 0
     async with channel.window:
-        now = anyio.current_time()
-        if must_wait and channel.is_lost(now):  # while others were read
-            raise NoReply(_what(session, which), attempts=0, waited=now - began)
+        if must_wait and channel.is_lost:  # while others were read
+            raise NoReply(_what(session, which), attempts=0, waited=anyio.current_time() - began)
         is_first = which not in session.reading
         session.reading.add(which)
         try:
@@ -75,12 +74,11 @@ async def _read(session: Session, which: str | int) -> ReportedValue:
                 try:
                     return await _ask(session, inbox, which, is_asked=not is_first)
                 except NoReply:
-                    if which == HASH_CHECK or channel.is_lost(anyio.current_time()):
+                    if which == HASH_CHECK or channel.is_lost:
                         raise
                     control = await _control_read(session, which)
                     if control is None:
-                        is_lost = channel.is_lost(anyio.current_time())
-                        answer = None if is_lost else await _read_list(session, inbox, which)
+                        answer = None if channel.is_lost else await _read_list(session, inbox, which)
                         if answer is None:
                             raise
                         _miss(session, which)
@@ -288,7 +286,7 @@ async def _read_list(session: Session, inbox: Inbox, which: str | int) -> Report
     if failures and not isinstance(failures[0], NoReply):
         raise failures[0]
     names = session.table.names
-    is_lost = bool(failures) or session.channel.is_lost(anyio.current_time())
+    is_lost = bool(failures) or session.channel.is_lost
     if is_lost or not names or max(names) - min(names) >= len(names):
         return None
     is_short = not session.table.is_complete
