@@ -109,12 +109,10 @@ async def _ask(
             raise refusal(session, which, message.error)
         return message if isinstance(message, dialect.value) else None
 
-    def attempts_max() -> int:
+    def attempts_max() -> int:  # of this moment: the loss is better known with each answer
         if channel.is_streaming:  # on a slow link, the answer is queued behind the list
             return ATTEMPTS_MAX
-        return (
-            attempts or channel.timing.attempts_max
-        )  # of this moment: loss is better known with each answer
+        return attempts or channel.timing.attempts_max
 
     wait = queue_time(session)
     if is_served is False:
