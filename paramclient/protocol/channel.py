@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from typing import Final, Protocol, TypeAlias, TypeVar
 
 import anyio
+import anyio.abc
 
 from paramclient.errors import LinkError, NoReply
 from paramclient.wire.messages import (
@@ -26,7 +27,7 @@ from paramclient.wire.messages import (
     ParamValue,
 )
 
-__all__ = ["PATIENCE_MIN", "Channel", "Gate", "Inbox", "Timing", "keys_of"]
+__all__ = ["PATIENCE_MIN", "Channel", "Gate", "Inbox", "Timing", "keys_of", "task_group"]
 
 T = TypeVar("T")
 
@@ -539,6 +540,16 @@ class Channel:
             if request is not None:
                 sent, attempt, timeout_min = request
                 scope.deadline = min(scope.deadline, sent + max(timing.timeout(attempt), timeout_min))
+
+
+@asynccontextmanager
+async def task_group() -> AsyncIterator[anyio.abc.TaskGroup]:
+    """Run the tasks of one conversation. The first of their errors is raised itself, and ends the others."""
+    try:
+        async with anyio.create_task_group() as tasks:
+            yield tasks
+    except ExceptionGroup as group:
+        raise group.exceptions[0] from None
 
 
 async def _accepted(inbox: Inbox, accept: Callable[[Message], T | None]) -> T:

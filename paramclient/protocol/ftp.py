@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import anyio
 
 from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoReply, UsageError
-from paramclient.protocol.channel import Channel, Inbox
+from paramclient.protocol.channel import Channel, Inbox, task_group
 from paramclient.wire.messages import FileTransfer, Message
 
 __all__ = [
@@ -511,15 +511,12 @@ class _FileReader:
                 wanted.append(pieces.reached)
             if not wanted:
                 return
-            try:
-                async with anyio.create_task_group() as tasks:
-                    self._reads = len(wanted)
-                    for at in wanted:
-                        await window.acquire()
-                        tasks.start_soon(self._read_block, at, window)
-                        await anyio.sleep(BLOCK_INTERVAL)
-            except ExceptionGroup as group:
-                raise group.exceptions[0] from None
+            async with task_group() as tasks:
+                self._reads = len(wanted)
+                for at in wanted:
+                    await window.acquire()
+                    tasks.start_soon(self._read_block, at, window)
+                    await anyio.sleep(BLOCK_INTERVAL)
 
     async def _read_block(self, offset: int, window: anyio.Semaphore) -> None:
         """Read one block, or find the end of the file there."""

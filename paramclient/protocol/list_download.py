@@ -8,7 +8,14 @@ from typing import Final
 import anyio
 
 from paramclient.errors import NoReply, ParamErrorCode
-from paramclient.protocol.channel import ATTEMPTS_MAX, LATE_GRACE, LATE_WAKE_UP, UNANSWERED_MAX, Inbox
+from paramclient.protocol.channel import (
+    ATTEMPTS_MAX,
+    LATE_GRACE,
+    LATE_WAKE_UP,
+    UNANSWERED_MAX,
+    Inbox,
+    task_group,
+)
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK, PARAMETERS_MAX, Message, ParamError
@@ -192,23 +199,20 @@ class _Download:
         Where no value arrives for seconds, and a window of reads is given up, the count is false: the
         component has none of the others.
         """
-        try:
-            async with anyio.create_task_group() as tasks:
-                while not self._is_read() and not self._is_silent():
-                    self.channel.is_streaming = not self._is_over()
-                    for index in self._gaps():
-                        if len(self._reading) >= self.channel.window_size:
-                            break
-                        if index not in self._reading and not self._is_given_up(index):
-                            self._reading.add(index)
-                            self._tried.setdefault(index, 0)
-                            self.result.lost += 1
-                            tasks.start_soon(self._read, index)
-                    await self.channel.gate.wait()
-                    await self._take_for(GAPS_INTERVAL)
-                tasks.cancel_scope.cancel()
-        except ExceptionGroup as group:
-            raise group.exceptions[0] from None
+        async with task_group() as tasks:
+            while not self._is_read() and not self._is_silent():
+                self.channel.is_streaming = not self._is_over()
+                for index in self._gaps():
+                    if len(self._reading) >= self.channel.window_size:
+                        break
+                    if index not in self._reading and not self._is_given_up(index):
+                        self._reading.add(index)
+                        self._tried.setdefault(index, 0)
+                        self.result.lost += 1
+                        tasks.start_soon(self._read, index)
+                await self.channel.gate.wait()
+                await self._take_for(GAPS_INTERVAL)
+            tasks.cancel_scope.cancel()
 
     def _is_read(self) -> bool:
         """Return whether the list has ended, and nothing more of it can be read."""

@@ -35,7 +35,7 @@ from paramclient.model.values import (
     format_value,
     type_name,
 )
-from paramclient.protocol.channel import Inbox
+from paramclient.protocol.channel import Inbox, task_group
 from paramclient.protocol.reads import queue_time, read, read_param, refusal
 from paramclient.protocol.session import ReplacedValue, Session
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
@@ -213,12 +213,9 @@ async def write_many(
             by_name: defaultdict[str, list[int]] = defaultdict(list)
             for place in places[:together]:
                 by_name[session.spelled(pairs[place][0])].append(place)
-            try:
-                async with anyio.create_task_group() as tasks:
-                    for same_name in by_name.values():
-                        tasks.start_soon(write_in_order, same_name)
-            except ExceptionGroup as group:  # of `done`
-                raise group.exceptions[0] from None
+            async with task_group() as tasks:  # its errors are those of `done`
+                for same_name in by_name.values():
+                    tasks.start_soon(write_in_order, same_name)
             del places[:together]
         for place in places:  # behind a failure
             outcomes[place] = replace(outcomes[place], error=failures[0])
