@@ -99,8 +99,11 @@ class Identification:
         capabilities: of AUTOPILOT_VERSION; None before it.
         encoding, encoding_reason: the parameter encoding and its evidence.
         is_settled: whether `identity` is as complete as it gets: the version was received, or never will be.
-        is_confirmed: whether a vehicle with a hardware id has reported it since it was lost, has rebooted or
-            its link was interrupted; until then, values may be of another vehicle.
+        is_confirmed: whether the vehicle has said who it is since it was lost, has rebooted or its link was
+            interrupted; until then, values may be of another vehicle. One without a hardware id never says.
+        vehicles: counts the vehicles of which it is certain that they are not the one before. One that was
+            not known before it was lost counts as another one.
+        former: the vehicle before; without a hardware id if that was not known.
     """
 
     def __init__(
@@ -113,6 +116,8 @@ class Identification:
         self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
         self.is_settled = False
         self.is_confirmed = True
+        self.vehicles = 0
+        self.former = self.identity
         self.chosen = chosen
         self._listens_only = listens_only
         self._has_no_heartbeat = False
@@ -210,29 +215,23 @@ class Identification:
             capabilities=message.capabilities,
         )
         self.capabilities = message.capabilities
+        is_another = before.uid is not None and before.key != self.identity.key
+        if is_another or not (self.is_confirmed or before.uid):
+            self.vehicles += 1
+            self.former = before
         self.is_confirmed = True
         self.settle()
-        return self.is_another(before)
-
-    def is_another(self, before: Identity) -> bool:
-        """Return whether the vehicle is another one than it was."""
-        return before.uid is not None and before.key != self.identity.key
+        return is_another
 
     def settle(self) -> None:
         """Take the identity as it is: no more of it will be received."""
         self.is_settled = True
+        self.is_confirmed = self.is_confirmed or self.identity.uid is None
         self._derive()
 
     def doubt(self) -> None:
         """Take note that another vehicle may use the address."""
-        self.is_confirmed = self.identity.uid is None
-
-    def forget(self) -> None:
-        """Forget everything: another vehicle uses the address."""
-        self.identity = Identity(self.identity.system, self.identity.link)
-        self.is_settled = False
-        self.autopilot = self.vehicle_type = self.capabilities = None
-        self._derive()
+        self.is_confirmed = self.is_settled and self.identity.uid is None
 
     async def request(self, channel: Channel) -> None:
         """Request AUTOPILOT_VERSION until it is received, or the component has refused or left it unanswered.

@@ -11,7 +11,6 @@ from typing import Any, Final, Generic, TypeVar
 import anyio
 
 from paramclient.errors import AnotherVehicle, NoReply
-from paramclient.model.identity import Identity
 from paramclient.model.values import Encoding, Param, ParamType
 from paramclient.protocol.channel import Channel, Gate
 from paramclient.protocol.dialect import Dialect, Digest, ReportedValue
@@ -227,25 +226,31 @@ class Session:
         is_open = self.identification.is_ardupilot and name.isascii() and name not in self.table.params
         return name.upper() if is_open else name
 
-    async def confirm(self, vehicle: Identity) -> None:
-        """Wait until the link is open, and until it is certain that this vehicle still uses the address.
+    async def confirm(self, vehicles: int) -> None:
+        """Wait until the link is open, and until it is certain that the same vehicle still uses the address.
+
+        Args:
+            vehicles: `Identification.vehicles` at the begin.
 
         Raises:
             AnotherVehicle: another one does.
-            NoReply: the vehicle was lost, has rebooted or its link was interrupted, and it does not say again
-                which one it is.
+            NoReply: the vehicle was lost, has rebooted or its link was interrupted, and did not say before
+                or does not say again which one it is.
             LinkError: the link has failed.
         """
-        began, (system, component) = anyio.current_time(), self.channel.target
+        began, identification = anyio.current_time(), self.identification
         await self.channel.gate.wait()
-        if not self.identification.is_confirmed:
+        if not identification.is_confirmed:
             await self._identified()
             await self.channel.gate.wait()
-            if not self.identification.is_confirmed:
-                waited = anyio.current_time() - began
-                raise NoReply(f"the identity of {system}/{component}", attempts=0, waited=waited)
-        if self.identification.is_another(vehicle):
-            raise AnotherVehicle(system, component, str(vehicle), str(self.identification.identity))
+        is_other = identification.vehicles != vehicles
+        if is_other and identification.former.uid is not None:
+            who = str(identification.former), str(identification.identity)
+            raise AnotherVehicle(*self.channel.target, *who)
+        if is_other or not identification.is_confirmed:
+            system, component = self.channel.target
+            waited = anyio.current_time() - began
+            raise NoReply(f"the identity of {system}/{component}", attempts=0, waited=waited)
 
     def lock(self, name: str) -> anyio.Lock:
         """Return the lock of the writes to one name: they run one after the other."""

@@ -25,7 +25,7 @@ from paramclient.errors import (
     ValueNotApplied,
     ValueUnsupported,
 )
-from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite
+from paramclient.model.identity import autopilot_name, reason_against_non_finite
 from paramclient.model.names import is_group_switch
 from paramclient.model.values import (
     Param,
@@ -55,6 +55,8 @@ EVIDENCE_READS: Final = 8
 """Indices that are read for evidence of the encoding: few components begin with more zeros and floats."""
 EXT_PROGRESS_TIMEOUT: Final = 60.0
 """Seconds for a component that reports progress to finish: a camera formats a card meanwhile."""
+EXT_PROGRESS_READ: Final = 2.0
+"""Seconds after which a read shows the value meanwhile: the final acknowledgement may be lost."""
 BATCH_SIZE: Final = 20
 """Sets in flight: bursts of 20 to a PX4 and 30 to an ArduPilot were all acknowledged (measured)."""
 LATE_ANSWER_TIME: Final = 0.3
@@ -74,7 +76,7 @@ async def write(
     author: str = "us",
     turn: AbstractAsyncContextManager[object] | None = None,
     sending: Callable[[], None] = lambda: None,
-    vehicle: Identity | None = None,
+    vehicles: int | None = None,
 ) -> SetResult:
     """Set one parameter, and prove its value by what the component reports.
 
@@ -93,7 +95,7 @@ async def write(
         author: of the change, for the history.
         turn: entered while requests are sent, but not while the value is watched.
         sending: called before each set is sent.
-        vehicle: to which it is sent; None for the present one.
+        vehicles: `Identification.vehicles` of the vehicle to which it is sent; None for the present one.
 
     Raises:
         UsageError: the value does not fit the type, or must not be sent.
@@ -105,7 +107,7 @@ async def write(
         NoReply: it did not answer. The value may have been set.
         LinkError: the link is closed for good.
     """
-    vehicle = vehicle or session.identification.identity
+    vehicles = session.identification.vehicles if vehicles is None else vehicles
     _check_finite(session, name, value, force=force)
     if session.spelled(name) != name:
         name = (await read(session, name)).param_id
@@ -115,7 +117,7 @@ async def write(
             async with turn or nullcontext():
                 before = await _read_writable(session, name)
                 try:
-                    result = await _Write(session, vehicle, before, value, sending).run()
+                    result = await _Write(session, vehicles, before, value, sending).run()
                 except (NoReply, LinkError, anyio.get_cancelled_exc_class()):
                     session.foreign_set(name, author, anyio.current_time())  # it may be acknowledged yet
                     raise
@@ -127,7 +129,7 @@ async def write(
                 with session.channel.gate.until_closed():
                     await anyio.sleep(settle)
                 now = await read_param(session, name)
-                await session.confirm(vehicle)
+                await session.confirm(vehicles)
                 if not now.same_value(result.param):
                     result = replace(result, status="adjusted", param=now)
             return result
@@ -160,7 +162,7 @@ async def write_many(
         timeout: seconds; None for no limit.
     """
     began, system, component = anyio.current_time(), *session.channel.target
-    vehicle = session.identification.identity
+    vehicles = session.identification.vehicles
     done = progress or (lambda outcome: None)
     outcomes = [SetOutcome(name, value, SetStatus.NOT_TRIED) for name, value in pairs]
     limiter = anyio.CapacityLimiter(BATCH_SIZE)
@@ -189,7 +191,7 @@ async def write_many(
                 author=author,
                 turn=turn(),
                 sending=sending,
-                vehicle=vehicle,
+                vehicles=vehicles,
             )
         except (NoReply, LinkError, AnotherVehicle) as error:
             failures.append(error)
@@ -244,7 +246,7 @@ class _Write:
     def __init__(
         self,
         session: Session,
-        vehicle: Identity,
+        vehicles: int,
         before: Param,
         value: WireValue,
         sending: Callable[[], None],
@@ -256,7 +258,7 @@ class _Write:
         self.value = value
         self.attempts = 0
         self._began = anyio.current_time()
-        self._vehicle = vehicle
+        self._vehicles = vehicles
         self._sending = sending
         self._raw = b""
         self._has_other_value = False
@@ -306,15 +308,23 @@ class _Write:
                 attempts=lambda: 0 if self._has_other_value else SILENT_SETS_MAX,
                 ready=self._confirm,
             )
+        until = anyio.current_time() + EXT_PROGRESS_TIMEOUT
         while isinstance(answer, ParamExtAck) and answer.param_result == ExtAckResult.IN_PROGRESS:
-            until = anyio.current_time() + EXT_PROGRESS_TIMEOUT
-            answer = await channel.wait_for(inbox, self._accept, until, 0)
+            now = anyio.current_time()
+            if now >= until or channel.is_lost:
+                break
+            answer = await channel.wait_for(inbox, self._accept, now, 0, EXT_PROGRESS_READ) or answer
+            await self._confirm()
+            with suppress(NoReply):  # the final acknowledgement may be lost
+                shown = await self._read(inbox)
+                if self._is_wanted(shown):
+                    return shown
         if isinstance(answer, Param) and answer.type_number == self.before.type_number:
             return answer
-        if answer is not None:  # only a read shows a changed type, and the value of an extended parameter
-            return await self._read(inbox)
         if not channel.is_silent(self._began):
-            with suppress(NoReply):
+            with suppress(
+                NoReply
+            ):  # only a read shows a changed type, and the value of an extended parameter
                 return await self._read(inbox)
         raise NoReply(what, attempts=self.attempts, waited=anyio.current_time() - self._began)
 
@@ -333,7 +343,7 @@ class _Write:
         return self._result(answer)
 
     async def _confirm(self) -> None:
-        await self.session.confirm(self._vehicle)
+        await self.session.confirm(self._vehicles)
 
     def _request(self, attempt: int) -> Message:
         """Return the set, and count it as sent."""

@@ -109,6 +109,12 @@ async def test_progress_extends_the_wait_and_a_lost_result_is_requested_again(se
         endpoint.down = lose_result
         result = await write(session, "CAM_WBMODE", 2)
         assert (result.actual, lost[0], result.attempts) == (2, 1, 2)
+        lost.clear()
+        lost.append(0)
+        began = anyio.current_time()
+        result = await write(session, "CAM_MODE", 1)
+        assert (result.actual, lost[0], result.attempts) == (1, 1, 1)  # a read has shown the value
+        assert anyio.current_time() - began <= seconds + 2.5
 
 
 @virtual_on_both

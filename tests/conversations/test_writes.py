@@ -436,16 +436,27 @@ async def test_an_acknowledgement_to_another_station_changes_no_type() -> None:
 
 
 @virtual_on_both
-@pytest.mark.parametrize("doubt", ["its clock", "an interrupted link"])
 @pytest.mark.parametrize("is_same", [False, True], ids=["another", "the same"])
+@pytest.mark.parametrize(
+    ("doubt", "said"),
+    [
+        ("its clock", "before"),
+        ("an interrupted link", "before"),
+        ("an interrupted link", "meanwhile"),
+        ("an interrupted link", "never"),
+    ],
+)
 async def test_no_set_is_sent_to_another_vehicle_and_a_rebooted_one_gets_the_others(
-    doubt: str, is_same: bool
+    doubt: str, is_same: bool, said: str
 ) -> None:
     first, other = PX4Vehicle(uid=1), PX4Vehicle(uid=2)
     async with converse(place := Tap(Air.symmetric([first], delay=0.05))) as conversation:
+        if said == "never":
+            place.down = lambda message: not isinstance(message, AutopilotVersion)
         session = (await conversation.node()).plain
-        await fetch_all(session)
-        await anyio.sleep(30.0)
+        if said == "before":
+            await fetch_all(session)
+            await anyio.sleep(30.0)
         floats = [each.name for each in first.listed if each.type is ParamType.REAL32]
         names = [name for name in floats if not name.startswith(("MPC", "LNDMC"))][:150]
         results: list[SetManyResult] = []
@@ -468,17 +479,17 @@ async def test_no_set_is_sent_to_another_vehicle_and_a_rebooted_one_gets_the_oth
             if doubt == "an interrupted link":
                 conversation.station.resume(anyio.current_time())
         (result,) = results
-        if is_same:
+        if is_same and said != "never":
             assert {each.status for each in result.outcomes} == {SetStatus.ACCEPTED}
             assert all(first.param(name).value == 0.125 for name in names)
             return
         assert not other.requests["PARAM_SET"]
-        assert isinstance(result.error, AnotherVehicle)
+        assert isinstance(result.error, NoReply if said == "never" else AnotherVehicle)
         assert result.counts[SetStatus.ACCEPTED] + result.counts[SetStatus.UNKNOWN] <= 80
         assert result.counts[SetStatus.NOT_TRIED] >= 70
         assert all(each.is_set or each.error is not None for each in result.outcomes)
         assert (await write(session, names[-1], 0.5)).status == "accepted"
-        assert other.param(names[-1]).value == 0.5
+        assert (first if is_same else other).param(names[-1]).value == 0.5
 
 
 @virtual
