@@ -28,7 +28,7 @@ from paramclient.protocol import station as station_module
 from paramclient.protocol import table as table_module
 from paramclient.protocol.commands import reboot, request_message
 from paramclient.protocol.fetch import FetchResult, Policy, fetch_all
-from paramclient.protocol.ftp import checksum, list_directory, read_file
+from paramclient.protocol.ftp import checksum, read_file
 from paramclient.protocol.node import Node
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
@@ -424,13 +424,11 @@ class _Session:
             self.start(partial(request_message, node.channel, messages.ComponentMetadata))
 
     def file(self) -> None:
-        node, what = self.node(), self.draw.number() % 4
+        node, what = self.node(), self.draw.number() % 3
         if node is None:
             return
         if what < 2:
             self.start(partial(read_file, node.channel, "@PARAM/param.pck", size_max=500))
-        elif what == 2:
-            self.start(partial(list_directory, node.channel, "/fs"))
         else:
             self.start(partial(checksum, node.channel, "/fs/a"))
 

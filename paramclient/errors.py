@@ -287,7 +287,7 @@ class VehicleError(ParamClientError):
     """
 
     def __init__(
-        self, message: str, *, system: int, component: int, name: str | None = None, index: int | None = None
+        self, message: str, system: int, component: int, *, name: str | None = None, index: int | None = None
     ) -> None:
         super().__init__(message)
         self.system = system
@@ -307,14 +307,14 @@ class UnknownParameter(VehicleError):
     def __init__(
         self,
         message: str,
-        *,
         system: int,
         component: int,
+        *,
         name: str | None = None,
         index: int | None = None,
         nearest: Sequence[str] = (),
     ) -> None:
-        super().__init__(message, system=system, component=component, name=name, index=index)
+        super().__init__(message, system, component, name=name, index=index)
         self.nearest = tuple(nearest)
 
 
@@ -330,14 +330,14 @@ class Refused(VehicleError):
     def __init__(
         self,
         message: str,
-        *,
         system: int,
         component: int,
+        *,
         code: int,
         name: str | None = None,
         index: int | None = None,
     ) -> None:
-        super().__init__(message, system=system, component=component, name=name, index=index)
+        super().__init__(message, system, component, name=name, index=index)
         self.code = code
         self.reason = ParamErrorCode.name_of(code)
 
@@ -354,7 +354,7 @@ class CommandRefused(Refused):
     def __init__(self, system: int, component: int, command: int, code: int) -> None:
         reason = CommandResult.name_of(code)
         message = f"{system}/{component} refused command MAV_CMD {command}: {reason}"
-        super().__init__(message, system=system, component=component, code=code)
+        super().__init__(message, system, component, code=code)
         self.command = command
         self.reason = reason
 
@@ -367,8 +367,8 @@ class ExtSetRefused(Refused):
         reason: the code in words.
     """
 
-    def __init__(self, message: str, *, system: int, component: int, code: int, name: str) -> None:
-        super().__init__(message, system=system, component=component, code=code, name=name)
+    def __init__(self, message: str, system: int, component: int, *, code: int, name: str) -> None:
+        super().__init__(message, system, component, code=code, name=name)
         self.reason = ExtAckResult.name_of(code)
 
 
@@ -398,14 +398,14 @@ class ValueNotApplied(VehicleError):
     def __init__(
         self,
         message: str,
-        *,
         system: int,
         component: int,
+        *,
         name: str,
         requested: float | int | str | bytes,
         actual: float | int | str | bytes,
     ) -> None:
-        super().__init__(message, system=system, component=component, name=name)
+        super().__init__(message, system, component, name=name)
         self.requested = requested
         self.actual = actual
 
@@ -425,9 +425,9 @@ class FileTransferError(VehicleError):
     """
 
     def __init__(
-        self, message: str, *, system: int, component: int, path: str, code: int, errno: int = 0
+        self, message: str, system: int, component: int, *, path: str, code: int, errno: int = 0
     ) -> None:
-        super().__init__(message, system=system, component=component)
+        super().__init__(message, system, component)
         self.path = path
         self.code = code
         self.errno = errno
@@ -450,7 +450,7 @@ class AnotherVehicle(VehicleError):
 
     def __init__(self, system: int, component: int, expected: str, found: str) -> None:
         message = f"another vehicle answers as {system}/{component}: expected {expected}, found {found}"
-        super().__init__(message, system=system, component=component)
+        super().__init__(message, system, component)
         self.expected = expected
         self.found = found
 

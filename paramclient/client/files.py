@@ -1,4 +1,4 @@
-"""MAVFTP calls: read and list files of a component."""
+"""MAVFTP calls: read files of a component, and their checksums."""
 
 from __future__ import annotations
 
@@ -51,15 +51,6 @@ class Ftp:
         """
         with self._channel(path, timeout) as channel:
             return await ftp.read_file(channel, path, size_max=size_max, progress=progress)
-
-    async def list(self, path: str, *, timeout: float | None = None) -> list[ftp.DirectoryEntry]:
-        """Return the entries of a directory.
-
-        Raises:
-            UsageError, FileTransferError, NoReply, LinkError: as from `read`.
-        """
-        with self._channel(path, timeout) as channel:
-            return await ftp.list_directory(channel, path)
 
     async def checksum(self, path: str, *, timeout: float | None = None) -> int:
         """Return the CRC-32 of a file, computed by the component; see `crc32_px4`.

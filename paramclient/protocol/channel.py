@@ -16,16 +16,8 @@ import anyio
 import anyio.abc
 
 from paramclient.errors import LinkError, NoReply
-from paramclient.wire.messages import (
-    NO_INDEX,
-    CommandAck,
-    FileTransfer,
-    Message,
-    ParamError,
-    ParamExtAck,
-    ParamExtValue,
-    ParamValue,
-)
+from paramclient.wire import messages
+from paramclient.wire.messages import Message
 
 __all__ = ["PATIENCE_MIN", "Channel", "Gate", "Inbox", "Timing", "keys_of", "task_group"]
 
@@ -292,19 +284,19 @@ class Timing:
 def keys_of(message: Message) -> tuple[Key, ...]:
     """Return the keys under which conversations wait for a message."""
     match message:
-        case ParamValue() | ParamExtValue():
+        case messages.ParamValue() | messages.ParamExtValue():
             value: Key = type(message)
-            if message.param_index == NO_INDEX:
+            if message.param_index == messages.NO_INDEX:
                 return (value, message.param_id), value
             return (value, message.param_id), (value, message.param_index), value
-        case ParamError(param_id=name, param_index=index):
-            return (ParamValue, name if index == -1 or name else index), (ParamValue, index)
-        case ParamExtAck(param_id=name):
-            return ((ParamExtAck, name),)
-        case CommandAck(command=command):
-            return ((CommandAck, command),)
-        case FileTransfer(payload=payload):
-            return (FileTransfer, int.from_bytes(payload[:2], "little")), FileTransfer
+        case messages.ParamError(param_id=name, param_index=index):
+            return (messages.ParamValue, name if index == -1 or name else index), (messages.ParamValue, index)
+        case messages.ParamExtAck(param_id=name):
+            return ((messages.ParamExtAck, name),)
+        case messages.CommandAck(command=command):
+            return ((messages.CommandAck, command),)
+        case messages.FileTransfer(payload=payload):
+            return (messages.FileTransfer, int.from_bytes(payload[:2], "little")), messages.FileTransfer
         case _:
             return (type(message),)
 
@@ -353,6 +345,9 @@ class Channel:
         self._waits: dict[anyio.CancelScope, tuple[float, int, float] | None] = {}
         self.window = anyio.Semaphore(WINDOW)
         self.window_size = WINDOW
+
+    def __str__(self) -> str:
+        return f"{self.system}/{self.component}"
 
     def widen(self, requests: int) -> None:
         """Enlarge the window to this many requests."""

@@ -9,15 +9,8 @@ import anyio
 from paramclient.errors import CommandRefused, CommandResult, NoReply, VehicleArmed
 from paramclient.protocol.channel import Channel
 from paramclient.protocol.node import Node
-from paramclient.wire.messages import (
-    MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN,
-    MAV_CMD_REQUEST_MESSAGE,
-    MAV_MODE_FLAG_SAFETY_ARMED,
-    CommandAck,
-    CommandLong,
-    Message,
-    message_id,
-)
+from paramclient.wire import messages
+from paramclient.wire.messages import Message, message_id
 
 __all__ = ["reboot", "request_message", "send_command"]
 
@@ -32,7 +25,7 @@ SAVING_TIME = 2.5
 """Seconds from a write until a PX4 has saved it: 0.3 s after it, and at most every 2 s (measured)."""
 
 
-async def send_command(channel: Channel, command: CommandLong) -> None:
+async def send_command(channel: Channel, command: messages.CommandLong) -> None:
     """Send a command until it is acknowledged.
 
     Raises:
@@ -42,15 +35,15 @@ async def send_command(channel: Channel, command: CommandLong) -> None:
     """
 
     def accept(message: Message) -> bool | None:
-        assert isinstance(message, CommandAck)
+        assert isinstance(message, messages.CommandAck)
         if message.result == CommandResult.IN_PROGRESS:
             return None
         if message.result != CommandResult.ACCEPTED:
             raise CommandRefused(*channel.target, command.command, message.result)
         return True
 
-    what = f"the acknowledgement of command {command.command} by {channel.system}/{channel.component}"
-    with channel.inbox((CommandAck, command.command)) as inbox:
+    what = f"the acknowledgement of command {command.command} by {channel}"
+    with channel.inbox((messages.CommandAck, command.command)) as inbox:
         await channel.exchange(command, inbox, accept, what=what)
 
 
@@ -62,19 +55,19 @@ async def request_message(channel: Channel, kind: type[M]) -> M | None:
         LinkError: the link is closed for good.
     """
     number = float(message_id(kind))  # type: ignore[arg-type]  # one of the message classes
-    request = CommandLong(*channel.target, MAV_CMD_REQUEST_MESSAGE, number)
+    request = messages.CommandLong(*channel.target, messages.MAV_CMD_REQUEST_MESSAGE, number)
 
     def accept(message: Message) -> M | bool | None:
         if isinstance(message, kind):
             return message
-        is_refusal = isinstance(message, CommandAck) and message.result not in (
+        is_refusal = isinstance(message, messages.CommandAck) and message.result not in (
             CommandResult.ACCEPTED,
             CommandResult.IN_PROGRESS,
         )
         return False if is_refusal else None
 
-    what = f"message {number:.0f} of {channel.system}/{channel.component}"
-    with channel.inbox(kind, (CommandAck, MAV_CMD_REQUEST_MESSAGE)) as inbox:
+    what = f"message {number:.0f} of {channel}"
+    with channel.inbox(kind, (messages.CommandAck, messages.MAV_CMD_REQUEST_MESSAGE)) as inbox:
         answer = await channel.exchange(request, inbox, accept, what=what)
     return answer if isinstance(answer, kind) else None
 
@@ -97,16 +90,12 @@ async def reboot(node: Node, *, returns: bool = True) -> None:
         LinkError: the link is closed for good.
     """
     presence, channel = node.presence, node.channel
-    if (presence.base_mode or 0) & MAV_MODE_FLAG_SAFETY_ARMED:
-        raise VehicleArmed(
-            f"{node.system}/{node.component} is armed: it was not rebooted",
-            system=node.system,
-            component=node.component,
-        )
+    if (presence.base_mode or 0) & messages.MAV_MODE_FLAG_SAFETY_ARMED:
+        raise VehicleArmed(f"{channel} is armed: it was not rebooted", *channel.target)
     generation = node.generation
     with channel.gate.until_closed():
         await anyio.sleep_until(node.plain.written_at + SAVING_TIME)
-    command = CommandLong(*channel.target, MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1.0)
+    command = messages.CommandLong(*channel.target, messages.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1.0)
     try:
         await send_command(channel, command)
     except NoReply:

@@ -16,21 +16,12 @@ from paramclient.model.values import (
     from_bits,
     known_type,
 )
-from paramclient.wire.messages import (
-    Message,
-    ParamExtRequestList,
-    ParamExtRequestRead,
-    ParamExtSet,
-    ParamExtValue,
-    ParamRequestList,
-    ParamRequestRead,
-    ParamSet,
-    ParamValue,
-)
+from paramclient.wire import messages
+from paramclient.wire.messages import Message
 
 __all__ = ["EXTENDED", "PLAIN", "Dialect", "Digest", "ReportedValue"]
 
-ReportedValue: TypeAlias = ParamValue | ParamExtValue
+ReportedValue: TypeAlias = messages.ParamValue | messages.ParamExtValue
 """The message with a value, in either protocol."""
 
 
@@ -92,18 +83,18 @@ class Dialect(ABC):
 
 class _Plain(Dialect):
     name = "plain"
-    value = ParamValue
+    value = messages.ParamValue
     has_ack = False
 
     def request_list(self, target: tuple[int, int]) -> Message:
-        return ParamRequestList(*target)
+        return messages.ParamRequestList(*target)
 
     def request_read(self, target: tuple[int, int], which: str | int) -> Message:
         name, index = (which, -1) if isinstance(which, str) else ("", which)
-        return ParamRequestRead(*target, name, index)
+        return messages.ParamRequestRead(*target, name, index)
 
     def request_set(self, target: tuple[int, int], name: str, raw: bytes, number: int) -> Message:
-        return ParamSet(*target, name, raw, number)
+        return messages.ParamSet(*target, name, raw, number)
 
     def encode(self, value: WireValue, number: int, encoding: Encoding) -> bytes:
         return encode_value(value, number, encoding)
@@ -116,18 +107,18 @@ class _Plain(Dialect):
 
 class _Extended(Dialect):
     name = "extended"
-    value = ParamExtValue
+    value = messages.ParamExtValue
     has_ack = True
 
     def request_list(self, target: tuple[int, int]) -> Message:
-        return ParamExtRequestList(*target)
+        return messages.ParamExtRequestList(*target)
 
     def request_read(self, target: tuple[int, int], which: str | int) -> Message:
         name, index = (which, -1) if isinstance(which, str) else ("", which)
-        return ParamExtRequestRead(*target, name, index)
+        return messages.ParamExtRequestRead(*target, name, index)
 
     def request_set(self, target: tuple[int, int], name: str, raw: bytes, number: int) -> Message:
-        return ParamExtSet(*target, name, raw, number)
+        return messages.ParamExtSet(*target, name, raw, number)
 
     def encode(self, value: WireValue, number: int, encoding: Encoding) -> bytes:
         return encode_ext_value(value, number)

@@ -212,9 +212,7 @@ class _Fetch:
         channel = self.session.channel
         if channel.is_silent(self._began):
             waited = anyio.current_time() - self._began
-            raise NoReply(
-                f"the parameters of {channel.system}/{channel.component}", attempts=0, waited=waited
-            )
+            raise NoReply(f"the parameters of {channel}", attempts=0, waited=waited)
         self._is_silent = answer.is_silent
         digest = answer.digest
         source = await self._download()

@@ -9,6 +9,7 @@ import anyio
 
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError, VehicleError
 from paramclient.protocol.ftp import BUSY, FTP_SILENT_TIME, FileCutOff, attempts_unproven, is_free, read_file
+from paramclient.protocol.identity import Identification
 from paramclient.protocol.param_pck import PACK_SIZE_MAX, PARAM_FILE, Pack, decode, decode_prefix
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
@@ -51,48 +52,50 @@ async def download_file(session: Session) -> int:
         raise FileUnavailable("the round trip is too long to find out whether MAVFTP is served")
     if not await is_free(session.channel):
         raise FileUnavailable(BUSY)
-    identification = session.identification
-    query = WITH_DEFAULTS
+    query, reason = WITH_DEFAULTS, ""
     attempts = 0
-    reason = ""
     while attempts < DOWNLOADS_MAX:
         requested_at = anyio.current_time()
         try:
             pack = decode(await _read(session, PARAM_FILE + query))
         except FileTransferError as error:
             is_missing = error.code == FileErrorCode.FILE_NOT_FOUND
-            adds_defaults = identification.is_ardupilot and (
-                identification.identity.firmware >= ARDUPILOT_WITH_DEFAULTS
-            )
-            if is_missing and query and not adds_defaults:
+            if is_missing and query and not _adds_defaults(session.identification):
                 query = ""
                 continue
             if is_missing or error.code == FileErrorCode.UNKNOWN_COMMAND:
                 session.serves_file = False
             raise FileUnavailable(f"the parameter file was refused: {error.reason}") from None
         except NoReply as error:
+            is_silent = not isinstance(error, FileCutOff)
             if isinstance(error, FileCutOff):
                 _store_beginning(session, error.prefix, requested_at)
-            is_silent = not isinstance(error, FileCutOff)
             session.ftp_unanswered += error.attempts * is_silent
             raise FileUnavailable("MAVFTP did not answer", is_silent=is_silent) from None
         except PackError as error:
-            reason = f"the parameter file is not valid: {error}"
-            attempts += 1
-            continue
-        if not pack.entries or len(pack.entries) != pack.total:
-            reason = f"the parameter file has {len(pack.entries)} of {pack.total} parameters"
-            attempts += 1
-            continue
-        known = session.table.count
-        if known not in (None, pack.total) and await _count(session) != pack.total:
-            reason = f"the parameter file has {pack.total} parameters, and the cached table {known}"
-            attempts += 1
-            continue
-        session.serves_file, session.ftp_unanswered = True, 0
-        _store(session, pack, requested_at)
-        return pack.total
-    raise FileUnavailable(reason)
+            reason = f"is not valid: {error}"
+        else:
+            reason = await _contradiction(session, pack)
+        if not reason:
+            session.serves_file, session.ftp_unanswered = True, 0
+            _store(session, pack, requested_at)
+            return pack.total
+        attempts += 1
+    raise FileUnavailable(f"the parameter file {reason}")
+
+
+def _adds_defaults(identification: Identification) -> bool:
+    return identification.is_ardupilot and identification.identity.firmware >= ARDUPILOT_WITH_DEFAULTS
+
+
+async def _contradiction(session: Session, pack: Pack) -> str:
+    """Return why a file cannot be the vehicle's whole table, or ""."""
+    if not pack.entries or len(pack.entries) != pack.total:
+        return f"has {len(pack.entries)} of {pack.total} parameters"
+    known = session.table.count
+    if known not in (None, pack.total) and await _count(session) != pack.total:
+        return f"has {pack.total} parameters, and the cached table {known}"
+    return ""
 
 
 async def _count(session: Session) -> int | None:

@@ -24,13 +24,11 @@ __all__ = [
     "BUSY",
     "SILENT_LOST",
     "FTP_SILENT_TIME",
-    "DirectoryEntry",
     "Opcode",
     "Packet",
     "attempts_unproven",
     "checksum",
     "is_free",
-    "list_directory",
     "read_file",
 ]
 
@@ -84,18 +82,6 @@ class Opcode(IntEnum):
     BURST_READ_FILE = 15
     ACK = 128
     NAK = 129
-
-
-class DirectoryEntry(NamedTuple):
-    """One entry of a directory; `size` is None for a directory."""
-
-    name: str
-    size: int | None
-
-    @property
-    def is_directory(self) -> bool:
-        """Whether the entry is a directory."""
-        return self.size is None
 
 
 _HEADER = struct.Struct("<HBBBBBxI")
@@ -228,40 +214,6 @@ async def checksum(channel: Channel, path: str, *, attempts: Callable[[], int] |
     return int.from_bytes(answer.data[:4], "little")
 
 
-async def list_directory(channel: Channel, path: str) -> list[DirectoryEntry]:
-    """Return the entries of a directory.
-
-    Raises:
-        FileTransferError: the component refused it.
-        NoReply: it does not answer.
-        LinkError: the link has failed.
-    """
-    entries: list[DirectoryEntry] = []
-    passed = 0
-    async with channel.ftp:
-        while True:
-            try:
-                answer = await _request(channel, Opcode.LIST_DIRECTORY, path, path_bytes(path), offset=passed)
-            except FileTransferError as error:
-                if error.code == FileErrorCode.EOF:
-                    return entries
-                raise
-            found = [each.decode("utf-8", "replace") for each in answer.data.split(b"\0") if each]
-            if not found:
-                return entries
-            passed += len(found)
-            entries += [entry for text in found if (entry := _entry(text)) is not None]
-
-
-def _entry(text: str) -> DirectoryEntry | None:
-    """Return the entry in `F<name>\t<size>` or `D<name>`; None for one to skip."""
-    kind, rest = text[:1], text[1:]
-    if kind == "D":
-        return DirectoryEntry(rest, None)
-    name, _, size = rest.partition("\t")
-    return DirectoryEntry(name, int(size) if size.isdecimal() else 0) if kind == "F" else None
-
-
 def path_bytes(path: str) -> bytes:
     """Return a path as the data of a request.
 
@@ -308,7 +260,7 @@ async def _request(
             FileTransfer(0, *channel.target, packet.pack()),
             inbox,
             accept,
-            what=f"MAVFTP {opcode.name} {path} of {channel.system}/{channel.component}",
+            what=f"MAVFTP {opcode.name} {path} of {channel}",
             attempts=attempts,
             copies=copies or (lambda attempt: channel.timing.copies if attempt else 1),
         )
@@ -468,7 +420,7 @@ class _FileReader:
                 if self._pieces.reached > offset:
                     return
                 if channel.is_silent(self._began):
-                    what = f"{self._path} of {channel.system}/{channel.component} at byte {offset}"
+                    what = f"{self._path} of {channel} at byte {offset}"
                     waited = anyio.current_time() - self._began
                     raise NoReply(what, attempts=attempt + 1, waited=waited)
 
@@ -551,14 +503,9 @@ class _FileReader:
 
     def _take(self, offset: int, data: bytes) -> None:
         if offset + len(data) > self._size_max:
-            system, component = self._channel.target
-            raise FileTransferError(
-                f"{self._path} of {system}/{component} is longer than {self._size_max} bytes",
-                system=system,
-                component=component,
-                path=self._path,
-                code=FileErrorCode.INVALID_DATA_SIZE,
-            )
+            what = f"{self._path} of {self._channel} is longer than {self._size_max} bytes"
+            code = FileErrorCode.INVALID_DATA_SIZE
+            raise FileTransferError(what, *self._channel.target, path=self._path, code=code)
         if offset == 0:
             self.begun(data)
         self._pieces.take(offset, data)
@@ -575,12 +522,5 @@ def _answer(message: Message) -> Packet | None:
 
 
 def _error(channel: Channel, path: str, code: int) -> FileTransferError:
-    system, component = channel.target
-    reason = FileErrorCode.name_of(code)
-    return FileTransferError(
-        f"{system}/{component} refused {path}: {reason}",
-        system=system,
-        component=component,
-        path=path,
-        code=code,
-    )
+    what = f"{channel} refused {path}: {FileErrorCode.name_of(code)}"
+    return FileTransferError(what, *channel.target, path=path, code=code)

@@ -12,27 +12,9 @@ from paramclient.errors import CommandResult, NoReply
 from paramclient.model.identity import Identity
 from paramclient.model.values import Encoding
 from paramclient.protocol.channel import Channel
+from paramclient.wire import messages
 from paramclient.wire.frames import enum_word
-from paramclient.wire.messages import (
-    CAPABILITY_FTP,
-    CAPABILITY_PARAM_ENCODE_BYTEWISE,
-    CAPABILITY_PARAM_ENCODE_C_CAST,
-    MAV_AUTOPILOT_ARDUPILOTMEGA,
-    MAV_AUTOPILOT_GENERIC,
-    MAV_AUTOPILOT_INVALID,
-    MAV_AUTOPILOT_PX4,
-    MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
-    MAV_CMD_REQUEST_MESSAGE,
-    MAV_TYPE_GCS,
-    MAV_TYPE_GENERIC,
-    AutopilotVersion,
-    CommandAck,
-    CommandLong,
-    Heartbeat,
-    HighLatency2,
-    Message,
-    message_id,
-)
+from paramclient.wire.messages import Message, message_id
 
 __all__ = ["HEARTBEAT_WAIT", "Identification", "expects_extended", "judge_encoding", "kind_in_words"]
 
@@ -46,8 +28,8 @@ VERSION_COPIES: Final = 2
 """Copies of each repeated request: without its answer, a cached table cannot be loaded, and is downloaded."""
 VERSION_ATTEMPTS_REFUSED: Final = 4
 """Requests after the first refusal, by both commands in turns: a refusal may concern only one of them."""
-_AUTOPILOTS: Final = {MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot", MAV_AUTOPILOT_PX4: "PX4"}
-_VEHICLES: Final = {1: "plane", MAV_TYPE_GCS: "ground station", 10: "rover", 11: "boat", 49: "radio"}
+_AUTOPILOTS: Final = {messages.MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot", messages.MAV_AUTOPILOT_PX4: "PX4"}
+_VEHICLES: Final = {1: "plane", messages.MAV_TYPE_GCS: "ground station", 10: "rover", 11: "boat", 49: "radio"}
 """Names of MAV_TYPE for users, where they differ from those of the enumeration."""
 _EXTENDED_TYPES: Final = frozenset({26, 30, 42, 44, 48})
 """MAV_TYPE of payloads: GIMBAL, CAMERA, WINCH, ILLUMINATOR, GRIPPER (MAVLink common message set)."""
@@ -72,13 +54,13 @@ def judge_encoding(
     if chosen is not None:
         return chosen, "chosen by the user"
     bits = capabilities or 0
-    if bits & CAPABILITY_PARAM_ENCODE_BYTEWISE:
+    if bits & messages.CAPABILITY_PARAM_ENCODE_BYTEWISE:
         return Encoding.BYTEWISE, "the vehicle's capability PARAM_ENCODE_BYTEWISE"
-    if bits & CAPABILITY_PARAM_ENCODE_C_CAST:
+    if bits & messages.CAPABILITY_PARAM_ENCODE_C_CAST:
         return Encoding.C_CAST, "the vehicle's capability PARAM_ENCODE_C_CAST"
-    if autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
+    if autopilot == messages.MAV_AUTOPILOT_ARDUPILOTMEGA:
         return Encoding.C_CAST, "its heartbeat says ArduPilot, which casts values to float"
-    if autopilot == MAV_AUTOPILOT_PX4:
+    if autopilot == messages.MAV_AUTOPILOT_PX4:
         return Encoding.BYTEWISE, "its heartbeat says PX4, which sends values byte by byte"
     return Encoding.BYTEWISE, "the standard's encoding, as nothing says otherwise"
 
@@ -126,29 +108,29 @@ class Identification:
     @property
     def is_encoding_known(self) -> bool:
         """Whether the user, or the component's AUTOPILOT_VERSION, names the encoding."""
-        bits = CAPABILITY_PARAM_ENCODE_BYTEWISE | CAPABILITY_PARAM_ENCODE_C_CAST
+        bits = messages.CAPABILITY_PARAM_ENCODE_BYTEWISE | messages.CAPABILITY_PARAM_ENCODE_C_CAST
         has_bit = bool((self.capabilities or 0) & bits)
         return self.chosen is not None or has_bit or (self.is_ardupilot and self.capabilities is not None)
 
     @property
     def is_px4(self) -> bool:
         """Whether the component is a PX4."""
-        return self.autopilot == MAV_AUTOPILOT_PX4
+        return self.autopilot == messages.MAV_AUTOPILOT_PX4
 
     @property
     def is_ardupilot(self) -> bool:
         """Whether the component is an ArduPilot."""
-        return self.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
+        return self.autopilot == messages.MAV_AUTOPILOT_ARDUPILOTMEGA
 
     @property
     def is_autopilot(self) -> bool:
         """Whether the heartbeat names an autopilot."""
-        return self.autopilot not in (None, MAV_AUTOPILOT_INVALID) and self.has_parameters
+        return self.autopilot not in (None, messages.MAV_AUTOPILOT_INVALID) and self.has_parameters
 
     @property
     def has_parameters(self) -> bool:
         """Whether the component may have parameters: it is no ground station."""
-        return self.vehicle_type != MAV_TYPE_GCS
+        return self.vehicle_type != messages.MAV_TYPE_GCS
 
     @property
     def may_serve_file(self) -> bool:
@@ -160,7 +142,7 @@ class Identification:
         if self.is_ardupilot and self.capabilities is None:
             return True
         has_none = self.is_px4 and self.identity.firmware < PX4_WITH_FILE
-        return bool((self.capabilities or 0) & CAPABILITY_FTP) and not has_none
+        return bool((self.capabilities or 0) & messages.CAPABILITY_FTP) and not has_none
 
     @property
     def is_encoding_certain(self) -> bool:
@@ -181,7 +163,7 @@ class Identification:
         while not self.is_encoding_certain:
             await self._changed.wait()
 
-    def heartbeat(self, message: Heartbeat | HighLatency2) -> bool:
+    def heartbeat(self, message: messages.Heartbeat | messages.HighLatency2) -> bool:
         """Take a heartbeat, and return whether it is another kind of vehicle than before."""
         kind = (message.autopilot, message.type)
         before = (self.autopilot, self.vehicle_type)
@@ -197,7 +179,7 @@ class Identification:
         self._has_no_heartbeat = True
         self._derive()
 
-    def version(self, message: AutopilotVersion) -> bool:
+    def version(self, message: messages.AutopilotVersion) -> bool:
         """Take an AUTOPILOT_VERSION, and return whether it is another vehicle's than the last one."""
         before = self.identity
         self.identity = Identity.from_version(
@@ -238,23 +220,23 @@ class Identification:
 
         MAV_CMD_REQUEST_MESSAGE first; older firmware knows only MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES.
         """
-        number = float(message_id(AutopilotVersion))
+        number = float(message_id(messages.AutopilotVersion))
         ways = (
-            CommandLong(*channel.target, MAV_CMD_REQUEST_MESSAGE, number),
-            CommandLong(*channel.target, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0),
+            messages.CommandLong(*channel.target, messages.MAV_CMD_REQUEST_MESSAGE, number),
+            messages.CommandLong(*channel.target, messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0),
         )
-        keys = [AutopilotVersion, *((CommandAck, way.command) for way in ways)]
+        keys = [messages.AutopilotVersion, *((messages.CommandAck, way.command) for way in ways)]
         refused: set[int] = set()
 
         def accept(message: Message) -> bool | None:
-            if isinstance(message, CommandAck):
+            if isinstance(message, messages.CommandAck):
                 if message.result not in (CommandResult.ACCEPTED, CommandResult.IN_PROGRESS):
                     refused.add(message.command)
                     return False
                 return None
             return True
 
-        def request_of(attempt: int) -> CommandLong:
+        def request_of(attempt: int) -> messages.CommandLong:
             if ways[0].command in refused or (attempt >= 2 and attempt % 2):
                 return ways[1]
             return ways[0]
@@ -292,9 +274,9 @@ def kind_in_words(autopilot: int | None, kind: int | None) -> str:
         kind: MAV_TYPE, or None.
     """
     words = []
-    if autopilot not in (None, MAV_AUTOPILOT_GENERIC, MAV_AUTOPILOT_INVALID):
+    if autopilot not in (None, messages.MAV_AUTOPILOT_GENERIC, messages.MAV_AUTOPILOT_INVALID):
         words.append(_AUTOPILOTS.get(autopilot) or enum_word("MAV_AUTOPILOT", autopilot))
-    if kind is not None and (kind != MAV_TYPE_GENERIC or not words):
+    if kind is not None and (kind != messages.MAV_TYPE_GENERIC or not words):
         words.append(_VEHICLES.get(kind) or enum_word("MAV_TYPE", kind))
     return " ".join(words)
 

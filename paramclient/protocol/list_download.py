@@ -135,7 +135,7 @@ class _Download:
             request,
             self._inbox,
             self._first,
-            what=f"the list of {channel.system}/{channel.component}",
+            what=f"the list of {channel}",
             attempts=LIST_REQUESTS_MAX,
             timeout_min=LIST_TIMEOUT_MIN,
         )
@@ -244,7 +244,7 @@ class _Download:
             return timing.copies if self._is_over() and len(self._missing()) <= channel.window_size else 1
 
         request = dialect.request_read(channel.reads_from, index)
-        what = f"index {index} of {channel.system}/{channel.component}"
+        what = f"index {index} of {channel}"
         attempts = ATTEMPTS_MAX
         with channel.inbox((dialect.value, index)) as inbox:
             try:

@@ -23,19 +23,8 @@ from paramclient.protocol.events import (
 from paramclient.protocol.identity import HEARTBEAT_WAIT, Identification
 from paramclient.protocol.presence import SYSTEM_TIME, Presence
 from paramclient.protocol.session import Session, Shared, Spawn
-from paramclient.wire.messages import (
-    HASH_CHECK,
-    MAV_CMD_REQUEST_MESSAGE,
-    AutopilotVersion,
-    CommandLong,
-    Heartbeat,
-    HighLatency2,
-    Message,
-    ParamExtAck,
-    ParamExtValue,
-    ParamValue,
-    SystemTime,
-)
+from paramclient.wire import messages
+from paramclient.wire.messages import CommandLong, Message
 
 __all__ = ["Node"]
 
@@ -124,31 +113,31 @@ class Node:
         elif silence > REBOOT_SILENCE_MIN and self.identification.is_settled:
             self._spawn(self._request_clock)
         match message:
-            case ParamValue():
+            case messages.ParamValue():
                 self.plain.receive(message, now)
-                if message.param_id == HASH_CHECK:
+                if message.param_id == messages.HASH_CHECK:
                     self.plain.announce(Digest.of(message))
-            case ParamExtValue():
+            case messages.ParamExtValue():
                 self.extended.table.store(message, now)
-            case ParamExtAck(param_id=name, raw=raw, param_type=number, param_result=result):
+            case messages.ParamExtAck(param_id=name, raw=raw, param_type=number, param_result=result):
                 table = self.extended.table
                 if result == ACCEPTED and (known := table.params.get(name)) is not None:
                     index = 65535 if known.index is None else known.index
-                    table.store(ParamExtValue(name, raw, number, table.count or 0, index), now)
-            case Heartbeat():
+                    table.store(messages.ParamExtValue(name, raw, number, table.count or 0, index), now)
+            case messages.Heartbeat():
                 if self.identification.heartbeat(message):
                     self._doubt()
                     self._spawn(self.identify)
                 self._settle_encoding()
                 if presence.heartbeat(message, now):
                     self.rebooted(now)
-            case HighLatency2():
+            case messages.HighLatency2():
                 presence.high_latency()
                 self.identification.heartbeat(message)
                 self._settle_encoding()
-            case SystemTime(time_boot_ms=boot_ms):
+            case messages.SystemTime(time_boot_ms=boot_ms):
                 self.boot_clock(SYSTEM_TIME, boot_ms, now)
-            case AutopilotVersion():
+            case messages.AutopilotVersion():
                 if self.identification.version(message):
                     self._replace()
                 self._settle_encoding()
@@ -180,7 +169,7 @@ class Node:
 
     def is_same_vehicle(self, message: Message) -> bool:
         """Return whether a message of another peer proves to be of this vehicle, by its hardware id."""
-        if not isinstance(message, AutopilotVersion):
+        if not isinstance(message, messages.AutopilotVersion):
             return False
         uid = hardware_id(message.uid, message.uid2)
         return uid is not None and uid == self.identification.identity.uid
@@ -231,7 +220,7 @@ class Node:
 
     async def _request_clock(self) -> None:
         """Request the time since boot: a reboot of an ArduCopter without telemetry shows in nothing else."""
-        request = CommandLong(*self.channel.target, MAV_CMD_REQUEST_MESSAGE, float(SYSTEM_TIME))
+        request = CommandLong(*self.channel.target, messages.MAV_CMD_REQUEST_MESSAGE, float(SYSTEM_TIME))
         for _ in range(CLOCK_REQUESTS):
             if self.identification.is_ardupilot and not self.presence.has_telemetry:
                 self.channel.send(request)

@@ -135,7 +135,7 @@ async def _ask(
 
 
 def _what(session: Session, which: str | int) -> str:
-    return f"parameter {which} of {session.channel.system}/{session.channel.component}"
+    return f"parameter {which} of {session.channel}"
 
 
 async def read_param(session: Session, which: str | int) -> Param:
@@ -187,19 +187,12 @@ def refusal(session: Session, which: str | int, code: int) -> UnknownParameter |
     """Return the error for a PARAM_ERROR with this code."""
     if code == ParamErrorCode.DOES_NOT_EXIST:
         return _unknown(session, which)
-    system, component = session.channel.target
+    channel = session.channel
     name, index = (which, None) if isinstance(which, str) else (None, which)
-    what = f"{system}/{component} refused {which}: {ParamErrorCode.name_of(code)}"
+    what = f"{channel} refused {which}: {ParamErrorCode.name_of(code)}"
     if code == ParamErrorCode.TYPE_MISMATCH:
-        return TypeMismatch(what, system=system, component=component, name=name, index=index)
-    return Refused(
-        what,
-        system=system,
-        component=component,
-        code=code,
-        name=name,
-        index=index,
-    )
+        return TypeMismatch(what, *channel.target, name=name, index=index)
+    return Refused(what, *channel.target, code=code, name=name, index=index)
 
 
 def queue_time(session: Session, more: int = 0) -> float:
@@ -293,15 +286,8 @@ async def _read_list(session: Session, inbox: Inbox, which: str | int) -> Report
 
 
 def _unknown(session: Session, which: str | int, reason: str = "") -> UnknownParameter:
-    system, component = session.channel.target
     name, index = (which, None) if isinstance(which, str) else (None, which)
     nearest = () if name is None else nearest_names(name, session.table.params)
-    what = f"{'' if name else 'parameter with index '}{which}{reason}"
-    return UnknownParameter(
-        f"{system}/{component} has no {what}{'.' if nearest else ''}{did_you_mean(nearest)}",
-        system=system,
-        component=component,
-        name=name,
-        index=index,
-        nearest=nearest,
-    )
+    what = f"{session.channel} has no {'' if name else 'parameter with index '}{which}{reason}"
+    what += f"{'.' if nearest else ''}{did_you_mean(nearest)}"
+    return UnknownParameter(what, *session.channel.target, name=name, index=index, nearest=nearest)

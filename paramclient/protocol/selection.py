@@ -119,7 +119,7 @@ def only_vehicle(
 def node_in_words(node: Node) -> str:
     """Return address, autopilot and kind of vehicle: `1/1 PX4 quadrotor`."""
     kind = kind_in_words(node.identification.autopilot, node.identification.vehicle_type)
-    return f"{node.system}/{node.component} {kind}".rstrip()
+    return f"{node.channel} {kind}".rstrip()
 
 
 def hint_of_link(station: Station, bytes_received: int) -> str:
@@ -155,12 +155,12 @@ def hint_of_node(station: Station, node: Node, now: float) -> str:
         return ""
     if not station.gate.is_open:
         return f"{station.link} is down at present."
-    label, silence = f"{node.system}/{node.component}", now - node.presence.received_at
+    label, silence = str(node.channel), now - node.presence.received_at
     if node.presence.is_lost or silence > HEARTBEAT_WAIT:
         return f"Nothing was received of {label} for {silence:.1f} s."
     does = f"{label} sends messages (the last one {silence:.1f} s ago)"
     others = [
-        f"{each.system}/{each.component}"
+        str(each.channel)
         for each in station.nodes.values()
         if each.system == node.system and each.plain.table.moments and not each.presence.has_beaten
     ]

@@ -248,9 +248,8 @@ class Session:
             who = str(identification.former), str(identification.identity)
             raise AnotherVehicle(*self.channel.target, *who)
         if is_other or not identification.is_confirmed:
-            system, component = self.channel.target
             waited = anyio.current_time() - began
-            raise NoReply(f"the identity of {system}/{component}", attempts=0, waited=waited)
+            raise NoReply(f"the identity of {self.channel}", attempts=0, waited=waited)
 
     def lock(self, name: str) -> anyio.Lock:
         """Return the lock of the writes to one name: they run one after the other."""
@@ -274,8 +273,7 @@ class Session:
     def encoding_doubt(self) -> str:
         """Why the encoding is probably wrong, as a sentence; "" without evidence, or by the user's choice."""
         why = self.table.contradicts if self.identification.chosen is None else ""
-        address = f"{self.channel.system}/{self.channel.component}"
-        return why and f"The encoding of {address} is probably wrong: {why}."
+        return why and f"The encoding of {self.channel} is probably wrong: {why}."
 
     def report(self, received: int, total: int | None) -> None:
         """Report the progress of a fetch."""

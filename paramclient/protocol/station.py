@@ -17,30 +17,9 @@ from paramclient.protocol.channel import Gate
 from paramclient.protocol.dialect import EXTENDED, PLAIN
 from paramclient.protocol.node import Node
 from paramclient.protocol.session import Spawn
+from paramclient.wire import messages
 from paramclient.wire.frames import BOOT_CLOCK_OFFSETS, Frame, Framer, sign_frame
-from paramclient.wire.messages import (
-    AUTOPILOT_COMPONENT,
-    COMP_ID_ALL,
-    DECODED_IDS,
-    MAV_AUTOPILOT_INVALID,
-    MAV_CMD_REQUEST_MESSAGE,
-    MAV_STATE_ACTIVE,
-    MAV_TYPE_GCS,
-    CommandLong,
-    Heartbeat,
-    HighLatency2,
-    Message,
-    ParamExtRequestList,
-    ParamExtRequestRead,
-    ParamExtSet,
-    ParamExtValue,
-    ParamSet,
-    ParamValue,
-    SetupSigning,
-    decode,
-    encode,
-    message_id,
-)
+from paramclient.wire.messages import Heartbeat, Message, ParamExtSet, ParamSet, decode, encode, message_id
 from paramclient.wire.signing import Signer, SigningKey, Verifier
 
 __all__ = ["Peer", "Station"]
@@ -61,7 +40,7 @@ SETUP_SIGNING_COUNT: Final = 3
 """SETUP_SIGNING messages that are sent: they have no acknowledgement, and a frame may be lost."""
 SETUP_SIGNING_INTERVAL: Final = 0.1
 """Seconds after each SETUP_SIGNING message."""
-_MAVLINK2_REQUESTS: Final = (ParamExtRequestRead, ParamExtRequestList, ParamExtSet)
+_MAVLINK2_REQUESTS: Final = (messages.ParamExtRequestRead, messages.ParamExtRequestList, ParamExtSet)
 """Requests that exist in MAVLink 2 only: a component that has sent MAVLink 1 so far may understand them."""
 
 logger = logging.getLogger(__name__)
@@ -112,7 +91,7 @@ class Station:
         self.nodes: dict[Address, Node] = {}
         self.gate = Gate()
         self.own_address = (system, component)
-        self.own_type = MAV_TYPE_GCS
+        self.own_type = messages.MAV_TYPE_GCS
         self.listens_only = listens_only
         self.listening_since = -math.inf
         self.verifier: Verifier | None = None
@@ -178,11 +157,13 @@ class Station:
         A heartbeat is due once a second only; the command brings it in one round trip (measured on PX4).
         """
         requests = self._sought[frame.system]
-        if frame.component == AUTOPILOT_COMPONENT and now >= self._seek_at and requests < SEEK_MAX:
+        if frame.component == messages.AUTOPILOT_COMPONENT and now >= self._seek_at and requests < SEEK_MAX:
             self._seek_at = now + SEEK_INTERVAL
             self._sought[frame.system] += 1
             target = (frame.system, frame.component)
-            request = CommandLong(*target, MAV_CMD_REQUEST_MESSAGE, float(message_id(Heartbeat)))
+            request = messages.CommandLong(
+                *target, messages.MAV_CMD_REQUEST_MESSAGE, float(message_id(Heartbeat))
+            )
             self.transmit(request, peer, frame.version)
 
     def probe(self, system: int, component: int) -> None:
@@ -197,7 +178,7 @@ class Station:
             PLAIN.request_read(target, 0),
             EXTENDED.request_read(target, 0),
             PLAIN.request_list(target),
-            PLAIN.request_read((system, COMP_ID_ALL), 0),
+            PLAIN.request_read((system, messages.COMP_ID_ALL), 0),
         )
         version = next((node.version for node in self.nodes.values()), 2)
         self.transmit(ways[number % len(ways)], None, version)
@@ -233,12 +214,14 @@ class Station:
         """
         for _ in range(SETUP_SIGNING_COUNT):
             self.gate.check()
-            self.transmit(SetupSigning(node.system, node.component, key, timestamp), node.peer, 2)
+            self.transmit(messages.SetupSigning(node.system, node.component, key, timestamp), node.peer, 2)
             await anyio.sleep(SETUP_SIGNING_INTERVAL)
 
     async def send_heartbeats(self) -> None:
         """Send our heartbeat once a second."""
-        beat = Heartbeat(self.own_type, MAV_AUTOPILOT_INVALID, system_status=MAV_STATE_ACTIVE)
+        beat = Heartbeat(
+            self.own_type, messages.MAV_AUTOPILOT_INVALID, system_status=messages.MAV_STATE_ACTIVE
+        )
         while not self.listens_only:
             if self.gate.is_open:
                 if self._signer is not None:
@@ -267,7 +250,7 @@ class Station:
             node.channel.fail(error)
 
     def _new_framer(self, *, stream: bool) -> Framer:
-        framer = Framer(DECODED_IDS, occasional=BOOT_CLOCK_OFFSETS, stream=stream)
+        framer = Framer(messages.DECODED_IDS, occasional=BOOT_CLOCK_OFFSETS, stream=stream)
         framer.takes_occasional = True
         return framer
 
@@ -302,7 +285,10 @@ class Station:
             self._take_foreign_set(message, frame, now)
             return
         if node is None:
-            is_sign = isinstance(message, Heartbeat | HighLatency2 | ParamValue | ParamExtValue)
+            is_sign = isinstance(
+                message,
+                Heartbeat | messages.HighLatency2 | messages.ParamValue | messages.ParamExtValue,
+            )
             if not is_sign or len(self.nodes) >= COMPONENTS_MAX:
                 return
             node = self._add(address, peer, now)
@@ -336,7 +322,7 @@ class Station:
         for node in self.nodes.values():
             if message.target_system == node.system and message.target_component in (
                 node.component,
-                COMP_ID_ALL,
+                messages.COMP_ID_ALL,
             ):
                 session = node.plain if isinstance(message, ParamSet) else node.extended
                 session.foreign_set(message.param_id, author, now)
@@ -360,7 +346,7 @@ class Station:
             spawn=self._spawn,
         )
         if self._asked.get((node.system, node.component), 0) > 2:
-            node.channel.reads_from = (node.system, COMP_ID_ALL)
+            node.channel.reads_from = (node.system, messages.COMP_ID_ALL)
         self.nodes[address] = node
         self._discovered(node)
         self._spawn(node.watch_presence)

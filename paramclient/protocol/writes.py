@@ -161,7 +161,7 @@ async def write_many(
         progress: called with each outcome, as it is known.
         timeout: seconds; None for no limit.
     """
-    began, system, component = anyio.current_time(), *session.channel.target
+    began = anyio.current_time()
     vehicles = session.identification.vehicles
     done = progress or (lambda outcome: None)
     outcomes = [SetOutcome(name, value, SetStatus.NOT_TRIED) for name, value in pairs]
@@ -224,14 +224,14 @@ async def write_many(
             done(outcomes[place])
     elapsed = anyio.current_time() - began
     if scope.cancelled_caught:
-        error = NoReply(f"{len(pairs)} writes to {system}/{component}", attempts=0, waited=elapsed)
+        error = NoReply(f"{len(pairs)} writes to {session.channel}", attempts=0, waited=elapsed)
         failures.insert(0, error)
         open_states = (SetStatus.NOT_TRIED, SetStatus.UNKNOWN)
         outcomes = [
             replace(each, error=error) if each.status in open_states and each.error is None else each
             for each in outcomes
         ]
-    return SetManyResult(system, component, tuple(outcomes), failures[0] if failures else None, elapsed)
+    return SetManyResult(*session.channel.target, tuple(outcomes), failures[0] if failures else None, elapsed)
 
 
 class _Write:
@@ -296,7 +296,7 @@ class _Write:
         Silence may be that of a firmware that acknowledges nothing, and another value may be an older one.
         """
         channel = self.channel
-        what = f"the acknowledgement of {self.name} by {channel.system}/{channel.component}"
+        what = f"the acknowledgement of {self.name} by {channel}"
         answer: Param | ParamExtAck | None = None
         self._has_other_value = False
         with suppress(NoReply):
@@ -416,7 +416,6 @@ class _Write:
 
     def _retype(self, answer: Param) -> None:
         """Take another type than the known one: encode again, or raise TypeMismatch; also the second time."""
-        system, component = self.channel.target
         self.before = replace(answer, trust=Trust.LIVE)
         try:
             if self._has_new_type:
@@ -424,36 +423,19 @@ class _Write:
             self._has_new_type = True
             self._encode()
         except UsageError as error:
-            raise TypeMismatch(
-                f"{self.name} of {system}/{component} is {type_name(answer.type_number)} now: {error}",
-                system=system,
-                component=component,
-                name=self.name,
-            ) from None
+            what = f"{self.name} of {self.channel} is {type_name(answer.type_number)} now: {error}"
+            raise TypeMismatch(what, *self.channel.target, name=self.name) from None
 
     def _ext_refusal(self, result: int) -> ExtSetRefused:
-        system, component = self.channel.target
         kind = ValueUnsupported if result == ExtAckResult.VALUE_UNSUPPORTED else SetFailed
-        return kind(
-            f"{system}/{component} refused {self.name}: {ExtAckResult.name_of(result)}",
-            system=system,
-            component=component,
-            code=result,
-            name=self.name,
-        )
+        what = f"{self.channel} refused {self.name}: {ExtAckResult.name_of(result)}"
+        return kind(what, *self.channel.target, code=result, name=self.name)
 
     def _not_applied(self, actual: Param) -> ValueNotApplied:
-        system, component = self.channel.target
-        number = actual.type_number
-        return ValueNotApplied(
-            f"{system}/{component} keeps {self.name} at {format_value(actual.settable, number)}; "
-            f"{format_value(self.value, number)} was sent {self.attempts} times",
-            system=system,
-            component=component,
-            name=self.name,
-            requested=self.value,
-            actual=actual.settable,
-        )
+        target, kept = self.channel.target, actual.settable
+        words, sent = (format_value(each, actual.type_number) for each in (kept, self.value))
+        what = f"{self.channel} keeps {self.name} at {words}; {sent} was sent {self.attempts} times"
+        return ValueNotApplied(what, *target, name=self.name, requested=self.value, actual=kept)
 
 
 async def _read_writable(session: Session, name: str) -> Param:
@@ -508,7 +490,5 @@ def _check_finite(session: Session, name: str, value: WireValue, *, force: bool)
         return
     why = reason_against_non_finite(autopilot_name(session.identification.autopilot or 0))
     if why:
-        system, component = session.channel.target
-        raise UsageError(
-            f"{name} = {value} was not sent to {system}/{component}: {why}. Force it to send it all the same."
-        )
+        not_sent = f"{name} = {value} was not sent to {session.channel}"
+        raise UsageError(f"{not_sent}: {why}. Force it to send it all the same.")

@@ -64,8 +64,6 @@ class Ftp:
         timeout: float | None = None,
     ) -> bytes:
         """Read a file. Its session on board is closed, also on cancellation."""
-    def list(self, path: str, *, timeout: float | None = None) -> list[ftp.DirectoryEntry]:
-        """Return the entries of a directory."""
     def checksum(self, path: str, *, timeout: float | None = None) -> int:
         """Return the CRC-32 of a file, computed by the component; see `crc32_px4`."""
 

@@ -232,7 +232,7 @@ async def test_the_client_s_end_ends_it() -> None:
         await anyio.sleep(0.3)
     assert isinstance(await reading, ClientClosed)
     with pytest.raises(ClientClosed):
-        await files.list("/")
+        await files.checksum("/x")
     assert not tasks_beside()
 
 

@@ -15,12 +15,10 @@ from paramclient.model.px4_hash import crc32_px4
 from paramclient.model.values import ParamType
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.ftp import (
-    DirectoryEntry,
     FileCutOff,
     Opcode,
     Packet,
     checksum,
-    list_directory,
     path_bytes,
     read_file,
 )
@@ -251,22 +249,6 @@ async def test_uses_of_mavftp_take_turns() -> None:
             tasks.start_soon(checksum, channel, "0.bin")
         assert got == files
         assert anyio.current_time() < 3.0
-
-
-@virtual
-@pytest.mark.parametrize("loss", [0.0, 0.3])
-async def test_directories_of_any_length_are_listed(loss: float) -> None:
-    vehicle = ArduPilotVehicle()
-    vehicle.files.update({f"/logs/{number:08}.BIN": CONTENT[:number] for number in range(70)})
-    vehicle.files["/logs/more/x"] = b""
-    async with converse(Air.symmetric([vehicle], loss=loss, seed=1)) as conversation:
-        channel = (await conversation.node()).channel
-        entries = await list_directory(channel, "/logs")
-        assert DirectoryEntry("more", None) in entries
-        assert entries.count(DirectoryEntry("00000069.BIN", 69)) == 1
-        assert len(entries) == 71
-        with pytest.raises(FileTransferError):
-            await list_directory(channel, "/nowhere")
 
 
 @virtual
