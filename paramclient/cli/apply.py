@@ -14,7 +14,7 @@ from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import say
-from paramclient.cli.session import CommandSession, announce_write, sessions
+from paramclient.cli.session import CommandSession, Sessions, sessions
 from paramclient.cli.setup_results import Address, SetupOutput
 from paramclient.cli.sources import (
     check_new,
@@ -160,7 +160,7 @@ async def _with_overlay(base: ParamSet, pattern: str, session: CommandSession) -
 
 
 async def set_up(
-    found: Sequence[CommandSession],
+    found: Sessions,
     show: SetupOutput,
     plans: Callable[[], Awaitable[FleetVerified]],
     write: Callable[[Callable[[Component, ApplyProgress], None]], Awaitable[FleetApplied]],
@@ -177,7 +177,7 @@ async def set_up(
             show.show_planned(fleet, reboot=reboot)
             if not await confirm("go on?"):
                 return None
-    await announce_write(found)
+    await found.announce_write()
     with show.progress_until_interrupted(f"{verb} {_title(found)}") as progress:
         return await write(progress)
 

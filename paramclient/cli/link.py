@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from typing import Final
@@ -12,7 +12,7 @@ import anyio
 
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import Seconds, TrafficOptions
-from paramclient.cli.output import live_view, milliseconds, print_json, print_line, print_table
+from paramclient.cli.output import LiveView, milliseconds, print_json, print_line, print_table
 from paramclient.cli.session import Deadline, listen, received_in_words
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
@@ -20,6 +20,7 @@ from paramclient.client.traffic import ComponentTraffic, TrafficReport
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import rounded
+from paramclient.protocol.channel import task_group
 from paramclient.wire.frames import enum_word, message_name
 from paramclient.wire.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS
 from paramclient.wire.signing import SigningReport
@@ -62,8 +63,19 @@ async def link(
     """
     is_live = sys.stdout.isatty() and not options.json
     limit = seconds if is_live or seconds is not None else LINK_LISTENING_TIME
-    async with listen(url, options, listen_only=listen_only) as client:
-        report = await _run_with_measurements(client, _show if is_live else _listen, limit)
+    async with listen(url, options, listen_only=listen_only) as client, task_group() as tasks:
+        tasks.start_soon(_measure_round_trips, client)
+        view, deadline = LiveView() if is_live else None, Deadline(limit)
+        while True:
+            report = client.traffic_report()  # raises if the link has failed
+            if view is not None:
+                nothing = ["", f"nothing received yet: {_pace(client, report)}"]
+                lines = _lines(client, report) if report.totals["frames"] else nothing
+                view.draw(_COLUMNS, _rows(client, report), lines)
+            if not (left := deadline.left(REFRESH_INTERVAL)):
+                break
+            await anyio.sleep(left)
+        tasks.cancel_scope.cancel()
         if not report.totals["frames"]:
             hint = received_in_words(client)
             raise NoReply(
@@ -76,48 +88,6 @@ async def link(
         for line in _lines(client, report):
             print_line(line)
     return ExitCode.DONE
-
-
-async def _run_with_measurements(
-    client: ParamClient,
-    listener: Callable[[ParamClient, float | None], Awaitable[TrafficReport]],
-    seconds: float | None,
-) -> TrafficReport:
-    """Run `listener` for at most `seconds` while the round trips are measured; return its report."""
-    outcome: TrafficReport | Exception
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(_measure_round_trips, client)
-        try:
-            outcome = await listener(client, seconds)
-        except Exception as error:  # raised here, the task group would wrap it in a group
-            outcome = error
-        tasks.cancel_scope.cancel()
-    if isinstance(outcome, Exception):
-        raise outcome
-    return outcome
-
-
-async def _listen(client: ParamClient, seconds: float | None) -> TrafficReport:
-    deadline = Deadline(seconds)
-    while left := deadline.left(REFRESH_INTERVAL):
-        client.traffic_report()  # raises if the link has failed
-        await anyio.sleep(left)
-    return client.traffic_report()
-
-
-async def _show(client: ParamClient, seconds: float | None) -> TrafficReport:
-    with live_view() as draw:
-        deadline = Deadline(seconds)  # starts after rich is loaded
-        while True:
-            report = client.traffic_report()
-            if report.totals["frames"]:
-                draw(_COLUMNS, _rows(client, report), _lines(client, report))
-            else:
-                draw(_COLUMNS, (), ["", f"nothing received yet: {_pace(client, report)}"])
-            left = deadline.left(REFRESH_INTERVAL)
-            if not left:
-                return report
-            await anyio.sleep(left)
 
 
 async def _measure_round_trips(client: ParamClient) -> None:

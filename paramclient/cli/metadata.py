@@ -35,11 +35,10 @@ from paramclient.metadata import (
     metadata_of,
     read_metadata,
 )
-from paramclient.metadata.info import number_of
 from paramclient.metadata.store import AddedFiles, file_address
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param, WireValue, check_name, format_value
+from paramclient.model.values import Param, WireValue, format_value
 from paramclient.model.wording import counted
 
 __all__ = [
@@ -59,11 +58,8 @@ __all__ = [
     "metadata_list",
     "metadata_remove",
     "needs_reboot",
-    "parse_pairs",
     "print_descriptions",
-    "problems",
     "request_from_vehicle",
-    "resolved",
     "units_of",
 ]
 
@@ -219,82 +215,6 @@ def files_of(autopilots: Collection[str]) -> str:
     return f" {_ARDUPILOT_FILES}" if "ardupilot" in autopilots else ""
 
 
-# Values to write
-
-
-def parse_pairs(words: Sequence[str], *, as_text: bool = False) -> list[tuple[str, WireValue]]:
-    """Parse the arguments of `set`: parameters and values, as `NAME VALUE` or `NAME=VALUE`.
-
-    A value after an equals sign may be the name of a value; it is returned as text. With `as_text`, every
-    value is.
-
-    Raises:
-        UsageError: a name has no value, or a name or value is invalid.
-    """
-    pairs: list[tuple[str, WireValue]] = []
-    left = iter(words)
-    for word in left:
-        _check_no_option(word)
-        name, equals, text = word.partition("=")
-        if not equals:
-            value = next(left, None)
-            if value is None:
-                break
-            pairs.append((check_name(name), value if as_text else _number(name, value)))
-        elif as_text:
-            pairs.append((check_name(name), text))
-        elif not text.strip():
-            raise UsageError(f"{name}: there is no value after the equals sign")
-        else:
-            number = _number_or_none(name, text)
-            pairs.append((check_name(name), text if number is None else number))
-    else:
-        if pairs:
-            return pairs
-    end = f", and {words[-1]} has no value" if words else ""
-    raise UsageError(f"set takes pairs of NAME and VALUE, or NAME=VALUE{end}")
-
-
-def _check_no_option(word: str) -> None:
-    """Check that an argument in the place of a name is not an unknown option.
-
-    The arguments of `set` may begin with a hyphen, because values may be negative. An unknown option would be
-    a name, and the value before it would be written.
-
-    Raises:
-        UsageError: it begins with a hyphen, which no parameter name of a vehicle does.
-    """
-    if word.startswith("-"):
-        raise UsageError(f"Unknown option: {word.partition('=')[0]}. Nothing was written.")
-
-
-def resolved(
-    pairs: Iterable[tuple[str, WireValue]], metadata: Metadata | None
-) -> list[tuple[str, WireValue]]:
-    """Return the pairs with every name of a value replaced by its number.
-
-    Raises:
-        UsageError: an unknown name of a value, or a parameter without metadata.
-    """
-    numbers: list[tuple[str, WireValue]] = []
-    for name, value in pairs:
-        if isinstance(value, str):
-            info = info_of(metadata, name)
-            if info is None:
-                raise UsageError(f"{name}: {value!r} is not a number, and no metadata describes {name}")
-            value = info.parse(value)
-        numbers.append((name, value))
-    return numbers
-
-
-def problems(pairs: Iterable[tuple[str, WireValue]], metadata: Metadata | None) -> Iterator[str]:
-    """Yield warnings about values, such as one outside of the range; the vehicle may accept them."""
-    for name, value in pairs:
-        info = info_of(metadata, name)
-        if info is not None and (problem := info.problem(value)) is not None:
-            yield problem
-
-
 def info_of(metadata: Metadata | None, name: str) -> ParamInfo | None:
     """Return the metadata of a parameter, or None."""
     return None if metadata is None else metadata.find(name)
@@ -366,26 +286,6 @@ def _fields(info: ParamInfo) -> Iterator[tuple[str, str]]:
         yield "read-only", "the vehicle sets it"
     if info.reboot_required:
         yield "reboot", "a change takes effect after a reboot"
-
-
-def _number(name: str, text: str) -> int | float:
-    if text.startswith("="):
-        raise UsageError(f"write {name}=VALUE without spaces, or {name} VALUE without an equals sign")
-    number = _number_or_none(name, text)
-    if number is None:
-        raise UsageError(
-            f"{name}: {text!r} is not a number, such as 12, 0x1F, -1.5, 1e-3, nan or inf. "
-            f"If it is the name of a value, write {shlex.quote(f'{name}={text}')}"
-        )
-    return number
-
-
-def _number_or_none(name: str, text: str) -> int | float | None:
-    """Parse a value exactly: an integer as an int, other numbers as a float; None if it is not a number."""
-    try:
-        return None if text != text.strip() else number_of(text)
-    except UsageError as error:
-        raise UsageError(f"{name}: {error}") from None
 
 
 def metadata_add(

@@ -2,54 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Annotated, Final
 
-import anyio
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.default_sources import say_sources
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.json_output import VehicleJson
-from paramclient.cli.metadata import (
-    MetadataChoice,
-    from_file,
-    known_of_session,
-    request_from_vehicle,
-)
+from paramclient.cli.json_output import VehicleJson, as_json
+from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session, request_from_vehicle
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import (
-    Coloured,
-    by_index,
-    print_json,
-    print_table,
-    printable,
-    report,
-    say,
-)
-from paramclient.cli.param_names import ChosenNames, check_given, suggest
-from paramclient.cli.read_commands import fetch_table
-from paramclient.cli.session import CommandSession, announce_write, connect
-from paramclient.cli.write_outcomes import (
-    outcome_cells,
-    outcomes_code,
-    report_outcomes,
-    summary,
-    write_all,
-    writes_json,
-)
+from paramclient.cli.output import Coloured, by_index, report, say
+from paramclient.cli.param_names import check_given
+from paramclient.cli.read_commands import get_chosen, report_all
+from paramclient.cli.session import CommandSession, Done, sessions
+from paramclient.cli.writes import WriteJob, write_all
 from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import NoReply, ParamClientError, UsageError, VehicleError
 from paramclient.metadata import Metadata
-from paramclient.model.defaults import DefaultSource, default_of
+from paramclient.model.defaults import Default, DefaultSource, default_of
 from paramclient.model.names import is_group_switch, is_pattern
 from paramclient.model.notation import typed, value_json
-from paramclient.model.values import Param, Trust, WireValue, bits_of, format_value, same_bits
+from paramclient.model.values import Param, WireValue, bits_of, format_value, same_bits
 from paramclient.model.wording import counted, first_of
-from paramclient.protocol.set_results import SetOutcome
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
 
 __all__ = ["reset"]
@@ -100,91 +78,200 @@ async def reset(
         raise UsageError("reset takes names, or --all, or --changed")
     name_patterns = check_given(names)
     described = from_file(metadata)
-    async with connect(url, options, writes=True) as session:
-        fetched = await fetch_table(session)
-        chosen, read_only = (await _chosen(session, name_patterns), ()) if names else _all_names(session)
-        if chosen is None:
-            return ExitCode.INCOMPLETE
-        code = ExitCode.DONE
-        if fetched.missing and any(map(is_pattern, name_patterns or "*")):
-            report(f"incomplete: {counted(len(fetched.missing), 'parameter')} were not received")
-            code = ExitCode.INCOMPLETE
-        component, deadline = session.component, session.deadline
-        params = await _read_unconfirmed(
-            component.params, lambda name: component.get(name, timeout=deadline.left()), chosen
-        )
-        if described is None:
-            described = await _known(session, metadata, params)
-        plan = _ResetPlan.of(session, params, described, read_only, lists_unknown=not changed)
-        if plan.choice.without_default:
-            code = ExitCode.INCOMPLETE
+    async with sessions(url, options, writes=True) as found:
+        jobs = {
+            each: await _prepare(each, name_patterns, described, metadata, changed=changed) for each in found
+        }
+        errors = [report_all(job.errors.values(), each.prefix) for each, job in jobs.items() if job.errors]
+        if errors:
+            report("nothing was written")
+            return max(errors)
+        code = max(job.code for job in jobs.values())
+        writes = any(job.writes for job in jobs.values())
+        asks = writes and not yes and can_confirm(options)
+        if dry_run or asks:
+            planned = [Done(each, _Planned(job)) for each, job in jobs.items()]
+            found.show(planned, ["name", "now", "default", "status"], "now default")
+            for job in jobs.values() if not options.json else []:
+                say(job.planned)
+                say_sources(job.session.label, job.sources)
         if dry_run:
-            plan.print_planned()
             return code
-        if plan.choice.values and not yes and can_confirm(options):
-            plan.print_planned()
-            if not await confirm("go on?"):
-                return ExitCode.INCOMPLETE
-        outcomes: Sequence[SetOutcome] = []
-        began = anyio.current_time()
-        if plan.choice.values:
-            await session.check_only()
-            await announce_write([session])
-            outcomes = await write_all(
-                session,
-                [*plan.choice.values.items()],
-                plan.print_outcomes,
-                verb="resetting",
-                settle=settle,
-                force=False,
-                durable=durable,
-            )
-        line = summary(session, outcomes, anyio.current_time() - began)
-    plan.print_outcomes(outcomes)
-    if not options.json:
-        say(f"{line if outcomes else plan.nothing}; {len(plan.choice.unchanged)} had their default already")
-        plan.say_sources()
-    report_outcomes(outcomes, described)
-    plan.report_unwritten()
-    return max(code, outcomes_code(outcomes))
+        if asks and not await confirm("go on?"):
+            return ExitCode.INCOMPLETE
+        written = await write_all(
+            found,
+            jobs,
+            ["name", "before", "default", "now", "status"],
+            "before default now",
+            verb="resetting",
+            settle=settle,
+            force=False,
+            durable=durable,
+        )
+    for job in jobs.values():
+        if not options.json:
+            say_sources(job.session.label, job.sources)
+    return max(code, written)
 
 
-def _all_names(session: CommandSession) -> tuple[list[str], tuple[str, ...]]:
-    """Return the names of all parameters in the order of their writes, and those of read-only ones apart."""
-    rules = rules_for(session.component.autopilot)
-    writable: list[str] = []
-    read_only: list[str] = []
-    for param in by_index(session.component.params.values()):
-        rule = rules.left_out(param.name)
-        (read_only if rule is not None and rule.category == READ_ONLY else writable).append(param.name)
-    return _in_order(session, writable), tuple(read_only)
+@dataclass
+class _ResetJob(WriteJob):
+    """The defaults that a reset writes to one vehicle.
+
+    Attributes:
+        before: the parameters before the reset, by name.
+        unchanged: names of parameters that have their default already.
+        without_default: names of parameters without a known default.
+        read_only: names of parameters that the vehicle lets no client write, and that were not named.
+        errors: the unknown names.
+        is_incomplete: whether parameters of a pattern were not received.
+    """
+
+    before: Mapping[str, Param] = field(default_factory=dict)
+    unchanged: Sequence[str] = ()
+    without_default: Sequence[str] = ()
+    read_only: Sequence[str] = ()
+    errors: Mapping[str, ParamClientError] = field(default_factory=dict)
+    is_incomplete: bool = False
+
+    @property
+    def sources(self) -> list[Default | None]:
+        """The defaults that are written, with their origins."""
+        return [default_of(self.before[name], value) for name, value in self.writes]
+
+    @property
+    def planned(self) -> str:
+        """The line about the values that would be written."""
+        return (
+            f"{self.session.receiver}: {len(self.writes)} to reset, {len(self.unchanged)} with their "
+            f"default, {len(self.without_default)} without a known default; nothing was sent"
+        )
+
+    def summary(self, more: str) -> str:
+        """Return the numbers of outcomes in words."""
+        done = super().summary(more) if self.writes else f"nothing to set on {self.session.receiver}"
+        return f"{done}; {len(self.unchanged)} had their default already"
+
+    @property
+    def code(self) -> int:
+        """The exit code for what is not written, and for all outcomes."""
+        is_part = self.is_incomplete or self.without_default
+        return max(super().code, ExitCode.INCOMPLETE if is_part else ExitCode.DONE)
+
+    @property
+    def unwritten(self) -> dict[str, object]:
+        """The JSON of the names that are not written."""
+        names = ("unchanged", "without_default", "read_only")
+        return {name: [*getattr(self, name)] for name in names}
+
+    def as_json(self) -> dict[str, object]:
+        """Return the JSON of the vehicle, the outcomes, and the names that are not written."""
+        return super().as_json() | self.unwritten
+
+    def rows(self) -> Iterator[Sequence[object]]:
+        """Yield the values before and after."""
+        for (name, _, actual, status), row in zip(super().rows(), self.planned_rows(), strict=False):
+            yield name, *row[1:3], actual, status
+        for name, before, default, status in self.planned_rows():
+            if default is None:
+                yield name, before, None, before, status
+
+    def planned_rows(self) -> Iterator[Sequence[object]]:
+        """Yield the values that would be sent, then the parameters without a known default."""
+        for name, value in self.writes:
+            param = self.before[name]
+            default = format_value(*typed(value, param.type_number))
+            yield name, _text(param), default, f"default of {_source(param)}"
+        for name in self.without_default:
+            yield name, _text(self.before[name]), None, Coloured("no known default", "yellow")
+
+    def report(self) -> None:
+        """Print remarks, errors, and what was not written."""
+        super().report()
+        prefix = self.session.prefix
+        if self.read_only and not self.session.options.json:
+            names = first_of(self.read_only, RESET_NAMES_MAX)
+            say(f"{prefix}left out, as they can only be read: {names}")
+        if self.without_default:
+            names = first_of(self.without_default, RESET_NAMES_MAX)
+            report(f"{prefix}not written, as their default is not known: {names}")
 
 
-async def _chosen(session: CommandSession, name_patterns: Sequence[str]) -> list[str] | None:
-    """Return the names that names and patterns choose; None after a report of the unknown ones."""
-    chosen = ChosenNames.of(session.component, name_patterns)
-    errors: dict[str, ParamClientError] = {**chosen.errors}
-    for name in chosen.names:
-        if name not in session.component.params:
-            try:
-                await session.component.get(name, timeout=session.deadline.left())
-            except VehicleError as error:
-                errors[name] = error
-    if not errors:
-        return _in_order(session, chosen.names)
-    for unknown in (await suggest(session, errors)).values():
-        report(str(unknown))
-    report("nothing was written")
-    return None
+@dataclass(frozen=True, slots=True)
+class _Planned:
+    """What a reset would write."""
+
+    job: _ResetJob
+
+    def as_json(self) -> dict[str, object]:
+        """Return the JSON of the values that would be sent."""
+        before = self.job.before
+        values = [
+            {
+                "name": name,
+                "value": value_json(before[name].settable, before[name].type_number),
+                "default": value_json(*typed(value, before[name].type_number)),
+                "source": _source(before[name]).value,
+            }
+            for name, value in self.job.writes
+        ]
+        vehicle = as_json(VehicleJson.of(self.job.session.component))
+        return {"vehicle": vehicle, "dry_run": True, "values": values, **self.job.unwritten}
+
+    def rows(self) -> Iterator[Sequence[object]]:
+        """Yield the rows."""
+        return self.job.planned_rows()
 
 
-def _in_order(session: CommandSession, names: Sequence[str]) -> list[str]:
-    """Return the names in the order of their writes.
+async def _prepare(
+    session: CommandSession,
+    names: Sequence[str],
+    described: Metadata | None,
+    choice: MetadataChoice,
+    *,
+    changed: bool,
+) -> _ResetJob:
+    """Choose the values to write; without names, all that the vehicle lets a client write.
 
     Switches such as *_ENABLE come last: their defaults may hide the parameters of their group.
     """
     autopilot = session.component.autopilot
-    return sorted(names, key=lambda name: is_group_switch(name, autopilot))
+    fetched = await session.fetch()
+    is_part = bool(fetched.missing) and any(map(is_pattern, names or "*"))
+    if is_part:
+        missing = counted(len(fetched.missing), "parameter")
+        report(f"{session.prefix}incomplete: {missing} were not received")
+    params, errors = await get_chosen(session, names or ["*"], is_fetched=True)
+    read_only: list[str] = []
+    if not names:
+        rules = rules_for(autopilot)
+        excluded = {each.name: rules.left_out(each.name) for each in by_index(params)}
+        read_only = [name for name, rule in excluded.items() if rule and rule.category == READ_ONLY]
+        params = [each for each in by_index(params) if each.name not in read_only]
+    if described is None:
+        described = await _known(session, choice, params)
+    defaults = {} if described is None else described.defaults_of(each.name for each in params)
+    writes: list[tuple[str, WireValue]] = []
+    unchanged: list[tuple[str, WireValue]] = []
+    unknown: list[str] = []
+    for param in sorted(params, key=lambda each: is_group_switch(each.name, autopilot)):
+        default = defaults.get(param.name) if param.default is None else param.default
+        if default is not None:
+            (unchanged if _has_value(param, default) else writes).append((param.name, default))
+        elif not changed:
+            unknown.append(param.name)
+    return _ResetJob(
+        session,
+        writes,
+        described,
+        before={each.name: each for each in params},
+        unchanged=[name for name, _ in unchanged],
+        without_default=unknown,
+        read_only=read_only,
+        errors=errors,
+        is_incomplete=is_part,
+    )
 
 
 async def _known(session: CommandSession, choice: str | None, params: Sequence[Param]) -> Metadata | None:
@@ -198,207 +285,17 @@ async def _known(session: CommandSession, choice: str | None, params: Sequence[P
     try:
         return await request_from_vehicle(session)
     except (UsageError, VehicleError, NoReply) as error:
-        say(printable(f"{session.label} gives no metadata with defaults: {error}"))
+        say(f"{session.label} gives no metadata with defaults: {error}")
         return None
 
 
-@dataclass(frozen=True, slots=True)
-class _ResetChoice:
-    """The values that a reset writes.
-
-    Attributes:
-        values: the defaults to write, by name, in the order of the names.
-        unchanged: names of parameters that have their default already.
-        without_default: names of parameters without a known default.
-    """
-
-    values: Mapping[str, WireValue]
-    unchanged: tuple[str, ...]
-    without_default: tuple[str, ...]
-
-    @classmethod
-    def of(cls, params: Iterable[Param], defaults: Mapping[str, WireValue]) -> _ResetChoice:
-        """Choose the values to write.
-
-        Args:
-            params: the current parameters.
-            defaults: defaults of parameters whose default the vehicle has not given; the vehicle's own
-                default has priority.
-        """
-        values: dict[str, WireValue] = {}
-        unchanged, unknown = [], []
-        for param in params:
-            default = defaults.get(param.name) if param.default is None else param.default
-            if default is None:
-                unknown.append(param.name)
-            elif _has_value(param, default):
-                unchanged.append(param.name)
-            else:
-                values[param.name] = default
-        return cls(values, tuple(unchanged), tuple(unknown))
+def _source(param: Param) -> DefaultSource:
+    """Return the origin of a default that is written."""
+    return DefaultSource.METADATA if param.default is None else DefaultSource.VEHICLE
 
 
-@dataclass(frozen=True, slots=True)
-class _ResetPlan:
-    """The values that a reset writes, and their output.
-
-    Attributes:
-        session: the session.
-        choice: the values.
-        params: the parameters before the reset, by name.
-        described: metadata of the vehicle, or None.
-        read_only: names of parameters that the vehicle lets no client write, and that were not named.
-    """
-
-    session: CommandSession
-    choice: _ResetChoice
-    params: Mapping[str, Param]
-    described: Metadata | None
-    read_only: tuple[str, ...]
-
-    @classmethod
-    def of(
-        cls,
-        session: CommandSession,
-        params: Sequence[Param],
-        described: Metadata | None,
-        read_only: tuple[str, ...],
-        *,
-        lists_unknown: bool,
-    ) -> _ResetPlan:
-        """Choose the values to write.
-
-        Args:
-            session: the session.
-            params: the parameters to reset.
-            described: metadata of the vehicle, or None.
-            read_only: as the attribute.
-            lists_unknown: whether parameters without a known default are listed.
-        """
-        defaults = {} if described is None else described.defaults_of(each.name for each in params)
-        if not lists_unknown:
-            params = [each for each in params if each.default is not None or each.name in defaults]
-        choice = _ResetChoice.of(params, defaults)
-        return cls(session, choice, {each.name: each for each in params}, described, read_only)
-
-    @property
-    def nothing(self) -> str:
-        """The line about a reset without a value to write."""
-        return f"nothing to set on {self.session.receiver}"
-
-    def print_planned(self) -> None:
-        """Print the values that would be sent."""
-        choice = self.choice
-        if self.session.options.json:
-            values = [
-                {
-                    "name": name,
-                    "value": value_json(self.params[name].settable, self.params[name].type_number),
-                    "default": value_json(*typed(value, self.params[name].type_number)),
-                    "source": self._source(name).value,
-                }
-                for name, value in choice.values.items()
-            ]
-            print_json({"vehicle": self._vehicle, "dry_run": True, "values": values, **self._unwritten})
-            return
-        rows: list[tuple[object, ...]] = [
-            (name, self._before(name), self._default(name), f"default of {self._source(name)}")
-            for name in choice.values
-        ]
-        rows += [(name, self._before(name), None, _NO_DEFAULT) for name in choice.without_default]
-        if rows:
-            print_table(["name", "now", "default", "status"], rows, right="now default")
-        say(
-            printable(
-                f"{self.session.receiver}: {len(choice.values)} to reset, {len(choice.unchanged)} with their "
-                f"default, {len(choice.without_default)} without a known default; nothing was sent"
-            )
-        )
-        self.say_sources()
-
-    def print_outcomes(self, outcomes: Sequence[SetOutcome]) -> None:
-        """Print the outcomes as a table or as JSON."""
-        if self.session.options.json:
-            results = writes_json(self.session, outcomes, self.described)
-            print_json({"vehicle": self._vehicle, "results": results, **self._unwritten})
-            return
-        rows: list[tuple[object, ...]] = []
-        for outcome in outcomes:
-            name, _, actual, status = outcome_cells(self.session, outcome)
-            rows.append((name, self._before(outcome.name), self._default(outcome.name), actual, status))
-        for name in self.choice.without_default:
-            before = self._before(name)
-            rows.append((name, before, None, before, _NO_DEFAULT))
-        if rows:
-            print_table(["name", "before", "default", "now", "status"], rows, right="before default now")
-
-    def say_sources(self) -> None:
-        """Print how many of the defaults are from the metadata, which has none of an airframe."""
-        values = self.choice.values
-        say_sources(
-            self.session.label, [default_of(self.params[name], each) for name, each in values.items()]
-        )
-
-    def report_unwritten(self) -> None:
-        """Print a line about the read-only parameters, and one about those without a known default."""
-        if self.read_only and not self.session.options.json:
-            say(printable(f"left out, as they can only be read: {first_of(self.read_only, RESET_NAMES_MAX)}"))
-        unknown = self.choice.without_default
-        if unknown:
-            names = first_of(unknown, RESET_NAMES_MAX)
-            report(f"not written, as their default is not known: {names}")
-
-    @property
-    def _vehicle(self) -> VehicleJson:
-        return VehicleJson.of(self.session.component)
-
-    @property
-    def _unwritten(self) -> dict[str, object]:
-        """The JSON of the names that are not written."""
-        return {
-            "unchanged": [*self.choice.unchanged],
-            "without_default": [*self.choice.without_default],
-            "read_only": [*self.read_only],
-        }
-
-    def _source(self, name: str) -> DefaultSource:
-        """Return the origin of a default that is written."""
-        return DefaultSource.METADATA if self.params[name].default is None else DefaultSource.VEHICLE
-
-    def _before(self, name: str) -> str:
-        param = self.params[name]
-        return format_value(param.settable, param.type_number)
-
-    def _default(self, name: str) -> str:
-        return format_value(*typed(self.choice.values[name], self.params[name].type_number))
-
-
-_NO_DEFAULT: Final = Coloured("no known default", "yellow")
-"""The cell of a parameter that is not written."""
-
-
-async def _read_unconfirmed(
-    table: Mapping[str, Param], read: Callable[[str], Awaitable[Param]], names: Iterable[str]
-) -> list[Param]:
-    """Return parameters of a fetched table in the order of the names; read those that are only cached.
-
-    Args:
-        table: `Component.params`.
-        read: reads a parameter into the table.
-        names: param_ids; of equal ones the first counts.
-
-    Raises:
-        UnknownParameter: the vehicle has no parameter with one of the names.
-        ParamClientError: as from `Component.get`.
-    """
-    params = []
-    for name in dict.fromkeys(names):
-        param = table.get(name)
-        if param is None or param.trust is Trust.CACHED:
-            await read(name)
-            param = table[name]
-        params.append(param)
-    return params
+def _text(param: Param) -> str:
+    return format_value(param.settable, param.type_number)
 
 
 def _has_value(param: Param, value: WireValue) -> bool:

@@ -24,7 +24,7 @@ from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets
 from paramclient.cli.offline import tables_of
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_json, printable, report, say
-from paramclient.cli.session import ChosenVehicle, CommandSession, report_others, run_on_all, sessions
+from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
 from paramclient.cli.sources import (
     check_link,
     choose,
@@ -168,7 +168,7 @@ async def _add_link(
 ) -> None:
     """Add the parameters of the vehicles on a link that were received or confirmed in this session."""
     async with sessions(url, options, extended=extended) as found:
-        for done in await run_on_all(found, fetch):
+        for done in await found.work(fetch):
             if done.result is None:
                 selection.faults.append(f"{done.session.address}: {done.error}")
                 continue
@@ -178,14 +178,13 @@ async def _add_link(
                 params = [table[name] for name in done.result if name in table]
                 described = await find_defaults(done.session, choice, given, params)
             selection.add(done.result, described)
-        await report_others(found)
+        await found.report_others()
 
 
 async def _fetch(session: CommandSession, *, refresh: bool, incomplete: bool) -> ParamSet:
     """Return the whole table of a vehicle, or with `incomplete` what was received of it."""
-    draws = not session.choice.is_all
     try:
-        return await whole_table(session, draws=draws, refresh=refresh, partial=incomplete)
+        return await whole_table(session, refresh=refresh, partial=incomplete)
     except VehicleError as error:
         raise VehicleError(
             f"{error}; {INCOMPLETE_HINT}", system=error.system, component=error.component

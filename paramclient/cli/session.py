@@ -4,54 +4,42 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Generic, TypeVar
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 import anyio
 import anyio.to_thread
 
 from paramclient.cache import CachedSummary
 from paramclient.cli.exit_codes import ExitCode, code_of
+from paramclient.cli.json_output import as_json
 from paramclient.cli.options import LinkOptions, TrafficOptions
-from paramclient.cli.output import (
-    local_time,
-    printable,
-    report,
-    say,
-    while_waiting,
-)
+from paramclient.cli.output import Status, local_time, print_json, print_table, report, say
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, ParamClientError, UsageError
 from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.model.identity import version_text
+from paramclient.model.values import Trust
 from paramclient.model.wording import counted, first_of
-from paramclient.protocol.fetch import Policy
+from paramclient.protocol.fetch import FetchResult, Policy
 from paramclient.protocol.identity import HEARTBEAT_WAIT, expects_extended, kind_in_words
 from paramclient.protocol.selection import address_in_words, hint_of_link, node_in_words
 from paramclient.wire.messages import MAV_AUTOPILOT_INVALID
 
 __all__ = [
+    "ChosenVehicle",
     "CommandSession",
     "Deadline",
     "Done",
-    "ChosenVehicle",
-    "announce_write",
+    "Sessions",
     "check_link_argument",
-    "connect",
-    "failed_json",
     "listen",
     "received_in_words",
-    "receiver_in_words",
-    "report_failures",
-    "report_others",
-    "run_on_all",
     "sessions",
-    "vehicle_in_words",
-    "wait_for_firmware",
     "wait_for_vehicle",
 ]
 
@@ -60,16 +48,13 @@ VEHICLE_TIMEOUT: Final = 10.0
 RECHECK_TIMEOUT: Final = 2.5
 """Seconds to check that the vehicle is still the only one: no wait is needed unless the vehicle or the link
 was lost in between."""
-
 UNHEARD_AGE_MAX: Final = 86_400.0
 """Seconds since a vehicle in the cache was heard, up to which a command names it if it is not heard now: one
 day, because a vehicle of an earlier one is probably not here any more."""
 CACHE_LIST_TIMEOUT: Final = 0.5
 """Seconds to wait for the list of vehicles in the cache, which takes milliseconds from a local one."""
-
 OTHERS_SHOWN_MAX: Final = 5
 """Other vehicles that a line names, so that it stays readable; it gives the number of further ones."""
-
 FIRMWARE_TIMEOUT: Final = 0.5
 """Seconds to wait for the firmware version of the vehicle, to name it to the user or to find its metadata."""
 FIRMWARE_POLL_INTERVAL: Final = 0.01
@@ -78,6 +63,7 @@ UID_POLL_INTERVAL: Final = 0.05
 """Seconds between two checks whether a vehicle with a hardware id was heard."""
 
 T = TypeVar("T")
+S = TypeVar("S", bound="Shown")
 
 _PARAMETER: Final = re.compile(r"[A-Z][A-Z0-9]*_[A-Z0-9_]*(=.*)?", re.IGNORECASE)
 """A text that is probably the name of a parameter, or NAME=VALUE: it has an underscore."""
@@ -119,8 +105,8 @@ class ChosenVehicle:
     is_all: bool = False
 
     @classmethod
-    def parse(cls, text: str | None) -> ChosenVehicle:
-        """Parse the value of --vehicle.
+    def parse(cls, text: str | None, *, one: str = "") -> ChosenVehicle:
+        """Parse the value of --vehicle; `one` says why it must be a single vehicle, if it must.
 
         Raises:
             UsageError: it names no vehicle of a link.
@@ -128,6 +114,8 @@ class ChosenVehicle:
         if text is None:
             return cls()
         if text.lower() == "all":
+            if one:
+                raise UsageError(f"--vehicle all is not possible here: {one}; name one vehicle")
             return cls(is_all=True)
         if found := _UID.fullmatch(text):
             return cls(uid=found[1].lower())
@@ -170,6 +158,11 @@ class CommandSession:
         return f"{self.component.system}/{self.component.component}"
 
     @property
+    def ids(self) -> dict[str, Any]:
+        """The address as members of JSON."""
+        return {"system": self.component.system, "component": self.component.component}
+
+    @property
     def label(self) -> str:
         """The component in words: `1/1 px4`; one that names no autopilot by its kind: `1/100 camera`."""
         autopilot = self.component.autopilot
@@ -188,8 +181,31 @@ class CommandSession:
 
     @property
     def receiver(self) -> str:
-        """The component with its kind and firmware; see `receiver_in_words`."""
-        return receiver_in_words(self.component)
+        """Address, kind and firmware of the component: `1/1 PX4 quadrotor, firmware 1.16.0`."""
+        firmware = self.component.identity.firmware
+        version = f", firmware {version_text(firmware)}" if firmware else ""
+        return f"{node_in_words(self.component.node)}{version}"
+
+    async def fetch(self, *, refresh: bool = False) -> FetchResult:
+        """Fetch the table; after an interruption, print what was received and kept."""
+        title = f"fetching {self.label}"
+        with Status(f"{title}: waiting for the first response", title) as status:
+            try:
+                return await self.component.fetch_all(
+                    refresh=refresh, timeout=self.deadline.left(), progress=status.update
+                )
+            except anyio.get_cancelled_exc_class():
+                count, params = self.component.count, self.component.params.values()
+                of = "" if count is None else f" of {count}"
+                kept = "not kept, without a cache" if self.client.cache is None else "kept in the cache"
+                received = sum(each.trust is not Trust.CACHED for each in params)
+                say(f"interrupted: {received}{of} {self.noun}s of {self.label} received and {kept}")
+                raise
+
+    def announce_write(self) -> None:
+        """Print a line on stderr about the vehicle that is written to, unless the subcommand prints JSON."""
+        if not self.options.json:
+            say(f"writing to {self.receiver} on {self.client.link.name}")
 
     async def check_only(self) -> None:
         """Check that the component is still the only one that --vehicle fits.
@@ -204,11 +220,8 @@ class CommandSession:
         choice, own = self.choice, self.component
         if choice.is_all:
             return
-        system, component = choice.system, choice.component
-        if choice.uid is not None:
-            system, component = own.system, own.component
-        timeout = self.deadline.left(RECHECK_TIMEOUT)
-        found = await self.client.only_component(system, component, timeout=timeout)
+        address = own.address if choice.uid is not None else (choice.system, choice.component)
+        found = await self.client.only_component(*address, timeout=self.deadline.left(RECHECK_TIMEOUT))
         if found.node is not own.node:
             other = f"{found.system}/{found.component} {found.autopilot}"
             raise AmbiguousVehicle(
@@ -217,6 +230,136 @@ class CommandSession:
                 vehicles=(self.label, other),
                 choose_by="system" if found.system != own.system else "component",
             )
+
+
+@dataclass(frozen=True, slots=True)
+class Done(Generic[T]):
+    """The outcome of the work on one vehicle: its result, or the error that ended it."""
+
+    session: CommandSession
+    result: T | None = None
+    error: ParamClientError | None = None
+
+
+class Shown(Protocol):
+    """What a subcommand prints of one vehicle: an object of JSON, or the rows of a table."""
+
+    def as_json(self) -> object:
+        """Return the object."""
+
+    def rows(self) -> Iterable[Sequence[object]]:
+        """Return the rows."""
+
+
+class Sessions(list[CommandSession]):
+    """The vehicles that a subcommand works on: the one of --vehicle, or all of them.
+
+    Args:
+        sessions: the vehicles.
+        writes: whether the subcommand writes, so that each outcome has its own error.
+    """
+
+    def __init__(self, sessions: Iterable[CommandSession], *, writes: bool) -> None:
+        super().__init__(sessions)
+        self._writes = writes
+
+    @property
+    def is_all(self) -> bool:
+        """Whether all vehicles of the link are meant."""
+        return self[0].choice.is_all
+
+    @property
+    def _names_vehicles(self) -> bool:
+        """Whether a table says which vehicle it shows: several are heard, and none was named."""
+        return self.is_all or (not self[0].choice.is_named and len(self[0].client.autopilots) > 1)
+
+    async def work(self, work: Callable[[CommandSession], Awaitable[T]]) -> list[Done[T]]:
+        """Work on all vehicles concurrently; return the outcomes. A failure of one does not stop the others.
+
+        Raises:
+            ParamClientError: the error of the vehicle, without --vehicle all.
+        """
+        if not self.is_all:
+            return [Done(self[0], await work(self[0]))]
+        done: dict[int, Done[T]] = {}
+
+        async def run(place: int, session: CommandSession) -> None:
+            try:
+                done[place] = Done(session, result=await work(session))
+            except ParamClientError as error:
+                done[place] = Done(session, error=error)
+
+        async with anyio.create_task_group() as tasks:
+            for place, session in enumerate(self):
+                tasks.start_soon(run, place, session)
+        return [done[place] for place in sorted(done)]
+
+    def show(self, done: Sequence[Done[S]], columns: Sequence[str], right: str = "") -> int:
+        """Print the results as one table or as JSON, then the failures; return the exit code for these.
+
+        Args:
+            done: the outcomes.
+            columns: the headings of the table.
+            right: as in `print_table`.
+        """
+        found = [(each.session, each.result) for each in done if each.result is not None]
+        failed = [(each.session, each.error) for each in done if each.error is not None]
+        if not self[0].options.json:
+            named = self._names_vehicles
+            rows = [
+                [*([session.address] if named else []), *cells]
+                for session, result in found
+                for cells in result.rows()
+            ]
+            if rows:
+                print_table([*(["vehicle"] if named else []), *columns], rows, right=right)
+        elif self.is_all:
+            vehicles = [session.ids | as_json(result.as_json()) for session, result in found]
+            errors = [session.ids | {"error": str(error)} for session, error in failed]
+            print_json({"vehicles": vehicles} | ({} if self._writes else {"errors": errors}))
+        else:
+            print_json(found[0][1].as_json())
+        for session, error in failed:
+            report(f"{session.label}: {error}")
+        return max((code_of(error) for _, error in failed), default=ExitCode.DONE)
+
+    async def announce_write(self) -> None:
+        """Name the vehicles that are written to, and those of the link that were not heard."""
+        for each in self:
+            each.announce_write()
+        await self.report_unheard()
+
+    async def report_unheard(self) -> None:
+        """Report vehicles of the link in the cache that were not heard, if --vehicle names none."""
+        if not self[0].choice.is_named:
+            for sentence in await _unheard_in_words(self[0]):
+                report(f"{sentence} --vehicle chooses one")
+
+    async def report_others(self) -> None:
+        """Report other vehicles of the link, if --vehicle did not choose the one that was used.
+
+        For subcommands that only read: they use the first vehicle heard, which may be another one next time.
+        A short command may end before another vehicle is heard; the cache knows those of earlier commands.
+        """
+        first = self[0]
+        if first.choice.is_named and not self.is_all:
+            return
+        used, others = {each.component.node for each in self}, [*first.client.autopilots]
+        if self.is_all:
+            others = [each for each in first.client.components.values() if _has_parameters(each)]
+        listed = first_of(
+            [node_in_words(each.node) for each in others if each.node not in used], OTHERS_SHOWN_MAX
+        )
+        unheard = await _unheard_in_words(first)
+        if self.is_all:
+            if listed:
+                report(f"--vehicle all chooses autopilots. Also heard, and not asked: {listed}")
+            for sentence in unheard:
+                report(sentence)
+        elif listed or unheard:
+            also = [f"Also on this link: {listed}."] if listed else []
+            used_first = f"{first.label} was used, the first vehicle heard."
+            report(f"{' '.join([used_first, *also, *unheard])} --vehicle chooses one")
 
 
 @asynccontextmanager
@@ -228,7 +371,7 @@ async def sessions(
     policy: Policy = Policy.AUTO,
     is_live: bool = False,
     extended: bool = False,
-) -> AsyncIterator[list[CommandSession]]:
+) -> AsyncIterator[Sessions]:
     """Open a link, and yield a session for each vehicle that --vehicle names.
 
     Args:
@@ -246,9 +389,8 @@ async def sessions(
         LinkError: the link cannot be opened, or failed.
     """
     check_link_argument(url)
-    choice, deadline = ChosenVehicle.parse(options.vehicle), Deadline(options.timeout)
-    if extended and choice.is_all:
-        raise UsageError("--vehicle all is not possible with --extended; name one vehicle")
+    one = "--extended works on one vehicle" if extended else ""
+    choice, deadline = ChosenVehicle.parse(options.vehicle, one=one), Deadline(options.timeout)
     async with ParamClient(
         url if is_live else _at_full_speed(url),
         cache=None if options.place is True else options.place,
@@ -260,135 +402,36 @@ async def sessions(
         **options.source,
     ) as client:
         timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
-        found = await _find(client, choice, timeout=timeout, only=writes)
+        if choice.is_all:
+            with _waiting(client, "vehicles"):
+                found = await client.find_autopilots(timeout=timeout)
+        else:
+            found = [await wait_for_vehicle(client, choice, timeout=timeout, only=writes)]
         if writes:
             await wait_for_firmware(found, deadline)
         for each in () if extended else found:
             if expects_extended(each.identity.vehicle_type, each.component):
-                label = f"{each.system}/{each.component}"
-                say(f"{label} usually has extended parameters: --extended uses them")
+                say(f"{each.system}/{each.component} usually has extended parameters: --extended uses them")
         chosen = [each.ext for each in found] if extended else found
-        yield [CommandSession(client, each, deadline, options, choice) for each in chosen]
+        found_sessions = (CommandSession(client, each, deadline, options, choice) for each in chosen)
+        yield Sessions(found_sessions, writes=writes)
 
 
-@asynccontextmanager
-async def connect(
-    url: str, options: LinkOptions, *, writes: bool = False, is_live: bool = False, extended: bool = False
-) -> AsyncIterator[CommandSession]:
-    """Open a link, and yield the session of one vehicle; arguments and errors as in `sessions`.
+def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> ParamClient:
+    """Return a client that counts all traffic, and neither reads nor writes a cache.
 
     Raises:
-        UsageError: also for --vehicle all.
+        UsageError: no such link.
     """
-    if ChosenVehicle.parse(options.vehicle).is_all:
-        raise UsageError("--vehicle all is not possible here; name one vehicle")
-    async with sessions(url, options, writes=writes, is_live=is_live, extended=extended) as found:
-        yield found[0]
-
-
-async def announce_write(found: Sequence[CommandSession]) -> None:
-    """Print a line on stderr for each vehicle to which the subcommand writes, unless it prints JSON.
-
-    Also reports vehicles of the link in the cache that were not heard, if --vehicle names none.
-    """
-    first = found[0]
-    if not first.options.json:
-        for each in found:
-            say(printable(f"writing to {each.receiver} on {each.client.link.name}"))
-    if not first.choice.is_named:
-        for sentence in await _unheard_in_words(first):
-            report(f"{sentence} --vehicle chooses one")
-
-
-async def report_others(found: Sequence[CommandSession]) -> None:
-    """Report other vehicles of the link, if --vehicle did not choose the one that was used.
-
-    For subcommands that only read: they use the first vehicle heard, which may be another one next time. A
-    short command may end before the heartbeat of another vehicle; the cache knows those of earlier commands.
-    """
-    first = found[0]
-    if first.choice.is_all:
-        own = [each.component.node for each in found]
-        parts = [each for each in first.client.components.values() if each.node not in own]
-        parts = [each for each in parts if each.node.identification.has_parameters]
-        if parts:
-            listed = first_of([vehicle_in_words(each) for each in parts], OTHERS_SHOWN_MAX)
-            report(f"--vehicle all chooses autopilots. Also heard, and not asked: {listed}")
-        for sentence in await _unheard_in_words(first):
-            report(sentence)
-    if first.choice.is_named:
-        return
-    others = [each for each in first.client.autopilots if each.system != first.component.system]
-    sentences = []
-    if others:
-        listed = first_of([vehicle_in_words(each) for each in others], OTHERS_SHOWN_MAX)
-        sentences.append(f"Also on this link: {listed}.")
-    sentences += await _unheard_in_words(first)
-    if sentences:
-        used = f"{first.label} was used, the first vehicle heard."
-        report(f"{' '.join([used, *sentences])} --vehicle chooses one")
-
-
-# Work on every session
-
-
-@dataclass(frozen=True, slots=True)
-class Done(Generic[T]):
-    """The outcome of the work on one vehicle: its result, or the error that ended it."""
-
-    session: CommandSession
-    result: T | None = None
-    error: ParamClientError | None = None
-
-
-async def run_on_all(
-    found: Sequence[CommandSession], work: Callable[[CommandSession], Awaitable[T]]
-) -> list[Done[T]]:
-    """Work on all vehicles concurrently; return the outcomes. A failure of one does not stop the others.
-
-    Raises:
-        ParamClientError: the error of the vehicle, without --vehicle all.
-    """
-    if not found[0].choice.is_all:
-        return [Done(found[0], await work(found[0]))]
-    done: dict[int, Done[T]] = {}
-
-    async def run(place: int, session: CommandSession) -> None:
-        try:
-            done[place] = Done(session, result=await work(session))
-        except ParamClientError as error:
-            done[place] = Done(session, error=error)
-
-    async with anyio.create_task_group() as tasks:
-        for place, session in enumerate(found):
-            tasks.start_soon(run, place, session)
-    return [done[place] for place in sorted(done)]
-
-
-def report_failures(done: Sequence[Done[T]]) -> int:
-    """Print the errors of vehicles on which the work failed; return the exit code for them."""
-    worst: int = ExitCode.DONE
-    for each in done:
-        if each.error is not None:
-            report(f"{each.session.label}: {each.error}")
-            worst = max(worst, code_of(each.error))
-    return worst
-
-
-def failed_json(done: Sequence[Done[T]]) -> list[dict[str, object]]:
-    """Return the JSON of the vehicles on which the work failed."""
-    return [
-        {
-            "system": each.session.component.system,
-            "component": each.session.component.component,
-            "error": str(each.error),
-        }
-        for each in done
-        if each.error is not None
-    ]
-
-
-# Vehicles
+    return ParamClient(
+        url,
+        cache=False,
+        traffic=True,
+        signing=options.signing,
+        listen_only=listen_only,
+        tlog=options.tlog,
+        **options.source,
+    )
 
 
 def check_link_argument(text: str) -> None:
@@ -411,67 +454,15 @@ def check_link_argument(text: str) -> None:
             ) from None
 
 
-async def _unheard_in_words(session: CommandSession) -> list[str]:
-    """Return a sentence about vehicles of the link in the cache that were not heard; none without any.
-
-    Vehicles that were heard last more than `UNHEARD_AGE_MAX` ago are left out, and so are those with the
-    system id of a heard one.
-    """
-    cache, now = session.client.cache, session.now
-    if cache is None:
-        return []
-    known: list[CachedSummary] = []
-    with anyio.move_on_after(CACHE_LIST_TIMEOUT), suppress(CacheError):
-        known = await anyio.to_thread.run_sync(cache.components, abandon_on_cancel=True)
-    heard = {each.system for each in session.client.components.values()}
-    link = session.client.link.name
-    unheard: dict[int, str] = {}
-    for each in known:
-        at = max(each.updated_at, each.synced_at or 0.0)
-        is_recent = now - at <= UNHEARD_AGE_MAX
-        if each.autopilot == MAV_AUTOPILOT_INVALID or not is_recent:
-            continue
-        if each.identity.link != link or each.system in heard:
-            continue
-        kind = kind_in_words(each.autopilot, each.identity.vehicle_type)
-        words = f"{each.system}/{each.component} {kind}".rstrip()
-        unheard.setdefault(each.system, f"{words} (last {local_time(at)})")
-    if not unheard:
-        return []
-    listed = first_of([unheard[system] for system in sorted(unheard)], OTHERS_SHOWN_MAX)
-    was = "was" if len(unheard) == 1 else "were"
-    return [f"{counted(len(unheard), 'vehicle')} of this link in the cache {was} not heard: {listed}."]
+def _at_full_speed(url: str) -> str:
+    """Return the link name; for a log without a speed, with the option for full speed."""
+    if not url.lower().startswith(f"{LinkKind.REPLAY}:"):
+        return url
+    spec = parse_link(url)
+    return spec.name if spec.options else replace(spec, options=(("speed", 0.0),)).name
 
 
-async def wait_for_firmware(vehicles: Sequence[Component], deadline: Deadline) -> None:
-    """Wait until the firmware versions of vehicles are known, for at most `FIRMWARE_TIMEOUT`."""
-    with anyio.move_on_after(deadline.left(FIRMWARE_TIMEOUT)):
-        while not all(each.identity.firmware for each in vehicles):  # noqa: ASYNC110 - no event
-            await anyio.sleep(FIRMWARE_POLL_INTERVAL)
-
-
-def receiver_in_words(component: Component) -> str:
-    """Return address, kind and firmware of a component: `1/1 PX4 quadrotor, firmware 1.16.0`."""
-    firmware = component.identity.firmware
-    return vehicle_in_words(component) + (f", firmware {version_text(firmware)}" if firmware else "")
-
-
-def vehicle_in_words(component: Component) -> str:
-    """Return address and kind of a component: `1/1 PX4 quadrotor`."""
-    return node_in_words(component.node)
-
-
-async def _find(
-    client: ParamClient, choice: ChosenVehicle, *, timeout: float | None, only: bool
-) -> list[Component]:
-    """Return the vehicles that a choice names; see `sessions`."""
-    if not choice.is_all:
-        return [await wait_for_vehicle(client, choice, timeout=timeout, only=only)]
-
-    async def look(_: Callable[[], None]) -> list[Component]:
-        return await client.find_autopilots(timeout=timeout)
-
-    return await while_waiting(look, f"vehicles on {client.link.name}", lambda: received_in_words(client))
+# Vehicles
 
 
 async def wait_for_vehicle(
@@ -488,25 +479,25 @@ async def wait_for_vehicle(
     Raises:
         ParamClientError: as from `ParamClient.component` and `ParamClient.only_component`.
     """
-    if choice.uid is None:
-        awaited = address_in_words(choice.system, choice.component, None)
-    else:
+    if choice.uid is not None:
         awaited = f"a vehicle with hardware id {choice.uid}"
+        with _waiting(client, awaited):
+            return await _find_by_uid(client, choice.uid, awaited, timeout)
+    address, deadline = (choice.system, choice.component), Deadline(timeout)
+    with _waiting(client, address_in_words(*address)):
+        if not only:
+            return await client.component(*address, timeout=timeout)
+        try:
+            return await client.only_component(*address, timeout=timeout)
+        except AmbiguousVehicle:  # of the first two; the user chooses among all that are heard
+            await anyio.sleep(deadline.left(HEARTBEAT_WAIT) or 0.0)
+            with suppress(NoReply):
+                await client.only_component(*address, timeout=RECHECK_TIMEOUT)
+            raise
 
-    async def look(_: Callable[[], None]) -> Component:
-        if choice.uid is not None:
-            return await _find_by_uid(client, choice.uid, awaited, timeout, only=only)
-        if only:
-            return await _find_only(client, choice, timeout)
-        return await client.component(choice.system, choice.component, timeout=timeout)
 
-    return await while_waiting(look, f"{awaited} on {client.link.name}", lambda: received_in_words(client))
-
-
-async def _find_by_uid(
-    client: ParamClient, uid: str, awaited: str, timeout: float | None, *, only: bool
-) -> Component:
-    """Wait for the autopilot with a hardware id; with `only`, also for another one that begins like it.
+async def _find_by_uid(client: ParamClient, uid: str, awaited: str, timeout: float | None) -> Component:
+    """Wait for the autopilot with a hardware id, and with the beginning of one also for a second.
 
     Raises:
         AmbiguousVehicle: several have this beginning.
@@ -517,56 +508,24 @@ async def _find_by_uid(
         while True:
             found = [each for each in client.autopilots if (each.identity.uid or "").startswith(uid)]
             if len(found) > 1:
-                words = [vehicle_in_words(each) for each in found]
+                words = [node_in_words(each.node) for each in found]
                 raise AmbiguousVehicle(
                     f"{len(found)} vehicles on this link have hardware ids that begin with {uid}: "
                     f"{', '.join(words)}.",
                     vehicles=words,
                     choose_by="system",
                 )
-            if found and (has_looked or not only or found[0].identity.uid == uid):
+            if found and (has_looked or found[0].identity.uid == uid):
                 return found[0]
-            if found:
-                has_looked = True
-                await anyio.sleep(HEARTBEAT_WAIT)
-                continue
+            has_looked = bool(found)
             client.core.station.gate.check()
-            await anyio.sleep(UID_POLL_INTERVAL)
+            await anyio.sleep(HEARTBEAT_WAIT if found else UID_POLL_INTERVAL)
     waited = anyio.current_time() - began
     raise NoReply(awaited, attempts=0, waited=waited, hint=received_in_words(client))
 
 
-async def _find_only(client: ParamClient, choice: ChosenVehicle, timeout: float | None) -> Component:
-    """Wait for the only component, as `ParamClient.only_component` does; the error lists all vehicles.
-
-    That call ends with the second vehicle that is heard. The user chooses one of all: the others are
-    waited for as long as an autopilot takes for a heartbeat.
-    """
-    deadline, address = Deadline(timeout), (choice.system, choice.component)
-    try:
-        return await client.only_component(*address, timeout=timeout)
-    except AmbiguousVehicle:
-        await anyio.sleep(deadline.left(HEARTBEAT_WAIT) or 0.0)
-        with suppress(NoReply):
-            await client.only_component(*address, timeout=RECHECK_TIMEOUT)
-        raise
-
-
-def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> ParamClient:
-    """Return a client that counts all traffic, and neither reads nor writes a cache.
-
-    Raises:
-        UsageError: no such link.
-    """
-    return ParamClient(
-        url,
-        cache=False,
-        traffic=True,
-        signing=options.signing,
-        listen_only=listen_only,
-        tlog=options.tlog,
-        **options.source,
-    )
+def _waiting(client: ParamClient, awaited: str) -> Status:
+    return Status(f"waiting for {awaited} on {client.link.name}", heard=lambda: received_in_words(client))
 
 
 def received_in_words(client: ParamClient) -> str:
@@ -574,9 +533,39 @@ def received_in_words(client: ParamClient) -> str:
     return hint_of_link(client.core.station, client.bytes_received)
 
 
-def _at_full_speed(url: str) -> str:
-    """Return the link name; for a log without a speed, with the option for full speed."""
-    if not url.lower().startswith(f"{LinkKind.REPLAY}:"):
-        return url
-    spec = parse_link(url)
-    return spec.name if spec.options else replace(spec, options=(("speed", 0.0),)).name
+async def wait_for_firmware(vehicles: Sequence[Component], deadline: Deadline) -> None:
+    """Wait until the firmware versions of vehicles are known, for at most `FIRMWARE_TIMEOUT`."""
+    with anyio.move_on_after(deadline.left(FIRMWARE_TIMEOUT)):
+        while not all(each.identity.firmware for each in vehicles):  # noqa: ASYNC110 - no event
+            await anyio.sleep(FIRMWARE_POLL_INTERVAL)
+
+
+def _has_parameters(component: Component) -> bool:
+    return component.node.identification.has_parameters
+
+
+async def _unheard_in_words(session: CommandSession) -> list[str]:
+    """Return a sentence about vehicles of the link in the cache that were not heard; none without any.
+
+    Vehicles that were heard last more than `UNHEARD_AGE_MAX` ago are left out, and so are those with the
+    system id of a heard one.
+    """
+    cache, link = session.client.cache, session.client.link.name
+    known: list[CachedSummary] = []
+    if cache is not None:
+        with anyio.move_on_after(CACHE_LIST_TIMEOUT), suppress(CacheError):
+            known = await anyio.to_thread.run_sync(cache.components, abandon_on_cancel=True)
+    heard = {each.system for each in session.client.components.values()}
+    unheard: dict[int, str] = {}
+    for each in known:
+        at = max(each.updated_at, each.synced_at or 0.0)
+        is_here = each.identity.link == link and session.now - at <= UNHEARD_AGE_MAX
+        if is_here and each.autopilot != MAV_AUTOPILOT_INVALID and each.system not in heard:
+            kind = kind_in_words(each.autopilot, each.identity.vehicle_type)
+            words = f"{each.system}/{each.component} {kind}".rstrip()
+            unheard.setdefault(each.system, f"{words} (last {local_time(at)})")
+    if not unheard:
+        return []
+    listed = first_of([unheard[system] for system in sorted(unheard)], OTHERS_SHOWN_MAX)
+    was = "was" if len(unheard) == 1 else "were"
+    return [f"{counted(len(unheard), 'vehicle')} of this link in the cache {was} not heard: {listed}."]

@@ -3,54 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+import shlex
+from collections.abc import AsyncIterator, Iterable, Sequence
 from typing import Annotated, Final
 
-import anyio
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from paramclient.cli.confirmation import can_ask, confirm
-from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.json_output import VehicleJson
-from paramclient.cli.metadata import (
-    MetadataChoice,
-    from_file,
-    info_of,
-    known_of_session,
-    parse_pairs,
-    problems,
-    resolved,
-)
+from paramclient.cli.metadata import MetadataChoice, from_file, info_of, known_of_session
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import print_json, print_table, printable, report, say
+from paramclient.cli.output import report
 from paramclient.cli.param_names import learn_spelling, spelling
 from paramclient.cli.read_commands import get_chosen
-from paramclient.cli.session import (
-    CommandSession,
-    announce_write,
-    check_link_argument,
-    run_on_all,
-    sessions,
-    wait_for_firmware,
-)
-from paramclient.cli.write_outcomes import (
-    OUTCOME_COLUMNS,
-    counted_outcomes,
-    outcome_cells,
-    outcomes_code,
-    report_outcomes,
-    summary,
-    write_all,
-    writes_json,
-)
+from paramclient.cli.session import CommandSession, check_link_argument, sessions, wait_for_firmware
+from paramclient.cli.writes import OUTCOME_COLUMNS, WriteJob, write_all
 from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
+from paramclient.metadata.info import number_of
 from paramclient.model.ext_values import parse_ext_value
-from paramclient.model.values import ParamType, WireValue, format_value
-from paramclient.protocol.set_results import SetOutcome
+from paramclient.model.values import WireValue, check_name, format_value
 
 __all__ = ["set_"]
 
@@ -91,56 +64,22 @@ async def set_(
     """
     check_link_argument(url)
     described = from_file(metadata)
-    wanted = parse_pairs(pairs, as_text=extended)
+    wanted = _parse_pairs(pairs, as_text=extended)
     if described is not None and not extended:
-        wanted = [*resolved(wanted, described)]
+        wanted = _resolved(wanted, described)
     async with sessions(url, options, writes=True, extended=extended) as found:
-        jobs = {each.address: await _prepare(each, wanted, described, metadata) for each in found}
+        jobs = {each: await _prepare(each, wanted, described, metadata) for each in found}
         await _check_values([*jobs.values()], force=force)
-        for each in found:
-            await each.check_only()
-        await announce_write(found)
-
-        async def work(session: CommandSession) -> Sequence[SetOutcome]:
-            job = jobs[session.address]
-            return await write_all(
-                session,
-                job.writes,
-                lambda so_far: _print([job], [so_far]),
-                verb="setting",
-                settle=settle,
-                force=force,
-                durable=durable,
-            )
-
-        began = anyio.current_time()
-        done = [each.result or () for each in await run_on_all(found, work)]
-        elapsed = anyio.current_time() - began
-        is_all = found[0].choice.is_all
-        lines = [
-            printable(f"{counted_outcomes(outcomes)} on {session.receiver}")
-            if is_all
-            else summary(session, outcomes, elapsed)
-            for session, outcomes in zip(found, done, strict=True)
-        ]
-    _print([*jobs.values()], done)
-    if not options.json:
-        for line in lines:
-            say(line)
-    code: int = ExitCode.DONE
-    for job, outcomes in zip(jobs.values(), done, strict=True):
-        report_outcomes(outcomes, job.described, vehicle=job.session.prefix)
-        code = max(code, outcomes_code(outcomes))
-    return code
-
-
-@dataclass(frozen=True, slots=True)
-class _Job:
-    """The values for one vehicle, and its metadata."""
-
-    session: CommandSession
-    writes: Sequence[tuple[str, WireValue]]
-    described: Metadata | None
+        return await write_all(
+            found,
+            jobs,
+            OUTCOME_COLUMNS,
+            "requested actual",
+            verb="setting",
+            settle=settle,
+            force=force,
+            durable=durable,
+        )
 
 
 async def _prepare(
@@ -148,52 +87,44 @@ async def _prepare(
     wanted: Sequence[tuple[str, WireValue]],
     described: Metadata | None,
     choice: MetadataChoice,
-) -> _Job:
-    """Return names and values as the vehicle and its metadata have them."""
-    if session.component.is_extended:
-        return _Job(session, await _extended_values(session, wanted), None)
-    await learn_spelling(session.component, [name for name, _ in wanted])
-    wanted = [(spelling(name, session.component), value) for name, value in wanted]
+) -> WriteJob:
+    """Return names and values as the vehicle and its metadata have them.
+
+    Raises:
+        UsageError: a text is no value of its parameter.
+        ParamClientError: the type of an extended parameter could not be read.
+    """
+    component = session.component
+    if component.is_extended:
+        params, errors = await get_chosen(session, [name for name, _ in wanted])
+        for error in errors.values():
+            if not isinstance(error, UnknownParameter):  # the write reports that
+                raise error
+        types = {param.name: param.type_number for param in params}
+        texts = [(spelling(name, component), str(text)) for name, text in wanted]
+        values: list[tuple[str, WireValue]] = [
+            (name, parse_ext_value(name, text, types[name]) if name in types else text)
+            for name, text in texts
+        ]
+        return WriteJob(session, values, None)
+    await learn_spelling(component, [name for name, _ in wanted])
+    wanted = [(spelling(name, component), value) for name, value in wanted]
     if described is None:
         named = [f"{name}: {value!r} is not a number" for name, value in wanted if isinstance(value, str)]
         described = await known_of_session(session, choice, needed_for=named[0] if named else "")
-    return _Job(session, resolved(wanted, described), described)
+    return WriteJob(session, _resolved(wanted, described), described)
 
 
-async def _extended_values(
-    session: CommandSession, wanted: Sequence[tuple[str, WireValue]]
-) -> list[tuple[str, WireValue]]:
-    """Return the values that texts give in the types of extended parameters, which are read first.
-
-    A name that the component does not have keeps its text; the write reports it.
-
-    Raises:
-        UsageError: a text is no value of the type.
-        ParamClientError: a type could not be read.
-    """
-    found, errors = await get_chosen(session, [name for name, _ in wanted])
-    for error in errors.values():
-        if not isinstance(error, UnknownParameter):
-            raise error
-    types = {param.name: param.type_number for param in found}
-    names = [(spelling(name, session.component), str(text)) for name, text in wanted]
-    return [
-        (name, parse_ext_value(name, text, types[name]) if name in types else text) for name, text in names
-    ]
-
-
-async def _check_values(jobs: Sequence[_Job], *, force: bool) -> None:
+async def _check_values(jobs: Sequence[WriteJob], *, force: bool) -> None:
     """Report values that are probably wrong; continue if the user confirms them, or with `force`.
 
     Raises:
         UsageError: the user does not confirm, or there is no terminal. Nothing was written.
     """
-    found = [problem for job in jobs for problem in problems(job.writes, job.described)]
-    for job in jobs:
-        found += await _fractions(job)
-    for problem in dict.fromkeys(found):
-        report(problem)
-    if not found or force:
+    doubts = dict.fromkeys([doubt for job in jobs async for doubt in _doubts(job)])
+    for doubt in doubts:
+        report(doubt)
+    if not doubts or force:
         return
     if not can_ask():
         raise UsageError("nothing was written; --force writes these values all the same")
@@ -203,54 +134,89 @@ async def _check_values(jobs: Sequence[_Job], *, force: bool) -> None:
         raise UsageError("nothing was written")
 
 
-async def _fractions(job: _Job) -> list[str]:
-    """Return sentences on fractions for parameters that are integers, by metadata or the vehicle's type."""
-    found = []
+async def _doubts(job: WriteJob) -> AsyncIterator[str]:
+    """Yield sentences on values outside the range, and on fractions for integers."""
     for name, value in job.writes:
+        info = info_of(job.described, name)
+        if info is not None and (problem := info.problem(value)) is not None:
+            yield problem
         if not isinstance(value, float) or not math.isfinite(value) or value.is_integer():
             continue
-        info, component = info_of(job.described, name), job.session.component
-        kind = None if info is None else info.type
-        if info is not None and info.bits:
-            kind = ParamType.INT32
-        if kind is None or not kind.is_integer:
+        is_integer = info is not None and (
+            bool(info.bits) or (info.type is not None and info.type.is_integer)
+        )
+        if not is_integer:
+            component, timeout = job.session.component, job.session.deadline.left()
             try:
-                known = component.params.get(name) or await component.get(
-                    name, timeout=job.session.deadline.left()
-                )
+                known = component.params.get(name) or await component.get(name, timeout=timeout)
             except ParamClientError:
                 continue  # the write will fail for the same reason, and say so
-            kind = known.type
-        if kind.is_integer:
-            found.append(f"{name}: {format_value(value)} is not a whole number, and {name} is an integer")
-    return found
+            is_integer = known.type.is_integer
+        if is_integer:
+            yield f"{name}: {format_value(value)} is not a whole number, and {name} is an integer"
 
 
-def _print(jobs: Sequence[_Job], done: Sequence[Sequence[SetOutcome]]) -> None:
-    """Print the outcomes of the vehicles as a table or as JSON."""
-    first = jobs[0].session
-    pairs = list(zip(jobs, done, strict=True))
-    if first.options.json:
-        objects = [
-            {
-                "vehicle": VehicleJson.of(job.session.component),
-                "results": writes_json(job.session, outcomes, job.described),
-            }
-            for job, outcomes in pairs
-        ]
-        vehicles = [
-            {"system": job.session.component.system, "component": job.session.component.component, **each}
-            for job, each in zip(jobs, objects, strict=True)
-        ]
-        print_json({"vehicles": vehicles} if first.choice.is_all else objects[0])
-        return
-    rows = (
-        (
-            *([job.session.address] if first.choice.is_all else []),
-            *outcome_cells(job.session, outcome, job.described),
-        )
-        for job, outcomes in pairs
-        for outcome in outcomes
-    )
-    columns = [*(["vehicle"] if first.choice.is_all else []), *OUTCOME_COLUMNS]
-    print_table(columns, rows, right="requested actual")
+# The arguments
+
+
+def _parse_pairs(words: Sequence[str], *, as_text: bool = False) -> list[tuple[str, WireValue]]:
+    """Parse parameters and values, as `NAME VALUE` or `NAME=VALUE`.
+
+    A value after an equals sign may be the name of a value; it is returned as text. With `as_text`, every
+    value is.
+
+    Raises:
+        UsageError: a name has no value, or a name or value is invalid.
+    """
+    pairs: list[tuple[str, WireValue]] = []
+    left = iter(words)
+    for word in left:
+        if word.startswith("-"):  # values may be negative, so that an unknown option would be a name
+            raise UsageError(f"Unknown option: {word.partition('=')[0]}. Nothing was written.")
+        name, equals, text = word.partition("=")
+        value = text if equals else next(left, None)
+        if value is None:
+            break
+        if not as_text and equals and not value.strip():
+            raise UsageError(f"{name}: there is no value after the equals sign")
+        number = None if as_text else _number_or_none(name, value)
+        if number is None and not (as_text or equals):
+            if value.startswith("="):
+                raise UsageError(f"write {name}=VALUE without spaces, or {name} VALUE without an equals sign")
+            raise UsageError(
+                f"{name}: {value!r} is not a number, such as 12, 0x1F, -1.5, 1e-3, nan or inf. "
+                f"If it is the name of a value, write {shlex.quote(f'{name}={value}')}"
+            )
+        pairs.append((check_name(name), value if number is None else number))
+    else:
+        if pairs:
+            return pairs
+    end = f", and {words[-1]} has no value" if words else ""
+    raise UsageError(f"set takes pairs of NAME and VALUE, or NAME=VALUE{end}")
+
+
+def _number_or_none(name: str, text: str) -> int | float | None:
+    """Parse a value exactly: an integer as an int, other numbers as a float; None if it is not a number."""
+    try:
+        return None if text != text.strip() else number_of(text)
+    except UsageError as error:
+        raise UsageError(f"{name}: {error}") from None
+
+
+def _resolved(
+    pairs: Iterable[tuple[str, WireValue]], metadata: Metadata | None
+) -> list[tuple[str, WireValue]]:
+    """Return the pairs with every name of a value replaced by its number.
+
+    Raises:
+        UsageError: an unknown name of a value, or a parameter without metadata.
+    """
+    numbers: list[tuple[str, WireValue]] = []
+    for name, value in pairs:
+        if isinstance(value, str):
+            info = info_of(metadata, name)
+            if info is None:
+                raise UsageError(f"{name}: {value!r} is not a number, and no metadata describes {name}")
+            value = info.parse(value)
+        numbers.append((name, value))
+    return numbers

@@ -11,7 +11,7 @@ import anyio
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.json_output import VehicleJson
 from paramclient.cli.json_setup import ApplyJson, PlanJson, applied_rows
-from paramclient.cli.output import Coloured, print_json, print_table, printable, progress_bar, report, say
+from paramclient.cli.output import Coloured, Status, print_json, print_table, printable, report, say
 from paramclient.cli.session import CommandSession
 from paramclient.client.component import Component
 from paramclient.errors import ParamClientError
@@ -135,7 +135,7 @@ class SetupOutput:
         steps: dict[Address, tuple[int, int]] = {}
         began = 0.0
         try:
-            with progress_bar(title) as draw:
+            with Status(f"{title}: waiting for the first response", title) as status:
 
                 def update(component: Component, state: ApplyProgress) -> None:
                     nonlocal began
@@ -144,11 +144,11 @@ class SetupOutput:
                     if state.row is not None:
                         rows.setdefault(address, {})[state.row.name] = state.row.so_far
                         began = began or anyio.current_time()
-                    if draw is not None and began:
+                    if began:
                         done, total = (sum(numbers) for numbers in zip(*steps.values(), strict=True))
                         seconds = anyio.current_time() - began
                         rate = done / seconds if seconds > RATE_DELAY else 0.0
-                        draw(Progress(done, total, rate, (total - done) / rate if rate else None))
+                        status.update(Progress(done, total, rate, (total - done) / rate if rate else None))
 
                 yield update
         except anyio.get_cancelled_exc_class():

@@ -12,7 +12,7 @@ from __future__ import annotations
 import difflib
 import sys
 from collections.abc import Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Final
@@ -22,8 +22,8 @@ import anyio
 from paramclient.cache import CachedSummary, ParamCache
 from paramclient.cache.lookup import address_of, is_vehicle_name
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import STDIN, progress_bar, report
-from paramclient.cli.session import ChosenVehicle, CommandSession, report_others, sessions
+from paramclient.cli.output import STDIN, report
+from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
 from paramclient.errors import FileError, NotInCache, UnknownVehicle, UsageError
 from paramclient.files import LARGEST_FILE, ParamFile, loads, read_file, read_renames
 from paramclient.files.formats import AUTOPILOT, ENDINGS
@@ -128,9 +128,9 @@ async def resolve_all(
     async def fetch(url: str) -> None:
         try:
             async with sessions(url, options, writes=writes, extended=extended) as opened:
-                found[url] = await whole_table(opened[0], draws=len(links) == 1)
+                found[url] = await whole_table(opened[0])
                 if not writes:
-                    await report_others(opened)
+                    await opened.report_others()
         except Exception as error:  # raised here, the task group would wrap it in a group
             errors.append(error)
             tasks.cancel_scope.cancel()
@@ -143,14 +143,11 @@ async def resolve_all(
     return [found[text] for text in texts]
 
 
-async def whole_table(
-    session: CommandSession, *, draws: bool, refresh: bool = False, partial: bool = False
-) -> ParamSet:
+async def whole_table(session: CommandSession, *, refresh: bool = False, partial: bool = False) -> ParamSet:
     """Fetch the table of a session's component; return the values received or confirmed in this session.
 
     Args:
         session: the session.
-        draws: whether the progress is drawn; two bars at a time would mix.
         refresh: as in `Component.fetch_all`.
         partial: whether a set of some parameters is returned; its source names the others.
 
@@ -158,9 +155,8 @@ async def whole_table(
         VehicleError: some parameters were not received; the message names them.
         NoReply, LinkError: as from `Component.fetch_all`.
     """
-    component, deadline, link = session.component, session.deadline, session.client.link.name
-    with progress_bar(f"fetching {session.label}") if draws else nullcontext() as progress:
-        result = await component.fetch_all(refresh=refresh, timeout=deadline.left(), progress=progress)
+    component, link = session.component, session.client.link.name
+    result = await session.fetch(refresh=refresh)
     for note in result.notes:
         report(f"{session.label} on {link}: {note}")
     found = await collect_set(component, result, source=f"link {link}")

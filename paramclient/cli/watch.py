@@ -5,16 +5,17 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncGenerator, Sequence
 from contextlib import aclosing, suppress
+from functools import partial
 from typing import Final, TypeAlias
 
 import anyio
 
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import local_time, print_json, print_line, printable, say
+from paramclient.cli.output import local_time, print_json, print_line, say
 from paramclient.cli.param_names import ChosenNames, check_given, may_appear
-from paramclient.cli.read_commands import fetch_table, get_chosen, report_all
-from paramclient.cli.session import CommandSession, connect, report_others
+from paramclient.cli.read_commands import get_chosen, report_all
+from paramclient.cli.session import CommandSession, Sessions, sessions
 from paramclient.client.events import Discovered, Event, Events, Found, Lost, Rebooted, Resynced
 from paramclient.client.streams import Changes
 from paramclient.errors import CacheError, ParamClientError
@@ -22,6 +23,7 @@ from paramclient.model.names import NameChoice, is_pattern
 from paramclient.model.notation import hash_text, time_text, value_json
 from paramclient.model.values import format_value
 from paramclient.model.wording import counted
+from paramclient.protocol.channel import task_group
 from paramclient.protocol.events import Change
 
 __all__ = ["watch"]
@@ -44,30 +46,31 @@ async def watch(url: str, /, *names: str, extended: bool = False, options: LinkO
         extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
     given = check_given(names)
-    async with connect(url, options, is_live=True, extended=extended) as session:
-        feed, events = session.component.changes(), session.client.events()
-        known: set[str] | None = None
-        if not session.client.listens_only:
-            code = await _begin(session, given)
-            if code:
-                return code
-            known = set(session.component.params)
-        everything = counted(len(session.component.params), session.noun)
-        say(printable(f"watching {', '.join(given) or everything} of {session.label}"))
-        await report_others([session])
-        failure: Exception | None = None
-        async with anyio.create_task_group() as tasks:
-            if given and not any(map(is_pattern, given)) and known is not None:
-                tasks.start_soon(_follow_groups, session)
-            with anyio.move_on_after(session.deadline.left()):
-                try:
-                    choice = NameChoice(given) if given else None
-                    await _print_changes_and_events(session, feed, events, known, choice)
-                except Exception as error:  # raised here, the task group would wrap it in a group
-                    failure = error
-            tasks.cancel_scope.cancel()
-        if failure is not None:
-            raise failure
+    async with sessions(url, options, is_live=True, extended=extended) as found:
+        codes = [each.result for each in await found.work(partial(_watch, given=given, found=found))]
+    return max(code or ExitCode.DONE for code in codes)
+
+
+async def _watch(session: CommandSession, given: Sequence[str], found: Sessions) -> int:
+    """Watch one vehicle; return the exit code."""
+    changes, events = session.component.changes(), session.client.events()
+    known: set[str] | None = None
+    if not session.client.listens_only:
+        code = await _begin(session, given)
+        if code:
+            return code
+        known = set(session.component.params)
+    everything = counted(len(session.component.params), session.noun)
+    say(f"watching {', '.join(given) or everything} of {session.label}")
+    if session is found[0]:
+        await found.report_others()
+    choice = NameChoice(given) if given else None
+    async with task_group() as tasks:
+        if given and not any(map(is_pattern, given)) and known is not None:
+            tasks.start_soon(_follow_groups, session)
+        with anyio.move_on_after(session.deadline.left()):
+            await _print_changes_and_events(session, changes, events, known, choice)
+        tasks.cancel_scope.cancel()
     return ExitCode.DONE
 
 
@@ -79,15 +82,15 @@ async def _begin(session: CommandSession, given: Sequence[str]) -> int:
     patterns = [text for text in given if is_pattern(text)]
     if patterns or not given:
         with suppress(CacheError):  # with an empty cache, all received parameters are new
-            await fetch_table(session)
+            await session.fetch()
     if not given:
         return ExitCode.DONE
     _, errors = await get_chosen(session, [text for text in given if not is_pattern(text)])
     errors |= ChosenNames.of(session.component, patterns).errors
     hidden = [name for name in errors if may_appear(name, session.component)]
     if hidden:
-        say(printable(f"not there at present: {', '.join(hidden)}"))
-    return report_all(error for name, error in errors.items() if name not in hidden)
+        say(f"{session.prefix}not there at present: {', '.join(hidden)}")
+    return report_all((error for name, error in errors.items() if name not in hidden), session.prefix)
 
 
 async def _follow_groups(session: CommandSession) -> None:
@@ -113,24 +116,25 @@ async def _print_changes_and_events(
             the first value of every parameter is not a change.
         choice: the names to watch; None for all.
     """
+    ids = session.ids if session.choice.is_all else {}
     async with aclosing(_merged(changes, events)) as merged:
         async for each in merged:
+            prefix = ""
             if isinstance(each, Change):
                 if each.kind == "first" and (known is None or each.name in known):
                     known = known and known - {each.name}
                     continue
                 if choice is not None and not choice.has(each.name):
                     continue
-                text = _change_text(each)
+                text, prefix = _change_text(each), session.prefix
             elif isinstance(each, Discovered) or each.component.node is not session.component.node:
                 continue
             else:
                 text = _event_text(each)
-            at = session.now
             if session.options.json:
-                print_json(_line(each, at))
+                print_json({"time": time_text(session.now)} | ids | _json(each))
             else:
-                print_line(f"{local_time(at)}  {text}")
+                print_line(f"{local_time(session.now)}  {prefix}{text}")
 
 
 async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | Event]:
@@ -156,23 +160,15 @@ async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | E
                 each.exception()  # both end with the link; one error is reported
 
 
-def _line(item: Change | _ComponentEvent, at: float) -> dict[str, object]:
-    """Return the JSON of a change or an event."""
+def _json(item: Change | _ComponentEvent) -> dict[str, object]:
+    """Return the JSON of a change or an event, without its time."""
     if isinstance(item, Change):
         old, new = (
             None if param is None else value_json(param.settable, param.type_number)
             for param in (item.old, item.new)
         )
-        return {
-            "time": time_text(at),
-            "name": item.name,
-            "old": old,
-            "new": new,
-            "by": item.by,
-            "kind": item.kind,
-        }
+        return {"name": item.name, "old": old, "new": new, "by": item.by, "kind": item.kind}
     event: dict[str, object] = {
-        "time": time_text(at),
         "event": type(item).__name__.lower(),
         "system": item.component.system,
         "component": item.component.component,
@@ -186,7 +182,7 @@ def _line(item: Change | _ComponentEvent, at: float) -> dict[str, object]:
 
 def _change_text(change: Change) -> str:
     old, new = (
-        "none" if param is None else printable(format_value(param.settable, param.type_number))
+        "none" if param is None else format_value(param.settable, param.type_number)
         for param in (change.old, change.new)
     )
     if change.kind == "added":

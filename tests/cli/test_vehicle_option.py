@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
-from tests.commands import Command, Put, behind, in_process, leaping
+from tests.commands import Command, Put, behind, in_process, leaping, strict
 
 TABLE: dict[str, Any] = {"A": 1.0, "B": 2.0}
 UID = "0a" * 18
@@ -85,7 +87,7 @@ def test_names_that_name_nothing(command: Command, put: Put, name: str, reason: 
 def test_subcommands_for_one_vehicle_refuse_all(command: Command, put: Put, tmp_path: Path) -> None:
     vehicle = px4()
     url = put(vehicle)
-    for words in (["reset", url, "A"], ["watch", url], ["check", url], ["set", url, "A", "1", "--extended"]):
+    for words in (["check", url], ["set", url, "A", "1", "--extended"]):
         done = in_words(command, *words, "--vehicle", "all")
         assert (done, vehicle.requests["PARAM_SET"]) == (2, 0)
 
@@ -106,3 +108,52 @@ def test_kinds_and_addresses_in_the_cache(command: Command, put: Put) -> None:
     missing = command("show", "4/9")
     assert missing.code == 2
     assert "no vehicle has system id 4 and a table of component 9" in missing.err
+
+
+def test_reset_writes_to_every_vehicle(command: Command, put: Put, tmp_path: Path) -> None:
+    described = tmp_path / "parameters.json"
+    described.write_text('{"version": 1, "parameters": [{"name": "A", "type": "Float", "default": 2.5}]}')
+    vehicles = (px4(), px4(4))
+    words = ["reset", put(Air(vehicles)), "A", "--metadata", described, "--vehicle", "all"]
+    done = command(*words)
+    assert done.code == 0, done.err
+    assert [row[:5] for row in done.rows] == [
+        ["vehicle", "name", "before", "default", "now"],
+        *([address, "A", "1.0", "2.5", "2.5"] for address in ("1/1", "4/1")),
+    ]
+    assert [each.values["A"] for each in vehicles] == [2.5, 2.5]
+    again = command(*words, "--json").json
+    assert [(each["system"], each["unchanged"]) for each in again["vehicles"]] == [(1, ["A"]), (4, ["A"])]
+
+
+def test_watch_prints_the_changes_of_every_vehicle(command: Command, put: Put) -> None:
+    class Changing(PX4Vehicle):
+        """A vehicle that changes a value on its own, 6 s after its first heartbeat."""
+
+        changes_at: float | None = None
+
+        def tick(self, now: float) -> None:
+            super().tick(now)
+            self.changes_at = self.changes_at or now + 6.0
+            if now >= self.changes_at:
+                self.changes_at = math.inf
+                self.set_param("A", 3.0)
+
+    url = put(Air([Changing(table=TABLE), Changing(system=2, table=TABLE)]))
+    watched = command("watch", url, "A", "--vehicle", "all", "--timeout", 20)
+    assert watched.code == 0, watched.err
+    assert sorted(re.sub(r"^\S+  ", "", line) for line in watched.out.splitlines()) == [
+        "1/1 px4: A  1.0 -> 3.0  (vehicle)",
+        "2/1 px4: A  1.0 -> 3.0  (vehicle)",
+    ]
+    url = put(Air([Changing(table=TABLE), Changing(system=2, table=TABLE)]))
+    lines = command("watch", url, "A", "--vehicle", "all", "--timeout", 20, "--json").out.splitlines()
+    assert {(strict(line)["system"], strict(line)["name"]) for line in lines} == {(1, "A"), (2, "A")}
+
+
+def test_a_read_says_which_vehicle_it_shows(command: Command, put: Put) -> None:
+    url = put(Air([px4(), copter()]))
+    several = command("fetch", url)
+    assert several.words[0][:2] == ["vehicle", "name"]
+    assert {row[0] for row in several.words[1:]} <= {"1/1", "4/1"}
+    assert command("fetch", url, "--vehicle", 1).words[0][0] == "name"
