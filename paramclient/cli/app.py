@@ -50,7 +50,7 @@ def run(arguments: Sequence[str]) -> int:
             report(_usage_text(error))
             return ExitCode.USAGE
         except ParamClientError as error:
-            text = text_of(error)
+            text = text_of(error, takes_all=not {"signing", "check", "--extended"} & {*arguments})
             report(in_local_time(text) if isinstance(error, CacheError) else text)
             return code_of(error)
         except BrokenPipeError:

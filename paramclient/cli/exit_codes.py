@@ -43,11 +43,17 @@ def code_of(error: ParamClientError) -> ExitCode:
     return next(code for kind, code in _CODES.items() if isinstance(error, kind))
 
 
-def text_of(error: ParamClientError) -> str:
-    """Return the message of an error for the command line, with options in place of Python arguments."""
+def text_of(error: ParamClientError, *, takes_all: bool) -> str:
+    """Return the message of an error for the command line, with options in place of Python arguments.
+
+    Args:
+        error: the error.
+        takes_all: whether the subcommand can work on all vehicles.
+    """
     if isinstance(error, AmbiguousVehicle) and error.choose_by:
         address = error.vehicles[0].partition(" ")[0] if error.vehicles else "1/1"
-        return f"{error.summary} Choose one with --vehicle, as in --vehicle {address}."
+        all_too = ", or all with --vehicle all" if takes_all and error.choose_by == "system" else ""
+        return f"{error.summary} Choose one with --vehicle {address}{all_too}."
     return str(error)
 
 

@@ -79,7 +79,7 @@ def test_the_error_of_several_vehicles_lists_all_that_send_a_heartbeat(
     assert (outcome.code, outcome.out) == (2, "")
     assert outcome.err == (
         "paramclient: 4 vehicles on this link: 1/1 PX4 quadrotor, 2/1 PX4 quadrotor, 3/1 PX4 quadrotor, "
-        "4/1 PX4 quadrotor. Choose one with --vehicle, as in --vehicle 1/1.\n"
+        "4/1 PX4 quadrotor. Choose one with --vehicle 1/1, or all with --vehicle all.\n"
     )
 
 
