@@ -62,9 +62,25 @@ class Server:
         return f"postgresql://tests@/postgres?host={quote(str(self.folder))}"
 
     def start(self) -> None:
-        """Start it, and wait until it answers."""
+        """Start it, and wait until it answers.
+
+        It ends at once while processes of a killed one before it still hold their memory, and is started again.
+        """
         import psycopg
 
+        deadline = time.monotonic() + _START_TIMEOUT
+        while True:
+            if self._process is None or self._process.poll() is not None:
+                self._process = self._launch()
+            try:
+                psycopg.connect(self.url, connect_timeout=2).close()
+            except psycopg.OperationalError:
+                assert time.monotonic() < deadline, "PostgreSQL does not start"
+                time.sleep(0.02)
+            else:
+                return
+
+    def _launch(self) -> subprocess.Popen[bytes]:
         settings = {
             "listen_addresses": "",
             "unix_socket_directories": self.folder,
@@ -72,7 +88,7 @@ class Server:
             "max_connections": 60,
             "shared_buffers": "32MB",
         }
-        self._process = subprocess.Popen(
+        return subprocess.Popen(
             [
                 self._programs / "postgres",
                 *("-D", self.folder / "data"),
@@ -85,15 +101,6 @@ class Server:
             stderr=subprocess.DEVNULL,
             start_new_session=True,
         )
-        deadline = time.monotonic() + _START_TIMEOUT
-        while True:
-            try:
-                psycopg.connect(self.url, connect_timeout=2).close()
-            except psycopg.OperationalError:
-                assert time.monotonic() < deadline, "PostgreSQL does not start"
-                time.sleep(0.02)
-            else:
-                return
 
     def stand_still(self) -> None:
         """Have it answer nothing, and keep its connections."""
