@@ -64,7 +64,7 @@ class Server:
     def start(self) -> None:
         """Start it, and wait until it answers.
 
-        It ends at once while processes of a killed one before it still hold their memory, and is started again.
+        While processes of a killed one still hold their memory, it ends at once, and is started again.
         """
         import psycopg
 

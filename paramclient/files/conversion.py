@@ -281,5 +281,5 @@ def _check(sets: Sequence[ParamSet], file_format: FileFormat) -> None:
     if any(each.is_extended for each in sets):
         if file_format is not FileFormat.JSON:
             raise UsageError(f"the format {file_format} cannot hold extended parameters; write .json")
-        if len(sets) > 1:
-            raise UsageError("a file of extended parameters holds one component, and no plain parameters")
+        if not all(each.is_extended for each in sets):
+            raise UsageError("a file has either plain or extended parameters, not both")

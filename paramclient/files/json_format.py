@@ -1,18 +1,16 @@
-"""paramclient's own file format, JSON: all fields of every parameter, exactly. Plain and extended parameters.
+"""paramclient's own file format, JSON: all fields of every parameter, exactly.
 
     {"paramclient": 1, "header": [...], "sets": [
       {"system": 1, "component": 1, "at": "2026-01-31T12:00:00Z", "identity": {...}, "params": {
-        "RTL_ALT": {"value": 1500, "type": "INT32", "bits": "000005dc", "default": 1500}}}]}
-
-    {"paramclient_extended": 1, "system": 1, "component": 100, "at": "2026-01-31T12:00:00Z", "params": {
-      "CAM_MODE": {"value": 1, "type": "UINT32"},
-      "CAM_NAME": {"value": "Front", "type": "CUSTOM"},
-      "CAM_LICENSE": {"hex": "ff00fe", "type": "CUSTOM"}}}
+        "RTL_ALT": {"value": 1500, "type": "INT32", "bits": "000005dc", "default": 1500}}},
+      {"system": 1, "component": 100, "extended": true, "params": {
+        "CAM_NAME": {"value": "Front", "type": "CUSTOM"},
+        "CAM_LICENSE": {"value": "hex:ff00fe", "type": "CUSTOM"}}}]}
 
 `value` is the shortest number that gives the same value in this type. "NaN", "Infinity" and "-Infinity" are
-text, as are four raw bytes ("0x0000002a"). `bits` are as in `Param.bits` and must agree with the value: an
-edit of only one of the two is an error. In a document of extended parameters, `value` is text for CUSTOM, and
-`hex` has the bytes of a value that is neither a number nor text. Each parameter is one line.
+text, as are raw bytes ("0x0000002a", a little-endian number). The value of an extended parameter of the type
+CUSTOM is text, or bytes in hexadecimal after `hex:`. `bits` are as in `Param.bits` and must agree with the
+value: an edit of only one of the two is an error. Each parameter is one line.
 """
 
 from __future__ import annotations
@@ -22,31 +20,26 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from datetime import datetime
 from typing import Any, Final, NoReturn, TypeAlias
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import FileFormat, ParamFile
 from paramclient.files.reading import Reading, as_type, excerpt, is_plain, time_of, undecoded_byte
-from paramclient.model.ext_values import (
-    EXT_VALUE_SIZE,
-    check_ext_value,
-    encode_ext_value,
-    ext_param,
-    own_bytes,
-)
+from paramclient.model.ext_values import check_ext_value
 from paramclient.model.identity import Identity
-from paramclient.model.notation import bits_written, value_json, value_written
+from paramclient.model.notation import bits_written, value_written
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import (
+    HEX,
     TYPES_BY_NAME,
     WIRE_SIZE,
     ParamType,
     WireValue,
+    bits_of,
     check_name,
     from_bits,
-    is_portable_name,
     type_name,
 )
 
@@ -60,20 +53,16 @@ Place: TypeAlias = tuple[str | int, ...]
 Checks: TypeAlias = Mapping[str, Callable[[Any], Any]]
 """By the name of a field, a function that returns the field's content, or raises UsageError."""
 VERSION: Final = 1
-"""Version of both kinds of documents, written and required."""
+"""Version of documents, written and required."""
 _KEY: Final = "paramclient"
-"""The key with the version of a document of plain parameters."""
-_EXT_KEY: Final = "paramclient_extended"
-"""The key with the version of a document of extended parameters."""
+"""The key with the version."""
 _NUMBER_EXPECTED: Final = "expected a number (or NaN, Infinity, 0x and 8 digits for raw bytes)"
 _CUSTOM: Final = ParamType.CUSTOM
-_EXT_PREFIX: Final = "EXT_"
-"""Begins the name of an unknown type of extended parameters: EXT_TYPE_77."""
+_TYPES: Final = TYPES_BY_NAME | {_CUSTOM.name: _CUSTOM}
 _WORDS: Final = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
-_raw: Final = re.compile(r"0x([0-9a-fA-F]{8})").fullmatch
+_raw: Final = re.compile(r"0x([0-9a-fA-F]{8,256})").fullmatch
 _type_number: Final = re.compile(r"TYPE_([0-9]{1,3})").fullmatch
 _bits: Final = re.compile(r"[0-9a-fA-F]{8}(?:[0-9a-fA-F]{8})?").fullmatch
-
 
 # Documents
 
@@ -169,94 +158,68 @@ def _line_of(text: str, key: str, *, last: bool = False) -> int | None:
 
 
 def read_json(reading: Reading, file_format: FileFormat) -> ParamFile:
-    """Read a document of plain or of extended parameters.
+    """Read a document.
 
     Raises:
         FileError: invalid JSON, a repeated key, or not a valid document. The error names up to 20 faults.
     """
     content = read_json_text(reading.text, reading.source)
-    if not isinstance(content, dict) or not content.keys() & {_KEY, _EXT_KEY}:
+    if not isinstance(content, dict) or _KEY not in content:
         raise FileError("not a parameter file of paramclient (JSON)", source=reading.source)
-    if _EXT_KEY in content:
-        known = {key: each for key, each in content.items() if key in _EXT_DOCUMENT}
-        return reading.file(file_format, sets=(_set(reading, known, ()),))
-    fields = _checked(reading, content, (), _DOCUMENT, {_KEY, "sets"})
-    sets = [_set(reading, each, ("sets", place)) for place, each in enumerate(fields.get("sets", []))]
-    return reading.file(file_format, tuple(fields.get("header", [])), sets=tuple(sets))
+    found = _checked(reading, content, (), _DOCUMENT, {_KEY, "sets"})
+    sets = [_set(reading, each, ("sets", place)) for place, each in enumerate(found.get("sets", []))]
+    if len({each.is_extended for each in sets}) > 1:
+        reading.fault(None, "a file has either plain or extended parameters, not both")
+    return reading.file(file_format, tuple(found.get("header", [])), sets=tuple(sets))
 
 
 def _set(reading: Reading, content: object, place: Place) -> ParamSet:
-    """Return the set at a position, without invalid fields; at the top, that of extended parameters."""
-    is_extended = not place
-    fields = _checked(reading, content, place, _EXT_DOCUMENT if is_extended else _SET, {"params"})
+    """Return the set at a position, without invalid fields."""
+    found = _checked(reading, content, place, _SET, {"params"})
+    is_extended = found.get("extended", False)
     params = {}
-    for name, each in fields.get("params", {}).items():
+    for name, each in found.get("params", {}).items():
         at = (*place, "params", name)
         try:
-            if not is_portable_name(check_name(name)) and is_extended:
-                raise UsageError("no name of a parameter")
+            check_name(name)
         except UsageError as error:
             _fault(reading, at, str(error), is_name=True)
             continue
-        try:
-            param = _ext_param(name, each) if is_extended else _param(reading, name, each, at)
-        except ValueError as error:
-            _fault(reading, at, str(error))
-            continue
-        if param is not None:
-            params[name] = param
+        before = reading.fault_count
+        known = _checked(reading, each, at, _PARAM, {"value"})
+        if reading.fault_count == before:
+            try:
+                params[name] = _param(name, known, is_extended=is_extended)
+            except UsageError as error:
+                _fault(reading, at, str(error))
     identity = None
-    if "identity" in fields:
-        known = _checked(reading, fields["identity"], (*place, "identity"), _IDENTITY, {"system"})
-        identity = Identity(**known) if "system" in known else None
-    ids = fields.get("component"), fields.get("system")
-    return ParamSet(params, *ids, identity, fields.get("at"), reading.source, is_extended)
+    if "identity" in found:
+        known = _checked(reading, found["identity"], (*place, "identity"), _IDENTITY, _IDS)
+        identity = Identity(**known) if known.keys() >= _IDS else None
+    ids = found.get("component"), found.get("system")
+    return ParamSet(params, *ids, identity, found.get("at"), reading.source, is_extended)
 
 
-def _param(reading: Reading, name: str, content: object, place: Place) -> WrittenParam | None:
-    """Return a plain parameter; None, with faults, if a field is not valid.
+def _param(name: str, found: Mapping[str, Any], *, is_extended: bool) -> WrittenParam:
+    """Return the parameter of valid fields.
 
     Raises:
         UsageError: the fields contradict each other.
     """
-    before = reading.fault_count
-    fields = _checked(reading, content, place, _PARAM, {"value"})
-    if reading.fault_count > before:
-        return None
-    value, kind, default = fields["value"], fields.get("type"), fields.get("default")
+    kind, default = found.get("type"), found.get("default")
+    value = _custom(found["value"]) if kind is _CUSTOM else _number(found["value"])
+    is_raw = isinstance(value, bytes) and kind is not _CUSTOM
+    if is_extended and (kind is None or (is_raw and isinstance(kind, ParamType))):
+        raise UsageError("an extended parameter has a type, and raw bytes only if MAVLink does not define it")
+    if not is_extended and (kind is _CUSTOM or (isinstance(value, bytes) and len(value) > WIRE_SIZE)):
+        raise UsageError("a plain parameter is a number, or four raw bytes")
     if kind is not None:
         value = as_type(value, kind)
         default = None if default is None else as_type(default, kind)
-    if "bits" in fields:
-        value = _with_bits(value, kind, fields["bits"])
-    return WrittenParam(
-        name, value, kind, default, fields.get("comment", ""), is_raw=isinstance(value, bytes)
-    )
-
-
-def _ext_param(name: str, fields: object) -> WrittenParam:
-    """Return an extended parameter: `value` or `hex`, and `type`.
-
-    Raises:
-        ValueError: a field is not valid.
-    """
-    if not isinstance(fields, dict) or not {"type"} <= fields.keys() <= {"value", "hex", "type"}:
-        raise ValueError("expected value or hex, and type")
-    written = fields.get("type")
-    number = _CUSTOM if written == _CUSTOM.name else _type(written, _EXT_PREFIX)
-    if ("value" in fields) == ("hex" in fields):
-        raise ValueError("expected either value or hex")
-    if "hex" in fields:
-        raw = bytes.fromhex(_text(fields["hex"]))
-        if len(raw) > EXT_VALUE_SIZE or own_bytes(raw, number) != raw:
-            raise ValueError(f"hex is not a value of type {type_name(number)}")
-        return WrittenParam.of(ext_param(name, raw, number))
-    value = fields["value"]
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        raise ValueError("the value must be a number or text")
-    if number != _CUSTOM and isinstance(value, str):
-        value = _WORDS.get(value, value)
-    return WrittenParam.of(ext_param(name, encode_ext_value(check_ext_value(value), number), number))
+    if "bits" in found:
+        value = _with_bits(value, kind, found["bits"])
+        is_raw = isinstance(value, bytes)
+    return WrittenParam(name, value, kind, default, found.get("comment", ""), is_raw=is_raw)
 
 
 def _whole(low: int, high: float, words: str) -> Callable[[Any], Any]:
@@ -286,11 +249,11 @@ def _time(content: object) -> float:
     return moment.timestamp()
 
 
-def _type(content: object, prefix: str = "") -> ParamType | int:
+def _type(content: object) -> ParamType | int:
     text = _text(content)
-    if text in TYPES_BY_NAME:
-        return TYPES_BY_NAME[text]
-    if text.startswith(prefix) and (match := _type_number(text.removeprefix(prefix))):
+    if text in _TYPES:
+        return _TYPES[text]
+    if match := _type_number(text):
         number = int(match[1])
         if number <= 255 and number not in TYPES_BY_NAME.values():
             return number
@@ -302,12 +265,22 @@ def _number(content: object) -> WireValue:
         if content in _WORDS:
             return _WORDS[content]
         if match := _raw(content):
-            return int(match[1], 16).to_bytes(4, "little")
+            return int(match[1], 16).to_bytes((len(match[1]) + 1) // 2, "little")
     elif isinstance(content, int | float) and not isinstance(content, bool):
         if not math.isinf(content):
             return content
         raise UsageError("the number is beyond the range of a double")
     raise UsageError(f"{_NUMBER_EXPECTED}{_found(content)}")
+
+
+def _custom(content: object) -> WireValue:
+    """Return a CUSTOM value: text, or bytes after `hex:`."""
+    text = _text(content)
+    try:
+        value = check_ext_value(bytes.fromhex(text.removeprefix(HEX)) if text.startswith(HEX) else text)
+    except ValueError as error:  # also a UsageError
+        raise UsageError(str(error)) from None
+    return from_bits(bits_of(value, _CUSTOM), _CUSTOM)
 
 
 def _with_bits(value: WireValue, kind: ParamType | int | None, text: str) -> WireValue:
@@ -330,122 +303,94 @@ _DOCUMENT: Final[Checks] = {_KEY: _version, "header": _texts, "sets": _list}
 _SET: Final[Checks] = {
     "system": _id,
     "component": _component,
+    "extended": _expected(lambda content: isinstance(content, bool), "true or false"),
     "identity": _object,
     "at": _time,
     "source": _text,
     "params": _object,
 }
 _IDENTITY: Final[Checks] = {
-    "system": _id,
-    "link": _text,
-    "uid": _text,
-    "git_hash": _text,
-    **dict.fromkeys(
-        ("autopilot", "vehicle_type", "firmware", "board", "vendor_id", "product_id", "capabilities"), _count
-    ),
-}
+    each.name: _text if "str" in str(each.type) else _count for each in fields(Identity)
+} | {"system": _id}
+_IDS: Final = frozenset({"system", "link"})
+"""The fields that an identity has at least."""
 _PARAM: Final[Checks] = {
-    "value": _number,
+    "value": lambda content: content,  # its notation depends on the type
     "type": _type,
     "bits": _text,
     "default": _number,
     "comment": _text,
 }
-_EXT_DOCUMENT: Final[Checks] = {_EXT_KEY: _version, **_SET}
 
 
 # Writing
 
 
 def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
-    """Generate the lines of a document: of one set of extended parameters, or of sets of plain ones.
+    """Generate the lines of a document.
 
     Raises:
         UsageError: a NaN with payload bits has no type.
     """
-    if sets[0].is_extended:
-        yield from _set_lines(sets[0], {_EXT_KEY: VERSION}, "")
-        return
     header = [_encodable(line) for line in (*around.header, *around.footer)]
-    yield "{"
-    yield f'  "{_KEY}": {VERSION},'
-    if header:
-        yield f'  "header": {_json(header)},'
-    yield '  "sets": ['
-    for number, each in enumerate(sets, start=1):
-        *lines, last = _set_lines(each, {}, "    ")
-        yield from (*lines, f"{last}," if number < len(sets) else last)
-    yield "  ]"
-    yield "}"
+    document = {_KEY: VERSION, "header": header or None, "sets": [_set_fields(each) for each in sets]}
+    yield _json(_without_none(document))
 
 
-def _set_lines(params: ParamSet, first: Mapping[str, object], indent: str) -> Iterator[str]:
-    """Generate the lines of the object of a set."""
-    fields = {
-        **first,
-        "system": params.system,
-        "component": params.component,
-        "at": None if params.at is None else time_of(params.at),
-        "source": _encodable(params.source) or None,
-        "identity": None if params.identity is None else asdict(params.identity),
-    }
-    yield f"{indent}{{"
-    for key, content in fields.items():
-        if content is not None:
-            yield f"{indent}  {_json(key)}: {_json(content)},"
-    yield f'{indent}  "params": {{'
-    for number, param in enumerate(params.values(), start=1):
-        comma = "," if number < len(params) else ""
-        yield f"{indent}    {_json(param.name)}: {_json(json_fields(params, param))}{comma}"
-    yield f"{indent}  }}"
-    yield f"{indent}}}"
+def _set_fields(params: ParamSet) -> dict[str, object]:
+    return _without_none(
+        {
+            "system": params.system,
+            "component": params.component,
+            "extended": params.is_extended or None,
+            "at": None if params.at is None else time_of(params.at),
+            "source": _encodable(params.source) or None,
+            "identity": None if params.identity is None else asdict(params.identity),
+            "params": {param.name: json_fields(params, param) for param in params.values()},
+        }
+    )
 
 
 def json_fields(params: ParamSet, param: WrittenParam) -> dict[str, object]:
     """Return the fields of a parameter, or raise UsageError if the format cannot express it."""
-    return _ext_fields(param) if params.is_extended else _fields(param)
-
-
-def _fields(param: WrittenParam) -> dict[str, object]:
-    fields: dict[str, object] = {"value": value_written(param.settable, param)}
-    if param.type_number is not None:
-        param.bits_as(param.type_number)  # raises UsageError if the value does not fit
-        fields["type"] = _type_text(param)
-        fields["bits"] = bits_written(param)
-    elif isinstance(param.value, float) and not is_plain(param.value):
+    number, value = param.type_number, param.settable
+    if number is not None:
+        param.bits_as(number)  # raises UsageError if the value does not fit
+    elif isinstance(value, float) and not is_plain(value):
         raise UsageError(f"{param.name} is a NaN with payload bits, and has no type for them")
-    if param.default is not None:
-        fields["default"] = value_written(param.default, param)
-    if param.comment:
-        fields["comment"] = _encodable(param.comment)
-    return fields
+    if isinstance(value, str) and value.startswith(HEX):  # as text, it would read as bytes
+        value = value.encode()
+    is_exact = params.is_extended and isinstance(value, str | bytes)
+    return _without_none(
+        {
+            "value": value_written(value, param),
+            "type": number and (f"TYPE_{number}" if param.type is ParamType.UNKNOWN else type_name(number)),
+            "bits": None if is_exact else bits_written(param),
+            "default": None if param.default is None else value_written(param.default, param),
+            "comment": _encodable(param.comment) or None,
+        }
+    )
 
 
-def _type_text(param: WrittenParam) -> str:
-    number = param.type_number or ParamType.UNKNOWN
-    return f"TYPE_{number}" if param.type is ParamType.UNKNOWN else type_name(number)
+def _without_none(fields: Mapping[str, object]) -> dict[str, object]:
+    return {name: content for name, content in fields.items() if content is not None}
 
 
-def _ext_fields(param: WrittenParam) -> dict[str, object]:
-    """Return the fields of an extended parameter; reading them gives the same bytes."""
-    number = param.type_number or ParamType.UNKNOWN
-    value, raw = param.settable, encode_ext_value(param.settable, number)
-    kind = type_name(number)
-    if param.type is ParamType.UNKNOWN:
-        kind = _EXT_PREFIX + kind
-    if isinstance(value, float):
-        written = value_json(value, ParamType(number))
-        if not isinstance(written, str) or encode_ext_value(_WORDS[written], number) == raw:
-            return {"value": written, "type": kind}  # else a NaN with payload bits
-    elif not isinstance(value, bytes):
-        return {"value": value, "type": kind}
-    return {"hex": raw.hex(), "type": kind}
+def _json(content: object, indent: str = "\n") -> str:
+    """Return JSON in which an object or a list is on one line if it contains no other."""
+    parts: list[tuple[str, object]] = []
+    if isinstance(content, dict):
+        parts = [(f"{json.dumps(key)}: ", each) for key, each in content.items()]
+    elif isinstance(content, list):
+        parts = [("", each) for each in content]
+    if not any(isinstance(each, dict | list) for _, each in parts):
+        return json.dumps(content, allow_nan=False)
+    begin, end = "{}" if isinstance(content, dict) else "[]"
+    inner = f"{indent}  "
+    lines = f",{inner}".join(f"{key}{_json(each, inner)}" for key, each in parts)
+    return f"{begin}{inner}{lines}{indent}{end}"
 
 
 def _encodable(text: str) -> str:
     """Return text without lone surrogates, which a file name may have and a document may not."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
-
-
-def _json(content: object) -> str:
-    return json.dumps(content, allow_nan=False)

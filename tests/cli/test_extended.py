@@ -27,7 +27,8 @@ def put(monkeypatch: pytest.MonkeyPatch) -> Put:
     return behind(monkeypatch, URL)
 
 
-EXT_FILE = '{"paramclient_extended": 1, "params": {"CAM_NAME": {"value": "%s", "type": "CUSTOM"}}}'
+EXT_FILE = """{"paramclient": 1, "sets": [{"extended": true, "params": {
+    "CAM_NAME": {"value": "%s", "type": "CUSTOM"}}}]}"""
 
 
 def small() -> Camera:
@@ -166,8 +167,9 @@ def test_restore_undoes_the_last_apply(command: Command, put: Put, tmp_path: Pat
     url = put(camera)
     file, backup = tmp_path / "camera.json", tmp_path / "before.json"
     file.write_text(
-        '{"paramclient_extended": 1, "component": 100, "params": {'
-        '"CAM_NAME": {"value": "Rear", "type": "CUSTOM"}, "CAM_KEY": {"hex": "01", "type": "CUSTOM"}}}'
+        '{"paramclient": 1, "sets": [{"extended": true, "component": 100, "params": {'
+        '"CAM_NAME": {"value": "Rear", "type": "CUSTOM"},'
+        '"CAM_KEY": {"value": "hex:01", "type": "CUSTOM"}}}]}'
     )
     assert command("apply", url, file, *CAMERA, "--backup", backup).code == 0
     assert camera.ext_values["CAM_NAME"] == "Rear"

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from paramclient.errors import FileError
-from paramclient.files import read_file, write_file
+from paramclient.files import loads, read_file, write_file
 from paramclient.model.ext_values import ext_param
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType
@@ -20,6 +20,7 @@ from paramclient.sim import Camera
 
 KINDS = ParamType
 DATA = Path(__file__).parents[1] / "data"
+TEXT = {"value": "x", "type": "CUSTOM"}
 ODD_NAN = struct.pack("<I", 0x7FC00001)
 
 
@@ -39,8 +40,13 @@ def every_kind() -> dict[str, WrittenParam]:
         written("BYTES", b"\xff\0\xfe"),
         written("UNKNOWN", b"\1\2", 77),
         written("NULL", b"null"),
+        written("HEX", b"hex:12"),
     ]
     return params | {param.name: param for param in more}
+
+
+def document(params: object) -> str:
+    return json.dumps({"paramclient": 1, "sets": [{"extended": True, "params": params}]})
 
 
 def read(path: Path) -> ParamSet:
@@ -49,7 +55,6 @@ def read(path: Path) -> ParamSet:
 
 
 def test_a_written_file_reads_back_unchanged(tmp_path: Path) -> None:
-    """The written file is the one that the first version of the format wrote."""
     path = tmp_path / "camera.json"
     params = every_kind()
     content = ParamSet(params, 100, 1, at=1_700_000_000.0, source="link sim:camera", is_extended=True)
@@ -78,60 +83,57 @@ def test_formats_that_cannot_hold_them(tmp_path: Path, ending: str) -> None:
     assert not path.exists()
 
 
-def test_a_file_is_for_one_component(tmp_path: Path) -> None:
+def test_a_file_is_of_one_kind(tmp_path: Path) -> None:
     camera, (plain, *_) = read(DATA / "camera.json"), read_file(DATA / "vehicle.json").sets
     assert (camera.is_extended, plain.is_extended) == (True, False)
-    with pytest.raises(FileError, match="holds one component, and no plain parameters"):
+    with pytest.raises(FileError, match="either plain or extended parameters, not both"):
         write_file(tmp_path / "both.json", [camera, plain])
 
 
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"value": 1}, "expected value or hex, and type"),
-        ({"value": 1, "type": "TYPE_5"}, "unknown type"),
-        ({"value": 1, "type": "EXT_TYPE_999"}, "unknown type"),
-        ({"type": "CUSTOM"}, "either value or hex"),
-        ({"value": 1, "hex": "00", "type": "INT32"}, "either value or hex"),
-        ({"value": 1, "type": "INT32", "more": 1}, "expected value or hex, and type"),
-        ({"value": True, "type": "INT32"}, "must be a number or text"),
-        ({"value": None, "type": "INT32"}, "must be a number or text"),
+        ({"value": 1}, "an extended parameter has a type"),
+        ({"value": 1, "type": "CUSTOM_5"}, "unknown type"),
+        ({"value": 1, "type": "TYPE_999"}, "unknown type"),
+        ({"type": "CUSTOM"}, "the field is missing"),
+        ({"value": 1, "type": "INT32", "more": 1}, "unknown field"),
+        ({"value": True, "type": "INT32"}, "expected a number"),
+        ({"value": None, "type": "INT32"}, "expected a number"),
         ({"value": 300, "type": "UINT8"}, "does not fit UINT8"),
-        ({"value": "one", "type": "UINT8"}, "'one' is not a number"),
-        ({"value": 1, "type": "CUSTOM"}, "1 is not text"),
+        ({"value": "one", "type": "UINT8"}, "expected a number"),
+        ({"value": 1, "type": "CUSTOM"}, "should be text, found 1"),
         ({"value": "x" * 129, "type": "CUSTOM"}, "129 bytes"),
-        ({"hex": "0", "type": "CUSTOM"}, "non-hexadecimal"),
-        ({"hex": 5, "type": "CUSTOM"}, "should be text, found 5"),
-        ({"hex": "0102", "type": "INT32"}, "hex is not a value of type INT32"),
-        ({"hex": "00" * 129, "type": "CUSTOM"}, "hex is not a value of type CUSTOM"),
-        (5, "expected value or hex, and type"),
+        ({"value": "hex:0", "type": "CUSTOM"}, "non-hexadecimal"),
+        ({"value": "hex:" + "00" * 129, "type": "CUSTOM"}, "129 bytes"),
+        ({"value": "0x00000102", "type": "INT32"}, "raw bytes only if MAVLink does not define it"),
+        ({"value": 5, "type": "TYPE_77"}, "TYPE_77 is not a type that MAVLink defines"),
+        (5, "should be an object, found 5"),
     ],
 )
 def test_an_invalid_file_is_an_error_with_its_path(tmp_path: Path, fields: object, words: str) -> None:
     path = tmp_path / "camera.json"
-    path.write_text(json.dumps({"paramclient_extended": 1, "params": {"CAM": fields}}))
+    path.write_text(document({"CAM": fields}))
     with pytest.raises(FileError, match=words) as caught:
         read_file(path)
     assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("sets", "words"),
     [
-        ('{"paramclient_extended": 2, "params": {}}', "should be 1, the version of the format, found 2"),
-        ('{"paramclient_extended": 1}', "params: the field is missing"),
-        ('{"paramclient_extended": 1, "params": []}', "params: it should be an object"),
-        ('{"paramclient_extended": 1, "params": {}}', "contains no parameters"),
+        ([{"extended": 1, "params": {}}], "should be true or false, found 1"),
+        ([{"params": {"A": TEXT}}], "a plain parameter is a number"),
+        ([{"params": {"A": {"value": "0x0000000102", "type": "INT8"}}}], "or four raw bytes"),
         (
-            '{"paramclient_extended": 1, "system": 0, "params": {"A": {"hex": "", "type": "CUSTOM"}}}',
-            "1 to 255",
+            [
+                {"params": {"A": {"value": 1}}},
+                {"extended": True, "params": {"A": {"value": 1, "type": "INT8"}}},
+            ],
+            "either plain or extended parameters, not both",
         ),
-        ('{"paramclient_extended": 1, "params": {"": {}}}', "at least one character"),
-        ('{"paramclient_extended": 1, "params": {"A": {}, "A": {}}}', "occurs twice"),
     ],
 )
-def test_documents_that_are_none(tmp_path: Path, content: str, words: str) -> None:
-    path = tmp_path / "camera.json"
-    path.write_text(content)
+def test_documents_of_the_wrong_kind(sets: list[object], words: str) -> None:
     with pytest.raises(FileError, match=words):
-        read_file(path)
+        loads(json.dumps({"paramclient": 1, "sets": sets}).encode())
