@@ -136,7 +136,7 @@ class _Download:
             self._inbox,
             self._first,
             what=f"the list of {channel}",
-            attempts=LIST_REQUESTS_MAX,
+            attempts=lambda: ATTEMPTS_MAX if channel.ftp.locked() else LIST_REQUESTS_MAX,  # behind its blocks
             timeout_min=LIST_TIMEOUT_MIN,
         )
         channel.is_streaming = True
