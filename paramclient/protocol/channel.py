@@ -88,19 +88,15 @@ class Gate:
 
     Attributes:
         error: with which requests fail, or None.
+        is_closed: whether the link has failed for good.
     """
 
     def __init__(self) -> None:
         self.error: LinkError | None = None
-        self._is_closed = False
+        self.is_closed = False
         self._open = anyio.Event()
         self._open.set()
         self._waits: dict[anyio.CancelScope, bool] = {}  # and whether they also end at a failure for a time
-
-    @property
-    def is_closed(self) -> bool:
-        """Whether the link has failed for good."""
-        return self._is_closed
 
     @property
     def is_open(self) -> bool:
@@ -109,7 +105,7 @@ class Gate:
 
     def open(self) -> None:
         """Let requests go on, unless the link is closed."""
-        if not self._is_closed:
+        if not self.is_closed:
             self.error = None
             self._open.set()
 
@@ -120,9 +116,9 @@ class Gate:
 
     def fail(self, error: LinkError, *, for_good: bool = False) -> None:
         """End all waits and all later requests with an error, until the link is open again, or for good."""
-        if for_good or not self._is_closed:
+        if for_good or not self.is_closed:
             self.error = error
-            self._is_closed = for_good
+            self.is_closed = for_good
             self._open.set()
             for scope, is_brief in self._waits.items():
                 if for_good or is_brief:
@@ -152,7 +148,7 @@ class Gate:
         Raises:
             LinkError: the link has failed for good; the block was cancelled.
         """
-        if self._is_closed:
+        if self.is_closed:
             self.check()
         with anyio.CancelScope() as scope:
             self._waits[scope] = or_failed
@@ -194,10 +190,6 @@ class Inbox:
 
     def __bool__(self) -> bool:
         return bool(self._messages)
-
-    def clear(self) -> None:
-        """Drop the messages that have arrived."""
-        self._messages.clear()
 
     async def next(self) -> Message:
         """Wait for the next message."""
@@ -313,6 +305,7 @@ class Channel:
     Attributes:
         target: the component's address.
         reads_from: where reads and lists are sent to: the address, or all components of the system.
+        send: queues a message for the component.
         timing: round trip and loss.
         window: limits the reads in flight; it follows what the vehicle serves.
         window_size: of the window.
@@ -339,7 +332,7 @@ class Channel:
         self.ftp = anyio.Lock()
         self.answered = anyio.Event()
         self._ftp_sequence: int | None = None
-        self._transmit = transmit
+        self.send = transmit
         self._presence = presence
         self.inboxes: dict[Key, list[Inbox]] = {}
         self._waits: dict[anyio.CancelScope, tuple[float, int, float] | None] = {}
@@ -365,10 +358,6 @@ class Channel:
             self._ftp_sequence = int(anyio.current_time() * FTP_SEQUENCES_PER_SECOND)
         self._ftp_sequence = (self._ftp_sequence + 2) & 0xFFFF
         return self._ftp_sequence
-
-    def send(self, message: Message) -> None:
-        """Queue a message."""
-        self._transmit(message)
 
     @property
     def is_waiting(self) -> bool:

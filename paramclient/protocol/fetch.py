@@ -37,6 +37,8 @@ NOT_READ: Final = "Values outside the vehicle's hash could not be read: {}."
 NOT_READ_SHOWN_MAX: Final = 5
 """Names of such values that the note has, so that it stays readable."""
 UNCONFIRMED: Final = "The cached table was not confirmed: {}."
+LOST: Final = "The component was lost."
+REPLACED: Final = "Another vehicle has taken the address, and its parameters were fetched: {}."
 UNPROVEN: Final = "The vehicle's hash could not be computed from the table; it was equal before and after."
 
 
@@ -185,6 +187,7 @@ class _Fetch:
         self._began = anyio.current_time()
         self._changed: tuple[str, ...] = ()
         self._is_silent = False  # MAVFTP
+        self._vehicles = session.identification.vehicles
 
     async def run(self, *, refresh: bool) -> FetchResult:
         """Fetch, and return the result."""
@@ -209,19 +212,36 @@ class _Fetch:
             self.notes.append(UNCONFIRMED.format(answer.reason))
         if self.policy is Policy.HASH_ONLY:
             return self._unconfirmed()
-        channel = self.session.channel
-        if channel.is_silent(self._began):
-            waited = anyio.current_time() - self._began
-            raise NoReply(f"the parameters of {channel}", attempts=0, waited=waited)
+        self._check_heard()
         self._is_silent = answer.is_silent
         digest = answer.digest
         source = await self._download()
         for _ in range(REPAIRS_MAX):
-            if not self.table.is_complete or self.listed.missing or await self._settle(digest):
+            is_whole = self.table.is_complete and not self.listed.missing
+            if not self._is_replaced() and (not is_whole or await self._settle(digest)):
                 break
             digest = None
             source = await self._download()
+        if self.session.channel.is_silent(self._began):
+            if not self.table.params:
+                self._check_heard()
+            self.notes.append(LOST)
         return self._result(source)
+
+    def _check_heard(self) -> None:
+        """Raise NoReply if the component is lost."""
+        channel = self.session.channel
+        if channel.is_silent(self._began):
+            waited = anyio.current_time() - self._began
+            raise NoReply(f"the parameters of {channel}", attempts=0, waited=waited)
+
+    def _is_replaced(self) -> bool:
+        """Return whether another vehicle has taken the address since the last call, and tell so."""
+        identification, before = self.session.identification, self._vehicles
+        self._vehicles = identification.vehicles
+        if self._vehicles != before:
+            self.notes.append(REPLACED.format(identification.identity))
+        return self._vehicles != before
 
     async def _download(self) -> FetchSource:
         """Download the file, or the list where there is none."""
@@ -236,7 +256,6 @@ class _Fetch:
                     return "ftp"
                 except FileUnavailable as error:
                     if session.channel.is_silent(self._began):
-                        self.notes.append(f"The component was lost: {error.reason}.")
                         return "ftp"
                     self.notes.append(f"Downloaded as a list: {error.reason}.")
                     self._is_silent = error.is_silent

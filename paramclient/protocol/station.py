@@ -15,7 +15,7 @@ from paramclient.model.values import Encoding
 from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_words
 from paramclient.protocol.channel import Gate
 from paramclient.protocol.dialect import EXTENDED, PLAIN
-from paramclient.protocol.node import Node
+from paramclient.protocol.node import RIVAL_TIME, Node
 from paramclient.protocol.session import Spawn
 from paramclient.wire import messages
 from paramclient.wire.frames import BOOT_CLOCK_OFFSETS, Frame, Framer, sign_frame
@@ -34,8 +34,6 @@ COMPONENTS_MAX: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each."""
 STREAM_PEERS_MAX: Final = 256
 """Peers of a stream with an unfinished frame."""
-RIVAL_TIME: Final = 5.0
-"""Seconds of silence after which another peer may take the ids of a component: its heartbeat timeout."""
 SETUP_SIGNING_COUNT: Final = 3
 """SETUP_SIGNING messages that are sent: they have no acknowledgement, and a frame may be lost."""
 SETUP_SIGNING_INTERVAL: Final = 0.1

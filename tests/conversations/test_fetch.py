@@ -144,6 +144,34 @@ def test_a_lost_vehicle_ends_a_fetch_within_7_s_with_what_came(kind: str, backen
             assert anyio.current_time() - endpoint.at < 7.0
             assert 50 < result.received < result.count
             assert len(result.params) == result.received
+            assert "The component was lost." in result.notes
+
+    run(main, backend=backend)
+
+
+@BACKENDS
+@pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
+def test_a_vehicle_that_takes_the_address_during_a_fetch_is_fetched_whole(kind: str, backend: str) -> None:
+    async def main() -> None:
+        ids = ({"uid": n} if kind == "px4" else {"uid2": bytes([n]) * 12} for n in (1, 2))
+        first, other = (new_vehicle(kind, **each) for each in ids)
+        other.values["ASPD_SCALE_1" if kind == "px4" else "PILOT_THR_FILT"] = 42.0
+        place = Tap(Air.symmetric([first], delay=0.05))
+        async with converse(place) as conversation:
+            node = await conversation.node()
+            results: list[FetchResult] = []
+
+            async def fetch() -> None:
+                results.append(await fetch_all(node.plain))
+
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(fetch)
+                await anyio.sleep(0.3)
+                conversation.station.interrupt()
+                place.endpoint = Air.symmetric([other], delay=0.05)
+                conversation.station.resume(anyio.current_time())
+            check_right(other, results[0])
+            assert results[0].notes[-1].startswith("Another vehicle has taken the address")
 
     run(main, backend=backend)
 
