@@ -8,7 +8,7 @@
 - `sources`: the parameters that an argument names: of a file, a link or the cache. `time_arguments`: times.
 - `param_names`: names and patterns of parameters, and suggestions.
 - `metadata`, `default_sources`: descriptions and defaults that a subcommand uses.
-- `write_outcomes`, `setup_results`, `confirmation`: outcomes of writes, and the question before them.
+- `writes`, `setup_results`, `confirmation`: writes and their outcomes, and the question before them.
 - `check_measurements`: what check measures.
 - `output`: tables, lines, progress, what a command waits for. `file_output`: files.
 - `json_output`, `json_cache`, `json_setup`: JSON.
