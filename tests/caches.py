@@ -107,8 +107,8 @@ def changes(cache: ParamCache, name: str | None = None) -> list[HistoryEntry]:
 
 def extended(cache: ParamCache, key: str | None = None) -> CachedComponent:
     """The only table of extended parameters, or that of a vehicle."""
-    [table] = [each for each in cache.ext_sizes() if key in (None, each[0])]
-    found = cache.load(*table, extended=True)
+    [table] = [each for each in cache.components(extended=True) if key in (None, each.key)]
+    found = cache.load(table.key, table.component, extended=True)
     assert found is not None
     return found
 

@@ -16,7 +16,7 @@ from paramclient.errors import CacheError
 
 __all__ = ["IDENTITY", "SCHEMA_VERSION", "TABLES", "Store", "Transaction"]
 
-SCHEMA_VERSION: Final = 21
+SCHEMA_VERSION: Final = 22
 """Version of the tables. Unreleased versions had lower numbers."""
 IDENTITY: Final = (
     "system, link, uid, autopilot, vehicle_type, firmware, git_hash,"
@@ -58,13 +58,13 @@ TABLES: Final = (
         known_since DOUBLE PRECISION,
         UNIQUE (vehicle, component, extended)
     )""",
-    # no value: the vehicle no longer has the parameter
+    # value: `Param.bits`, little-endian, in 8 bytes, in more for text and bytes, in 4 for the raw bytes of a
+    # message; no value: the vehicle no longer has the parameter
     """CREATE TABLE parameter (
         owner BIGINT NOT NULL REFERENCES component (id) ON DELETE CASCADE,
         name TEXT NOT NULL,
         type INTEGER,
         value BYTEA,
-        is_raw INTEGER,
         param_index INTEGER,
         volatile INTEGER NOT NULL,
         heard_at DOUBLE PRECISION NOT NULL,
@@ -82,10 +82,8 @@ TABLES: Final = (
         old_at DOUBLE PRECISION,
         old_type INTEGER,
         old_value BYTEA,
-        old_is_raw INTEGER,
         new_type INTEGER,
-        new_value BYTEA,
-        new_is_raw INTEGER
+        new_value BYTEA
     )""",
     "CREATE INDEX history_by_time ON history (owner, at)",
     "CREATE INDEX history_by_name ON history (owner, name)",
@@ -107,7 +105,6 @@ TABLES: Final = (
         name TEXT NOT NULL,
         type INTEGER NOT NULL,
         value BYTEA NOT NULL,
-        is_raw INTEGER NOT NULL,
         default_value BYTEA,
         PRIMARY KEY (snapshot, position)
     ){clustered}""",

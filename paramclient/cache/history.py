@@ -38,8 +38,8 @@ SAME_CHANGE_MAX: Final = 2.0
 """Maximum seconds between the times of one change in the cache and in a log: the cache may have received it
 later, or from another link."""
 
-_OLD: Final = "old_type, old_value, old_is_raw"
-_LINE: Final = f"at, name, author, old_at, {_OLD}, new_type, new_value, new_is_raw"
+_OLD: Final = "old_type, old_value"
+_LINE: Final = f"at, name, author, old_at, {_OLD}, new_type, new_value"
 
 
 class Line(NamedTuple):
@@ -70,7 +70,7 @@ def add_lines(tx: Transaction, owner: int, lines: Iterable[Line]) -> None:
     ]
     if not rows:
         return
-    tx.many(f"INSERT INTO history (owner, {_LINE}) VALUES (?{', ?' * 10})", rows)
+    tx.many(f"INSERT INTO history (owner, {_LINE}) VALUES (?{', ?' * 8})", rows)
     found = tx.all(
         "SELECT at FROM history WHERE owner = ? ORDER BY at DESC, id DESC"
         f" LIMIT 1 OFFSET {HISTORY_ENTRIES_MAX}",
@@ -78,10 +78,7 @@ def add_lines(tx: Transaction, owner: int, lines: Iterable[Line]) -> None:
     )
     for (at,) in found:
         tx.do("DELETE FROM history WHERE owner = ? AND at <= ?", (owner, at))
-        tx.do(
-            "UPDATE component SET known_since = ? WHERE id = ? AND known_since < ?",
-            (at, owner, at),
-        )
+        tx.do("UPDATE component SET known_since = ? WHERE id = ? AND known_since < ?", (at, owner, at))
 
 
 def load_lines(tx: Transaction, owner: int) -> dict[str, list[Line]]:
@@ -200,7 +197,7 @@ def merged_lines(
 
 def _line(cells: Sequence[Any]) -> Line:
     at, name, author, old_at, *values = cells
-    return Line(at, name, author, old_at, stored_value(values[:3]), stored_value(values[3:]))
+    return Line(at, name, author, old_at, stored_value(values[:2]), stored_value(values[2:]))
 
 
-_NO_VALUE: Final = (None, None, None)
+_NO_VALUE: Final = (None, None)

@@ -10,16 +10,8 @@ from typing import Any, Final, NamedTuple
 from paramclient.errors import UsageError
 from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.params import ParamMap
-from paramclient.model.values import (
-    Param,
-    ParamType,
-    Trust,
-    WireValue,
-    bits_of,
-    byte_length,
-    from_bits,
-    same_bits,
-)
+from paramclient.model.paramset import WrittenParam
+from paramclient.model.values import WIRE_SIZE, Param, Trust, bits_of, byte_length, from_bits, same_bits
 
 __all__ = [
     "BY_US",
@@ -44,7 +36,7 @@ BY_US: Final = "us"
 AUTHOR_LENGTH_MAX: Final = 128
 """Characters of an author's name: enough for a name with an address, and a program's own description."""
 BITS_SIZE: Final = 8
-"""Bytes of a stored plain value: `Param.bits`, little-endian, in the size of the largest type."""
+"""Bytes of a stored value, the size of the largest type of a number."""
 
 
 def check_author(author: str | None) -> str:
@@ -67,30 +59,31 @@ class StoredValue(NamedTuple):
 
     Attributes:
         type: number of the type.
-        value: `Param.bits`, little-endian, in 8 bytes; in more for text and bytes.
-        is_raw: 1 if a plain value is only known as the four bytes of the message.
+        value: `Param.bits`, little-endian, in 8 bytes, and in more for text and bytes; or the four bytes of
+            the message, if a plain value is only known as these.
     """
 
     type: int
     value: bytes
-    is_raw: int
+
+    @classmethod
+    def of(cls, number: int, bits: int, *, is_raw: bool = False) -> StoredValue:
+        """Return the value with these bits."""
+        least = WIRE_SIZE if is_raw else BITS_SIZE
+        return cls(number, bits.to_bytes(max(least, byte_length(bits)), "little"))
 
     def is_same(self, other: StoredValue) -> bool:
         """Return whether both are the same value in the same type (−0 equals 0)."""
-        if self == other:
-            return True
-        if (self.type, self.is_raw) != (other.type, other.is_raw):
-            return False
-        return same_bits(
-            self.type, int.from_bytes(self.value, "little"), int.from_bytes(other.value, "little")
-        )
+        one, two = (int.from_bytes(each.value, "little") for each in (self, other))
+        is_alike = (self.type, len(self.value)) == (other.type, len(other.value))
+        return self == other or (is_alike and same_bits(self.type, one, two))
 
     def param(self, name: str, index: int | None = None, default: bytes | None = None) -> Param:
         """Return it as a parameter, with trust CACHED."""
         bits = int.from_bytes(self.value, "little")
-        is_raw = bool(self.is_raw)
+        is_raw = len(self.value) < BITS_SIZE
         value = from_bits(bits, self.type, is_raw=is_raw)
-        given = default_value(default, self.type)
+        given = None if default is None else from_bits(int.from_bytes(default, "little"), self.type)
         return Param(name, value, self.type, index, bits, Trust.CACHED, given, is_raw)
 
 
@@ -117,17 +110,22 @@ class StoredParam(NamedTuple):
 
     @classmethod
     def of(
-        cls, param: Param, heard_at: float, volatile: bool | None = None, by: str = BY_VEHICLE
+        cls, param: Param | WrittenParam, heard_at: float, volatile: bool | None = None, by: str = BY_VEHICLE
     ) -> StoredParam:
-        """Return an observation of a parameter; its trust is not stored."""
-        number = int(param.type_number)
+        """Return an observation of a parameter, whose type is known; its trust is not stored.
+
+        Raises:
+            UsageError: the type does not hold the value.
+        """
+        number, default = int(param.type_number or 0), param.default
+        bits, index = (param.bits, param.index) if isinstance(param, Param) else (param.bits_as(number), None)
         return cls(
             param.name,
-            StoredValue(number, _bits_cell(param.bits), int(param.is_raw)),
-            param.index,
+            StoredValue.of(number, bits, is_raw=param.is_raw),
+            index,
             None if volatile is None else int(volatile),
             heard_at,
-            None if param.default is None else _bits_cell(bits_of(param.default, number)),
+            None if default is None else StoredValue.of(number, bits_of(default, number)).value,
             by,
         )
 
@@ -346,20 +344,6 @@ def stored_value(cells: Sequence[Any]) -> StoredValue | None:
 def is_same_value(one: StoredValue | None, other: StoredValue | None) -> bool:
     """Return whether two values, or missing ones, are the same."""
     return one is other or (one is not None and other is not None and one.is_same(other))
-
-
-def default_value(default: bytes | None, number: int) -> WireValue | None:
-    """Return a stored default as a value of its type."""
-    return None if default is None else from_bits(int.from_bytes(default, "little"), number)
-
-
-def written_value(number: ParamType | int, bits: int, *, is_raw: bool) -> StoredValue:
-    """Return a plain value as it is stored."""
-    return StoredValue(int(number), _bits_cell(bits), int(is_raw))
-
-
-def _bits_cell(bits: int) -> bytes:
-    return bits.to_bytes(max(BITS_SIZE, byte_length(bits)), "little")
 
 
 def _minute(at: float) -> str:

@@ -3,88 +3,54 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Final, TypeAlias
+from typing import Final
 
 from paramclient.cache.database import Transaction
 from paramclient.cache.history import values_at
-from paramclient.cache.records import (
-    SnapshotSummary,
-    StoredParam,
-    StoredTable,
-    StoredValue,
-    written_value,
-)
-from paramclient.cache.tables import (
-    identity_cells,
-    load_rows,
-    read_identity,
-    time_cell,
-)
+from paramclient.cache.records import SnapshotSummary, StoredParam, StoredTable, StoredValue
+from paramclient.cache.tables import identity_cells, load_rows, read_identity, time_cell
 from paramclient.errors import NotInCache, UsageError
 from paramclient.model.identity import Identity
-from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import bits_of
+from paramclient.model.paramset import ParamSet
+from paramclient.model.values import Param
 
-__all__ = [
-    "SNAPSHOTS",
-    "SnapshotRow",
-    "end_operation",
-    "load_snapshots",
-    "load_state",
-    "rows_of",
-    "rows_of_table",
-    "store_snapshot",
-]
+__all__ = ["SNAPSHOTS", "end_operation", "load_snapshots", "load_state", "rows_of", "store_snapshot"]
 
 SNAPSHOTS: Final = 50
 """Maximum number of snapshots of each table, the newest: one is stored before each applied file, so they
 cover weeks of work on one vehicle."""
 
-SnapshotRow: TypeAlias = tuple[str, StoredValue, bytes | None]
-"""Name, value and default of a parameter."""
-
 
 def store_snapshot(
-    tx: Transaction,
-    table: StoredTable,
-    identity: Identity,
-    rows: Sequence[SnapshotRow],
-    *,
-    at: float,
-    reason: str,
-    hash: int | None,  # noqa: A002  # the word of the record
-    complete: bool,
-    is_of_operation: bool,
+    tx: Transaction, owner: int, new: SnapshotSummary, identity: Identity, rows: Sequence[StoredParam]
 ) -> SnapshotSummary:
-    """Store a snapshot of a table, delete the oldest ones beyond `SNAPSHOTS`, and return it."""
-    text = reason.encode("utf-8", "backslashreplace").decode()  # a file name in it may not be UTF-8
+    """Store a snapshot of a table, delete the oldest ones beyond `SNAPSHOTS`, and return it.
+
+    Its number and its size are those that it gets.
+    """
+    stored = [(each.name, *each.stored, each.default) for each in rows if each.stored is not None]
+    reason = new.reason.encode("utf-8", "backslashreplace").decode()  # a file name in it may not be UTF-8
+    reason = reason.replace("\0", "\\x00")  # PostgreSQL's text type does not allow NUL
+    at, ended = round(new.at, 3), None if new.ended is None else int(new.ended)
     [(number,)] = tx.all(
         "INSERT INTO snapshot (owner, at, reason, identity, hash, complete, ended)"
         " VALUES (?, ?, ?, ?, ?, ?, ?) RETURNING id",
-        (
-            table.owner,
-            round(time_cell(at), 3),
-            text.replace("\0", "\\x00"),  # PostgreSQL's text type does not allow NUL
-            json.dumps(identity_cells(identity)),
-            hash,
-            int(complete),
-            0 if is_of_operation else None,
-        ),
+        (owner, at, reason, json.dumps(identity_cells(identity)), new.hash, int(new.complete), ended),
     )
     tx.many(
-        "INSERT INTO snapshot_parameter (snapshot, position, name, type, value, is_raw, default_value)"
-        " VALUES (?, ?, ?, ?, ?, ?, ?)",
-        [(number, place, name, *value, default) for place, (name, value, default) in enumerate(rows)],
+        "INSERT INTO snapshot_parameter (snapshot, position, name, type, value, default_value)"
+        " VALUES (?, ?, ?, ?, ?, ?)",
+        [(number, place, *cells) for place, cells in enumerate(stored)],
     )
     tx.do(
         "DELETE FROM snapshot WHERE owner = ? AND id NOT IN"
         f" (SELECT id FROM snapshot WHERE owner = ? ORDER BY id DESC LIMIT {SNAPSHOTS})",
-        (table.owner, table.owner),
+        (owner, owner),
     )
-    return load_snapshots(tx, table)[-1]
+    return replace(new, id=number, at=at, reason=reason, size=len(stored))
 
 
 def end_operation(tx: Transaction, number: int) -> None:
@@ -138,32 +104,20 @@ def load_state(tx: Transaction, table: StoredTable, when: float) -> ParamSet:
         )
     identity = replace(known.identity, firmware=0, git_hash="", capabilities=0)
     values = values_at(tx, table.owner, load_rows(tx, table.owner), when)
-    rows: list[SnapshotRow] = [(name, value, None) for name, value in values.items()]
-    return _param_set(rows, table, identity, when, f"history of {known.key}")
+    params = [value.param(name) for name, value in values.items()]
+    return _param_set(params, table, identity, when, f"history of {known.key}")
 
 
-def rows_of_table(rows: Mapping[str, StoredParam]) -> list[SnapshotRow]:
-    """Return the parameters of a stored table as those of a snapshot."""
-    return [(name, row.stored, row.default) for name, row in rows.items() if row.stored is not None]
-
-
-def rows_of(params: ParamSet) -> list[SnapshotRow]:
+def rows_of(params: ParamSet) -> list[StoredParam]:
     """Return the parameters of a set as those of a snapshot.
 
     Raises:
         UsageError: the type of a parameter is unknown, or does not hold its value.
     """
-    rows: list[SnapshotRow] = []
-    for name, each in params.items():
-        number = each.type_number
-        if number is None:
-            raise UsageError(f"a snapshot has the type of each parameter; that of {name} is not known")
-        value = written_value(number, each.bits_as(number), is_raw=each.is_raw)
-        default = None
-        if each.default is not None:
-            default = written_value(number, bits_of(each.default, number), is_raw=False).value
-        rows.append((name, value, default))
-    return rows
+    untyped = [name for name, each in params.items() if each.type_number is None]
+    if untyped:
+        raise UsageError(f"a snapshot has the type of each parameter; that of {untyped[0]} is not known")
+    return [StoredParam.of(each, 0.0) for each in params.values()]
 
 
 def _of_snapshot(tx: Transaction, table: StoredTable, number: int) -> ParamSet:
@@ -174,26 +128,23 @@ def _of_snapshot(tx: Transaction, table: StoredTable, number: int) -> ParamSet:
         listed = f"those kept are {', '.join(kept)}" if kept else "none is kept"
         raise NotInCache(f"there is no snapshot {number} of {key}, component {component}: {listed}")
     [(at, described)] = found
-    rows: list[SnapshotRow] = [
-        (name, StoredValue(*value), default)
-        for name, default, *value in tx.all(
-            "SELECT name, default_value, type, value, is_raw FROM snapshot_parameter"
-            " WHERE snapshot = ? ORDER BY position",
-            (number,),
-        )
-    ]
-    return _param_set(rows, table, read_identity(json.loads(described)), at, f"snapshot {number} of {key}")
+    rows = tx.all(
+        "SELECT name, default_value, type, value FROM snapshot_parameter"
+        " WHERE snapshot = ? ORDER BY position",
+        (number,),
+    )
+    params = [StoredValue(*value).param(name, None, default) for name, default, *value in rows]
+    return _param_set(params, table, read_identity(json.loads(described)), at, f"snapshot {number} of {key}")
 
 
 def _param_set(
-    rows: Iterable[SnapshotRow], table: StoredTable, identity: Identity, at: float, source: str
+    params: Iterable[Param], table: StoredTable, identity: Identity, at: float, source: str
 ) -> ParamSet:
-    params = {}
-    for name, stored, default in rows:
-        each = stored.param(name, None, default)
-        params[name] = WrittenParam(name, each.value, stored.type, each.default, is_raw=each.is_raw)
     known = table.summary
-    return ParamSet(params, known.component, known.identity.system, identity, at, source)
+    system = known.identity.system
+    return ParamSet.of(
+        params, component=known.component, system=system, identity=identity, at=at, source=source
+    )
 
 
 def _second(at: float) -> str:

@@ -169,13 +169,14 @@ class ParamCache:
         """Return all vehicles, the last seen first."""
         return self._read(tables.load_vehicles)
 
-    def components(self, vehicle: str | None = None) -> list[CachedSummary]:
+    def components(self, vehicle: str | None = None, *, extended: bool = False) -> list[CachedSummary]:
         """Return all tables without parameters, ordered as `vehicles()`, then by component id.
 
         Args:
             vehicle: only this vehicle: its system id (`"4"`), its address (`"4/1"`), `px4` or `ardupilot` if
                 only one has that autopilot, `uid:` with at least 6 digits of its hardware id, its full
                 hardware id, or its key.
+            extended: tables of extended parameters, which are not empty, instead of the plain ones.
 
         Raises:
             UnknownVehicle: no vehicle in the cache has this name.
@@ -183,8 +184,9 @@ class ParamCache:
         """
 
         def work(tx: Transaction) -> list[CachedSummary]:
-            found = tables.load_tables(tx, None if vehicle is None else self._choose(tx, vehicle))
-            return [each.summary for each in found]
+            key = None if vehicle is None else self._choose(tx, vehicle)
+            found = tables.load_tables(tx, key, extended=extended)
+            return [each.summary for each in found if each.summary.size or not extended]
 
         return self._read(work)
 
@@ -215,16 +217,6 @@ class ParamCache:
             return tables.load_component(tx, table)
 
         return self._read(work)
-
-    def ext_sizes(self) -> dict[tuple[str, int], int]:
-        """Return the number of extended parameters of each component that has some, by key and component."""
-        return self._read(
-            lambda tx: {
-                (each.key, each.component): each.size
-                for _, _, each in tables.load_tables(tx, extended=True)
-                if each.size
-            }
-        )
 
     def remove(self, vehicle: str, component: int | None = None) -> int:
         """Remove a vehicle's tables with history and snapshots, and return the number of tables.
@@ -307,28 +299,22 @@ class ParamCache:
             UnknownVehicle: a name was given, and there is no such table.
             AmbiguousVehicle: several vehicles have this name.
         """
-        moment = time.time() if at is None else at
-        rows = None if params is None else snapshots.rows_of(params)
+        moment = tables.time_cell(time.time() if at is None else at)
+        given = None if params is None else snapshots.rows_of(params)
+        ended = False if is_of_operation else None
 
         def work(tx: Transaction) -> SnapshotSummary:
             if isinstance(vehicle, str):
                 table = self._table(tx, vehicle, component, extended=extended)
-                identity = table.summary.identity
             else:
                 table = ensure_table(tx, vehicle, component, moment, extended=extended)
-                identity = vehicle
-            known = rows is None
-            return snapshots.store_snapshot(
-                tx,
-                table,
-                identity,
-                snapshots.rows_of_table(tables.load_rows(tx, table.owner)) if rows is None else rows,
-                at=moment,
-                reason=reason,
-                hash=table.summary.hash if known else hash,
-                complete=table.summary.complete if known else complete,
-                is_of_operation=is_of_operation,
-            )
+            known = table.summary
+            identity = known.identity if isinstance(vehicle, str) else vehicle
+            rows, state = given, (hash, complete)
+            if rows is None:
+                rows, state = [*tables.load_rows(tx, table.owner).values()], (known.hash, known.complete)
+            new = SnapshotSummary(0, known.key, component, moment, reason, 0, *state, ended)
+            return snapshots.store_snapshot(tx, table.owner, new, identity, rows)
 
         return self._store.run(work, writing=True)
 
@@ -410,12 +396,7 @@ class ParamCache:
         return table
 
     def _choose(
-        self,
-        tx: Transaction,
-        vehicle: str | None,
-        *,
-        system: int | None = None,
-        component: int | None = None,
+        self, tx: Transaction, vehicle: str | None, *, system: int | None = None, component: int | None = None
     ) -> str:
         """Return the key of the only vehicle that matches; see `paramclient.cache.lookup`."""
         known = tables.load_vehicles(tx)

@@ -137,7 +137,7 @@ def load_rows(tx: Transaction, owner: int, names: Collection[str] | None = None)
         return {}
     where = "" if names is None else f" AND name IN ({', '.join('?' * len(names))})"
     rows = tx.all(
-        "SELECT name, param_index, volatile, heard_at, default_value, type, value, is_raw FROM parameter"
+        "SELECT name, param_index, volatile, heard_at, default_value, type, value FROM parameter"
         f" WHERE owner = ?{where}",
         (owner, *(names or ())),
     )

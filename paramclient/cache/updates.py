@@ -31,12 +31,12 @@ NAMES_SELECTED_MAX: Final = 200
 
 _UPSERT: Final = """
     INSERT INTO parameter
-        (owner, name, type, value, is_raw, param_index, volatile, heard_at, default_value)
-    VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)
+        (owner, name, type, value, param_index, volatile, heard_at, default_value)
+    VALUES (?, ?, ?, ?, ?, ?, ?, ?)
     ON CONFLICT (owner, name) DO UPDATE SET
-        (type, value, is_raw, param_index, volatile, heard_at, default_value) =
-        (excluded.type, excluded.value, excluded.is_raw, excluded.param_index, excluded.volatile,
-         excluded.heard_at, excluded.default_value)
+        (type, value, param_index, volatile, heard_at, default_value) =
+        (excluded.type, excluded.value, excluded.param_index, excluded.volatile, excluded.heard_at,
+         excluded.default_value)
     WHERE parameter.heard_at <= excluded.heard_at OR parameter.heard_at > ?"""
 """The last value is the time after which stored times are from before the clock was set back."""
 
@@ -171,7 +171,7 @@ def _write_rows(tx: Transaction, owner: int, items: Sequence[StoredParam], horiz
     """Write observations of different names; return of each whether no newer one is stored."""
     rows = [
         (
-            *(owner, item.name, *(item.stored or (None, None, None))),
+            *(owner, item.name, *(item.stored or (None, None))),
             *(item.param_index, item.volatile or 0, item.heard_at, item.default, horizon),
         )
         for item in items

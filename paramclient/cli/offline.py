@@ -99,7 +99,7 @@ def show(
     is_log = vehicle is not None and vehicle.lower().startswith("replay:")
     with _open(options) if not is_log or vehicle is None else cache_of_log(vehicle) as cache:
         summaries = _tables_to_show(cache, None if is_log else vehicle, extended=extended)
-        extended_sizes = cache.ext_sizes()
+        extended_sizes = _extended_sizes(cache)
         is_list = vehicle is None and len(summaries) > 1 and not options.json
         tables = [] if is_list else _load(cache, summaries, extended=extended)
         _check_known(cache, name_patterns, [name for table in tables for name in table.params])
@@ -125,7 +125,7 @@ def show(
 def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     """List the tables in the cache, most recently received vehicles first."""
     with _open(options) as cache:
-        summaries, extended = cache.components(), cache.ext_sizes()
+        summaries, extended = cache.components(), _extended_sizes(cache)
     if options.json:
         components = [SummaryJson.of(each, extended.get((each.key, each.component))) for each in summaries]
         print_json({"path": cache.place, "components": components})
@@ -269,6 +269,11 @@ class _View:
         infos = {each.name: None if metadata is None else metadata.find(each.name) for each in self.params}
         params = {each.name: ParamJson.of(each, infos[each.name], whole=whole) for each in self.params}
         return TableJson.of(self.table, params)
+
+
+def _extended_sizes(cache: ParamCache) -> dict[tuple[str, int], int]:
+    """Return the number of extended parameters of each component that has some, by key and component."""
+    return {(each.key, each.component): each.size for each in cache.components(extended=True)}
 
 
 def _print_summaries(summaries: Sequence[CachedSummary], extended: Mapping[tuple[str, int], int]) -> None:

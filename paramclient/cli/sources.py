@@ -288,11 +288,8 @@ def tables_in(
     if name == "":
         raise UsageError("a vehicle in the cache needs a name: its system id, its hardware id, or its key")
     is_system = extended and name is not None and name.isdecimal()
-    known = cache.components(None if is_system else name)
-    if extended:
-        sizes = cache.ext_sizes()
-        known = [each for each in known if (each.key, each.component) in sizes]
-        known = [each for each in known if not is_system or str(each.system) == name]
+    known = cache.components(None if is_system else name, extended=extended)
+    known = [each for each in known if not is_system or str(each.system) == name]
     address = None if name is None else address_of(name)
     component = component if address is None else address[1]
     chosen = [each for each in known if component in (None, each.component)]

@@ -83,11 +83,7 @@ _FORMATS: Final = {
 
 
 def loads(
-    data: bytes,
-    *,
-    source: str = "",
-    file_format: FileFormat | str | None = None,
-    partial: bool = False,
+    data: bytes, *, source: str = "", file_format: FileFormat | str | None = None, partial: bool = False
 ) -> ParamFile:
     """Parse a parameter file.
 
@@ -110,10 +106,7 @@ def loads(
 
 
 def read_file(
-    path: str | os.PathLike[str],
-    *,
-    file_format: FileFormat | str | None = None,
-    partial: bool = False,
+    path: str | os.PathLike[str], *, file_format: FileFormat | str | None = None, partial: bool = False
 ) -> ParamFile:
     """Read a parameter file of any supported format. Blocks until the disk has delivered it.
 
