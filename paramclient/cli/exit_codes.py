@@ -12,6 +12,7 @@ from paramclient.errors import (
     NoReply,
     PackError,
     ParamClientError,
+    UnknownParameter,
     UsageError,
     VehicleError,
 )
@@ -58,6 +59,7 @@ def text_of(error: ParamClientError, *, takes_all: bool) -> str:
 
 
 _CODES: Final = {
+    UnknownParameter: ExitCode.USAGE,  # as everywhere for a name that does not exist
     VehicleError: ExitCode.INCOMPLETE,
     PackError: ExitCode.INCOMPLETE,
     UsageError: ExitCode.USAGE,

@@ -194,7 +194,7 @@ def with_suggestion(error: ParamClientError, known: Collection[str]) -> ParamCli
     if not nearest:
         return error
     return UnknownParameter(
-        f"{error}.{did_you_mean(nearest)}",
+        f"{error.system}/{error.component} has no {error.name}{did_you_mean(nearest)}",
         system=error.system,
         component=error.component,
         name=error.name,

@@ -11,6 +11,7 @@ from typing import Annotated, Final, Literal, TypeAlias
 import anyio.to_thread
 from cyclopts import Parameter
 
+from paramclient.cli.cached import tables_of
 from paramclient.cli.default_sources import (
     DEFAULTS_HINT,
     STORED_DEFAULTS_HINT,
@@ -21,7 +22,6 @@ from paramclient.cli.default_sources import (
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.file_output import noun_of
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets
-from paramclient.cli.offline import tables_of
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_json, printable, report, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, sessions

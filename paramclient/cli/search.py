@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Annotated, Final
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from paramclient.cache import CachedComponent, HistoryEntry, ParamCache
+from paramclient.cli.cached import load_tables
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_cache import HistoryLineJson
 from paramclient.cli.json_output import InfoJson, ParamJson
@@ -21,15 +21,15 @@ from paramclient.cli.metadata import (
     print_descriptions,
 )
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import local_time, print_json, print_line, print_table, printable, report, say
+from paramclient.cli.output import local_time, print_json, print_line, print_table, report, say
 from paramclient.cli.param_names import unmatched_text
 from paramclient.cli.sources import tables_in
-from paramclient.errors import NotInCache, UsageError
+from paramclient.errors import UsageError
 from paramclient.metadata import Metadata, ParamInfo
 from paramclient.model.defaults import DefaultSource, default_of
 from paramclient.model.identity import autopilot_name, has_autopilot
 from paramclient.model.notation import time_text
-from paramclient.model.values import check_name, format_value, type_name
+from paramclient.model.values import Param, check_name, format_value, type_name
 from paramclient.model.wording import counted
 
 __all__ = ["info", "search"]
@@ -65,12 +65,9 @@ def search(
     lowered_words = " ".join((word, *words)).casefold().split()
     if not lowered_words:
         raise UsageError("search takes one or more words")
-    found = _Known.of(options, vehicle, from_file(metadata, offline=True))
-    ranked = sorted(
-        (rank, name)
-        for name in found.names
-        if (rank := _rank(name, found.info(name), lowered_words)) is not None
-    )
+    found = _Known(options, vehicle, from_file(metadata, offline=True))
+    ranks = {name: _rank(name, found.info(name), lowered_words) for name in found.names}
+    ranked = sorted((rank, name) for name, rank in ranks.items() if rank is not None)
     names = [name for _, name in ranked[:limit]]
     if options.json:
         print_json({"results": [found.as_json(name) for name in names]})
@@ -84,10 +81,8 @@ def search(
         addresses = ", ".join(f"{each.system}/{each.component}" for each in found.undescribed)
         of_some = f"of {addresses}, " if found.metadata else ""
         request = how_to_describe(found.undescribed, names[0] if names else "")
-        say(printable(f"{of_some}only names were searched: {request}"))
-    if not names:
-        return ExitCode.INCOMPLETE
-    return ExitCode.DONE
+        say(f"{of_some}only names were searched: {request}")
+    return ExitCode.DONE if names else ExitCode.INCOMPLETE
 
 
 def info(
@@ -106,66 +101,55 @@ def info(
         metadata: A file that describes parameters. Default: the stored metadata of each vehicle's firmware.
     """
     check_name(name)
-    found = _Known.of(options, vehicle, from_file(metadata, offline=True))
-    spelled = {each.upper(): each for each in found.names}.get(name.upper())
-    described = None if spelled is None else found.info(spelled)
-    if spelled is None:  # a description of a group, FOO{n}_BAR, is not among the names
-        described, spelled = found.info(name.upper()), name.upper()
-    tables = found.having(spelled)
+    found = _Known(options, vehicle, from_file(metadata, offline=True))
+    # a description of a group, FOO{n}_BAR, is not among the names
+    spelled = next((each for each in found.names if each.upper() == name.upper()), name.upper())
+    described, tables = found.info(spelled), found.having(spelled)
     if described is None and not tables:
         text = unmatched_text([name], found.names, lambda: ())
-        raise NotInCache(f"no parameter of the cache is called {text}")
+        raise UsageError(f"no parameter of the cache is called {text}")
     with ParamCache(options.cache) as cache:
-        changes = {
-            (each.key, each.component): cache.history(each.key, each.component, spelled, CHANGES_SHOWN)
-            for each in tables
-        }
+        changes = [cache.history(each.key, each.component, spelled, CHANGES_SHOWN) for each in tables]
     if options.json:
-        values = [_value_json(each, spelled, described, changes[each.key, each.component]) for each in tables]
+        values = [_value_json(*each, spelled, described) for each in zip(tables, changes, strict=True)]
         known = None if described is None else InfoJson.of(described)
         print_json({"name": spelled, "metadata": known, "vehicles": values})
         return ExitCode.DONE
     print_descriptions([spelled], Metadata.of([described] if described is not None else []))
     if described is None and found.undescribed:
-        say(printable(how_to_describe(found.undescribed, spelled)))
-    for table in tables:
+        say(how_to_describe(found.undescribed, spelled))
+    for each in zip(tables, changes, strict=True):
         print_line("")
-        for line in _lines_of(table, spelled, described, changes[table.key, table.component]):
+        for line in _lines_of(*each, spelled, described):
             print_line(line)
     return ExitCode.DONE
 
 
-@dataclass(frozen=True)
 class _Known:
-    """The cached tables, and the metadata of each."""
+    """The cached tables of all vehicles or of one, and the metadata of each.
 
-    tables: Sequence[CachedComponent]
-    metadata: Sequence[Metadata]
-    names: frozenset[str]
-    undescribed: Sequence[CachedComponent]
-    """The tables without metadata. A camera has none: its firmware has no such metadata."""
+    Attributes:
+        tables: the tables.
+        metadata: all metadata.
+        names: the names of the tables; without a table, those of the metadata.
+        undescribed: the tables without metadata. A camera has none: its firmware has no such metadata.
+    """
 
-    @classmethod
-    def of(cls, options: CacheOptions, vehicle: str | None, described: Metadata | None) -> _Known:
-        """Load the tables of all vehicles, or of one."""
+    def __init__(self, options: CacheOptions, vehicle: str | None, given: Metadata | None) -> None:
         with ParamCache(options.cache) as cache:
-            summaries = tables_in(cache, vehicle, None)
-            summaries.sort(key=lambda each: (each.system, each.component))
-            loaded = (cache.load(each.key, each.component) for each in summaries)
-            tables = [table for table in loaded if table is not None]
-            found = [described] * max(1, len(tables))
-            if described is None:
-                found = [known_of_table(cache.path, table) for table in tables]
-        metadata = list({id(each): each for each in found if each is not None}.values())
-        names = {name for table in tables for name in table.params}
-        if not tables or described is not None:
-            names.update(name for each in metadata for name in each if "{" not in name)
-        without = [
+            summaries = sorted(tables_in(cache, vehicle), key=lambda each: (each.system, each.component))
+            self.tables = load_tables(cache, summaries)
+            found = [given or known_of_table(cache.path, table) for table in self.tables]
+        known = [each for each in [given, *found] if each is not None]
+        self.metadata = list({id(each): each for each in known}.values())
+        self.names = {name for table in self.tables for name in table.params}
+        if given is not None:
+            self.names.update(name for name in given if "{" not in name)
+        self.undescribed = [
             table
-            for table, each in zip(tables, found, strict=False)
+            for table, each in zip(self.tables, found, strict=True)
             if each is None and has_autopilot(table.autopilot)
         ]
-        return cls(tables, metadata, frozenset(names), without)
 
     def info(self, name: str) -> ParamInfo | None:
         """Return the description of a parameter, or None."""
@@ -184,10 +168,8 @@ class _Known:
 
     def cells(self, name: str) -> tuple[object, ...]:
         """Return the row of a found parameter, with its value if that is the same on all vehicles."""
-        tables = self.having(name)
-        described = self.info(name)
-        params = [table.params[name] for table in tables]
-        values = {format_value(each.settable, each.type_number) for each in params}
+        tables, described = self.having(name), self.info(name)
+        values = {_value(table.params[name]) for table in tables}
         return (
             name,
             f"{len(values)} values" if len(values) > 1 else next(iter(values), None),
@@ -209,7 +191,7 @@ def _rank(name: str, described: ParamInfo | None, lowered_words: Iterable[str]) 
 
 
 def _value_json(
-    table: CachedComponent, name: str, described: ParamInfo | None, changes: Sequence[HistoryEntry]
+    table: CachedComponent, changes: Sequence[HistoryEntry], name: str, described: ParamInfo | None
 ) -> dict[str, object]:
     """Return the JSON of the cached value of one vehicle, with its last changes."""
     default = None if described is None else described.default
@@ -225,20 +207,22 @@ def _value_json(
 
 
 def _lines_of(
-    table: CachedComponent, name: str, described: ParamInfo | None, changes: Sequence[HistoryEntry]
+    table: CachedComponent, changes: Sequence[HistoryEntry], name: str, described: ParamInfo | None
 ) -> Iterator[str]:
     """Yield the lines about the value of one vehicle."""
     param = table.params[name]
     meaning = "" if described is None else described.text(param.settable) or ""
     yield f"{table.system}/{table.component} {autopilot_name(table.autopilot)} ({table.key})"
-    value = format_value(param.settable, param.type_number)
-    yield f"  value: {value}{f' ({meaning})' if meaning else ''}, {type_name(param.type_number)}"
+    yield f"  value: {_value(param)}{f' ({meaning})' if meaning else ''}, {type_name(param.type_number)}"
     default = default_of(param, None if described is None else described.default)
     if default is not None:
         origin = " (from the metadata)" if default.source is DefaultSource.METADATA else ""
         yield f"  default of the firmware: {format_value(default.value, param.type_number)}{origin}"
     yield f"  heard: {local_time(table.heard_at[name])}"
     for entry in changes:
-        new = "removed" if entry.new is None else format_value(entry.new.settable, entry.new.type_number)
-        old = format_value(entry.old.settable, entry.old.type_number)
-        yield f"  changed: {local_time(entry.at)}  {old} -> {new}  ({entry.by})"
+        new = "removed" if entry.new is None else _value(entry.new)
+        yield f"  changed: {local_time(entry.at)}  {_value(entry.old)} -> {new}  ({entry.by})"
+
+
+def _value(param: Param) -> str:
+    return format_value(param.settable, param.type_number)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -151,8 +152,9 @@ class WriteJob:
                 cause = (each.status, type(each.error)) if is_open else str(each.error)
                 errors.setdefault(cause, []).append(each)
         for group in errors.values():
-            names = first_of(list(dict.fromkeys(each.name for each in group)), WRITE_NAMES_MAX)
-            report(f"{prefix}{names}: {group[0].error}")
+            names, text = list(dict.fromkeys(each.name for each in group)), str(group[0].error)
+            is_named = len(names) == 1 and names[0] in re.split(r"[ ,:;]", text)
+            report(f"{prefix}{'' if is_named else first_of(names, WRITE_NAMES_MAX) + ': '}{text}")
 
     def _type_of(self, outcome: SetOutcome) -> ParamType | int:
         """Return the vehicle's type of a parameter; REAL32 if it is not known."""

@@ -120,7 +120,7 @@ def nearest_names(name: str, names: Iterable[str]) -> tuple[str, ...]:
 def _candidates(upper_name: str, name: str, names: Iterable[str]) -> list[tuple[str, str]]:
     """Return the names to compare with `name`, each in upper case and as given."""
     length = AFFIX_LENGTH
-    others = [other for other in names if other != name]
+    others = [other for other in names if other not in (name, "")]
     head, tail = upper_name[:length], upper_name[-length:]
     found = [
         pair
@@ -138,11 +138,11 @@ def _candidates(upper_name: str, name: str, names: Iterable[str]) -> list[tuple[
 
 
 def did_you_mean(nearest: Sequence[str]) -> str:
-    """Return the suggestion of similar names as a sentence that begins with a space; "" without any."""
+    """Return the suggestion of similar names as the end of a sentence, from its semicolon; "" without any."""
     if not nearest:
         return ""
     *others, last = nearest
-    return f" Did you mean {', '.join(others)} or {last}?" if others else f" Did you mean {last}?"
+    return f"; did you mean {', '.join(others)} or {last}?" if others else f"; did you mean {last}?"
 
 
 def unknown_name(name: object, names: Collection[str], *, among: bool = False) -> KeyError:
@@ -155,7 +155,7 @@ def unknown_name(name: object, names: Collection[str], *, among: bool = False) -
     """
     nearest = nearest_names(name, names) if isinstance(name, str) else ()
     if nearest:
-        return KeyError(f"no parameter {name}.{did_you_mean(nearest)}")
+        return KeyError(f"no parameter {name}{did_you_mean(nearest)}")
     return KeyError(f"no parameter {name}{f' among the {len(names)} known ones' if among else ''}")
 
 

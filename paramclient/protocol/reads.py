@@ -288,6 +288,6 @@ async def _read_list(session: Session, inbox: Inbox, which: str | int) -> Report
 def _unknown(session: Session, which: str | int, reason: str = "") -> UnknownParameter:
     name, index = (which, None) if isinstance(which, str) else (None, which)
     nearest = () if name is None else nearest_names(name, session.table.params)
-    what = f"{session.channel} has no {'' if name else 'parameter with index '}{which}{reason}"
-    what += f"{'.' if nearest else ''}{did_you_mean(nearest)}"
+    what = f"{session.channel} has no {'' if name else 'parameter with index '}{which}"
+    what += did_you_mean(nearest) or reason
     return UnknownParameter(what, *session.channel.target, name=name, index=index, nearest=nearest)

@@ -46,7 +46,7 @@ def test_get_reads_from_every_vehicle(
     assert read.words[0] == ["vehicle", "name", "value", "type", "index"]
     assert [line[:3] for line in read.words[1:]] == [["1/1", "GAIN", "4.0"], ["2/1", "GAIN", "4.0"]]
     read = command("get", url, "OF_*", "--vehicle", "all", "--json")
-    assert read.code == 1
+    assert read.code == 2
     first, second = read.json["vehicles"]
     assert (first["system"], first["component"]) == (1, 1)
     assert first["params"]["OF_PX4"]["value"] == 1.5
@@ -108,7 +108,7 @@ def test_set_writes_to_every_vehicle(
     assert [line[0] for line in written.words[1:]] == ["1/1", "2/1"]
     assert [each.values["GAIN"] for each in vehicles] == [6.5, 6.5]
     written = command("set", url, "GAIN", "7", "OF_PX4", "2", "--vehicle", "all", "--json")
-    assert written.code == 1
+    assert written.code == 2
     first, second = written.json["vehicles"]
     assert [each["vehicle"]["kind"] for each in (first, second)] == ["PX4 quadrotor", "ArduPilot quadrotor"]
     assert [each["status"] for each in first["results"]] == ["accepted", "accepted"]

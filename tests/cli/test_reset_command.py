@@ -175,15 +175,15 @@ def test_what_the_vehicle_lets_no_client_write_is_left_out_unless_it_is_named(
     assert command("reset", put(vehicle), choice, "--json").json["read_only"] == ["BARO1_GND_PRESS"]
     named = command("reset", put(vehicle), "BARO1_GND_PRESS")
     assert named.code == 1
-    assert "BARO1_GND_PRESS: " in named.err
+    assert "1/1 refused BARO1_GND_PRESS" in named.err
 
 
 @pytest.mark.parametrize("names", [["COUNT", "MC_ROLLP"], ["COUNT", "NOT_*"]])
 def test_with_an_unknown_name_nothing_is_written(command: Command, put: Put, names: list[str]) -> None:
     tap = Tap(copter())
     done = command("reset", put(tap), *names)
-    assert (done.code, done.out, written(tap)) == (1, "", [])
-    expected = "no parameter that matches NOT_*" if "NOT_*" in names else "Did you mean MC_ROLL_P?"
+    assert (done.code, done.out, written(tap)) == (2, "", [])
+    expected = "no parameter that matches NOT_*" if "NOT_*" in names else "; did you mean MC_ROLL_P?"
     assert expected in done.err
     assert done.err.endswith("paramclient: nothing was written\n")
 

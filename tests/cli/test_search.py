@@ -111,9 +111,9 @@ def test_info_prints_description_values_and_changes(command: Command) -> None:
 
 def test_info_of_an_unknown_name_suggests_others(command: Command) -> None:
     wrong = command("info", "MC_ROLLP")
-    assert (wrong.code, wrong.out) == (5, "")
+    assert (wrong.code, wrong.out) == (2, "")
     assert "MC_ROLLP (did you mean MC_ROLL_P?)" in wrong.err
-    assert command("info", "RTL_ALT", "--vehicle", 1).code == 5
+    assert command("info", "RTL_ALT", "--vehicle", 1).code == 2
     undescribed = command("info", "RTL_ALT")
     assert "2/1 ardupilot" in undescribed.out
     assert "no metadata is stored for the firmware of ardupilot" in undescribed.err

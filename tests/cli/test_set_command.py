@@ -76,7 +76,7 @@ def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put) -> No
     )
     words = ["A", 5, "NO_SUCH", 1, "COUNT", 7.6, "FIXED", 9, "A", 6]
     done = command("set", put(vehicle), *words, "--force")
-    assert done.code == 1
+    assert done.code == 2
     assert [[row[0], row[-1]] for row in done.rows[1:]] == [
         ["A", "accepted"],
         ["NO_SUCH", "not on this vehicle"],
@@ -88,8 +88,8 @@ def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put) -> No
     assert doubt == "paramclient: COUNT: 7.6 is not a whole number, and COUNT is an integer"
     assert announced == "writing to 1/1 ArduPilot quadrotor, firmware 4.6.0-dev on sim:custom"
     assert line.startswith("3 of 5 set, 1 not on this vehicle, 1 refused on 1/1 ArduPilot ")
-    assert "NO_SUCH: " in done.err
-    assert "FIXED: " in done.err
+    assert "paramclient: 1/1 has no NO_SUCH\n" in done.err
+    assert "paramclient: 1/1 refused FIXED: " in done.err
     assert vehicle.values["A"] == 6
 
 

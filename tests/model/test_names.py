@@ -27,12 +27,13 @@ def test_a_name_is_not_suggested_for_itself_and_nothing_for_an_unlike_one() -> N
     assert "MC_YAW_P" not in nearest_names("MC_YAW_P", NAMES)
     assert nearest_names("BATTERY", NAMES) == ()
     assert nearest_names("BATTERY", []) == ()
+    assert nearest_names("", ["", "A"]) == nearest_names("A", [""]) == ()
 
 
 def test_suggestions_are_a_sentence() -> None:
     assert did_you_mean(()) == ""
-    assert did_you_mean(["A"]) == " Did you mean A?"
-    assert did_you_mean(["A", "B", "C"]) == " Did you mean A, B or C?"
+    assert did_you_mean(["A"]) == "; did you mean A?"
+    assert did_you_mean(["A", "B", "C"]) == "; did you mean A, B or C?"
 
 
 def test_upper_and_lower_case_do_not_matter_in_a_selection() -> None:

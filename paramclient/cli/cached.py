@@ -1,0 +1,238 @@
+"""The subcommands cache (list, path, remove) and history, which need no link."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Annotated, Final
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from paramclient.cache import CachedComponent, CachedSummary, HistoryEntry, ParamCache, SnapshotSummary
+from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson, SummaryJson
+from paramclient.cli.options import CacheOptions
+from paramclient.cli.output import local_time, print_json, print_line, print_table, say
+from paramclient.cli.param_names import cached_names, check_given, unmatched_text
+from paramclient.cli.sources import component_of, tables_in
+from paramclient.cli.time_arguments import parse_time
+from paramclient.errors import UsageError
+from paramclient.model.identity import autopilot_name
+from paramclient.model.names import NameChoice
+from paramclient.model.notation import hash_text
+from paramclient.model.values import Param, format_value
+from paramclient.model.wording import counted
+
+__all__ = [
+    "cache_list",
+    "cache_path",
+    "cache_remove",
+    "extended_sizes",
+    "history",
+    "load_tables",
+    "print_summaries",
+    "tables_of",
+]
+
+_DEFAULTS: Final = CacheOptions()
+
+
+def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
+    """List the tables in the cache, most recently received vehicles first."""
+    with ParamCache(options.cache) as cache:
+        summaries = cache.components()
+        if not options.json:
+            print_summaries(cache, summaries)
+            return ExitCode.DONE
+        sizes = extended_sizes(cache)
+    components = [SummaryJson.of(each, sizes.get((each.key, each.component))) for each in summaries]
+    print_json({"path": cache.place, "components": components})
+    return ExitCode.DONE
+
+
+def cache_path(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
+    """Print the path or the URL of the cache."""
+    with ParamCache(options.cache) as cache:
+        path = cache.place
+    if options.json:
+        print_json({"path": path})
+    else:
+        print_line(path)
+    return ExitCode.DONE
+
+
+def cache_remove(vehicle: str, /, *, options: CacheOptions = _DEFAULTS) -> ExitCode:
+    """Remove a vehicle from the cache: its tables and their history.
+
+    Args:
+        vehicle: A vehicle in the cache: 4, px4 or ardupilot, its hardware id (in full, or uid: and at least 6
+            digits), or its key; or 4/1, to remove only the table of this component.
+    """
+    with ParamCache(options.cache) as cache:
+        key = tables_in(cache, vehicle)[0].key
+        removed = cache.remove(key, component_of(vehicle))
+    if options.json:
+        print_json({"key": key, "removed": removed})
+    else:
+        print_line(f"removed {counted(removed, 'table')} of {key}")
+    return ExitCode.DONE
+
+
+def print_summaries(cache: ParamCache, summaries: Sequence[CachedSummary]) -> None:
+    """Print a line for each table, with the number of extended parameters if any table has some."""
+    if not summaries:
+        say(f"the cache {cache.place} is empty")
+        return
+    sizes = extended_sizes(cache)
+    more = ["extended"] if sizes else []
+    rows = (
+        (
+            f"{each.system}/{each.component}",
+            autopilot_name(each.autopilot),
+            each.size,
+            *(sizes.get((each.key, each.component)) for _ in more),
+            hash_text(each.hash),
+            None if each.synced_at is None else local_time(each.synced_at),
+            each.key,
+        )
+        for each in summaries
+    )
+    columns = ["component", "autopilot", "params", *more, "hash", "synced", "key"]
+    print_table(columns, rows, right="params extended")
+
+
+def extended_sizes(cache: ParamCache) -> dict[tuple[str, int], int]:
+    """Return the number of extended parameters of each component that has some, by key and component."""
+    return {(each.key, each.component): each.size for each in cache.components(extended=True)}
+
+
+def load_tables(
+    cache: ParamCache, summaries: Sequence[CachedSummary], *, extended: bool = False
+) -> list[CachedComponent]:
+    """Load tables; another process may have removed one."""
+    loaded = (cache.load(each.key, each.component, extended=extended) for each in summaries)
+    return [table for table in loaded if table is not None]
+
+
+def tables_of(
+    cache: str | None, vehicle: str, component: int | None, *, extended: bool
+) -> list[CachedComponent]:
+    """Return the cached tables of a vehicle, or that of one of its components.
+
+    Raises:
+        NotInCache, UnknownVehicle, AmbiguousVehicle: as `tables_in`.
+        CacheError: the cache cannot be read.
+    """
+    with ParamCache(cache) as opened:
+        return load_tables(
+            opened, tables_in(opened, vehicle, component, extended=extended), extended=extended
+        )
+
+
+# history
+
+
+def history(
+    vehicle: str,
+    /,
+    *names: str,
+    since: str | None = None,
+    limit: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
+    snapshots: bool = False,
+    extended: bool = False,
+    options: CacheOptions = _DEFAULTS,
+) -> ExitCode:
+    """Print the changes of a vehicle's values: time, old and new value, author. The newest change is last.
+
+    With --snapshots, print the snapshots of the vehicle's tables instead, each with its number.
+
+    Args:
+        vehicle: A vehicle in the cache: 4 or 4/1, px4 or ardupilot, its hardware id (in full, or uid: and at
+            least 6 digits), or its key.
+        names: Print only these parameters: names in upper or lower case, or patterns such as "MC_*".
+        since: Print only changes from this time on: 2h ago, yesterday, '2026-11-20 14:00'. A time without a
+            time zone is in the time zone of this computer, like the printed times.
+        limit: Print at most this number of changes, the newest ones.
+        snapshots: Print the snapshots instead of the changes.
+        extended: Extended parameters (PARAM_EXT_*), such as a camera's.
+    """
+    begin = None if since is None else parse_time(since, time.time())
+    if begin is not None and not options.json:
+        say(f"since {local_time(begin)}")
+    chosen = check_given(names)
+    if snapshots and chosen:
+        raise UsageError("--snapshots lists whole tables and takes no parameter name")
+    with ParamCache(options.cache) as cache:
+        key, component = tables_in(cache, vehicle, extended=extended)[0].key, component_of(vehicle)
+        if snapshots:
+            kept = cache.snapshots(key, component, extended=extended)
+            kept = [each for each in kept if begin is None or each.at >= begin]
+            _print_snapshots(kept[-limit:] if limit else kept, options)
+        else:
+            entries = _entries(cache, key, component, chosen, begin, extended=extended)
+            _print_entries(entries[-limit:] if limit else entries, options)
+    return ExitCode.DONE
+
+
+def _entries(
+    cache: ParamCache,
+    key: str,
+    component: int | None,
+    chosen: Sequence[str],
+    begin: float | None,
+    *,
+    extended: bool,
+) -> list[HistoryEntry]:
+    """Return the changes of the parameters that names and patterns choose; of all parameters without any.
+
+    Raises:
+        UsageError: the vehicle has and had no such parameter.
+    """
+    if not chosen:
+        return cache.history(key, component, None, None, begin, extended=extended)
+    entries = cache.history(key, component, extended=extended)
+    known = {entry.name for entry in entries}
+    summaries = [each for each in cache.components(key) if component in (None, each.component)]
+    known.update(name for each in load_tables(cache, summaries, extended=extended) for name in each.params)
+    names, unmatched = NameChoice(chosen).divide(known)
+    if unmatched:
+        text = unmatched_text(unmatched, known, lambda: cached_names(cache))
+        raise UsageError(f"no parameter of {key} in the cache is called {text}")
+    return [entry for entry in entries if entry.name in names and (begin is None or entry.at >= begin)]
+
+
+def _print_entries(entries: Sequence[HistoryEntry], options: CacheOptions) -> None:
+    if options.json:
+        print_json({"history": [HistoryLineJson.of(each) for each in entries]})
+        return
+    rows = (
+        (local_time(each.at), each.component, each.name, _value(each.old), _value(each.new), each.by)
+        for each in entries
+    )
+    print_table(["time", "component", "name", "old", "new", "by"], rows)
+
+
+def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> None:
+    if options.json:
+        print_json({"snapshots": [SnapshotJson.of(each) for each in kept]})
+        return
+    if not kept:
+        say("no snapshots: apply and restore store one before they write")
+        return
+    rows = (
+        (each.id, local_time(each.at), each.component, each.size, hash_text(each.hash), _reason(each))
+        for each in kept
+    )
+    print_table(["id", "time", "component", "params", "hash", "reason"], rows, right="id params")
+
+
+def _reason(each: SnapshotSummary) -> str:
+    notes = [] if each.complete else ["not complete"]
+    if each.ended is False:
+        notes.append("interrupted, or still running")
+    return f"{each.reason} ({', '.join(notes)})" if notes else each.reason
+
+
+def _value(param: Param | None) -> str | None:
+    return None if param is None else format_value(param.settable, param.type_number)

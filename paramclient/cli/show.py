@@ -1,0 +1,251 @@
+"""The subcommand show: cached tables, parameter files and logs, without a link."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Final
+
+from paramclient.cache import CachedComponent, CachedSummary, ParamCache
+from paramclient.cli.cached import extended_sizes, load_tables, print_summaries
+from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in, report_no_defaults, say_sources
+from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.file_output import described
+from paramclient.cli.json_cache import TableJson
+from paramclient.cli.json_output import ParamJson, SetJson
+from paramclient.cli.logs import cache_of_log
+from paramclient.cli.metadata import (
+    DESCRIBED_COLUMNS,
+    MetadataChoice,
+    described_cells,
+    from_file,
+    info_of,
+    known_of_table,
+    print_descriptions,
+)
+from paramclient.cli.options import CacheOptions
+from paramclient.cli.output import by_index, default_text, local_time, print_json, print_table, say
+from paramclient.cli.param_names import cached_names, check_given, unmatched_text
+from paramclient.cli.sources import is_file, open_file, source_of, tables_in
+from paramclient.errors import UnknownVehicle, UsageError
+from paramclient.files import ParamFile
+from paramclient.files.formats import address
+from paramclient.metadata import Metadata, MetadataStore
+from paramclient.model.comparison import non_defaults
+from paramclient.model.defaults import Default, add_default, add_defaults, default_of
+from paramclient.model.identity import autopilot_name
+from paramclient.model.names import NameChoice
+from paramclient.model.notation import hash_text, typed
+from paramclient.model.paramset import ParamSet
+from paramclient.model.values import Param, format_value, type_name
+
+__all__ = ["show"]
+
+_DEFAULTS: Final = CacheOptions()
+
+
+def show(
+    vehicle: str | None = None,
+    /,
+    *names: str,
+    changed: bool = False,
+    metadata: MetadataChoice = None,
+    extended: bool = False,
+    options: CacheOptions = _DEFAULTS,
+) -> ExitCode:
+    """Print the cached parameters of a vehicle, or those of a parameter file or a telemetry log.
+
+    With --changed, exit code 1: the firmware's defaults are not known.
+
+    Args:
+        vehicle: A parameter file, or - for the standard input; a log (.bin, .ulg, .tlog); a vehicle in the
+            cache: 4 or 4/1, px4 or ardupilot, its hardware id (in full, or uid: and at least 6 digits) or its
+            key, also with the prefix cache:.
+        changed: Print only parameters that differ from the firmware's defaults: those of the vehicle, else
+            those of its metadata.
+        names: Print only these parameters of a vehicle, with their metadata: names in upper or lower case, or
+            patterns such as "MC_*".
+        metadata: A file that describes parameters. Default: the stored metadata of the vehicle's firmware.
+            With a parameter file only for --changed.
+        extended: Extended parameters (PARAM_EXT_*), such as a camera's.
+    """
+    vehicle = None if vehicle is None else source_of(vehicle)
+    if vehicle is not None and is_file(vehicle):
+        if names or (metadata is not None and not changed):
+            raise UsageError(
+                "names, and --metadata without --changed, go with a vehicle in the cache, not with a "
+                "parameter file"
+            )
+        file = open_file(vehicle, partial=True)
+        return _show_file(file, from_file(metadata, offline=True), options, changed=changed)
+    chosen, given = check_given(names), from_file(metadata, offline=True)
+    is_log = vehicle is not None and vehicle.lower().startswith("replay:")
+    with cache_of_log(vehicle) if vehicle and is_log else ParamCache(options.cache) as cache:
+        summaries = _tables_to_show(cache, None if is_log else vehicle, extended=extended)
+        sizes = extended_sizes(cache)
+        if vehicle is None and not options.json and len(summaries) != 1:
+            print_summaries(cache, summaries)
+            if summaries:
+                say("paramclient show VEHICLE prints the table of one vehicle, by its system id or its key")
+            return ExitCode.DONE
+        tables = load_tables(cache, summaries, extended=extended)
+        known = [name for table in tables for name in table.params]
+        _, unmatched = NameChoice(chosen).divide(known)
+        if unmatched:
+            text = unmatched_text(unmatched, known, lambda: cached_names(cache))
+            raise UsageError(f"not among the cached parameters: {text}")
+        views = [
+            _View(each, chosen, given or known_of_table(cache.path, each), changed=changed) for each in tables
+        ]
+    if options.json:
+        print_json({"components": [view.as_json() for view in views]})
+    for view in [] if options.json else views:
+        view.print()
+        if not view.table.size and (number := sizes.get((view.table.key, view.table.component))):
+            say(f"{number} extended parameters: --extended prints them")
+    if changed and views and not any(view.defaults for view in views):
+        report_no_defaults(STORED_DEFAULTS_HINT)
+        return ExitCode.INCOMPLETE
+    return ExitCode.DONE
+
+
+def _tables_to_show(cache: ParamCache, vehicle: str | None, *, extended: bool) -> list[CachedSummary]:
+    """Return the tables that the arguments of show name, as `tables_in` does.
+
+    Raises:
+        UsageError: the name of a parameter is in the place of the vehicle.
+        UnknownVehicle, AmbiguousVehicle: as `tables_in`.
+    """
+    try:
+        return tables_in(cache, vehicle, extended=extended)
+    except UnknownVehicle:
+        if vehicle is None or vehicle.upper() not in map(str.upper, cached_names(cache)):
+            raise
+        raise UsageError(
+            f"{vehicle} is the name of a parameter: the first argument of show is the vehicle, as in "
+            f"`paramclient show 1 {vehicle}`; `paramclient info {vehicle}` prints it for every vehicle"
+        ) from None
+
+
+class _View:
+    """A cached table, and the part of it to show.
+
+    Args:
+        table: the table.
+        names: names and patterns; empty for all parameters.
+        metadata: the metadata of the parameters, or None.
+        changed: whether to show only parameters that differ from the defaults.
+    """
+
+    def __init__(
+        self, table: CachedComponent, names: Sequence[str], metadata: Metadata | None, *, changed: bool
+    ) -> None:
+        self.table, self._metadata, self._is_part, self._changed = table, metadata, bool(names), changed
+        self._described = defaults_in(metadata, table.params)
+        shown: Mapping[str, Param] = table.params
+        if changed:
+            shown = {name: shown[name] for name in table.params.changed(self._described)}
+        chosen = NameChoice(names).divide(table.params)[0] if names else set(shown)
+        self._params = [param for name, param in shown.items() if name in chosen]
+
+    @property
+    def defaults(self) -> list[Default]:
+        """The known defaults of the whole table."""
+        return self._defaults_of(self.table.params.values())
+
+    def as_json(self) -> TableJson:
+        """Return the JSON object."""
+        params = {
+            each.name: ParamJson.of(each, info_of(self._metadata, each.name), whole=self._is_part)
+            for each in self._params
+        }
+        return TableJson.of(self.table, params)
+
+    def print(self) -> None:
+        """Print the table, and a line about it on stderr."""
+        table, changed, metadata = self.table, self._changed, self._metadata
+        if changed and not self.defaults:
+            return
+        more = () if metadata is None else DESCRIBED_COLUMNS
+        columns = ["name", "value", *(["default"] * changed), "type", "index", "received", *more]
+        print_table(columns, self._rows(), right="value default index")
+        if self._is_part:
+            if metadata is not None:
+                print_descriptions([each.name for each in self._params], metadata)
+            return
+        text = f"{table.system}/{table.component}"
+        if changed:
+            say_sources(text, self._defaults_of(self._params))
+        count = f"{len(self._params)} of {table.size}" if changed else f"{table.size}"
+        differ = " differ from their default:" if changed else " of"
+        synced = "never complete" if table.synced_at is None else f"synced {local_time(table.synced_at)}"
+        crc = "" if table.hash is None else f"; hash {hash_text(table.hash)}"
+        vehicle = f"{text} {autopilot_name(table.autopilot)} ({table.key})"
+        say(f"{count} parameters{differ} {vehicle}, {synced}{crc}")
+
+    def _rows(self) -> Iterator[Sequence[object]]:
+        for param in by_index(self._params):
+            known = add_default(param, self._described.get(param.name))
+            yield (
+                param.name,
+                format_value(param.settable, param.type_number),
+                *([default_text(known)] * self._changed),
+                type_name(param.type_number),
+                param.index,
+                local_time(self.table.heard_at[param.name]),
+                *(() if self._metadata is None else described_cells(self._metadata, param)),
+            )
+
+    def _defaults_of(self, params: Iterable[Param]) -> list[Default]:
+        found = (default_of(each, self._described.get(each.name)) for each in params)
+        return [default for default in found if default is not None]
+
+
+# Files
+
+
+def _show_file(file: ParamFile, given: Metadata | None, options: CacheOptions, *, changed: bool) -> ExitCode:
+    """Print the parameters of a file; with `changed`, those that differ from the firmware's defaults."""
+    shown: list[tuple[ParamSet, dict[str, Default]]] = [(each, {}) for each in file.sets]
+    if changed:
+        store = MetadataStore.beside(ParamCache(options.cache).path)
+        known = store.known_of_sets(file.sets) if given is None else [given] * len(file.sets)
+        shown = []
+        for each, metadata in zip(file.sets, known, strict=True):
+            more = defaults_in(metadata, each)
+            filled = add_defaults(each, more)
+            if any(param.default is not None for param in filled.values()):
+                differing = non_defaults(filled)
+                found = {name: default_of(each[name], more.get(name)) for name in differing}
+                shown.append((differing, {name: each for name, each in found.items() if each is not None}))
+    if options.json:
+        components = [
+            SetJson.with_sources(each, {name: default.source.value for name, default in defaults.items()})
+            for each, defaults in shown
+        ]
+        print_json({"file": file.source, "format": file.file_format.value, "components": components})
+    for each, defaults in [] if options.json else shown:
+        _print_set(each, ", those that differ from their default" if changed else "")
+        say_sources(address(each), defaults.values())
+    if changed and not shown:
+        report_no_defaults(STORED_DEFAULTS_HINT)
+        return ExitCode.INCOMPLETE
+    return ExitCode.DONE
+
+
+def _print_set(params: ParamSet, more: str) -> None:
+    """Print the table of a set, without empty columns."""
+    rows = [
+        (
+            param.name,
+            format_value(*typed(param.settable, param.type_number)),
+            None if param.default is None else format_value(*typed(param.default, param.type_number)),
+            None if param.type_number is None else type_name(param.type_number),
+            param.comment or None,
+        )
+        for param in params.values()
+    ]
+    columns = ("name", "value", "default", "type", "comment")
+    kept = [at for at in range(5) if at < 2 or any(row[at] is not None for row in rows)]
+    shown = ([row[at] for at in kept] for row in rows)
+    print_table([columns[at] for at in kept], shown, right="value default")
+    say(f"{described(params)}{more}")
