@@ -34,7 +34,7 @@ MAY_IMPORT = {
     "metadata": SHELL | {"files"},
     "client": SHELL | {"sim"},
     "provision": SHELL | {"files"},
-    "logs": SHELL | {"files"},
+    "logs": SHELL | {"files", "metadata"},
     "sync": SHELL | {"sim", "metadata", "provision"},
     "testing": {"errors", "sim"},
     "": SHELL | {"files"},

@@ -6,7 +6,7 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -24,7 +24,7 @@ from paramclient.protocol.node import Node
 from paramclient.protocol.selection import vehicle_of
 from paramclient.protocol.session import Session
 
-__all__ = ["CacheWriter", "choose_cache"]
+__all__ = ["CacheWriter", "choose_cache", "update_of"]
 
 FLUSH_INTERVAL: Final = 0.25
 """Seconds from a change to its commit: changes are collected for half of that time."""
@@ -316,40 +316,21 @@ class CacheWriter:
         return node.identification.is_confirmed and self._vehicles[node].identification.is_confirmed
 
     def _update(self, node: Node, session: Session, record: _Record) -> TableUpdate:
-        table, vehicle = session.table, self._vehicles[node]
+        vehicle = self._vehicles[node]
         identity, heard = self._identities[node], vehicle.identification
         if heard.autopilot is not None:
             identity = replace(identity, autopilot=heard.autopilot, vehicle_type=heard.vehicle_type or 0)
         ahead = self._seconds_ahead()
-
-        def observed(param: Param, at: float, by: str = BY_VEHICLE) -> StoredParam:
-            is_volatile = param.name in table.volatile if table.volatile or table.volatile_is_known else None
-            return StoredParam.of(table.with_default(param), at + ahead, is_volatile, by)
-
-        params = [
-            StoredParam.gone(each.name, at + ahead) if each.new is None else observed(each.new, at, each.by)
-            for each, at in record.changes
-        ]
-        if record.is_whole:
-            params += [observed(param, table.moments[name]) for name, param in table.params.items()]
-        is_extended = session is node.extended
-        state = TableState(
-            hash=table.hash if table.is_complete else None,
-            count=table.count,
-            complete=table.is_complete,
-            volatile_known=table.volatile_is_known,
-            synced_at=record.synced_at if record.fetched_at is None else record.fetched_at + ahead,
-            file_works=session.serves_file,
-        )
-        return TableUpdate(
-            identity=identity,
-            component=node.component,
+        return update_of(
+            node,
+            session,
+            identity,
+            record.changes,
             autopilot=identity.autopilot if node is vehicle else node.identification.autopilot or 0,
             at=time.time(),
-            table=state,
-            params=params,
-            replace=record.is_whole and table.is_complete,
-            extended=is_extended,
+            synced_at=record.synced_at if record.fetched_at is None else record.fetched_at + ahead,
+            is_whole=record.is_whole,
+            ahead=ahead,
         )
 
     def _seconds_ahead(self) -> float:
@@ -382,6 +363,64 @@ class CacheWriter:
                 logger.warning("continuing without the cache: %s", error)
             self.failure = error
             raise CacheError(str(error)) from error
+
+
+def update_of(
+    node: Node,
+    session: Session,
+    identity: Identity,
+    changes: Iterable[tuple[Change, float]],
+    *,
+    autopilot: int,
+    at: float,
+    synced_at: float | None,
+    is_whole: bool,
+    ahead: float = 0.0,
+) -> TableUpdate:
+    """Return the update with which the cache takes a table.
+
+    Args:
+        node, session: the component and its parameters.
+        identity: of its vehicle.
+        changes: changed parameters in order, each with its time.
+        autopilot: MAV_AUTOPILOT of the component.
+        at: time of the update, in unix seconds.
+        synced_at: time of the last verification of the table, likewise, or None.
+        is_whole: whether all parameters of the table follow the changes.
+        ahead: seconds from the times of the table and of the changes to unix time.
+    """
+    table = session.table
+
+    def observed(param: Param, moment: float, by: str = BY_VEHICLE) -> StoredParam:
+        is_volatile = param.name in table.volatile if table.volatile or table.volatile_is_known else None
+        return StoredParam.of(table.with_default(param), moment + ahead, is_volatile, by)
+
+    params = [
+        StoredParam.gone(each.name, moment + ahead)
+        if each.new is None
+        else observed(each.new, moment, each.by)
+        for each, moment in changes
+    ]
+    if is_whole:
+        params += [observed(param, table.moments[name]) for name, param in table.params.items()]
+    state = TableState(
+        hash=table.hash if table.is_complete else None,
+        count=table.count,
+        complete=table.is_complete,
+        volatile_known=table.volatile_is_known,
+        synced_at=synced_at,
+        file_works=session.serves_file,
+    )
+    return TableUpdate(
+        identity=identity,
+        component=node.component,
+        autopilot=autopilot,
+        at=at,
+        table=state,
+        params=params,
+        replace=is_whole and table.is_complete,
+        extended=session is node.extended,
+    )
 
 
 def choose_cache(

@@ -16,7 +16,8 @@ from pymavlink.DFReader import DFReader_binary
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import LogFormat
-from paramclient.logs.logged_params import LoggedChange, OnboardLog, log_link
+from paramclient.logs.logged_params import OnboardLog, log_link
+from paramclient.metadata.store import ARDUPILOT, OLD_NAMES
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import WireValue, check_name, shortest_float
@@ -24,16 +25,7 @@ from paramclient.wire.messages import MAV_AUTOPILOT_ARDUPILOTMEGA
 
 __all__ = ["read_dataflash"]
 
-VEHICLE_TYPES: Final = {
-    "ArduCopter": 2,
-    "ArduPlane": 1,
-    "ArduRover": 10,
-    "ArduSub": 12,
-    "Blimp": 7,
-    "AntennaTracker": 5,
-    "APMrover2": 10,
-    "Rover": 10,
-}
+VEHICLE_TYPES: Final = {name: types[0] for name, types in ARDUPILOT.values()}
 """MAV_TYPE by the name of the firmware in MSG. A copter with other than four rotors reports another type in
 its heartbeat."""
 SYSTEM_ID_NAMES: Final = ("MAV_SYSID", "SYSID_THISMAV")
@@ -94,8 +86,8 @@ class _Messages:
 
     def __init__(self) -> None:
         self.initial: dict[str, WrittenParam] = {}
-        self._changes: list[LoggedChange] = []
-        self._values: dict[str, WireValue] = {}  # the latest, by name
+        self._changes: list[tuple[float, WrittenParam]] = []
+        self._latest: dict[str, WrittenParam] = {}
         self._began = self._last = self._ended = 0.0  # of all PARM, and the last one of the initial run
         self._boot_time: float | None = None
         self._damaged = 0
@@ -140,26 +132,27 @@ class _Messages:
         except (UsageError, KeyError, TypeError):
             self._damaged += 1
             return
-        if not self._values:
+        if not self._latest:
             self._began = self._last = time
         self._ended = max(self._ended, time)
-        known = self._values.get(name)
-        default = fields.get("Default", math.nan)
+        known, default = self._latest.get(name), fields.get("Default", math.nan)
         has_default = not math.isnan(default)
         if known is None and (has_default or time - self._last <= INITIAL_GAP_MAX):
-            self.initial[name] = WrittenParam(name, value, None, _number(default) if has_default else None)
+            known = WrittenParam(name, value, None, _number(default) if has_default else None)
+            self.initial[name] = known
             self._last = time
-        elif value != known:
-            self._changes.append(LoggedChange(time, name, value))
-        self._values[name] = value
+        elif known is None or value != known.value:
+            known = WrittenParam(name, value, None, None if known is None else known.default)
+            self._changes.append((time, known))
+        self._latest[name] = known
 
     def _receive_text(self, text: str) -> None:
         if (found := _FIRMWARE.match(text)) is not None:
             name, *numbers, commit = found.groups()
             self._texts["firmware"] = int.from_bytes(bytes(min(int(each), 255) for each in (*numbers, 0)))
             self._texts["git_hash"] = commit or ""
-            if name in VEHICLE_TYPES:
-                self._texts["vehicle_type"] = VEHICLE_TYPES[name]
+            if (kind := VEHICLE_TYPES.get(OLD_NAMES.get(name, name))) is not None:
+                self._texts["vehicle_type"] = kind
         elif (found := _HARDWARE_ID.search(text)) is not None:
             words = (bytes.fromhex(word)[::-1] for word in found.groups())
             self._texts["uid"] = b"".join(words).ljust(UID_SIZE, b"\0").hex()

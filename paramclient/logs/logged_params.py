@@ -9,24 +9,8 @@ from dataclasses import dataclass, replace
 from paramclient.files.formats import AUTOPILOT, LogFormat
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import WireValue
 
-__all__ = ["ImportedTable", "LoggedChange", "OnboardLog", "log_link"]
-
-
-@dataclass(frozen=True, slots=True)
-class LoggedChange:
-    """A value that was recorded after the initial ones.
-
-    Attributes:
-        time: seconds since the boot of the autopilot.
-        name: param_id.
-        value: the new value.
-    """
-
-    time: float
-    name: str
-    value: WireValue
+__all__ = ["ImportedTable", "OnboardLog", "log_link"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +22,7 @@ class OnboardLog:
         file_format: the log format.
         identity: the vehicle, as far as the log describes it.
         initial: the parameters at the beginning of the log, by name.
-        changes: the later values, in the order of the log.
+        changes: the later values in the order of the log, each with its time in seconds since boot.
         began: when the initial parameters were recorded, in seconds since boot.
         ended: the last time that was read, in seconds since boot.
         boot_time: the Unix time of the boot in seconds, or None if the log has no time of a GPS receiver.
@@ -49,7 +33,7 @@ class OnboardLog:
     file_format: LogFormat
     identity: Identity
     initial: Mapping[str, WrittenParam]
-    changes: tuple[LoggedChange, ...] = ()
+    changes: tuple[tuple[float, WrittenParam], ...] = ()
     began: float = 0.0
     ended: float = 0.0
     boot_time: float | None = None
@@ -64,14 +48,9 @@ class OnboardLog:
     def at_end(self) -> ParamSet:
         """Return the parameters at the end of the log: the initial ones with all changes."""
         start = self.at_start()
-        params = dict(self.initial) | {each.name: self.changed(each) for each in self.changes}
+        params = {**self.initial, **{each.name: each for _, each in self.changes}}
         at = None if self.boot_time is None else self.boot_time + self.ended
         return replace(start, params=params, at=at)
-
-    def changed(self, change: LoggedChange) -> WrittenParam:
-        """Return a changed parameter, with the type and default of the initial one."""
-        known = self.initial.get(change.name, WrittenParam(change.name, change.value))
-        return WrittenParam(change.name, change.value, known.type_number, known.default, known.comment)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ import io
 import os
 import stat
 from collections.abc import Mapping
-from contextlib import redirect_stderr, redirect_stdout, suppress
+from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -18,7 +18,7 @@ from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import AUTOPILOT, LogFormat
 from paramclient.logs.logged_params import ImportedTable, OnboardLog
 from paramclient.model.paramset import WrittenParam
-from paramclient.model.values import Param, ParamType, Trust, bits_of, from_bits
+from paramclient.model.values import ParamType
 
 __all__ = ["import_onboard_log", "is_onboard_log", "read_onboard_log"]
 
@@ -108,15 +108,12 @@ def _store(log: OnboardLog, cache: ParamCache) -> ImportedTable:
         )
     if not identity.system:
         raise FileError("not imported: the log has no system id", source=log.source)
-    types = _types(log, cache)
-    observed = [(log.began, written) for written in log.initial.values()]
-    observed += [(change.time, log.changed(change)) for change in log.changes]
+    types, boot = _types(log, cache), log.boot_time
+    observed = [(log.began, each) for each in log.initial.values()] + [*log.changes]
+    stored = [_stored(each, types, boot + time) for time, each in observed]
     update = partial(TableUpdate, identity=identity, component=AUTOPILOT, autopilot=identity.autopilot)
-    by_time: dict[float, list[StoredParam]] = {}
-    for time, written in observed:
-        at = log.boot_time + time
-        by_time.setdefault(at, []).append(StoredParam.of(_param(written, types), at))
-    cache.merge([update(at=at, params=params) for at, params in by_time.items()])
+    times = [each.heard_at for each in stored]
+    cache.merge([update(at=min(times)), update(at=max(times), params=stored)])
     notes = log.notes
     if untyped := sum(param.type_number is None and name not in types for name, param in log.initial.items()):
         notes += (f"the log has no types: {untyped} parameters that no cached table has are REAL32",)
@@ -137,16 +134,10 @@ def _types(log: OnboardLog, cache: ParamCache) -> Mapping[str, ParamType | int]:
     return types
 
 
-def _param(written: WrittenParam, types: Mapping[str, ParamType | int]) -> Param:
-    """Return a logged value as a parameter; as a REAL32 if its type is unknown or cannot hold it."""
-    kind = types.get(written.name, ParamType.REAL32) if written.type_number is None else written.type_number
+def _stored(param: WrittenParam, types: Mapping[str, ParamType | int], at: float) -> StoredParam:
+    """Return the observation of a logged value; as a REAL32 if its type is unknown or cannot hold it."""
+    kind = types.get(param.name, ParamType.REAL32) if param.type_number is None else param.type_number
     try:
-        bits = written.bits_as(kind)
+        return StoredParam.of(WrittenParam(param.name, param.value, kind, param.default), at)
     except UsageError:
-        kind = ParamType.REAL32
-        bits = written.bits_as(kind)
-    default = None
-    if written.default is not None:
-        with suppress(UsageError):
-            default = from_bits(bits_of(written.default, kind), kind)
-    return Param(written.name, from_bits(bits, kind), kind, None, bits, Trust.CACHED, default)
+        return StoredParam.of(WrittenParam(param.name, param.value, ParamType.REAL32), at)

@@ -13,7 +13,8 @@ import anyio
 import anyio.lowlevel
 import anyio.to_thread
 
-from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
+from paramclient.cache import ParamCache, TableUpdate
+from paramclient.client.cache_writer import update_of
 from paramclient.links.replay import LOG_PEER
 from paramclient.links.tlog import Record, open_log, read_records
 from paramclient.logs.logged_params import ImportedTable
@@ -89,7 +90,7 @@ class _Import:
         self._introductions = introductions
         self._cache = cache
         self._at = 0.0
-        self._observed: dict[Session, list[StoredParam]] = {}
+        self._changes: dict[Session, list[tuple[Change, float]]] = {}
         self._complete_at: dict[Session, float] = {}
         self._station = Station(
             link=name,
@@ -107,11 +108,12 @@ class _Import:
             self._station.receive(record.data, LOG_PEER, self._at)
         nodes = [node for _, node in sorted(self._station.nodes.items())]
         nodes = [node for node in nodes if node.plain.table.params or node.extended.table.params]
-        # that the vehicle was there at the beginning, and the tables
-        updates = [self._update_of(node, node.since) for node in nodes]
-        updates += [self._update(node, session) for node in nodes for session in node.sessions]
-        updates = [update for update in updates if update.params or update.table is None]
-        await anyio.to_thread.run_sync(partial(self._cache.merge, updates))
+        updates = [self._update(node, session) for node in nodes for session in node.sessions]
+        updates = [update for update in updates if update.params]
+        seen = [  # that the vehicle was there at the beginning
+            replace(self._update(node, node.plain), at=node.since, table=None, params=()) for node in nodes
+        ]
+        await anyio.to_thread.run_sync(partial(self._cache.merge, [*seen, *updates]))
         return tuple(self._imported_table(node) for node in nodes)
 
     def _introduce(self, node: Node) -> None:
@@ -125,36 +127,19 @@ class _Import:
     def _take_change(self, session: Session, change: Change) -> None:
         if session.table.is_complete:
             self._complete_at.setdefault(session, self._at)
-        self._observed.setdefault(session, []).append(
-            StoredParam.gone(change.name, self._at)
-            if change.new is None
-            else StoredParam.of(change.new, self._at, None, change.by)
-        )
-
-    def _update_of(self, node: Node, at: float) -> TableUpdate:
-        identity, autopilot = self._identity_of(node), node.identification.autopilot or 0
-        return TableUpdate(identity=identity, component=node.component, autopilot=autopilot, at=at)
+        self._changes.setdefault(session, []).append((change, self._at))
 
     def _update(self, node: Node, session: Session) -> TableUpdate:
-        table, observed = session.table, self._observed.get(session, [])
         session.confirm_announced()
-        volatile = table.volatile if table.volatile_is_known else None
-        last = [
-            StoredParam.of(param, table.moments[name], None if volatile is None else name in volatile)
-            for name, param in table.params.items()
-        ]
-        state = TableState(
-            hash=table.hash if table.is_complete else None,
-            count=table.count,
-            complete=table.is_complete,
-            volatile_known=table.volatile_is_known,
-            synced_at=self._complete_at.get(session) if table.is_complete else None,
-        )
-        return replace(
-            self._update_of(node, node.presence.received_at),
-            table=state,
-            params=[*observed, *last],
-            extended=session is node.extended,
+        return update_of(
+            node,
+            session,
+            self._identity_of(node),
+            self._changes.get(session, ()),
+            autopilot=node.identification.autopilot or 0,
+            at=node.presence.received_at,
+            synced_at=self._complete_at.get(session) if session.table.is_complete else None,
+            is_whole=True,
         )
 
     def _identity_of(self, node: Node) -> Identity:

@@ -15,7 +15,7 @@ from pyulog.exceptions import ULogException
 
 from paramclient.errors import FileError
 from paramclient.files.formats import LogFormat
-from paramclient.logs.logged_params import LoggedChange, OnboardLog, log_link
+from paramclient.logs.logged_params import OnboardLog, log_link
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import ParamType, is_portable_name
@@ -57,7 +57,8 @@ def read_ulog(path: str) -> OnboardLog:
     except ULogException as error:
         raise FileError(f"cannot be read as a ULog file: {error}", source=path) from error
     params, changes = _valid(log.initial_parameters.items()), log.changed_parameters
-    initial = _with_defaults(log, params)
+    defaults = _defaults(log, params)
+    initial = {name: _param(name, value, defaults) for name, value in params.items()}
     if not initial:
         raise FileError("the log has no parameters", source=path)
     valid = [change for change in changes if _valid([change[1:]])]
@@ -72,7 +73,7 @@ def read_ulog(path: str) -> OnboardLog:
         LogFormat.ULOG,
         _identity(log.msg_info_dict, initial, path),
         initial,
-        tuple(LoggedChange(micros / 1e6, name, value) for micros, name, value in valid),
+        tuple((micros / 1e6, _param(name, value, defaults)) for micros, name, value in valid),
         log.start_timestamp / 1e6,
         log.last_timestamp / 1e6,
         _boot_time(log),
@@ -90,22 +91,21 @@ def _valid(params: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _with_defaults(log: Any, params: Mapping[str, Any]) -> dict[str, WrittenParam]:
-    """Return the initial parameters with their defaults.
+def _defaults(log: Any, params: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the defaults of the parameters.
 
     PX4 logs a default only where the value differs from it (PX4 guide); for the others, the value is the
     default. A log without that flag has no defaults.
     """
-    defaults: dict[str, Any] = dict.fromkeys(params)
-    if log.has_default_parameters:
-        firmware, current = map(log.get_default_parameters, (FIRMWARE_DEFAULTS, CURRENT_DEFAULTS))
-        defaults = {**params, **firmware, **current}
-    return {
-        name: WrittenParam(
-            name, value, ParamType.REAL32 if isinstance(value, float) else ParamType.INT32, defaults[name]
-        )
-        for name, value in params.items()
-    }
+    if not log.has_default_parameters:
+        return {}
+    firmware, current = map(log.get_default_parameters, (FIRMWARE_DEFAULTS, CURRENT_DEFAULTS))
+    return {**params, **firmware, **current}
+
+
+def _param(name: str, value: Any, defaults: Mapping[str, Any]) -> WrittenParam:
+    kind = ParamType.REAL32 if isinstance(value, float) else ParamType.INT32
+    return WrittenParam(name, value, kind, defaults.get(name))
 
 
 def _identity(info: Mapping[str, Any], params: Mapping[str, WrittenParam], path: str) -> Identity:

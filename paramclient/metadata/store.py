@@ -44,7 +44,8 @@ ARDUPILOT: Final[dict[VehicleKind, tuple[str, tuple[int, ...]]]] = {
 }
 """ArduPilot's firmwares: the name in its metadata files, which is also their folder on the internet; and
 MAV_TYPE of the heartbeat."""
-_OLD_NAMES: Final = {"APMrover2": "Rover", "ArduRover": "Rover"}
+OLD_NAMES: Final = {"APMrover2": "Rover", "ArduRover": "Rover"}
+"""Names of earlier versions of these firmwares."""
 _version: Final = re.compile(r"[0-9]{1,3}(\.[0-9]{1,3}){0,2}").fullmatch
 _kinds: Final[dict[str, VehicleKind]] = {kind: kind for kind in get_args(VehicleKind)}
 _name: Final = re.compile(rf"({'|'.join(_kinds)})(?:-([0-9.]+))?\.added").fullmatch
@@ -348,7 +349,7 @@ def _kind_of(identity: Identity) -> VehicleKind | None:
 def _kind_of_file(metadata: Metadata) -> VehicleKind | None:
     """Return the only vehicle type that a file names; PX4's files are recognized by the types of
     parameters."""
-    names = {_OLD_NAMES.get(info.group, info.group) for info in metadata.values()}
+    names = {OLD_NAMES.get(info.group, info.group) for info in metadata.values()}
     kinds = [kind for kind, (name, _) in ARDUPILOT.items() if name in names]
     if not kinds and all(info.type is not None for info in metadata.values()):
         return "px4"

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from paramclient.errors import FileError, UsageError
-from paramclient.logs.logged_params import LoggedChange
 from paramclient.logs.onboard import is_onboard_log, read_onboard_log
 from paramclient.model.values import ParamType
 from tests.logs.writers import ULogWriter, dataflash
@@ -64,7 +63,10 @@ def test_later_values_of_a_dataflash_log_are_changes(tmp_path: Path) -> None:
         ("PARM", 70_000_000, "SCR_USER1", 4.0, NAN),
     ]
     log = read_onboard_log(written(tmp_path, dataflash([*COMMON, FIX, *later])))
-    assert log.changes == (LoggedChange(60.0, "ATC_RAT_RLL_P", 0.2), LoggedChange(70.0, "SCR_USER1", 4))
+    assert [(at, param.name, param.value) for at, param in log.changes] == [
+        (60.0, "ATC_RAT_RLL_P", 0.2),
+        (70.0, "SCR_USER1", 4),
+    ]
     assert "SCR_USER1" not in log.at_start()
     assert log.at_start()["ATC_RAT_RLL_P"].value == 0.135
     end = log.at_end()
@@ -116,7 +118,7 @@ def test_a_ulog_file_has_types_defaults_changes_and_the_vehicle(tmp_path: Path) 
     assert (identity.system, identity.autopilot, identity.vehicle_type) == (3, 12, 13)
     assert identity.uid == "0001" + "00" * 6 + "0123456789abcdef0123"
     assert (identity.firmware, identity.git_hash) == (0x011100FF, "a70a5583aaaabbbb")
-    assert log.changes == (LoggedChange(2.0, "MC_ROLL_P", 8.0),)
+    assert [(at, param.name, param.value) for at, param in log.changes] == [(2.0, "MC_ROLL_P", 8.0)]
     assert log.boot_time == pytest.approx(BOOT)
     assert log.at_start()["MC_ROLL_P"].value == 7.5
     assert log.at_end()["MC_ROLL_P"].value == 8.0

@@ -101,7 +101,7 @@ def test_a_log_of_a_real_copter() -> None:
     assert (identity.system, identity.vehicle_type, identity.git_hash) == (1, 2, "fbb78585")
     assert identity.firmware == 0x04060000
     assert log.boot_time == pytest.approx(1795415873.79, abs=0.01)
-    assert [change.name for change in log.changes if change.name.startswith("ATC")] == ["ATC_RAT_RLL_P"]
+    assert [each.name for _, each in log.changes if each.name.startswith("ATC")] == ["ATC_RAT_RLL_P"]
     assert (
         len(log.initial.keys() & read_file(DATA / "ardupilot_param_withdefaults.pck").choose().keys()) > 1300
     )
