@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Final
 
 from cyclopts import Parameter
@@ -13,7 +13,7 @@ from paramclient.cache import CachedComponent, CachedSummary, HistoryEntry, Para
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson, SummaryJson
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import local_time, print_json, print_line, print_table, say
+from paramclient.cli.output import local_time, print_json, print_line, say, show
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
 from paramclient.cli.sources import component_of, tables_in
 from paramclient.cli.time_arguments import parse_time
@@ -31,7 +31,7 @@ __all__ = [
     "extended_sizes",
     "history",
     "load_tables",
-    "print_summaries",
+    "show_summaries",
     "tables_of",
 ]
 
@@ -41,13 +41,8 @@ _DEFAULTS: Final = CacheOptions()
 def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     """List the tables in the cache, most recently received vehicles first."""
     with ParamCache(options.cache) as cache:
-        summaries = cache.components()
-        if not options.json:
-            print_summaries(cache, summaries)
-            return ExitCode.DONE
-        sizes = extended_sizes(cache)
-    components = [SummaryJson.of(each, sizes.get((each.key, each.component))) for each in summaries]
-    print_json({"path": cache.place, "components": components})
+        summaries, sizes = cache.components(), extended_sizes(cache)
+    show_summaries(cache, summaries, sizes, json=options.json)
     return ExitCode.DONE
 
 
@@ -79,13 +74,16 @@ def cache_remove(vehicle: str, /, *, options: CacheOptions = _DEFAULTS) -> ExitC
     return ExitCode.DONE
 
 
-def print_summaries(cache: ParamCache, summaries: Sequence[CachedSummary]) -> None:
+def show_summaries(
+    cache: ParamCache,
+    summaries: Sequence[CachedSummary],
+    sizes: Mapping[tuple[str, int], int],
+    *,
+    json: bool = False,
+) -> None:
     """Print a line for each table, with the number of extended parameters if any table has some."""
-    if not summaries:
-        say(f"the cache {cache.place} is empty")
-        return
-    sizes = extended_sizes(cache)
     more = ["extended"] if sizes else []
+    components = [SummaryJson.of(each, sizes.get((each.key, each.component))) for each in summaries]
     rows = (
         (
             f"{each.system}/{each.component}",
@@ -98,8 +96,14 @@ def print_summaries(cache: ParamCache, summaries: Sequence[CachedSummary]) -> No
         )
         for each in summaries
     )
-    columns = ["component", "autopilot", "params", *more, "hash", "synced", "key"]
-    print_table(columns, rows, right="params extended")
+    show(
+        {"path": cache.place, "components": components},
+        ["component", "autopilot", "params", *more, "hash", "synced", "key"],
+        rows,
+        json=json,
+        right="params extended",
+        empty=f"the cache {cache.place} is empty",
+    )
 
 
 def extended_sizes(cache: ParamCache) -> dict[tuple[str, int], int]:
@@ -168,10 +172,26 @@ def history(
         if snapshots:
             kept = cache.snapshots(key, component, extended=extended)
             kept = [each for each in kept if begin is None or each.at >= begin]
-            _print_snapshots(kept[-limit:] if limit else kept, options)
+            kept = kept[-limit:] if limit else kept
         else:
             entries = _entries(cache, key, component, chosen, begin, extended=extended)
-            _print_entries(entries[-limit:] if limit else entries, options)
+            entries = entries[-limit:] if limit else entries
+    if snapshots:
+        show(
+            {"snapshots": [SnapshotJson.of(each) for each in kept]},
+            ["id", "time", "component", "params", "hash", "reason"],
+            map(_snapshot_cells, kept),
+            json=options.json,
+            right="id params",
+            empty="no snapshots: apply and restore store one before they write",
+        )
+    else:
+        show(
+            {"history": [HistoryLineJson.of(each) for each in entries]},
+            ["time", "component", "name", "old", "new", "by"],
+            map(_entry_cells, entries),
+            json=options.json,
+        )
     return ExitCode.DONE
 
 
@@ -202,36 +222,16 @@ def _entries(
     return [entry for entry in entries if entry.name in names and (begin is None or entry.at >= begin)]
 
 
-def _print_entries(entries: Sequence[HistoryEntry], options: CacheOptions) -> None:
-    if options.json:
-        print_json({"history": [HistoryLineJson.of(each) for each in entries]})
-        return
-    rows = (
-        (local_time(each.at), each.component, each.name, _value(each.old), _value(each.new), each.by)
-        for each in entries
-    )
-    print_table(["time", "component", "name", "old", "new", "by"], rows)
+def _entry_cells(each: HistoryEntry) -> Sequence[object]:
+    return local_time(each.at), each.component, each.name, _value(each.old), _value(each.new), each.by
 
 
-def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> None:
-    if options.json:
-        print_json({"snapshots": [SnapshotJson.of(each) for each in kept]})
-        return
-    if not kept:
-        say("no snapshots: apply and restore store one before they write")
-        return
-    rows = (
-        (each.id, local_time(each.at), each.component, each.size, hash_text(each.hash), _reason(each))
-        for each in kept
-    )
-    print_table(["id", "time", "component", "params", "hash", "reason"], rows, right="id params")
-
-
-def _reason(each: SnapshotSummary) -> str:
+def _snapshot_cells(each: SnapshotSummary) -> Sequence[object]:
     notes = [] if each.complete else ["not complete"]
     if each.ended is False:
         notes.append("interrupted, or still running")
-    return f"{each.reason} ({', '.join(notes)})" if notes else each.reason
+    reason = f"{each.reason} ({', '.join(notes)})" if notes else each.reason
+    return each.id, local_time(each.at), each.component, each.size, hash_text(each.hash), reason
 
 
 def _value(param: Param | None) -> str | None:

@@ -18,7 +18,7 @@ from cyclopts import Parameter
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import CacheOptions, LinkOptions
-from paramclient.cli.output import print_json, print_line, print_table, printable, say
+from paramclient.cli.output import print_json, print_line, say, show
 from paramclient.cli.session import (
     FIRMWARE_POLL_INTERVAL,
     FIRMWARE_TIMEOUT,
@@ -171,7 +171,7 @@ class _DownloadNotice:
     def __call__(self, received: int, size: int | None) -> None:
         if not self._is_done and size is not None and size >= ANNOUNCED_SIZE_MIN:
             self._is_done = True
-            say(printable(f"downloading the parameter metadata of {self._vehicle}: {size:,} bytes"))
+            say(f"downloading the parameter metadata of {self._vehicle}: {size:,} bytes")
 
 
 def known_of_table(cache: Path, table: CachedComponent) -> Metadata | None:
@@ -311,20 +311,21 @@ def metadata_add(
     if options.json:
         print_json(_added_json(added, len(metadata)))
     else:
-        say(printable(f"{counted(len(metadata), 'description')} from {file} for {added}"))
+        say(f"{counted(len(metadata), 'description')} from {file} for {added}")
     return ExitCode.DONE
 
 
 def metadata_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     """Print the metadata files that were added."""
-    rows = [(each, len(read_metadata(each.path))) for each in _files(options)]
-    if options.json:
-        print_json({"metadata": [_added_json(*row) for row in rows]})
-    elif rows:
-        cells = ((each.kind, each.firmware or "any", count) for each, count in rows)
-        print_table(["vehicle", "firmware", "descriptions"], cells, right="descriptions")
-    else:
-        say("no metadata was added")
+    counts = [(each, len(read_metadata(each.path))) for each in _files(options)]
+    show(
+        {"metadata": [_added_json(*each) for each in counts]},
+        ["vehicle", "firmware", "descriptions"],
+        ((each.kind, each.firmware or "any", count) for each, count in counts),
+        json=options.json,
+        right="descriptions",
+        empty="no metadata was added",
+    )
     return ExitCode.DONE
 
 

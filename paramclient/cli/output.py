@@ -39,6 +39,7 @@ __all__ = [
     "printable",
     "report",
     "say",
+    "show",
 ]
 
 STDIN: Final = "stdin:"
@@ -197,6 +198,24 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
     for line in _table_lines(columns, rows, right.split(), width, styled=is_terminal):
         print(line)
     sys.stdout.flush()
+
+
+def show(
+    item: object,
+    columns: Sequence[str],
+    rows: Iterable[Sequence[object]],
+    *,
+    json: bool,
+    right: str = "",
+    empty: str = "",
+) -> None:
+    """Print an object as JSON, or its rows as a table; if `empty` is given and there are none, say that."""
+    if json:
+        print_json(item)
+    elif (cells := list(rows)) or not empty:
+        print_table(columns, cells, right=right)
+    else:
+        say(empty)
 
 
 class LiveView:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.output import print_json, print_table, say
+from paramclient.cli.output import show
 from paramclient.links import SerialPort, list_ports
 
 __all__ = ["ports"]
@@ -18,13 +18,13 @@ def ports(*, json: bool = False) -> ExitCode:
         json: Print JSON.
     """
     found = list_ports()
-    if json:
-        print_json({"ports": [_port_json(port) for port in found]})
-    elif found:
-        columns = ["device", "autopilot", "product", "manufacturer", "usb id", "link"]
-        print_table(columns, map(_port_cells, found))
-    else:
-        say("this computer has no serial ports")
+    show(
+        {"ports": [_port_json(port) for port in found]},
+        ["device", "autopilot", "product", "manufacturer", "usb id", "link"],
+        map(_port_cells, found),
+        json=json,
+        empty="this computer has no serial ports",
+    )
     return ExitCode.DONE
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
-from paramclient.cli.cached import extended_sizes, load_tables, print_summaries
+from paramclient.cli.cached import extended_sizes, load_tables, show_summaries
 from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.file_output import described
@@ -83,7 +83,7 @@ def show(
         summaries = _tables_to_show(cache, None if is_log else vehicle, extended=extended)
         sizes = extended_sizes(cache)
         if vehicle is None and not options.json and len(summaries) != 1:
-            print_summaries(cache, summaries)
+            show_summaries(cache, summaries, sizes)
             if summaries:
                 say("paramclient show VEHICLE prints the table of one vehicle, by its system id or its key")
             return ExitCode.DONE

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import AsyncGenerator, Sequence
-from contextlib import aclosing, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Final, TypeAlias
 
@@ -16,7 +15,7 @@ from paramclient.cli.output import local_time, print_json, print_line, say
 from paramclient.cli.param_names import ChosenNames, check_given, may_appear
 from paramclient.cli.read_commands import get_chosen, report_all
 from paramclient.cli.session import CommandSession, Sessions, sessions
-from paramclient.client.events import Discovered, Event, Events, Found, Lost, Rebooted, Resynced
+from paramclient.client.events import Discovered, Events, Found, Lost, Rebooted, Resynced
 from paramclient.client.streams import Changes
 from paramclient.errors import CacheError, ParamClientError
 from paramclient.model.names import NameChoice, is_pattern
@@ -69,7 +68,9 @@ async def _watch(session: CommandSession, given: Sequence[str], found: Sessions)
         if given and not any(map(is_pattern, given)) and known is not None:
             tasks.start_soon(_follow_groups, session)
         with anyio.move_on_after(session.deadline.left()):
-            await _print_changes_and_events(session, changes, events, known, choice)
+            async with task_group() as printing:  # both end with a log
+                printing.start_soon(_print_events, session, events)
+                await _print_changes(session, changes, known, choice)
         tasks.cancel_scope.cancel()
     return ExitCode.DONE
 
@@ -99,65 +100,37 @@ async def _follow_groups(session: CommandSession) -> None:
         await session.component.fetch_all()
 
 
-async def _print_changes_and_events(
-    session: CommandSession,
-    changes: Changes,
-    events: Events,
-    known: set[str] | None,
-    choice: NameChoice | None,
+async def _print_changes(
+    session: CommandSession, changes: Changes, known: set[str] | None, choice: NameChoice | None
 ) -> None:
-    """Print changes and events of the component until cancelled.
+    """Print changes of the component until cancelled.
 
     Args:
         session: the session.
         changes: the changes of the component.
-        events: the events of the client.
         known: names of the table at the start. The first value of any other parameter is not a change. None:
             the first value of every parameter is not a change.
         choice: the names to watch; None for all.
     """
-    ids = session.ids if session.choice.is_all else {}
-    async with aclosing(_merged(changes, events)) as merged:
-        async for each in merged:
-            prefix = ""
-            if isinstance(each, Change):
-                if each.kind == "first" and (known is None or each.name in known):
-                    known = known and known - {each.name}
-                    continue
-                if choice is not None and not choice.has(each.name):
-                    continue
-                text, prefix = _change_text(each), session.prefix
-            elif isinstance(each, Discovered) or each.component.node is not session.component.node:
-                continue
-            else:
-                text = _event_text(each)
-            if session.options.json:
-                print_json({"time": time_text(session.now)} | ids | _json(each))
-            else:
-                print_line(f"{local_time(session.now)}  {prefix}{text}")
+    async for change in changes:
+        if change.kind == "first" and (known is None or change.name in known):
+            known = known and known - {change.name}
+        elif choice is None or choice.has(change.name):
+            _print(session, change, f"{session.prefix}{_change_text(change)}")
 
 
-async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | Event]:
-    """Yield changes and events in the order of their arrival."""
-    waiting: dict[asyncio.Future[Change | Event], Changes | Events] = {}
+async def _print_events(session: CommandSession, events: Events) -> None:
+    async for event in events:
+        if not isinstance(event, Discovered) and event.component.node is session.component.node:
+            _print(session, event, _event_text(event))
 
-    def wait(feed: Changes | Events) -> None:
-        waiting[asyncio.ensure_future(anext(feed))] = feed
 
-    try:
-        wait(changes)
-        wait(events)
-        while waiting:
-            done, _ = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
-            for each in [each for each in waiting if each in done]:
-                feed = waiting.pop(each)
-                if not isinstance(each.exception(), StopAsyncIteration):  # else a log has ended
-                    wait(feed)
-                    yield each.result()
-    finally:
-        for each in waiting:
-            if not each.cancel():
-                each.exception()  # both end with the link; one error is reported
+def _print(session: CommandSession, item: Change | _ComponentEvent, text: str) -> None:
+    if session.options.json:
+        ids = session.ids if session.choice.is_all else {}
+        print_json({"time": time_text(session.now)} | ids | _json(item))
+    else:
+        print_line(f"{local_time(session.now)}  {text}")
 
 
 def _json(item: Change | _ComponentEvent) -> dict[str, object]:
