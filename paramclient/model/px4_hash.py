@@ -45,9 +45,6 @@ _GROUPS = tuple(
 )
 
 
-_POLYNOMIAL = 0xEDB88320
-
-
 def crc32_px4(data: bytes, crc: int = 0) -> int:
     """Return PX4's CRC-32: polynomial 0xEDB88320, reflected, start 0, no final xor (crc.c, `crc32part`).
 
@@ -56,14 +53,19 @@ def crc32_px4(data: bytes, crc: int = 0) -> int:
     return zlib.crc32(data, crc ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
+_STEPS = [crc32_px4(bytes((byte,))) for byte in range(256)]
+_BYTES = {step >> 24: byte for byte, step in enumerate(_STEPS)}
+
+
 def crc32_px4_before(crc: int, size: int) -> int:
     """Return the CRC-32 from which `size` zero bytes lead to this one: the inverse of `crc32_px4`.
 
-    Of the difference of two checksums, it is the difference of the last `size` bytes (at most 4) of two files
-    that are equal before them.
+    Of the difference of two checksums, it is for up to 4 bytes the difference of the last `size` bytes of two
+    files that are equal before them.
     """
-    for _ in range(8 * size):
-        crc = (crc ^ _POLYNOMIAL) << 1 | 1 if crc >> 31 else crc << 1
+    for _ in range(size):
+        byte = _BYTES[crc >> 24]
+        crc = (crc ^ _STEPS[byte]) << 8 | byte
     return crc
 
 

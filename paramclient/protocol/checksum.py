@@ -1,67 +1,77 @@
 """ArduPilot's answer to "is the table current?": the checksum of its parameter file.
 
-MAVFTP's CalcFileCRC32 returns the CRC-32 of `@PARAM/param.pck`, of all parameters or of a range, in one round
-trip and without opening the file. The same file is encoded from the table. A CRC-32 behind known bytes
-determines the last four: the checksum of one parameter shows its exact value, if name and type are known.
-Values that move by themselves are found that way, and so are those that were changed. The checksum is linear:
-such a value can also make up for another name or type, and no other checksum would show it. So each is read
-by its index too. Nothing is taken over until the checksum of the whole file agrees.
+MAVFTP's CalcFileCRC32 returns the CRC-32 of `@PARAM/param.pck`, of all parameters or of the first ones, in
+one round trip and without opening the file. The same file is encoded from the table. The checksum is linear:
+the difference of two of them depends only on the bytes that differ. So two of them show whether the rows
+between their ends differ. Where one value does, its new bits follow from each row in which it may be, and the
+row in which these are a simple value is probably the one.
+
+Such a value can also make up for another name or type, and no checksum would show it. So each is read by its
+index too. Nothing is taken over until the checksum of the whole file agrees.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection
+from itertools import accumulate, pairwise
 from typing import Final
 
 import anyio
 
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, VehicleError
 from paramclient.model.px4_hash import crc32_px4, crc32_px4_before
-from paramclient.model.values import Encoding, ParamType, as_reported, bits_of, bits_of_wire, from_bits
+from paramclient.model.values import Encoding, ParamType, Trust, as_reported, bits_of, bits_of_wire, from_bits
+from paramclient.protocol.channel import task_group
 from paramclient.protocol.ftp import BUSY, attempts_unproven, checksum, is_free
-from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode
-from paramclient.protocol.reads import read
+from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode_entries, header
+from paramclient.protocol.reads import READS_PER_SLOT_ARDUPILOT, SLOT_ARDUPILOT, read
 from paramclient.protocol.session import Session
 from paramclient.protocol.table import Table
 
-__all__ = ["CHECKED_READ_SIZE", "ChecksumUnavailable", "TableDiffers", "may_be_rounded", "prove"]
+__all__ = ["CHECKED_READ_SIZE", "ChecksumUnavailable", "TableDiffers", "is_moving", "may_be_rounded", "prove"]
 
 CHECKED_READ_SIZE: Final = 64
 """Bytes that ArduPilot reads at a time for a checksum: the padding of the file depends on it (measured)."""
 AT_ONCE: Final = 5
 """Requests sent at once: ArduPilot's queue has 5 places, and drops the surplus silently (measured)."""
-INTERVAL: Final = 0.005
-"""Seconds between further requests: ArduPilot keeps up with one in 3 ms (measured)."""
+INTERVAL: Final = 0.006
+"""Seconds between further requests: ArduPilot loses some of those sent every 4 ms (measured)."""
+REQUEST_SIZE: Final = 54
+"""Bytes of a request on the link."""
+FILE_ROUND_TRIPS: Final = 3
+"""Round trips of a download: to open the file, to its first block, and to close it."""
+FILE_RATE: Final = 48_500
+"""Bytes per second of a download where the link does not limit it (measured)."""
 FLOAT32_EXACT: Final = 2**24
 """The largest integer up to which float32 holds all."""
 BOOT_COUNT: Final = "STAT_BOOTCNT"
-MOVING: Final = re.compile(r"STAT_RUNTIME|STAT_BOOTCNT")
-"""Names that have another value at almost every connection: the seconds and the number of runs."""
+SECONDS: Final = re.compile(r"STAT_RUNTIME|STAT_FLTTIME")
+"""Names of values that count seconds."""
+MOVING: Final = re.compile(f"{SECONDS.pattern}|{BOOT_COUNT}")
+"""Names that have another value at almost every connection."""
+SECONDS_SLACK: Final = 60.0
+"""By how much these may grow more than time passes: they are stored every 30 s."""
 MEASURED: Final = re.compile(
     r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|ARSPD\d?_OFFSET|COMPASS_DEC|BARO\d_GND_PRESS"
 )
 """Names that each start of the vehicle measures again (measured)."""
-MOVING_MAX: Final = 12
-"""Values that are read one by one for their own sake; a table with more of them is downloaded."""
-SEARCHES_MAX: Final = 4
-"""Searches for changed values; each finds one at least."""
-PLACES_MAX: Final = 4
-"""Ranges that differ, at most, for a search to go on."""
 TOO_MANY: Final = "it differs, and a download is quicker than a search for the changes"
 OTHER: Final = "the vehicle has other parameters than the cached table"
 PROOFS_MAX: Final = 2
-"""Proofs: the vehicle may announce a change in the middle of one."""
+"""Proofs: the vehicle may change a value in the middle of one."""
+PARTS_MIN: Final = 3
 PARTS_MAX: Final = 12
-"""Parts of a range that one search compares at once."""
-PART_TIME: Final = 0.01
-"""Seconds of round trip for each further part: on a quick link halving takes the fewest bytes, and on a slow
-one many parts take the fewest round trips."""
-QUICK_ROUND_TRIP: Final = 0.05
-"""Seconds of round trip up to which values that move are read before anything is searched."""
-SEARCH_TIME_MAX: Final = 0.3
-"""Seconds that the last requests took, above which a download of the file is quicker than a search."""
+"""Parts into which a range that differs is divided."""
+PART_TIME: Final = 0.008
+"""Seconds of round trip for each of these: on a quick link few parts take the fewest bytes, and on a slow one
+many parts take the fewest round trips."""
+SLOW_ROUND_TRIP: Final = 0.05
+"""Seconds of round trip from which on values that move are compared at once."""
+GUESS_BITS: Final = 29
+"""Bits of a value, and of the number of rows in which it may be, up to which a guess is hardly chance: in
+each wrong row, any of 2**32 values would explain the difference."""
 
 
 class ChecksumUnavailable(Exception):
@@ -82,11 +92,8 @@ class TableDiffers(ChecksumUnavailable):
     """The vehicle's table is another one, and a search is not worth it."""
 
 
-async def prove(session: Session) -> tuple[str, ...]:
+async def prove(session: Session) -> None:
     """Prove a complete table by the vehicle's checksum, after reading the values that have changed.
-
-    Returns:
-        The names whose values have changed, except for those that move by themselves.
 
     Raises:
         ChecksumUnavailable: the vehicle computes no checksum now.
@@ -100,10 +107,8 @@ async def prove(session: Session) -> tuple[str, ...]:
             for _ in range(PROOFS_MAX):
                 proof = _Proof(session, _rows(session.table))
                 await proof.run()
-                await proof.confirm()
-                changed = proof.take_over()
-                if changed is not None:
-                    return changed
+                if proof.take_over():
+                    return
         except FileTransferError as error:
             if error.code == FileErrorCode.UNKNOWN_COMMAND:
                 session.serves_checksum = False
@@ -115,183 +120,211 @@ async def prove(session: Session) -> tuple[str, ...]:
     raise ChecksumUnavailable("the parameters change all the time")
 
 
+def is_moving(name: str) -> bool:
+    """Return whether ArduPilot changes this value itself, at each start or all the time."""
+    return bool(MOVING.fullmatch(name) or MEASURED.fullmatch(name))
+
+
 class _Proof:
     """One proof: the file as the vehicle must have it, which is brought in line with its checksums."""
 
     def __init__(self, session: Session, rows: list[PackedParam]) -> None:
         self._session = session
         self._rows = rows
-        self._changed: dict[int, float] = {}  # by index, when the checksum was requested
-        self._checksum = 0
+        entries = [b"", *encode_entries(rows, with_defaults=False, read_size=CHECKED_READ_SIZE)]
+        self._content = b"".join(entries)  # behind the header
+        self._ends = list(accumulate(map(len, entries)))  # of the first rows, by their number
+        self._found: dict[int, int] = {}  # the vehicle's checksum of the first rows, by their number
+        self._changed: dict[int, float] = {}  # by index, when the value was known
+        self._refuted: set[tuple[int, int]] = set()  # wrong guesses
         self._round_trip = math.inf  # of the quickest requests
-        self._last_time = 0.0  # of the last requests
-        self._turn_at = -math.inf
+        self._byte_time = 0.0  # seconds for each byte of requests that waited for each other
 
     async def run(self) -> None:
-        """Compare, and read what differs.
+        """Compare, and read what differs, until nothing does.
 
         Raises:
             TableDiffers: the tables are too different.
         """
-        if await self._agrees():
-            return
-        moving = list(self._moving())
-        if len(moving) > MOVING_MAX:
-            raise TableDiffers(f"{len(moving)} values of the cached table are not exact")
-        whole = range(len(self._rows))
-        places = await self._round([whole] if self._round_trip > QUICK_ROUND_TRIP else [], moving)
-        if all(at in self._changed for at, row in enumerate(self._rows) if row.name == BOOT_COUNT):
-            measured = [at for at, row in enumerate(self._rows) if MEASURED.fullmatch(row.name)]
-            places = await self._round([], measured)
-        searches = 0
-        while not self._is_equal() and self._last_time <= SEARCH_TIME_MAX and searches < SEARCHES_MAX:
-            places = await self._round(places or [whole])
-            searches += not places
-        if self._is_equal() or await self._agrees():
-            return
-        raise TableDiffers(TOO_MANY)
-
-    def _moving(self) -> Iterator[int]:
-        """Return the indices of values that probably are others, or that may be rounded."""
-        learnt = self._session.table.volatile
-        for at, row in enumerate(self._rows):
-            is_learnt = row.name in learnt and not MEASURED.fullmatch(row.name)
-            if is_learnt or MOVING.fullmatch(row.name) or may_be_rounded(row):
-                yield at
-
-    async def _agrees(self) -> bool:
-        """Request the checksum of the whole file, and return whether it is that of the rows."""
-        (self._checksum,) = await self._request([None])
-        return self._is_equal()
-
-    def _is_equal(self) -> bool:
-        return self._checksum == _checksum_of(self._rows)
-
-    async def _round(self, places: list[range], indices: Sequence[int] = ()) -> list[range]:
-        """Take over the values at some indices, and ask for the parts of ranges that differ.
-
-        Returns:
-            The parts that differ; the value of a part of one parameter is taken over instead.
-        """
-        if len(places) > PLACES_MAX:
-            raise TableDiffers(TOO_MANY)
-        began = anyio.current_time()
-        single = [range(at, at + 1) for at in indices]
-        splits = [self._split(place) for place in places]
-        asked = [*single, *(part for parts in splits for part in parts[:-1] or parts)]
-        found = dict(zip(asked, await self._request(asked), strict=True))
-        for part in single:
-            self._solve(part.start, found[part], began)
-        remaining = []
-        for parts in splits:
-            differing = [
-                part for part in parts if part in found and found[part] != _checksum_of(self._rows, part)
-            ]
-            for part in differing or parts[-1:]:  # if no other one does, the last one differs
-                if len(part) == 1 and part in found:
-                    self._solve(part.start, found[part], began)
+        rows = self._rows
+        whole, learnt = range(len(rows)), self._session.table.volatile
+        moving = {at for at, row in enumerate(rows) if MOVING.fullmatch(row.name) or may_be_rounded(row)}
+        measured = {at for at, row in enumerate(rows) if MEASURED.fullmatch(row.name) and row.bits}
+        suspects = {at for at, row in enumerate(rows) if row.name in learnt} - moving - measured
+        await self._request({len(whole), *(self._ends_of(moving, whole) if self._is_slow else ())})
+        while places := self._places():
+            if any(len(place) == 1 and rows[place.start].name == BOOT_COUNT for place in places):
+                suspects |= measured
+            guesses: dict[int, int] = {}
+            numbers: set[int] = set()
+            for place, difference in places.items():
+                suspected = {at: rows[at].bits for at in suspects if at in place}
+                if ends := self._ends_of(moving, place):
+                    numbers |= ends
+                elif guessed := suspected or self._guess(place, difference):
+                    guesses |= guessed
+                elif len(place) > 1:
+                    numbers |= self._parts(place)
                 else:
-                    remaining.append(part)
-        return remaining
+                    raise TableDiffers(OTHER)
+            self._weigh(len(guesses), len(numbers))
+            if numbers:
+                await self._request(numbers)
+            else:
+                await self._read(guesses)
+                suspects -= guesses.keys()
 
-    def _split(self, place: range) -> list[range]:
-        count = min(1 + max(1, int(self._round_trip / PART_TIME)), PARTS_MAX)
-        size = -(-len(place) // count)
-        return [place[at : at + size] for at in range(0, len(place), size)]
+    @property
+    def _is_slow(self) -> bool:
+        """Whether round trips count more than bytes, for a table that was not proven on this link."""
+        channel, params = self._session.channel, self._session.table.params.values()
+        is_slow = (channel.timing.round_trip or 0.0) > SLOW_ROUND_TRIP
+        return is_slow and any(param.trust is Trust.CACHED for param in params)
 
-    def _solve(self, at: int, found: int, requested_at: float) -> None:
-        """Take over the one value with which the file of one parameter has this checksum."""
-        row, known = self._rows[at], _checksum_of(self._rows, range(at, at + 1))
-        difference = crc32_px4_before(found ^ known, row.type.size)
-        if difference >> 8 * row.type.size:
+    def _ends_of(self, indices: Collection[int], place: range) -> set[int]:
+        """Return the numbers of rows whose checksums show these values, as far as they are in a range and not
+        known; with all rows, as the values may just have moved."""
+        ends = {end for at in indices if at in place for end in (at, at + 1)} - {0, *self._found}
+        return ends and {*ends, len(self._rows)}
+
+    def _parts(self, place: range) -> set[int]:
+        parts = min(max(PARTS_MIN, int(self._round_trip / PART_TIME)), PARTS_MAX)
+        size = -(-len(place) // parts)
+        return set(range(place.start + size, place.stop, size))
+
+    def _places(self) -> dict[range, int]:
+        """Return the ranges that differ, between the rows of known checksums, with the difference."""
+        places = {}
+        before = 0
+        for start, stop in pairwise([0, *sorted(self._found)]):
+            head = crc32_px4(header(stop, len(self._rows)))
+            now = self._found[stop] ^ crc32_px4(self._content[: self._ends[stop]], head)
+            difference = now ^ crc32_px4(bytes(self._ends[stop] - self._ends[start]), before)
+            before = now
+            if difference:
+                places[range(start, stop)] = difference
+        return places
+
+    def _guess(self, place: range, difference: int) -> dict[int, int]:
+        """Return the index and the bits of the simplest value that explains a difference alone, unless there
+        is none, or it may be chance.
+
+        Raises:
+            TableDiffers: the number of parameters in the header explains it.
+        """
+        guess: dict[int, int] = {}
+        bits_max = GUESS_BITS - math.log2(len(place)) if len(place) > 1 else math.inf
+        for at in reversed(place):
+            row = self._rows[at]
+            change = crc32_px4_before(difference, row.type.size)
+            bits = row.bits ^ change
+            if not change >> 8 * row.type.size and (at, bits) not in self._refuted:
+                size = _bits_to_write(bits, row.type)
+                if size <= bits_max:
+                    guess, bits_max = {at: bits}, size
+            difference = crc32_px4_before(difference, self._ends[at + 1] - self._ends[at])
+        if place.start == 0 and not crc32_px4_before(difference, 2) >> 16:
             raise TableDiffers(OTHER)
-        if difference:
-            self._rows[at] = row._replace(bits=row.bits ^ difference)
-            self._changed[at] = requested_at
+        return guess
 
-    async def _request(self, places: Sequence[range | None]) -> list[int]:
-        """Return the vehicle's checksums of some ranges, or with None, of all."""
-        if not places:
-            return []
-        session, began = self._session, anyio.current_time()
-        answers: dict[int, int] = {}
-        errors: list[FileTransferError | NoReply] = []
+    def _weigh(self, reads: int, requests: int) -> None:
+        """Compare the time of the next step with that of a download.
+
+        Raises:
+            TableDiffers: the download is quicker.
+        """
+        trip = self._round_trip
+        search = 2 * trip + INTERVAL * requests + SLOT_ARDUPILOT * (0.5 + reads // READS_PER_SLOT_ARDUPILOT)
+        byte_time = max(1 / FILE_RATE, self._byte_time)
+        if search > FILE_ROUND_TRIPS * trip + byte_time * len(self._content):
+            raise TableDiffers(TOO_MANY)
+
+    async def _request(self, numbers: Collection[int]) -> None:
+        """Request the vehicle's checksums of the first rows, by their numbers."""
+        session = self._session
         is_proven = session.serves_checksum or session.serves_file
         attempts = None if is_proven else attempts_unproven(session.channel)
 
-        async def request(number: int, place: range | None) -> None:
-            query = "" if place is None else f"?start={place.start}&count={len(place)}"
-            try:
-                await self._turn()
-                answers[number] = await checksum(session.channel, PARAM_FILE + query, attempts=attempts)
-            except (FileTransferError, NoReply) as error:
-                errors.append(error)
-                tasks.cancel_scope.cancel()
+        async def request(number: int) -> None:
+            query = "" if number == len(self._rows) else f"?count={number}"
+            self._found[number] = await checksum(session.channel, PARAM_FILE + query, attempts=attempts)
 
-        async with anyio.create_task_group() as tasks:
-            for number, place in enumerate(places):
-                tasks.start_soon(request, number, place)
-        if errors:
-            raise errors[0]
+        async with task_group() as tasks:
+            for place, number in enumerate(numbers):
+                if place >= AT_ONCE:
+                    await anyio.sleep(INTERVAL)
+                tasks.start_soon(request, number)
+            sent_at = anyio.current_time()
         session.serves_checksum = True
-        self._last_time = anyio.current_time() - began
-        self._round_trip = min(self._round_trip, self._last_time)
-        return [answers[number] for number in range(len(places))]
+        elapsed = anyio.current_time() - sent_at
+        self._round_trip = min(self._round_trip, elapsed)
+        self._byte_time = (elapsed - self._round_trip) / (REQUEST_SIZE * len(numbers))
 
-    async def _turn(self) -> None:
-        """Wait until the vehicle's queue has room for a request."""
-        now = anyio.current_time()
-        self._turn_at = max(self._turn_at, now - AT_ONCE * INTERVAL) + INTERVAL
-        await anyio.sleep(max(self._turn_at - now, 0.0))
+    async def _read(self, guesses: dict[int, int]) -> None:
+        """Read values by their indices, and take over those that are others; `guesses` has their exact bits.
 
-    async def confirm(self) -> None:
-        """Read the changed values by their indices, and compare names and types.
+        A value that has counted the seconds since it was known needs no read: nothing else explains it.
 
         Raises:
             TableDiffers: the vehicle has another parameter at such an index.
         """
-        other: list[int] = []
+        table, now = self._session.table, anyio.current_time()
 
-        async def read_one(at: int) -> None:
+        async def read_one(at: int, guess: int) -> None:
+            row = self._rows[at]
+            if SECONDS.fullmatch(row.name) and row.type is ParamType.INT32:
+                passed = now - table.moments[row.name] + SECONDS_SLACK
+                if 0 < int(from_bits(guess, row.type)) - int(from_bits(row.bits, row.type)) <= passed:
+                    self._take(at, guess, now)
+                    return
             try:
                 found = await read(self._session, at)
             except (NoReply, VehicleError):
-                other.append(at)
-            else:
-                if (found.param_id, found.param_type) != (self._rows[at].name, self._rows[at].type):
-                    other.append(at)
+                raise TableDiffers(OTHER) from None
+            if (found.param_id, found.param_type) != (row.name, row.type):
+                raise TableDiffers(OTHER)
+            for bits in (guess, row.bits, bits_of_wire(found.raw, row.type, table.encoding)[0]):
+                if as_reported(bits, row.type, table.encoding) == found.raw:
+                    break
+            if bits != guess:
+                self._refuted.add((at, guess))
+            self._take(at, bits, now)
 
-        async with anyio.create_task_group() as tasks:
-            for at in self._changed:
-                tasks.start_soon(read_one, at)
-        if other:
-            raise TableDiffers(OTHER)
+        async with task_group() as tasks:
+            for at, guess in guesses.items():
+                tasks.start_soon(read_one, at, guess)
 
-    def take_over(self) -> tuple[str, ...] | None:
-        """Put the proven file into the table, and learn which values change.
+    def _take(self, at: int, bits: int, now: float) -> None:
+        row, end = self._rows[at], self._ends[at + 1]
+        if bits != row.bits:
+            value = bits.to_bytes(row.type.size, "little")
+            self._rows[at] = row._replace(bits=bits)
+            self._content = self._content[: end - len(value)] + value + self._content[end:]
+            self._changed[at] = now
 
-        Returns:
-            The names of the changed values, without those that move by themselves; None where the table has
-            changed meanwhile.
-        """
+    def take_over(self) -> bool:
+        """Put the proven file into the table, and learn which values change; return False where the table has
+        changed meanwhile."""
         table = self._session.table
-        names = [self._rows[at].name for at in self._changed]
         if table.count != len(self._rows):
-            return None
+            return False
         for at, moment in self._changed.items():
             table.store_entry(self._rows[at], at, moment, with_defaults=False)
-        if _checksum_of(_rows(table)) != self._checksum:
-            return None
-        if names:
-            table.volatile = frozenset(names)
-        table.prove(self._checksum)
-        return tuple(each for each in names if not (MOVING.fullmatch(each) or MEASURED.fullmatch(each)))
+        if _rows(table) != self._rows:
+            return False
+        if self._changed:
+            table.volatile = frozenset(self._rows[at].name for at in self._changed)
+        table.prove(self._found[len(self._rows)])
+        return True
 
 
-def _checksum_of(rows: Sequence[PackedParam], place: range | None = None) -> int:
-    """Return the checksum of the file with these rows, or of a range of it."""
-    part = rows if place is None else rows[place.start : place.stop]
-    return crc32_px4(encode(part, total=len(rows), read_size=CHECKED_READ_SIZE))
+def _bits_to_write(bits: int, kind: ParamType) -> float:
+    """Return how many bits it takes to write a value: few for those that people choose."""
+    value = abs(float(from_bits(bits, kind)))
+    digits = repr(value).partition("e")[0].replace(".", "").strip("0")
+    if not 0 < value < math.inf:
+        return 8 * kind.size if value else 0
+    return min(1 + len(digits) * math.log2(10) + 2 * abs(math.log10(value)), 8 * kind.size)
 
 
 def _rows(table: Table) -> list[PackedParam]:

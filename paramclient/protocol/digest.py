@@ -25,7 +25,6 @@ class Answer:
     Attributes:
         is_current: whether it confirms the table, as it is now.
         digest: the vehicle's hash now, or None for a vehicle without one.
-        changed: the names whose values were others, and were read.
         reason: why an ArduPilot confirms nothing, as a sentence; or empty.
         is_silent: whether that was because it does not answer to MAVFTP.
         is_other: whether that was because its table is another one.
@@ -33,7 +32,6 @@ class Answer:
 
     is_current: bool = False
     digest: Digest | None = None
-    changed: tuple[str, ...] = ()
     reason: str = ""
     is_silent: bool = False
     is_other: bool = False
@@ -52,10 +50,11 @@ async def ask(session: Session) -> Answer:
     """
     if _may_prove(session):
         try:
-            return Answer(is_current=True, changed=await prove(session))
+            await prove(session)
         except ChecksumUnavailable as error:
             is_other = isinstance(error, TableDiffers)
             return Answer(reason=error.reason, is_silent=error.is_silent, is_other=is_other)
+        return Answer(is_current=True)
     digest = await request_digest(session)
     if not session.table.agrees_with(digest):
         return Answer(digest=digest)

@@ -13,6 +13,7 @@ from paramclient.errors import NoReply
 from paramclient.model.params import ParamMap
 from paramclient.model.values import Param
 from paramclient.model.wording import first_of
+from paramclient.protocol.checksum import is_moving
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.digest import Answer, ask, request_digest
 from paramclient.protocol.file_download import FileUnavailable, download_file
@@ -21,7 +22,7 @@ from paramclient.protocol.list_download import ListResult, download_list
 from paramclient.protocol.reads import read_many
 from paramclient.protocol.session import Session
 
-__all__ = ["FetchResult", "FetchSource", "Policy", "Progress", "fetch_all", "result_of"]
+__all__ = ["FetchResult", "FetchSource", "Policy", "Progress", "differing", "fetch_all", "result_of"]
 
 FetchSource: TypeAlias = Literal["cache", "ftp", "stream"]
 """Where a fetch has the values from: the cache, the packed file (MAVFTP) or the list."""
@@ -34,8 +35,9 @@ CHANGED_MEANWHILE: Final = "The parameters changed during the download: the tabl
 NOT_REFRESHED: Final = "The values outside the hash were not read again, because the policy is hash-only."
 LEFT_OUT: Final = "Skipped {}: no parameter file can contain this name."
 NOT_READ: Final = "Values outside the vehicle's hash could not be read: {}."
-NOT_READ_SHOWN_MAX: Final = 5
-"""Names of such values that the note has, so that it stays readable."""
+CHANGED: Final = "Changed since they were cached: {}."
+SHOWN_MAX: Final = 5
+"""Names that a note has, so that it stays readable."""
 UNCONFIRMED: Final = "The cached table was not confirmed: {}."
 LOST: Final = "The component was lost."
 REPLACED: Final = "Another vehicle has taken the address, and its parameters were fetched: {}."
@@ -97,8 +99,8 @@ class FetchResult:
         lost: values of the list that were lost, so that they had to be read one by one or by another list.
         repeated: values received more than once.
         round_trip: the measured round trip in seconds, smoothed, or None.
-        changed: names whose cached values were others, and were read, where an ArduPilot then confirmed the
-            table; without those that it changes itself at each start or all the time.
+        changed: names whose cached values were others, where an ArduPilot computed a checksum of the table;
+            without those that it changes itself at each start or all the time.
     """
 
     system: int
@@ -185,6 +187,7 @@ class _Fetch:
         self.notes: list[str] = []
         self.listed = ListResult()
         self._began = anyio.current_time()
+        self._before = session.table.view()
         self._changed: tuple[str, ...] = ()
         self._is_silent = False  # MAVFTP
         self._vehicles = session.identification.vehicles
@@ -200,9 +203,7 @@ class _Fetch:
         elif can_confirm:
             answer = await ask(self.session)
         if answer.is_current:
-            self._changed = answer.changed
-            if answer.changed:
-                self.notes.append(f"Changed since they were cached: {', '.join(answer.changed)}.")
+            self._name_changes()
             if self.policy is Policy.AUTO:
                 await self._read_unverified()
             elif self.table.unverified():
@@ -226,6 +227,8 @@ class _Fetch:
             if not self.table.params:
                 self._check_heard()
             self.notes.append(LOST)
+        if answer.is_other:
+            self._name_changes()
         return self._result(source)
 
     def _check_heard(self) -> None:
@@ -242,6 +245,13 @@ class _Fetch:
         if self._vehicles != before:
             self.notes.append(REPLACED.format(identification.identity))
         return self._vehicles != before
+
+    def _name_changes(self) -> None:
+        """Take note of the values that are others than at the begin, without those that change themselves."""
+        changed = differing(self._before, self.table.params)
+        self._changed = tuple(name for name in changed if not is_moving(name))
+        if self._changed:
+            self.notes.append(CHANGED.format(first_of(self._changed, SHOWN_MAX)))
 
     async def _download(self) -> FetchSource:
         """Download the file, or the list where there is none."""
@@ -292,7 +302,7 @@ class _Fetch:
         """Read the values that the digest does not cover."""
         await read_many(self.session, self.table.unverified(), lambda name, result: None)
         if left := self.table.unverified(self._began):
-            self.notes.append(NOT_READ.format(first_of(left, NOT_READ_SHOWN_MAX)))
+            self.notes.append(NOT_READ.format(first_of(left, SHOWN_MAX)))
 
     def _unconfirmed(self) -> FetchResult:
         """Return the table as it is cached."""
@@ -339,4 +349,12 @@ def result_of(
         listed.repeated,
         channel.timing.round_trip,
         cached=tuple(cached),
+    )
+
+
+def differing(before: Mapping[str, Param], now: Mapping[str, Param]) -> tuple[str, ...]:
+    """Return the names whose parameters are others than before, new, or gone."""
+    names = dict.fromkeys([*before, *now])
+    return tuple(
+        name for name in names if (name in before) != (name in now) or not before[name].same_value(now[name])
     )

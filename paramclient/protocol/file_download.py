@@ -8,6 +8,7 @@ from typing import Final
 import anyio
 
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError, VehicleError
+from paramclient.protocol.channel import task_group
 from paramclient.protocol.ftp import BUSY, FTP_SILENT_TIME, FileCutOff, attempts_unproven, is_free, read_file
 from paramclient.protocol.identity import Identification
 from paramclient.protocol.param_pck import PACK_SIZE_MAX, PARAM_FILE, Pack, decode, decode_prefix
@@ -57,7 +58,8 @@ async def download_file(session: Session) -> int:
     while attempts < DOWNLOADS_MAX:
         requested_at = anyio.current_time()
         try:
-            pack = decode(await _read(session, PARAM_FILE + query))
+            data, count = await _read(session, PARAM_FILE + query)
+            pack = decode(data)
         except FileTransferError as error:
             is_missing = error.code == FileErrorCode.FILE_NOT_FOUND
             if is_missing and query and not _adds_defaults(session.identification):
@@ -75,7 +77,7 @@ async def download_file(session: Session) -> int:
         except PackError as error:
             reason = f"is not valid: {error}"
         else:
-            reason = await _contradiction(session, pack)
+            reason = await _contradiction(session, pack, count)
         if not reason:
             session.serves_file, session.ftp_unanswered = True, 0
             _store(session, pack, requested_at)
@@ -88,12 +90,15 @@ def _adds_defaults(identification: Identification) -> bool:
     return identification.is_ardupilot and identification.identity.firmware >= ARDUPILOT_WITH_DEFAULTS
 
 
-async def _contradiction(session: Session, pack: Pack) -> str:
-    """Return why a file cannot be the vehicle's whole table, or ""."""
+async def _contradiction(session: Session, pack: Pack, count: int | None) -> str:
+    """Return why a file cannot be the vehicle's whole table, or "".
+
+    `count`: that of the vehicle, as read beside the file; None where it was not.
+    """
     if not pack.entries or len(pack.entries) != pack.total:
         return f"has {len(pack.entries)} of {pack.total} parameters"
     known = session.table.count
-    if known not in (None, pack.total) and await _count(session) != pack.total:
+    if pack.total not in (known or pack.total, count) and await _count(session) != pack.total:
         return f"has {pack.total} parameters, and the cached table {known}"
     return ""
 
@@ -109,23 +114,32 @@ async def _count(session: Session) -> int | None:
     return None
 
 
-async def _read(session: Session, path: str) -> bytes:
-    channel = session.channel
-    total = session.table.count
+async def _read(session: Session, path: str) -> tuple[bytes, int | None]:
+    """Read the file; beside it also the vehicle's number of parameters, if the table has another."""
+    channel, known = session.channel, session.table.count
+    total, count = known, None
+
+    async def read_count() -> None:
+        nonlocal count
+        count = await _count(session)
 
     def begun(head: bytes) -> None:
         nonlocal total
         with suppress(PackError):
             total = decode_prefix(head)[0].total
+        if known not in (None, total):
+            tasks.start_soon(read_count)
 
     def report(received: int, size: int | None) -> None:
         if size and total:
             session.report(min(received * total // size, total), total)
 
     attempts = None if session.serves_file else attempts_unproven(channel)
-    return await read_file(
-        channel, path, size_max=PACK_SIZE_MAX, open_attempts=attempts, progress=report, begun=begun
-    )
+    async with task_group() as tasks:
+        data = await read_file(
+            channel, path, size_max=PACK_SIZE_MAX, open_attempts=attempts, progress=report, begun=begun
+        )
+    return data, count
 
 
 def _store_beginning(session: Session, prefix: bytes, requested_at: float) -> None:

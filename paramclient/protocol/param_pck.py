@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
 from paramclient.errors import PackError, UsageError
@@ -27,6 +27,8 @@ __all__ = [
     "decode",
     "decode_prefix",
     "encode",
+    "encode_entries",
+    "header",
 ]
 
 PARAM_FILE: Final = "@PARAM/param.pck"
@@ -137,10 +139,14 @@ def encode(
     total = len(rows) if total is None else total
     if not len(rows) <= total <= 0xFFFF:
         raise UsageError(f"{len(rows)} entries of a table of {total}, and the file counts to 65535")
-    magic = _MAGIC_WITH_DEFAULTS if with_defaults else _MAGIC
-    out = bytearray(_HEADER.pack(magic, len(rows), total))
-    _append(out, rows, with_defaults, read_size)
-    return bytes(out)
+    return header(len(rows), total, with_defaults=with_defaults) + b"".join(
+        encode_entries(rows, with_defaults=with_defaults, read_size=read_size)
+    )
+
+
+def header(number: int, total: int, *, with_defaults: bool = False) -> bytes:
+    """Return the header of a file with a number of entries, of a table with `total`."""
+    return _HEADER.pack(_MAGIC_WITH_DEFAULTS if with_defaults else _MAGIC, number, total)
 
 
 def _header(data: bytes) -> tuple[int, int, int]:
@@ -201,8 +207,9 @@ def _entries(
     return tuple(found.values())
 
 
-def _append(out: bytearray, rows: list[PackedParam], with_defaults: bool, read_size: int | None) -> None:
-    last = ""
+def encode_entries(rows: Iterable[PackedParam], *, with_defaults: bool, read_size: int) -> Iterator[bytes]:
+    """Yield each entry behind the header, with its padding before it; see `encode`."""
+    last, length = "", _HEADER.size
     names = set()
     for name, kind, bits, default in rows:
         check_name(name)
@@ -221,14 +228,12 @@ def _append(out: bytearray, rows: list[PackedParam], with_defaults: bool, read_s
             raise UsageError(f"{name}: its value or default has more bits than {kind.name}") from None
         shared = _shared(last, name)
         own = name[shared:].encode("ascii")
-        size = 2 + len(own) + len(value)
-        if read_size is not None:
-            over = (len(out) + size) % read_size
-            if 0 < over < kind.size:
-                out += bytes(kind.size - over)
-        out += bytes((number, shared | len(own) - 1 << 4))
-        out += own
-        out += value
+        entry = bytes((number, shared | len(own) - 1 << 4)) + own + value
+        over = (length + len(entry)) % read_size
+        if 0 < over < kind.size:
+            entry = bytes(kind.size - over) + entry
+        length += len(entry)
+        yield entry
         last = name
 
 

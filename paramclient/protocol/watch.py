@@ -14,7 +14,7 @@ from paramclient.errors import LinkError, NoReply
 from paramclient.model.values import Param, Trust
 from paramclient.protocol.digest import ask, may_confirm
 from paramclient.protocol.events import Resynced
-from paramclient.protocol.fetch import Policy, fetch_all
+from paramclient.protocol.fetch import Policy, differing, fetch_all
 from paramclient.protocol.presence import Presence
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import MAV_MODE_FLAG_SAFETY_ARMED
@@ -183,13 +183,6 @@ class Watch:
                 return
         self._is_doubted = False
         self.confirmed_at = anyio.current_time()
-        changed = _differing(before, table.params)
+        changed = differing(before, table.params)
         if was_doubted or changed:
             self._emit(Resynced(changed, table.hash))
-
-
-def _differing(before: Mapping[str, Param], now: Mapping[str, Param]) -> tuple[str, ...]:
-    names = dict.fromkeys([*before, *now])
-    return tuple(
-        name for name in names if (name in before) != (name in now) or not before[name].same_value(now[name])
-    )

@@ -109,8 +109,6 @@ class FileServer:
     _answered_at: float = -math.inf
     _last: tuple[Address, Packet] | None = None
     _packed: tuple[object, bytes] | None = None
-    _busy_time: float = 0.0
-    _late: tuple[float, Packet, Address] | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rate) and self.rate > 0.0):
@@ -127,7 +125,7 @@ class FileServer:
         """Close all sessions, as after switching off."""
         self._open.clear()
         self._waiting.clear()
-        self._burst = self._last = self._late = None
+        self._burst = self._last = None
         self._free_at = self._answered_at = -math.inf
 
     def receive(self, payload: bytes, sender: Address, now: float) -> None:
@@ -138,8 +136,6 @@ class FileServer:
 
     def next_deadline(self) -> float:
         """Return the time of the next work, or infinity."""
-        if self._late is not None:
-            return self._late[0]
         request_at = max(self._waiting[0][0], self._free_at) if self._waiting else math.inf
         if self._burst is None:
             return request_at
@@ -155,17 +151,9 @@ class FileServer:
                 self._free_at = now
                 break
             burst = self._burst
-            if self._late is not None:
-                _, answer, sender = self._late
-                self._late = None
-                self._free_at = due + _size(answer) / (3 * self.rate)
-            elif burst is None or (self.is_px4 and due < burst.at):
+            if burst is None or (self.is_px4 and due < burst.at):
                 _, request, sender = self._waiting.popleft()
                 answer = self._answer(request, sender, due)
-                if answer is not None and self._busy_time > 0.0:
-                    self._late = (due + self._busy_time, answer, sender)
-                    self._busy_time = 0.0
-                    continue
                 if answer is not None:
                     self._free_at = due + _size(answer) / (3 * self.rate)
             else:
@@ -330,7 +318,6 @@ class FileServer:
                 with_defaults=bool(query["withdefaults"]),
                 read_size=_CHECKSUM_READ,
             )
-            self._busy_time = _CHECKSUM_TIME * len(content)
         return _NOT_FOUND if content is None else _number(crc32_px4(content))
 
     def _terminate(self, number: int, now: float) -> _Answer:
@@ -400,8 +387,6 @@ _LARGEST = 0xFFFF
 """Largest offset of a write, in bytes."""
 _CHECKSUM_READ = 64
 """Bytes that ArduPilot reads at a time for a checksum."""
-_CHECKSUM_TIME = 1e-6
-"""Seconds of a checksum for each byte of a generated file."""
 
 
 def _no(code: FileErrorCode, errno: int = 0) -> _Answer:
