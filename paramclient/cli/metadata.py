@@ -6,8 +6,7 @@ The subcommands metadata add, list and remove: metadata files that are stored fo
 from __future__ import annotations
 
 import shlex
-import sys
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Final, TypeAlias
 
@@ -18,12 +17,8 @@ from cyclopts import Parameter
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import CacheOptions, LinkOptions
-from paramclient.cli.output import print_json, print_line, say, show
-from paramclient.cli.session import (
-    FIRMWARE_POLL_INTERVAL,
-    FIRMWARE_TIMEOUT,
-    CommandSession,
-)
+from paramclient.cli.output import Status, print_json, print_line, say, show
+from paramclient.cli.session import CommandSession, wait_for_firmware
 from paramclient.errors import UsageError
 from paramclient.links import LinkKind
 from paramclient.metadata import (
@@ -40,13 +35,13 @@ from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, WireValue, format_value
 from paramclient.model.wording import counted
+from paramclient.protocol.fetch import Progress
 
 __all__ = [
     "DESCRIBED_COLUMNS",
     "VEHICLE",
     "MetadataChoice",
     "described_cells",
-    "files_of",
     "from_file",
     "how_to_describe",
     "info_of",
@@ -72,8 +67,6 @@ _ARDUPILOT_FILES: Final = "ArduPilot's files are at https://autotest.ardupilot.o
 """Where the files of firmware that does not provide its metadata are, for messages."""
 ARDUPILOT_NAME: Final = "ardupilot"
 """The autopilot that does not serve its metadata."""
-ANNOUNCED_SIZE_MIN: Final = 5_000
-"""Bytes from which the download of a metadata file is announced: the first, general file is smaller."""
 
 _DEFAULTS: Final = CacheOptions()
 
@@ -106,19 +99,19 @@ async def known_of_session(
         UsageError: the vehicle provides no metadata although it is required.
         VehicleError, NoReply, LinkError: as `metadata_of`.
     """
-    if choice == VEHICLE or needed_for:
-        found = await request_from_vehicle(session)
-        if found is None and choice != VEHICLE:
-            found = await _stored(session, added_only=True)
-        if found is None:
-            problem = f"{needed_for}. " if needed_for else ""
-            raise UsageError(
-                f"{problem}{session.label} does not describe its parameters; --metadata takes a file that "
-                "does, and `paramclient metadata add` remembers one."
-                f"{files_of([session.component.autopilot])}"
-            )
-        return found
-    return await _stored(session)
+    if choice != VEHICLE and not needed_for:
+        return await _stored(session)
+    found = await request_from_vehicle(session)
+    if found is None and choice != VEHICLE:
+        found = await _stored(session, added_only=True)
+    if found is None:
+        problem = f"{needed_for}. " if needed_for else ""
+        files = f" {_ARDUPILOT_FILES}" if session.component.autopilot == ARDUPILOT_NAME else ""
+        raise UsageError(
+            f"{problem}{session.label} does not describe its parameters; --metadata takes a file that "
+            f"does, and `paramclient metadata add` remembers one.{files}"
+        )
+    return found
 
 
 async def request_from_vehicle(session: CommandSession) -> Metadata | None:
@@ -127,8 +120,13 @@ async def request_from_vehicle(session: CommandSession) -> Metadata | None:
     Raises:
         UsageError, VehicleError, NoReply, LinkError: as `metadata_of`.
     """
-    progress = _DownloadNotice(session.label)
-    return await metadata_of(session.component, timeout=session.deadline.left(), progress=progress)
+    what, began = f"the parameter metadata of {session.label}", anyio.current_time()
+    with Status(f"waiting for {what}", f"downloading {what}, bytes:") as status:
+
+        def progress(received: int, size: int | None) -> None:
+            status.update(Progress.after(received, size, anyio.current_time() - began))
+
+        return await metadata_of(session.component, timeout=session.deadline.left(), progress=progress)
 
 
 async def _stored(session: CommandSession, *, added_only: bool = False) -> Metadata | None:
@@ -137,41 +135,15 @@ async def _stored(session: CommandSession, *, added_only: bool = False) -> Metad
     With `added_only`, metadata that a vehicle has provided is left out: the firmware may have been built from
     other sources since, and only the vehicle can confirm it.
     """
-    store = _store_of(session)
-    return None if store is None else await _found_in(session, store, added_only=added_only)
-
-
-async def _found_in(session: CommandSession, store: MetadataStore, *, added_only: bool) -> Metadata | None:
-    """Return the metadata in a store of the vehicle's firmware; or None."""
-    component = session.component
-    if not store.has_notes:
-        return None
-    with anyio.move_on_after(session.deadline.left(FIRMWARE_TIMEOUT)):
-        while not component.identity.git_hash:  # noqa: ASYNC110 - no event
-            await anyio.sleep(FIRMWARE_POLL_INTERVAL)
-    find = store.added.find if added_only else store.known
-    return await anyio.to_thread.run_sync(find, component.identity, component.component)
-
-
-def _store_of(session: CommandSession) -> MetadataStore | None:
-    """Return the metadata beside the cache; or None."""
     if session.options.place is False:
         return None
     cache = session.client.cache or ParamCache(session.options.cache)
-    return MetadataStore.beside(cache.path)
-
-
-class _DownloadNotice:
-    """Announces the download of a large metadata file, once and only on a terminal."""
-
-    def __init__(self, vehicle: str) -> None:
-        self._vehicle = vehicle
-        self._is_done = not sys.stderr.isatty()
-
-    def __call__(self, received: int, size: int | None) -> None:
-        if not self._is_done and size is not None and size >= ANNOUNCED_SIZE_MIN:
-            self._is_done = True
-            say(f"downloading the parameter metadata of {self._vehicle}: {size:,} bytes")
+    store, component = MetadataStore.beside(cache.path), session.component
+    if not store.has_notes:
+        return None
+    await wait_for_firmware([component], session.deadline)
+    find = store.added.find if added_only else store.known
+    return await anyio.to_thread.run_sync(find, component.identity, component.component)
 
 
 def known_of_table(cache: Path, table: CachedComponent) -> Metadata | None:
@@ -208,11 +180,6 @@ def how_to_describe(tables: Sequence[CachedComponent], name: str) -> str:
         words = ["paramclient", "get", link, shown, "--vehicle", str(table.system), "--metadata", VEHICLE]
         requests.append(f"`{shlex.join(words)}` loads it from {table.system}/{table.component}.")
     return f"no metadata is stored for the firmware of {' and '.join(sorted(firsts))}. {' '.join(requests)}"
-
-
-def files_of(autopilots: Collection[str]) -> str:
-    """Return where the metadata files of vehicles are, as a sentence that begins with a space; or ""."""
-    return f" {_ARDUPILOT_FILES}" if "ardupilot" in autopilots else ""
 
 
 def info_of(metadata: Metadata | None, name: str) -> ParamInfo | None:

@@ -40,6 +40,7 @@ __all__ = [
     "listen",
     "received_in_words",
     "sessions",
+    "wait_for_firmware",
     "wait_for_vehicle",
 ]
 
@@ -57,8 +58,6 @@ OTHERS_SHOWN_MAX: Final = 5
 """Other vehicles that a line names, so that it stays readable; it gives the number of further ones."""
 FIRMWARE_TIMEOUT: Final = 0.5
 """Seconds to wait for the firmware version of the vehicle, to name it to the user or to find its metadata."""
-FIRMWARE_POLL_INTERVAL: Final = 0.01
-"""Seconds between two checks whether the firmware version is known."""
 UID_POLL_INTERVAL: Final = 0.05
 """Seconds between two checks whether a vehicle with a hardware id was heard."""
 
@@ -536,8 +535,8 @@ def received_in_words(client: ParamClient) -> str:
 async def wait_for_firmware(vehicles: Sequence[Component], deadline: Deadline) -> None:
     """Wait until the firmware versions of vehicles are known, for at most `FIRMWARE_TIMEOUT`."""
     with anyio.move_on_after(deadline.left(FIRMWARE_TIMEOUT)):
-        while not all(each.identity.firmware for each in vehicles):  # noqa: ASYNC110 - no event
-            await anyio.sleep(FIRMWARE_POLL_INTERVAL)
+        for each in vehicles:
+            await each.wait_until_identified(FIRMWARE_TIMEOUT)
 
 
 def _has_parameters(component: Component) -> bool:

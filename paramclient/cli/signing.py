@@ -71,7 +71,7 @@ def setup(
         raise UsageError("no key is given; name one with --signing-key FILE or --signing-passphrase")
     present = None if present_key is None else read_key(present_key)
     _confirm(options, f"The key will be sent over {url} in clear text.")
-    return partial(_setup, url, options, key, present)
+    return partial(_change, url, options, key, present)
 
 
 def disable(url: str, /, *, options: SigningTarget = _DEFAULTS) -> Callable[[], Awaitable[int]]:
@@ -85,7 +85,7 @@ def disable(url: str, /, *, options: SigningTarget = _DEFAULTS) -> Callable[[], 
     """
     key = options.key
     _confirm(options, f"The vehicle on {url} will then accept commands from any sender.")
-    return partial(_disable, url, options, key)
+    return partial(_change, url, options, None, key)
 
 
 def _confirm(options: SigningTarget, consequence: str) -> None:
@@ -100,74 +100,61 @@ def _confirm(options: SigningTarget, consequence: str) -> None:
         raise UsageError(
             "nothing was sent; add --link-is-safe if no other person or program can listen on this link"
         )
-    sys.stderr.write(
-        f"{printable(consequence)} Can no other person or program listen or send on this link? [y/N] "
-    )
+    question = "Can no other person or program listen or send on this link? [y/N] "
+    sys.stderr.write(f"{printable(consequence)} {question}")
     sys.stderr.flush()
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
         raise UsageError("nothing was sent")
 
 
-async def _setup(url: str, options: SigningTarget, key: SigningKey, present: SigningKey | None) -> int:
-    deadline = Deadline(options.timeout)
-    link = create_link(url)
-    address = await _send(link, options, deadline, key, present)
-    signing = Signing(key, SigningPolicy.ACCEPT_ALL)
-    async with ParamClient(link, cache=False, signing=signing, **options.source) as client:
-        vehicle = await _read_value(client, address, deadline, "does not answer requests signed with the key")
-        report = client.signing_report()
-        if report is None or address not in {(each.system, each.component) for each in report.streams}:
-            raise _refused(address, "answers, but does not sign with the key: it has not accepted the key")
-    _show(options, vehicle, key)
-    return ExitCode.DONE
-
-
-async def _disable(url: str, options: SigningTarget, key: SigningKey | None) -> int:
-    deadline = Deadline(options.timeout)
-    link = create_link(url)
-    address = await _send(link, options, deadline, None, key)
-    async with ParamClient(link, cache=False, traffic=True, **options.source) as client:
-        vehicle = await _read_value(client, address, deadline, "does not answer unsigned requests")
-        before = _count_signed(client, address)
-        await _read_value(client, address, deadline, "does not answer unsigned requests")
-        if _count_signed(client, address) > before:
-            raise _refused(address, "still signs; it may require its present key, see --signing-key")
-    _show(options, vehicle, None)
-    return ExitCode.DONE
-
-
-async def _send(
-    link: Link,
-    options: SigningTarget,
-    deadline: Deadline,
-    key: SigningKey | None,
-    present: SigningKey | None,
-) -> tuple[int, int]:
-    """Send SETUP_SIGNING, signed with the vehicle's current key if known; return the vehicle's address."""
-    signing = None if present is None else Signing(present, SigningPolicy.ACCEPT_ALL)
-    async with ParamClient(link, cache=False, signing=signing, **options.source) as client:
+async def _change(
+    url: str, options: SigningTarget, key: SigningKey | None, present: SigningKey | None
+) -> int:
+    """Send SETUP_SIGNING with a key or with none, signed with the present one if known, and verify it."""
+    choice = ChosenVehicle.parse(options.vehicle, one="a signing key is set on one vehicle at a time")
+    deadline, link = Deadline(options.timeout), create_link(url)
+    async with _client(link, options, present) as client:
         timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
-        choice = ChosenVehicle.parse(options.vehicle)
-        if choice.is_all:
-            raise UsageError("a signing key is set on one vehicle at a time")
         vehicle = await wait_for_vehicle(client, choice, timeout=timeout, only=True)
         await vehicle.setup_signing(key, link_is_safe=True)
-        return vehicle.system, vehicle.component
+        address = vehicle.address
+    async with _client(link, options, key) as client:
+        vehicle = await _read_value(client, address, deadline, is_signed=key is not None)
+        report, before = client.signing_report(), _count_signed(client, address)
+        if key is None:
+            await _read_value(client, address, deadline, is_signed=False)
+            if _count_signed(client, address) > before:
+                raise _refused(address, "still signs; it may require its present key, see --signing-key")
+        elif report is None or address not in {(each.system, each.component) for each in report.streams}:
+            raise _refused(address, "answers, but does not sign with the key: it has not accepted the key")
+    name = {"system": vehicle.system, "component": vehicle.component, "autopilot": vehicle.autopilot}
+    if options.json:
+        print_json(name | {"signs": key is not None, "fingerprint": key and key.fingerprint})
+    else:
+        state = "no longer signs" if key is None else f"signs with the key {key.fingerprint} now"
+        print_line(f"{vehicle.system}/{vehicle.component} {vehicle.autopilot} {state}")
+    return ExitCode.DONE
+
+
+def _client(link: Link, options: SigningTarget, key: SigningKey | None) -> ParamClient:
+    signing = None if key is None else Signing(key, SigningPolicy.ACCEPT_ALL)
+    return ParamClient(link, cache=False, traffic=True, signing=signing, **options.source)
 
 
 async def _read_value(
-    client: ParamClient, address: tuple[int, int], deadline: Deadline, failure: str
+    client: ParamClient, address: tuple[int, int], deadline: Deadline, *, is_signed: bool
 ) -> Component:
     """Read a value of the vehicle with the signing of the client; return the vehicle.
 
     Raises:
-        VehicleError: the vehicle did not answer; the message ends with `failure`.
+        VehicleError: the vehicle did not answer.
     """
     try:
         vehicle = await client.component(*address, timeout=deadline.left(PROOF_TIMEOUT))
         await vehicle.get(0, timeout=deadline.left(PROOF_TIMEOUT))
     except NoReply:
-        raise _refused(address, failure) from None
+        requests = "requests signed with the key" if is_signed else "unsigned requests"
+        raise _refused(address, f"does not answer {requests}") from None
     return vehicle
 
 
@@ -177,22 +164,4 @@ def _count_signed(client: ParamClient, address: tuple[int, int]) -> int:
 
 
 def _refused(address: tuple[int, int], failure: str) -> VehicleError:
-    system, component = address
-    return VehicleError(f"{system}/{component} {failure}", system=system, component=component)
-
-
-def _show(options: SigningTarget, vehicle: Component, key: SigningKey | None) -> None:
-    if options.json:
-        print_json(
-            {
-                "system": vehicle.system,
-                "component": vehicle.component,
-                "autopilot": vehicle.autopilot,
-                "signs": key is not None,
-                "fingerprint": None if key is None else key.fingerprint,
-            }
-        )
-        return
-    name = f"{vehicle.system}/{vehicle.component} {vehicle.autopilot}"
-    state = "no longer signs" if key is None else f"signs with the key {key.fingerprint} now"
-    print_line(f"{name} {state}")
+    return VehicleError(f"{address[0]}/{address[1]} {failure}", *address)
