@@ -384,19 +384,30 @@ class _FileReader:
         self._pieces = _Pieces()
         self._has_bursts = True
         self._began = self._last = 0.0
-        self._blocks = 0
         self._reads = 0  # in progress
+        self._bursts = 0  # that were requested, and have not ended
 
     async def read(self) -> bytes:
         """Return the content of the file."""
         self._began = anyio.current_time()
-        while self._has_bursts and self._pieces.end is None:
-            before = self._pieces.reached
-            await self._burst(before)
-            if self._pieces.reached == before:
-                break
+        with self._channel.inbox(FileTransfer) as inbox:
+            while self._has_bursts and self._pieces.end is None:
+                before = self._pieces.reached
+                await self._burst(inbox, before)
+                if self._pieces.reached == before:
+                    break
+            await self._take_repeated(inbox)
         await self._read_gaps()
         return self._pieces.content()
+
+    async def _take_repeated(self, inbox: Inbox) -> None:
+        """Take the blocks of bursts that were requested once more because the first block was late.
+
+        An ArduPilot serves them one after the other, and nothing else before.
+        """
+        pause = max(self._channel.timing.timeout(0), BURST_PAUSE_MIN)
+        while self._bursts > 0 and self._pieces.gaps() and await self._take_burst(inbox, pause):
+            pass
 
     @property
     def prefix(self) -> bytes:
@@ -404,30 +415,30 @@ class _FileReader:
         gaps = self._pieces.gaps()
         return self._pieces.content()[: gaps[0][0] if gaps else None]
 
-    async def _burst(self, offset: int) -> None:
+    async def _burst(self, inbox: Inbox, offset: int) -> None:
         """Request the rest of the file from an offset, and take its blocks until they end or pause."""
         channel = self._channel
-        with channel.inbox(FileTransfer) as inbox:
-            for attempt in range(channel.timing.attempts_max):
-                await channel.gate.wait()
-                sequence = channel.next_ftp_sequence()
-                request = Packet(
-                    sequence, self._session, Opcode.BURST_READ_FILE, size=self._read_size, offset=offset
-                )
-                channel.send(FileTransfer(0, *channel.target, request.pack()))
-                if await self._take_burst(inbox, max(channel.timing.timeout(attempt), BURST_PAUSE_MIN)):
-                    return
-                if self._pieces.reached > offset:
-                    return
-                if channel.is_silent(self._began):
-                    what = f"{self._path} of {channel} at byte {offset}"
-                    waited = anyio.current_time() - self._began
-                    raise NoReply(what, attempts=attempt + 1, waited=waited)
+        for attempt in range(channel.timing.attempts_max):
+            await channel.gate.wait()
+            sequence = channel.next_ftp_sequence()
+            request = Packet(
+                sequence, self._session, Opcode.BURST_READ_FILE, size=self._read_size, offset=offset
+            )
+            channel.send(FileTransfer(0, *channel.target, request.pack()))
+            self._bursts += 1
+            if await self._take_burst(inbox, max(channel.timing.timeout(attempt), BURST_PAUSE_MIN)):
+                return
+            if self._pieces.reached > offset:
+                return
+            if channel.is_silent(self._began):
+                what = f"{self._path} of {channel} at byte {offset}"
+                waited = anyio.current_time() - self._began
+                raise NoReply(what, attempts=attempt + 1, waited=waited)
 
     async def _take_burst(self, inbox: Inbox, pause: float) -> bool:
         """Take the blocks of a burst until it is over; return False at a pause."""
         self._last = anyio.current_time()
-        first = math.inf
+        first, blocks = math.inf, -1
         while True:
             packet = None
             with self._channel.waiting_until(self._last + pause):
@@ -436,12 +447,13 @@ class _FileReader:
                 return False
             if packet.requested != Opcode.BURST_READ_FILE or packet.session != self._session:
                 continue
+            self._bursts -= packet.opcode == Opcode.NAK or packet.burst_complete
             if packet.opcode == Opcode.NAK:
                 self._end_of_burst(packet)
                 return True
             self._take(packet.offset, packet.data)
-            first = min(first, self._last)
-            interval = (self._last - first) / max(self._blocks, 1)
+            first, blocks = min(first, self._last), blocks + 1
+            interval = (self._last - first) / max(blocks, 1)
             pause = max(BLOCK_PAUSE_MIN, BLOCK_INTERVALS * interval)
             if packet.burst_complete:
                 return True
@@ -509,7 +521,6 @@ class _FileReader:
         if offset == 0:
             self.begun(data)
         self._pieces.take(offset, data)
-        self._blocks += 1
         self._last = anyio.current_time()
         if self.progress is not None:
             self.progress(self._pieces.received)
