@@ -257,6 +257,7 @@ class ParamClient:
             timeout: seconds; None waits without limit.
 
         Raises:
+            UsageError: an id that no component can have.
             NoReply: no message of the component arrived in time.
             LinkError: the link failed, or the client was closed.
         """
@@ -326,6 +327,7 @@ class ParamClient:
             timeout: seconds for the whole call; None waits without limit.
 
         Raises:
+            UsageError: an id that no component can have.
             AmbiguousVehicle: several vehicles are on the link, or the only one has several autopilots.
                 `vehicles` and the message list them.
             NoReply: no message of the component arrived in time, or too late to exclude a second vehicle.
@@ -501,6 +503,9 @@ class ParamClient:
         began = anyio.current_time()
         station = self.core.station
         system, component = asked
+        for number in asked:
+            if number is not None and not 0 <= number <= 255:
+                raise UsageError(f"system and component ids are 0 to 255, not {number}")
         probe_at = 0.0 if system and component else math.inf
         found = choose()
         with anyio.move_on_after(timeout):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import pty
 import re
@@ -873,6 +874,34 @@ def test_a_fetch_that_is_interrupted_ends_cleanly(number: int, code: int, tmp_pa
             listener.recv(100)  # the client has sent a request
             fetching.send_signal(number)
             assert ended(fetching) == Outcome(code, "", "")
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_ctrl_c_during_a_fetch_says_what_was_received_and_kept(
+    command: Command, put: Put, tmp_path: Path, kept: bool
+) -> None:
+    class Interrupting(PX4Vehicle):
+        """A vehicle that is fetched until the user interrupts it."""
+
+        ends_at: float | None = None
+
+        def tick(self, now: float) -> None:
+            super().tick(now)
+            self.ends_at = self.ends_at or now + 30
+            if now > self.ends_at:
+                self.ends_at = math.inf
+                signal.raise_signal(signal.SIGINT)
+
+    cache = ["--cache", tmp_path / "cache"] if kept else ["--no-cache"]
+    done = command("fetch", put(Interrupting(burst=1, period=0.2)), *cache)
+    assert (done.code, done.out) == (130, "")
+    where = "kept in the cache" if kept else "not kept, without a cache"
+    found = re.fullmatch(
+        rf"interrupted: ([0-9]+) of 903 parameters of 1/1 px4 received and {where}\n", done.err
+    )
+    assert found
+    if kept:
+        assert command("cache", "list", *cache, "--json").json["components"][0]["size"] == int(found[1]) > 0
 
 
 def test_a_second_signal_does_not_wait(live_command: Command, warm: Path) -> None:

@@ -300,6 +300,15 @@ async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str)
 
 
 @in_simulated_time
+@pytest.mark.parametrize("wanted", [{"system": 300}, {"component": -1}])
+async def test_an_id_that_no_component_has_is_an_error_at_once(wanted: dict[str, Any]) -> None:
+    async with ParamClient("sim:px4", cache=False) as client:
+        for find in (client.component, client.only_component):
+            with pytest.raises(UsageError, match="ids are 0 to 255, not"):
+                await find(**wanted, timeout=None)
+
+
+@in_simulated_time
 async def test_a_read_gives_the_value_the_vehicle_has_now() -> None:
     vehicle = small_px4()
     async with a_client(vehicle) as client:
