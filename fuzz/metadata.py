@@ -1,4 +1,4 @@
-"""Fuzz target: metadata of a file or a vehicle. Only MetadataError is raised, and all descriptions work."""
+"""Fuzz target: metadata of a file or a vehicle. Only FileError is raised, and all descriptions work."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from contextlib import suppress
 from typing import Final
 
-from paramclient.errors import MetadataError, UsageError
+from paramclient.errors import FileError, UsageError
 from paramclient.metadata import read_content
 
 __all__ = ["INPUT_SIZE_MAX", "run"]
@@ -22,7 +22,7 @@ def run(data: bytes) -> None:
     """Read a metadata file with this content."""
     try:
         known = read_content(data, source="fuzz")
-    except MetadataError as error:
+    except FileError as error:
         assert str(error).startswith("fuzz")
         return
     assert len(known) == len(list(known))

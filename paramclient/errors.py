@@ -4,9 +4,8 @@ The tree shows the cause of each error::
 
     ParamClientError
     ├── UsageError(ValueError)        the caller: an invalid name, value, link name or argument
-    │   ├── FileError                 a parameter file that cannot be read or written
+    │   ├── FileError                 a file of parameters or of metadata that cannot be read or written
     │   ├── InvalidParameters         invalid values for a set-up
-    │   ├── MetadataError             invalid or inaccessible parameter metadata
     │   ├── AlreadyRestored           the state before the last apply was already restored
     │   ├── UnknownVehicle            no vehicle in the cache matches the given name
     │   └── AmbiguousVehicle          several vehicles match, on the link or in the cache
@@ -53,7 +52,6 @@ __all__ = [
     "FileTransferError",
     "InvalidParameters",
     "LinkError",
-    "MetadataError",
     "NoReply",
     "NotDurable",
     "NotInCache",
@@ -182,12 +180,13 @@ class InvalidParameters(UsageError):
 
 
 class FileError(UsageError):
-    """A parameter file cannot be read or written. An existing file at the target path is unchanged.
+    """A file of parameters or of metadata cannot be read or written. An existing file at the target path is
+    unchanged.
 
     The text has one line for each bad line of the file, `quad.param:17: expected …, found …`.
 
     Attributes:
-        source: the file's name as given; "" for bytes without a name.
+        source: the file's name as given, or the address of metadata; "" for bytes without a name.
         line: the first bad line, from 1; None if the error concerns no single line.
         reason: the first line of the text, without the file's name and line number.
     """
@@ -208,18 +207,6 @@ class FileError(UsageError):
         self.source = source
         self.line = line
         self.reason = message
-
-
-class MetadataError(UsageError):
-    """Parameter metadata is invalid, or is at an address from which metadata is not downloaded.
-
-    Attributes:
-        source: the file or the address, in words.
-    """
-
-    def __init__(self, message: str, *, source: str) -> None:
-        super().__init__(message)
-        self.source = source
 
 
 class AlreadyRestored(UsageError):

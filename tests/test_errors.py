@@ -14,7 +14,6 @@ from paramclient.errors import (
     FileTransferError,
     InvalidParameters,
     LinkError,
-    MetadataError,
     NoReply,
     PackError,
     ParamClientError,
@@ -33,7 +32,6 @@ from paramclient.errors import (
     ("kind", "base"),
     [
         (UsageError, ValueError),
-        (MetadataError, UsageError),
         (FileError, UsageError),
         (UnknownParameter, VehicleError),
         (Refused, VehicleError),

@@ -16,7 +16,7 @@ import anyio.to_thread
 
 from paramclient.client.component import Component
 from paramclient.client.files import Ftp
-from paramclient.errors import MetadataError, UsageError
+from paramclient.errors import FileError, UsageError
 from paramclient.metadata.formats import PACKED_SIZE_MAX, json_of, naming, read_content, unpacked
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.store import MetadataStore, has_checksum
@@ -52,7 +52,7 @@ async def metadata_of(
         progress: as in `Ftp.read`, for each of the two files.
 
     Raises:
-        MetadataError: the metadata is only on the internet (`source` is the address), is on an unknown
+        FileError: the metadata is only on the internet (`source` is the address), is on an unknown
             component, does not have the announced checksum, or is damaged.
         FileTransferError: the vehicle does not serve the file that it names.
         NoReply: no response in time.
@@ -114,14 +114,11 @@ class _Files:
         try:
             content = await files.read(path, progress=self.progress, size_max=PACKED_SIZE_MAX)
         except UsageError as error:
-            raise MetadataError(
-                f"{self.label} announces its metadata at {uri}: {error}", source=uri
-            ) from error
+            raise FileError(f"announced by {self.label}: {error}", source=uri) from error
         if crc is not None:
             if not await _in_thread(has_checksum, content, crc):
-                raise MetadataError(
-                    f"{uri} of {self.label} does not have the announced checksum {crc:08x}", source=uri
-                )
+                problem = f"the file of {self.label} does not have the announced checksum {crc:08x}"
+                raise FileError(problem, source=uri)
             if self.kept is not None:
                 await _in_thread(self.kept.put, content, crc)
         return content
@@ -130,9 +127,9 @@ class _Files:
         """Return server and path of `mftp://PATH`, or of `mftp://[;comp=ID]PATH` on another component."""
         found = _ON_BOARD.fullmatch(uri)
         if found is None:
-            raise MetadataError(
-                f"{self.label} announces its metadata at {uri}, which is not downloaded from "
-                f"there: download the file, and pass it to read_metadata or --metadata",
+            raise FileError(
+                f"{self.label} has its metadata at this address, from which it is not downloaded: download"
+                " the file, and pass it to read_metadata or --metadata",
                 source=uri,
             )
         number, path = found.groups()
@@ -140,9 +137,8 @@ class _Files:
         if number is not None and int(number) != self.component.component:
             other = self.component.client.components.get((self.component.system, int(number)))
         if other is None:
-            raise MetadataError(
-                f"{self.label} announces its metadata at {uri}, but component {number} has not been heard",
-                source=uri,
+            raise FileError(
+                f"announced by {self.label}, but component {number} has not been heard", source=uri
             )
         return Ftp(other), path
 

@@ -7,13 +7,13 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Final
 
-from paramclient.errors import MetadataError, UsageError
+from paramclient.errors import FileError, UsageError
+from paramclient.files.disk import read_bytes
 from paramclient.metadata.info import Metadata
 
-__all__ = ["PACKED_SIZE_MAX", "json_of", "naming", "read_bytes", "read_content", "read_metadata", "unpacked"]
+__all__ = ["PACKED_SIZE_MAX", "json_of", "naming", "read_content", "read_metadata", "unpacked"]
 
 PACKED_SIZE_MAX: Final = 4 << 20
 """Bytes of a packed file, or of a file from a vehicle; PX4's has about 0.1 million."""
@@ -33,23 +33,10 @@ def read_metadata(path: str | os.PathLike[str]) -> Metadata:
     Each may be packed with xz. The format is detected from the content, not from the name.
 
     Raises:
-        MetadataError: the file cannot be read, is too large, or has another format.
+        FileError: the file cannot be read, is too large, or has another format.
     """
-    return read_content(read_bytes(path), source=os.fspath(path))
-
-
-def read_bytes(path: str | os.PathLike[str]) -> bytes:
-    """Return the bytes of a metadata file, at most one more than it may have.
-
-    Raises:
-        MetadataError: the file cannot be read.
-    """
-    try:
-        with Path(path).open("rb") as file:
-            return file.read(CONTENT_SIZE_MAX + 1)
-    except OSError as error:
-        text = f"{os.fspath(path)}: cannot be read: {error.strerror or error}"
-        raise MetadataError(text, source=os.fspath(path)) from error
+    source = os.fspath(path)
+    return read_content(read_bytes(source), source=source)
 
 
 def read_content(content: bytes, *, source: str) -> Metadata:
@@ -60,7 +47,7 @@ def read_content(content: bytes, *, source: str) -> Metadata:
         source: their origin, for errors and for users.
 
     Raises:
-        MetadataError: as `read_metadata`.
+        FileError: as `read_metadata`.
     """
     with naming(source):
         metadata = _read_unpacked(unpacked(content).removeprefix(b"\xef\xbb\xbf"))
@@ -72,11 +59,11 @@ def read_content(content: bytes, *, source: str) -> Metadata:
 
 @contextmanager
 def naming(source: str) -> Iterator[None]:
-    """Turn UsageError into MetadataError with the origin of a file."""
+    """Turn UsageError into FileError with the origin of a file."""
     try:
         yield
     except UsageError as error:
-        raise MetadataError(f"{source}: {error}", source=source) from None
+        raise FileError(str(error), source=source) from None
 
 
 def json_of(content: bytes) -> dict[str, object]:

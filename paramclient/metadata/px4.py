@@ -155,12 +155,6 @@ def validated(model: type[Model], document: object, within: tuple[int | str, ...
         raise UsageError(f"{place.lstrip('.')}{': ' if place else ''}{first['msg']}") from None
 
 
-_TYPES: Final = {
-    "Uint8": ParamType.UINT8,
-    "Int8": ParamType.INT8,
-    "Uint16": ParamType.UINT16,
-    "Int16": ParamType.INT16,
-    "Uint32": ParamType.UINT32,
-    "Int32": ParamType.INT32,
-    "Float": ParamType.REAL32,
+_TYPES: Final = {kind.name.capitalize(): kind for kind in ParamType if kind.is_integer} | {
+    "Float": ParamType.REAL32
 }

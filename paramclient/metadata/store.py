@@ -13,10 +13,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final, Literal, TypeAlias, get_args
 
-from paramclient.errors import FileError, MetadataError, UsageError
-from paramclient.files.disk import replace_file
+from paramclient.errors import FileError, UsageError
+from paramclient.files.disk import read_bytes, replace_file
 from paramclient.files.formats import AUTOPILOT
-from paramclient.metadata.formats import PACKED_SIZE_MAX, read_bytes, read_content, read_metadata, unpacked
+from paramclient.metadata.formats import read_content, unpacked
 from paramclient.metadata.info import Metadata
 from paramclient.model.identity import Identity, autopilot_name, version_text
 from paramclient.model.paramset import ParamSet
@@ -133,9 +133,9 @@ class MetadataStore:
             return None
         try:
             crc = int(noted, 16)
-            if self.get(crc) is not None:
-                return _parsed_once(self._file(crc), crc)
-        except MetadataError as error:
+            if (content := self.get(crc)) is not None:
+                return _parsed(self._file(crc), content)
+        except FileError as error:
             logger.warning("%s", error)
         except ValueError:
             logger.warning("%s is damaged and was removed", note)
@@ -158,20 +158,19 @@ class MetadataStore:
             yield from self.folder.iterdir()
 
     def _read(self, path: Path) -> bytes | None:
-        try:
-            with path.open("rb") as file:
-                return file.read(PACKED_SIZE_MAX + 1)
-        except FileNotFoundError:
+        if not path.exists():
             return None
-        except OSError as error:
-            logger.warning("%s cannot be read: %s", path, error.strerror)
+        try:
+            return read_bytes(str(path))
+        except FileError as error:
+            logger.warning("%s", error)
             return None
 
     def _write(self, path: Path, content: bytes) -> None:
         """Replace a file, and delete the least recently used ones and those of killed processes."""
         try:
             _replace(path, content)
-        except MetadataError as error:
+        except FileError as error:
             logger.warning("%s", error)
             return
         times = {}
@@ -196,17 +195,9 @@ def has_checksum(content: bytes, crc: int) -> bool:
         return False
 
 
-def _parsed(path: Path) -> Metadata:
-    """Return the content of a metadata file; that of an unchanged file is parsed once."""
-    with suppress(OSError):
-        found = path.stat()
-        return _parsed_once(path, (found.st_mtime_ns, found.st_size, found.st_ino))
-    return read_metadata(path)  # raises the error
-
-
 @lru_cache(maxsize=PARSED_FILES_MAX)
-def _parsed_once(path: Path, version: object) -> Metadata:
-    return read_metadata(path)
+def _parsed(path: Path, content: bytes) -> Metadata:
+    return read_content(content, source=str(path))
 
 
 def _remove(path: Path) -> None:
@@ -266,11 +257,12 @@ class AddedFiles:
 
         Raises:
             UsageError: the version is not one, or the file names no known vehicle type.
-            MetadataError: the file cannot be read or copied, or has no metadata.
+            FileError: the file cannot be read or copied, or has no metadata.
         """
         if firmware is not None and not _version(firmware):
             raise UsageError(f"a firmware version is written as 4.6 or 4.6.1, not {firmware!r}")
-        source, content = os.fspath(path), read_bytes(path)
+        source = os.fspath(path)
+        content = read_bytes(source)
         metadata = read_content(content, source=source)
         chosen = kind or _kind_of_file(metadata)
         if chosen is None:
@@ -285,15 +277,14 @@ class AddedFiles:
 
         Raises:
             UsageError: there is none.
-            MetadataError: it cannot be removed.
+            FileError: it cannot be removed.
         """
         for each in self:
             if (each.kind, each.firmware) == (kind, firmware):
                 try:
                     each.path.unlink(missing_ok=True)
                 except OSError as error:
-                    text = f"{each.path}: cannot be removed: {error.strerror}"
-                    raise MetadataError(text, source=str(each.path)) from error
+                    raise FileError(f"cannot be removed: {error.strerror}", source=str(each.path)) from error
                 return each
         known = ", ".join(map(str, self)) or "none"
         raise UsageError(f"no metadata was added for {kind} {firmware or 'any version'}; added: {known}")
@@ -311,8 +302,8 @@ class AddedFiles:
         fitting = [each for each in self if each.kind == kind and _fits(each.firmware, version)]
         for each in sorted(fitting, key=lambda one: len(_numbers(one.firmware)), reverse=True):
             try:
-                return _parsed(each.path)
-            except MetadataError as error:
+                return _parsed(each.path, read_bytes(str(each.path)))
+            except FileError as error:
                 logger.warning("%s", error)
         return None
 
@@ -328,14 +319,11 @@ def _replace(path: Path, content: bytes) -> None:
     """Replace a file atomically by one that only its owner can read; create the folder if needed.
 
     Raises:
-        MetadataError: writing failed; an existing file is unchanged.
+        FileError: writing failed; an existing file is unchanged.
     """
-    try:
+    with suppress(OSError):  # replacing the file gives the reason
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        replace_file(str(path), content, new_mode=0o600)
-    except (OSError, FileError) as error:
-        reason = error.reason if isinstance(error, FileError) else f"cannot be written: {error.strerror}"
-        raise MetadataError(f"{path}: {reason}", source=str(path)) from error
+    replace_file(str(path), content, new_mode=0o600)
 
 
 def _kind_of(identity: Identity) -> VehicleKind | None:

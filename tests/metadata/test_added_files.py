@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from paramclient import MetadataError, UsageError
+from paramclient import FileError, UsageError
 from paramclient.metadata import AddedFiles, MetadataStore
 from paramclient.model.identity import Identity
 from paramclient.model.px4_hash import crc32_px4
@@ -81,7 +81,7 @@ def test_a_file_must_be_metadata_of_a_known_vehicle(tmp_path: Path) -> None:
     assert files.add(DATA / "parameters.json")[0].kind == "px4"
     with pytest.raises(UsageError, match=r"written as 4\.6"):
         files.add(DATA / "parameters.json", firmware="../4")
-    with pytest.raises(MetadataError):
+    with pytest.raises(FileError):
         files.add(DATA / "px4_flight.ulg", "px4")
 
 

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from paramclient import UsageError
-from paramclient.errors import MetadataError
+from paramclient.errors import FileError
 from paramclient.metadata import Metadata, ParamInfo, formats, read_content, read_metadata
 from paramclient.metadata.formats import TEXT_LENGTH_MAX
 from paramclient.model.values import ParamType
@@ -303,7 +303,7 @@ WRONG = {
 
 @pytest.mark.parametrize(("content", "said"), WRONG.values(), ids=WRONG)
 def test_invalid_files_are_rejected_with_the_reason(content: bytes, said: str) -> None:
-    with pytest.raises(MetadataError, match=f"^the file[,:] .*{said}|^the file, {said}") as caught:
+    with pytest.raises(FileError, match=f"^the file[,:] .*{said}|^the file, {said}") as caught:
         read_content(content, source="the file")
     assert caught.value.source == "the file"
     assert isinstance(caught.value, UsageError)
@@ -321,7 +321,7 @@ ENTITIES = [
 def test_a_document_type_is_rejected(text: str, encoding: str) -> None:
     content = text.encode(encoding)
     said = "document type" if encoding == "utf-8" else "neither JSON nor XML"
-    with pytest.raises(MetadataError, match=said):
+    with pytest.raises(FileError, match=said):
         read_content(content, source="the file")
 
 
@@ -336,14 +336,14 @@ def test_a_document_type_is_rejected(text: str, encoding: str) -> None:
 def test_the_texts_of_one_parameter_are_limited(members: dict[str, Any]) -> None:
     """The description of a group may be that of thousands of parameters."""
     document = {"version": 1, "parameters": [{"name": "A{n}", "shortDesc": "a", **members}]}
-    with pytest.raises(MetadataError, match=r"^p: the texts of 'A\{n\}' have more than 65,536 characters$"):
+    with pytest.raises(FileError, match=r"^p: the texts of 'A\{n\}' have more than 65,536 characters$"):
         read_content(json.dumps(document).encode(), source="p")
 
 
 def test_a_file_with_too_large_content_is_rejected() -> None:
     packed = lzma.compress(bytes(formats.CONTENT_SIZE_MAX + 1), preset=1)
     assert len(packed) < 10_000
-    with pytest.raises(MetadataError, match="too large"):
+    with pytest.raises(FileError, match="too large"):
         read_content(packed, source="the file")
 
 
@@ -357,9 +357,9 @@ def test_empty_ranges_and_invalid_values_are_left_out() -> None:
 
 
 def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(MetadataError, match=r"none\.json: cannot be read: No such file"):
+    with pytest.raises(FileError, match=r"none\.json: cannot be read: No such file"):
         read_metadata(tmp_path / "none.json")
-    with pytest.raises(MetadataError, match="cannot be read: Is a directory"):
+    with pytest.raises(FileError, match="cannot be read: not a regular file"):
         read_metadata(tmp_path)
 
 
@@ -376,7 +376,7 @@ def test_a_damaged_file_is_read_or_rejected(data: st.DataObject) -> None:
                 break
     try:
         read = read_content(bytes(content), source="the file")
-    except MetadataError:
+    except FileError:
         return
     for info in read.values():
         for value in (0, 1, 2.5, math.nan):

@@ -16,7 +16,7 @@ import anyio.to_thread
 import pytest
 
 from paramclient import ClientClosed, FileTransferError, NoReply
-from paramclient.errors import MetadataError
+from paramclient.errors import FileError
 from paramclient.metadata import Metadata, MetadataStore, download, metadata_of, store
 from paramclient.model.identity import Identity
 from paramclient.model.px4_hash import crc32_px4
@@ -146,7 +146,7 @@ async def test_nothing_is_downloaded_from_the_internet() -> None:
     publish(vehicle, uri="https://example.invalid/parameters.json.xz")
     async with a_client(vehicle) as client:
         with pytest.raises(
-            MetadataError, match=r"1/1 .* at https://example\.invalid/.*, which is not downloaded"
+            FileError, match=r"https://example\.invalid/.*: 1/1 has its metadata .* not downloaded"
         ) as caught:
             await metadata_of(await client.component())
     assert caught.value.source == "https://example.invalid/parameters.json.xz"
@@ -164,7 +164,7 @@ async def test_a_file_on_board_is_preferred_to_the_internet() -> None:
 async def test_a_file_on_another_component() -> None:
     vehicle, camera = describing(), PX4Vehicle(component=100, table={"CAM_MODE": 1})
     camera.files["/p.json"] = json.dumps({"version": 1, "parameters": [{"name": "CAM_MODE"}]}).encode()
-    for number, expected in ((100, Metadata), (101, MetadataError)):
+    for number, expected in ((100, Metadata), (101, FileError)):
         publish(vehicle, uri=f"mftp://[;comp={number}]/p.json")
         async with a_client(Air([vehicle, camera])) as client:
             await client.component(component=100)
@@ -188,13 +188,13 @@ async def test_files_that_are_not_as_announced(wrong: str, tmp_path: Path) -> No
         publish(vehicle, uri="mftp://" + "x" * 240)
     kept = MetadataStore(tmp_path)
     said = {
-        "checksum": (MetadataError, "does not have the announced checksum"),
+        "checksum": (FileError, "does not have the announced checksum"),
         "missing": (FileTransferError, "file not found"),
         "damaged": (
-            MetadataError,
+            FileError,
             f"mftp://{METADATA_FILE} of 1/1: cannot be unpacked: the file is truncated",
         ),
-        "long": (MetadataError, r"1/1 announces its metadata at mftp://x*: .* 1 to 238 bytes"),
+        "long": (FileError, r"mftp://x*: announced by 1/1: .* 1 to 238 bytes"),
     }[wrong]
     async with a_client(vehicle) as client:
         component = await client.component()
