@@ -46,8 +46,9 @@ from paramclient.wire.signing import SigningKey
 
 __all__ = ["SETTLE_MAX", "Component", "ComponentState"]
 
-CACHE_TIMEOUT: Final = 1.5
-"""Seconds to wait for the identity of a component, without which its cached table cannot be loaded."""
+CACHE_TIMEOUT: Final = 5.0
+"""Seconds to wait for the identity of a component, without which its cached table cannot be loaded: twice the
+longest round trip in use."""
 REBOOT_TIMEOUT: Final = 60.0
 """Seconds for a vehicle to reboot and report its identity, by default: small autopilot boards take up to 30
 seconds, and boards that calibrate sensors first a little longer."""
@@ -567,7 +568,7 @@ class Component:
             await self.vehicle.identification.settled()
 
     async def wait_for_cache(self) -> None:
-        """Wait until the cached table, if there is one, is in the table; 1.5 s at most.
+        """Wait until the cached table, if there is one, is in the table; 5 s at most.
 
         Raises:
             LinkError: the client was closed.

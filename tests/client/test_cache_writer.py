@@ -92,6 +92,16 @@ def trusts(component: Component, names: Collection[str] | None = None) -> set[Tr
 # Starting from it
 
 
+@pytest.mark.parametrize("delay", [0.4, 1.0])
+@in_simulated_time
+async def test_a_long_round_trip_is_no_reason_for_a_download(path: Path, delay: float) -> None:
+    """The cached table is known only with the identity, which is late then."""
+    vehicle = ArduPilotVehicle()
+    await session(vehicle, path)
+    result = await session(Air.symmetric([vehicle], delay=delay), path)
+    assert (result.source, result.missing) == ("cache", ())
+
+
 @pytest.mark.parametrize("make", [PX4Vehicle, small_px4], ids=["903 parameters", "25 parameters"])
 @in_simulated_time
 async def test_an_unchanged_vehicle_is_not_downloaded_again(
