@@ -20,7 +20,7 @@ from itertools import accumulate
 from typing import ClassVar, Final, Self, TextIO
 
 from paramclient.cli.json_output import as_json
-from paramclient.model.values import Param, format_value
+from paramclient.model.values import Param
 from paramclient.protocol.fetch import Progress
 
 __all__ = [
@@ -29,7 +29,6 @@ __all__ = [
     "LiveView",
     "Status",
     "by_index",
-    "default_text",
     "in_local_time",
     "local_time",
     "milliseconds",
@@ -95,11 +94,6 @@ def _escaped(character: str) -> str:
 def milliseconds(seconds: float) -> str:
     """Return a time in seconds as milliseconds: `103 ms`, or `0.4 ms` below 10 ms."""
     return f"{seconds * 1000:.{0 if seconds >= 0.01 else 1}f} ms"
-
-
-def default_text(param: Param) -> str | None:
-    """Return the firmware's default as text, or None if it is not known."""
-    return None if param.default is None else format_value(param.default, param.type_number)
 
 
 def local_time(at: float) -> str:

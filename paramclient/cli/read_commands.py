@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
 import anyio
@@ -12,25 +12,21 @@ from cyclopts import Parameter
 
 from paramclient.cli.default_sources import find_defaults, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode, code_of
-from paramclient.cli.json_output import FetchJson, ParamJson
+from paramclient.cli.json_output import FetchJson
 from paramclient.cli.metadata import (
-    DESCRIBED_COLUMNS,
     MetadataChoice,
-    described_cells,
     from_file,
-    info_of,
     known_of_session,
 )
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import Status, by_index, default_text, milliseconds, report, say
+from paramclient.cli.output import Status, by_index, milliseconds, report, say
 from paramclient.cli.param_names import ChosenNames, check_given, learn_spelling, suggest
+from paramclient.cli.param_table import RIGHT, ParamTable
 from paramclient.cli.session import CommandSession, sessions
 from paramclient.errors import ParamClientError, UsageError
-from paramclient.metadata import Metadata
-from paramclient.model.defaults import Default, add_default, default_of
 from paramclient.model.names import NameChoice, is_pattern
 from paramclient.model.notation import hash_text
-from paramclient.model.values import Param, Trust, format_value, type_name
+from paramclient.model.values import Param, Trust
 from paramclient.model.wording import first_of
 from paramclient.protocol.fetch import FetchResult, Policy
 
@@ -80,37 +76,37 @@ async def fetch(
         async def work(session: CommandSession) -> _Fetched:
             fetched = _Fetched.of(session, await session.fetch(refresh=refresh), policy)
             if changed or options.json or metadata is not None:
-                fetched.described = await find_defaults(session, metadata, given, fetched.params)
+                table = fetched.table
+                table.described = await find_defaults(session, metadata, given, table.params)
             return fetched
 
         done = await found.work(work)
         await found.report_others()
-    tables = [each.result for each in done if each.result is not None]
-    if only and tables:
-        chosen, unmatched = NameChoice(only).choose({param.name for each in tables for param in each.params})
+    fetched = [each.result for each in done if each.result is not None]
+    if only and fetched:
+        received = {param.name for each in fetched for param in each.table.params}
+        chosen, unmatched = NameChoice(only).choose(received)
         if unmatched:
-            whose = "any vehicle" if found.is_all else tables[0].session.label
+            whose = "any vehicle" if found.is_all else fetched[0].session.label
             raise UsageError(f"no parameter of {whose} is called {unmatched}")
-        for each in tables:
-            each.params = [param for param in each.params if param.name in chosen]
-    has_defaults = any(each.defaults for each in tables)
-    for each in tables:
+        for each in fetched:
+            each.table.keep(chosen)
+    lacks_defaults = changed and not any(each.table.defaults for each in fetched)
+    for each in fetched:
         for note in each.result.notes:
             report(f"{each.session.prefix}{note}")
         if changed:
-            each.keep_changed()
-    shows_defaults = changed and has_defaults
-    code = found.show(done, [*_COLUMNS, "trust", *(["default"] * changed)], _RIGHT)
-    for each in tables if shows_defaults or not changed else []:
-        if not options.json and changed:
-            say_sources(each.session.label, each.defaults)
-        if not options.json:
-            say(each.summary)
-    for each in tables:
+            each.table.keep_changed()
+    code = found.show(done, max([each.table.columns for each in fetched], key=len, default=[]), RIGHT)
+    for each in [] if options.json or lacks_defaults else fetched:
+        if changed:
+            say_sources(each.session.label, each.table.defaults)
+        say(each.summary)
+    for each in fetched:
         if each.result.missing:
             report(each.incomplete)
             code = max(code, ExitCode.INCOMPLETE)
-    if changed and not has_defaults:
+    if lacks_defaults:
         report_no_defaults()
         code = max(code, ExitCode.INCOMPLETE)
     return code
@@ -141,67 +137,44 @@ async def get(
 
         async def work(session: CommandSession) -> _Read:
             params, errors = await get_chosen(session, chosen)
-            return _Read(params, errors, given or await known_of_session(session, metadata))
+            known = given or await known_of_session(session, metadata)
+            return _Read(ParamTable(params, metadata=known), errors)
 
         done = await found.work(work)
         await found.report_others()
-    is_described = any(each.result is not None and each.result.described for each in done)
-    code = found.show(done, [*_COLUMNS, *(DESCRIBED_COLUMNS if is_described else [])], _RIGHT)
-    for each in done:
-        if each.result is not None:
-            if doubt := each.session.component.session.encoding_doubt:
-                report(f"{each.session.prefix}{doubt}")
-            code = max(code, report_all(each.result.errors.values(), each.session.prefix))
+    read = [(each.session, each.result) for each in done if each.result is not None]
+    code = found.show(done, max([each.table.columns for _, each in read], key=len, default=[]), RIGHT)
+    for session, each in read:
+        if doubt := session.component.session.encoding_doubt:
+            report(f"{session.prefix}{doubt}")
+        code = max(code, report_all(each.errors.values(), session.prefix))
     return code
 
 
-_COLUMNS: Final = ("name", "value", "type", "index")
-_RIGHT: Final = "value index default"
-
-
-def _cells(param: Param) -> tuple[object, ...]:
-    """Return the cells of `_COLUMNS`."""
-    value = format_value(param.settable, param.type_number)
-    return param.name, value, type_name(param.type_number), param.index
-
-
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _Fetched:
     """The parameters that were received or confirmed in this session.
 
     A value that is only cached is left out. If the policy prevents its request, it is included and named in
-    `cached` of the result. `described` has defaults of the metadata, by name.
+    `cached` of the result.
     """
 
     session: CommandSession
     result: FetchResult
-    params: list[Param]
+    table: ParamTable
     traffic: dict[str, int]
-    described: Mapping[str, int | float] = field(default_factory=dict)
-    shows_defaults: bool = False
 
     @classmethod
     def of(cls, session: CommandSession, result: FetchResult, policy: Policy) -> _Fetched:
         """Select the parameters of a fetch under a policy."""
         left_out = set(result.cached) if policy is Policy.AUTO else set()
+        params = by_index(each for name, each in result.params.items() if name not in left_out)
         return cls(
             session,
             replace(result, cached=()) if left_out else result,
-            by_index(each for name, each in result.params.items() if name not in left_out),
+            ParamTable(params, more=("trust", lambda param: param.trust)),
             {"bytes_received": session.client.bytes_received, "bytes_sent": session.client.bytes_sent},
         )
-
-    @property
-    def defaults(self) -> list[Default]:
-        """The known defaults of the parameters."""
-        found = (default_of(param, self.described.get(param.name)) for param in self.params)
-        return [default for default in found if default is not None]
-
-    def keep_changed(self) -> None:
-        """Show only the parameters that differ from their default, with it."""
-        known = {param.name: add_default(param, self.described.get(param.name)) for param in self.params}
-        self.params = [param for param in self.params if known[param.name].is_changed]
-        self.shows_defaults = True
 
     @property
     def incomplete(self) -> str:
@@ -232,39 +205,31 @@ class _Fetched:
 
     def as_json(self) -> FetchJson:
         """Return the JSON object."""
+        table = self.table
         return FetchJson.of(
-            self.session.component, self.result, self.params, described=self.described, **self.traffic
+            self.session.component, self.result, table.params, described=table.described, **self.traffic
         )
 
-    def rows(self) -> Iterator[Sequence[object]]:
-        """Yield the rows, with the defaults if only differing parameters are shown."""
-        for param in self.params:
-            known = add_default(param, self.described.get(param.name))
-            yield *_cells(param), param.trust, *([default_text(known)] if self.shows_defaults else [])
+    def rows(self) -> Iterable[Sequence[object]]:
+        """Return the rows of the table."""
+        return self.table.rows()
 
 
 @dataclass(frozen=True, slots=True)
 class _Read:
-    """The parameters that were read from a vehicle, the errors by name, and the metadata."""
+    """The parameters that were read from a vehicle, and the errors by name."""
 
-    params: Sequence[Param]
+    table: ParamTable
     errors: Mapping[str, ParamClientError]
-    described: Metadata | None
 
     def as_json(self) -> dict[str, object]:
         """Return the JSON of the parameters with all their metadata, and of the errors."""
-        read = {
-            each.name: ParamJson.of(each, info_of(self.described, each.name), whole=True)
-            for each in self.params
-        }
         failed = {name: str(error) for name, error in self.errors.items()}
-        return {"params": read} | ({"errors": failed} if failed else {})
+        return {"params": self.table.as_json(whole=True)} | ({"errors": failed} if failed else {})
 
-    def rows(self) -> Iterator[Sequence[object]]:
-        """Yield the rows, with meaning and units if there is metadata."""
-        for param in self.params:
-            described = None if self.described is None else described_cells(self.described, param)
-            yield *_cells(param), *(described or ())
+    def rows(self) -> Iterable[Sequence[object]]:
+        """Return the rows of the table."""
+        return self.table.rows()
 
 
 async def get_chosen(

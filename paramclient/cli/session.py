@@ -305,8 +305,8 @@ class Sessions(list[CommandSession]):
         failed = [(each.session, each.error) for each in done if each.error is not None]
         if not self[0].options.json:
             named = self._names_vehicles
-            rows = [
-                [*([session.address] if named else []), *cells]
+            rows = [  # a vehicle without metadata has fewer cells
+                [*([session.address] if named else []), *cells, *[None] * (len(columns) - len(cells))]
                 for session, result in found
                 for cells in result.rows()
             ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
@@ -11,32 +11,30 @@ from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in, r
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.file_output import described
 from paramclient.cli.json_cache import TableJson
-from paramclient.cli.json_output import ParamJson, SetJson
+from paramclient.cli.json_output import SetJson
 from paramclient.cli.logs import cache_of_log
 from paramclient.cli.metadata import (
-    DESCRIBED_COLUMNS,
     MetadataChoice,
-    described_cells,
     from_file,
-    info_of,
     known_of_table,
     print_descriptions,
 )
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import by_index, default_text, local_time, print_json, print_table, say
+from paramclient.cli.output import by_index, local_time, print_json, print_table, say
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
+from paramclient.cli.param_table import RIGHT, ParamTable
 from paramclient.cli.sources import is_file, open_file, source_of, tables_in
 from paramclient.errors import UnknownVehicle, UsageError
 from paramclient.files import ParamFile
 from paramclient.files.formats import address
 from paramclient.metadata import Metadata, MetadataStore
 from paramclient.model.comparison import non_defaults
-from paramclient.model.defaults import Default, add_default, add_defaults, default_of
+from paramclient.model.defaults import Default, add_defaults, default_of
 from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice
 from paramclient.model.notation import hash_text, typed
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param, format_value, type_name
+from paramclient.model.values import format_value, type_name
 
 __all__ = ["show"]
 
@@ -102,7 +100,7 @@ def show(
         view.print()
         if not view.table.size and (number := sizes.get((view.table.key, view.table.component))):
             say(f"{number} extended parameters: --extended prints them")
-    if changed and views and not any(view.defaults for view in views):
+    if changed and views and not any(view.has_defaults for view in views):
         report_no_defaults(STORED_DEFAULTS_HINT)
         return ExitCode.INCOMPLETE
     return ExitCode.DONE
@@ -139,65 +137,39 @@ class _View:
     def __init__(
         self, table: CachedComponent, names: Sequence[str], metadata: Metadata | None, *, changed: bool
     ) -> None:
-        self.table, self._metadata, self._is_part, self._changed = table, metadata, bool(names), changed
-        self._described = defaults_in(metadata, table.params)
-        shown: Mapping[str, Param] = table.params
+        self.table, self._is_part, self._changed = table, bool(names), changed
+        heard = ("received", lambda param: local_time(table.heard_at[param.name]))
+        described = defaults_in(metadata, table.params)
+        params = table.params.values()
+        self._shown = ParamTable(by_index(params), metadata=metadata, described=described, more=heard)
+        self.has_defaults = bool(self._shown.defaults)
+        if names:
+            self._shown.keep(NameChoice(names).divide(table.params)[0])
         if changed:
-            shown = {name: shown[name] for name in table.params.changed(self._described)}
-        chosen = NameChoice(names).divide(table.params)[0] if names else set(shown)
-        self._params = [param for name, param in shown.items() if name in chosen]
-
-    @property
-    def defaults(self) -> list[Default]:
-        """The known defaults of the whole table."""
-        return self._defaults_of(self.table.params.values())
+            self._shown.keep_changed()
 
     def as_json(self) -> TableJson:
         """Return the JSON object."""
-        params = {
-            each.name: ParamJson.of(each, info_of(self._metadata, each.name), whole=self._is_part)
-            for each in self._params
-        }
-        return TableJson.of(self.table, params)
+        return TableJson.of(self.table, self._shown.as_json(whole=self._is_part))
 
     def print(self) -> None:
         """Print the table, and a line about it on stderr."""
-        table, changed, metadata = self.table, self._changed, self._metadata
-        if changed and not self.defaults:
+        table, shown = self.table, self._shown
+        if self._changed and not self.has_defaults:
             return
-        more = () if metadata is None else DESCRIBED_COLUMNS
-        columns = ["name", "value", *(["default"] * changed), "type", "index", "received", *more]
-        print_table(columns, self._rows(), right="value default index")
+        print_table(shown.columns, shown.rows(), right=RIGHT)
         if self._is_part:
-            if metadata is not None:
-                print_descriptions([each.name for each in self._params], metadata)
+            if shown.metadata is not None:
+                print_descriptions([each.name for each in shown.params], shown.metadata)
             return
-        text = f"{table.system}/{table.component}"
-        if changed:
-            say_sources(text, self._defaults_of(self._params))
-        count = f"{len(self._params)} of {table.size}" if changed else f"{table.size}"
-        differ = " differ from their default:" if changed else " of"
+        address = f"{table.system}/{table.component}"
+        count = f"{table.size} parameters of"
+        if self._changed:
+            say_sources(address, shown.defaults)
+            count = f"{len(shown.params)} of {table.size} parameters differ from their default:"
         synced = "never complete" if table.synced_at is None else f"synced {local_time(table.synced_at)}"
         crc = "" if table.hash is None else f"; hash {hash_text(table.hash)}"
-        vehicle = f"{text} {autopilot_name(table.autopilot)} ({table.key})"
-        say(f"{count} parameters{differ} {vehicle}, {synced}{crc}")
-
-    def _rows(self) -> Iterator[Sequence[object]]:
-        for param in by_index(self._params):
-            known = add_default(param, self._described.get(param.name))
-            yield (
-                param.name,
-                format_value(param.settable, param.type_number),
-                *([default_text(known)] * self._changed),
-                type_name(param.type_number),
-                param.index,
-                local_time(self.table.heard_at[param.name]),
-                *(() if self._metadata is None else described_cells(self._metadata, param)),
-            )
-
-    def _defaults_of(self, params: Iterable[Param]) -> list[Default]:
-        found = (default_of(each, self._described.get(each.name)) for each in params)
-        return [default for default in found if default is not None]
+        say(f"{count} {address} {autopilot_name(table.autopilot)} ({table.key}), {synced}{crc}")
 
 
 # Files

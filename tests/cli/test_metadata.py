@@ -9,7 +9,7 @@ import pytest
 
 from paramclient.metadata import MetadataStore
 from paramclient.model.values import ParamType
-from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
 from tests.commands import Command, Put, behind, in_process, leaping
 
 DATA = Path(__file__).parents[1] / "data"
@@ -237,3 +237,11 @@ def test_show_prints_the_metadata_of_a_parameter(command: Command, shown: tuple[
         "  step: 1 cm",
         "  reboot: a change takes effect after a reboot",
     ]
+
+
+def test_a_vehicle_without_metadata_beside_one_with_it(command: Command, put: Put, tmp_path: Path) -> None:
+    url, cache = put(Air([quad(), copter(2)])), ["--cache", tmp_path / "cache.sqlite3"]
+    assert command("get", url, "MC_ROLL_P", "--vehicle", 1, "--metadata", "vehicle", *cache).code == 0
+    done = command("get", url, "MC_ROLL_P", "TST_ALT", "--vehicle", "all", *cache)
+    assert done.rows[0][-2:] == ["meaning", "units"]
+    assert [row[:3] for row in done.rows[1:]] == [["1/1", "MC_ROLL_P", "6.5"], ["2/1", "TST_ALT", "100.0"]]
