@@ -11,7 +11,7 @@ from cyclopts.validators import Number
 
 from paramclient.cache import CachedComponent, CachedSummary, HistoryEntry, ParamCache, SnapshotSummary
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson, SummaryJson
+from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson
 from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import local_time, print_json, print_line, say, show
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
@@ -20,7 +20,7 @@ from paramclient.cli.time_arguments import parse_time
 from paramclient.errors import UsageError
 from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice
-from paramclient.model.notation import hash_text
+from paramclient.model.notation import hash_text, time_or_none
 from paramclient.model.values import Param, format_value
 from paramclient.model.wording import counted
 
@@ -83,7 +83,7 @@ def show_summaries(
 ) -> None:
     """Print a line for each table, with the number of extended parameters if any table has some."""
     more = ["extended"] if sizes else []
-    components = [SummaryJson.of(each, sizes.get((each.key, each.component))) for each in summaries]
+    components = [_summary_json(each, sizes.get((each.key, each.component))) for each in summaries]
     rows = (
         (
             f"{each.system}/{each.component}",
@@ -104,6 +104,24 @@ def show_summaries(
         right="params extended",
         empty=f"the cache {cache.place} is empty",
     )
+
+
+def _summary_json(summary: CachedSummary, extended: int | None) -> dict[str, object]:
+    """Return a table without its parameters, with the number of its extended ones or None."""
+    return {
+        "key": summary.key,
+        "system": summary.system,
+        "component": summary.component,
+        "autopilot": autopilot_name(summary.autopilot),
+        "uid": summary.identity.uid,
+        "size": summary.size,
+        "count": summary.count,
+        "complete": summary.complete,
+        "hash": hash_text(summary.hash),
+        "synced_at": time_or_none(summary.synced_at),
+        "updated_at": time_or_none(summary.updated_at),
+        **({} if extended is None else {"extended": extended}),
+    }
 
 
 def extended_sizes(cache: ParamCache) -> dict[tuple[str, int], int]:

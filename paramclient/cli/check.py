@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
+from dataclasses import asdict
 from importlib.metadata import version
 from statistics import median
 from typing import Annotated, Any, Final
@@ -13,7 +14,6 @@ import anyio
 from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.json_output import IdentityJson, as_json
 from paramclient.cli.options import Seconds, TrafficOptions
 from paramclient.cli.output import Coloured, Status, milliseconds, print_json, print_line, print_table
 from paramclient.cli.session import VEHICLE_TIMEOUT, ChosenVehicle, Deadline, listen, wait_for_vehicle
@@ -204,7 +204,7 @@ class _Report:
             "component": component.component,
             "autopilot": component.autopilot,
             "vehicle_type": vehicle_type,
-            "identity": as_json(IdentityJson.of(identity)),
+            "identity": asdict(identity),
             "has_version": has_version,
             "encoding": component.encoding.value,
             "encoding_reason": component.encoding_reason,

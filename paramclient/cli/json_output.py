@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FetchJson",
-    "IdentityJson",
     "InfoJson",
     "Json",
     "OriginJson",
@@ -284,28 +283,6 @@ class VehicleJson(Json):
             firmware=version_text(identity.firmware) if identity.firmware else None,
             uid=identity.uid,
         )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IdentityJson(Json):
-    """The identity of a vehicle; the members are those of `Identity`."""
-
-    system: int
-    link: str
-    uid: str | None
-    autopilot: int
-    vehicle_type: int
-    firmware: int
-    git_hash: str
-    board: int
-    vendor_id: int
-    product_id: int
-    capabilities: int
-
-    @classmethod
-    def of(cls, identity: Identity) -> IdentityJson:
-        """Return an identity."""
-        return cls.take(identity)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

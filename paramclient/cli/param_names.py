@@ -26,7 +26,6 @@ __all__ = [
     "spelling",
     "suggest",
     "unmatched_text",
-    "with_suggestion",
 ]
 
 CACHED_TABLES_MAX: Final = 20
@@ -108,10 +107,21 @@ async def suggest(
 ) -> dict[str, ParamClientError]:
     """Return the errors with suggestions from the cache for names to which the vehicle has no similar one."""
     cache = session.client.cache
-    if cache is None or not any(map(_lacks_suggestion, errors.values())):
+    lacking = {
+        name: error
+        for name, error in errors.items()
+        if isinstance(error, UnknownParameter) and not (error.nearest or is_pattern(name))
+    }
+    if cache is None or not lacking:
         return errors
     known = await anyio.to_thread.run_sync(cached_names, cache, session.component.autopilot)
-    return {name: with_suggestion(error, known) for name, error in errors.items()}
+    better: dict[str, ParamClientError] = {}
+    for name, error in lacking.items():
+        if nearest := nearest_names(name, known):
+            system, component = error.system, error.component
+            text = f"{system}/{component} has no {name}{did_you_mean(nearest)}"
+            better[name] = UnknownParameter(text, system, component, name=name, nearest=nearest)
+    return errors | better
 
 
 def cached_names(cache: ParamCache, autopilot: str | None = None) -> frozenset[str]:
@@ -171,32 +181,5 @@ def spelling(name: str, component: Component) -> str:
 
 
 def _no_match(pattern: str, component: Component) -> UnknownParameter:
-    label = f"{component.system}/{component.component}"
-    return UnknownParameter(
-        f"{label} has no parameter that matches {pattern}",
-        system=component.system,
-        component=component.component,
-        name=pattern,
-    )
-
-
-def _lacks_suggestion(error: ParamClientError) -> bool:
-    return isinstance(error, UnknownParameter) and not error.nearest and not is_pattern(error.name or "*")
-
-
-def with_suggestion(error: ParamClientError, known: Collection[str]) -> ParamClientError:
-    """Return the error of an unknown name with similar ones of these names, if it has none yet."""
-    if not _lacks_suggestion(error):
-        return error
-    assert isinstance(error, UnknownParameter)
-    assert error.name is not None
-    nearest = nearest_names(error.name, known)
-    if not nearest:
-        return error
-    return UnknownParameter(
-        f"{error.system}/{error.component} has no {error.name}{did_you_mean(nearest)}",
-        system=error.system,
-        component=error.component,
-        name=error.name,
-        nearest=nearest,
-    )
+    text = f"{component.system}/{component.component} has no parameter that matches {pattern}"
+    return UnknownParameter(text, component.system, component.component, name=pattern)

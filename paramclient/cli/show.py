@@ -10,7 +10,6 @@ from paramclient.cli.cached import extended_sizes, load_tables, show_summaries
 from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.file_output import described
-from paramclient.cli.json_cache import TableJson
 from paramclient.cli.json_output import SetJson
 from paramclient.cli.logs import cache_of_log
 from paramclient.cli.metadata import (
@@ -32,7 +31,7 @@ from paramclient.model.comparison import non_defaults
 from paramclient.model.defaults import Default, add_defaults, default_of
 from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice
-from paramclient.model.notation import hash_text, typed
+from paramclient.model.notation import hash_text, time_or_none, typed
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import format_value, type_name
 
@@ -148,9 +147,18 @@ class _View:
         if changed:
             self._shown.keep_changed()
 
-    def as_json(self) -> TableJson:
-        """Return the JSON object."""
-        return TableJson.of(self.table, self._shown.as_json(whole=self._is_part))
+    def as_json(self) -> dict[str, object]:
+        """Return the JSON of the table."""
+        table = self.table
+        return {
+            "system": table.system,
+            "component": table.component,
+            "autopilot": autopilot_name(table.autopilot),
+            "uid": table.identity.uid,
+            "hash": hash_text(table.hash),
+            "synced_at": time_or_none(table.synced_at),
+            "params": self._shown.as_json(whole=self._is_part),
+        }
 
     def print(self) -> None:
         """Print the table, and a line about it on stderr."""
