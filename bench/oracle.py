@@ -54,17 +54,7 @@ class TellingLink(FaultyLink):
         lost = self.lost
         super().send(data, now)
         if self.lost > lost:
-            self.losses.append((max(now, self._free_at) + self._delay, data))
-
-    @property
-    def is_free_at(self) -> float:
-        """The time at which the next datagram would leave without queueing."""
-        return self._free_at
-
-    @property
-    def travel(self) -> float:
-        """The transit time in seconds."""
-        return self._delay
+            self.losses.append((max(now, self.free_at) + self.delay, data))
 
 
 class _Oracle(ABC):
@@ -148,7 +138,7 @@ class _Oracle(ABC):
 
     def _learn_of_losses(self, now: float) -> None:
         """Convert the losses of the links to reports, and process those that are due."""
-        for losses, later in ((self.downlink.losses, 0.0), (self.uplink.losses, self.downlink.travel)):
+        for losses, later in ((self.downlink.losses, 0.0), (self.uplink.losses, self.downlink.delay)):
             for at, data in losses:
                 for message in self._read(data):
                     self._sequence += 1
@@ -227,7 +217,7 @@ class _ListOracle(_Oracle):
             if index in self.missing:
                 self.send(messages.ParamRequestRead(1, 1, "", index), now)
                 self.next_send = max(self.next_send, now - 4 * self.per_read) + self.per_read
-                self.next_send = max(self.next_send, self.uplink.is_free_at)
+                self.next_send = max(self.next_send, self.uplink.free_at)
 
     def is_done(self) -> bool:
         return not self.missing

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from anyio.abc import TaskStatus
 from cyclopts import Parameter
@@ -20,7 +20,6 @@ from paramclient.links.udp import UdpIn
 
 if TYPE_CHECKING:
     from paramclient.sim import OtherStation, Vehicle
-    from paramclient.sim.vehicle import VehicleOptions
 
 __all__ = ["FaultOptions", "VehicleFaults", "sim"]
 
@@ -71,10 +70,7 @@ class VehicleFaults:
     several times."""
 
     list_stops_at: int | None = None
-    """Number of values after which the list stops. Default: never."""
-
-    list_stops: float = 1
-    """Number of lists that --list-stops-at applies to; inf for all."""
+    """Number of values after which the list stops, once. Default: never."""
 
     boot_time: float = 0.0
     """Seconds after each start in which the vehicle reports that it boots, and does not send its list."""
@@ -88,21 +84,16 @@ class VehicleFaults:
     armed: bool = False
     """Report that the vehicle is armed; it then refuses to reboot."""
 
-    high_latency: bool = False
-    """Simulate a satellite link: HIGH_LATENCY2 every 5 s, and no list."""
-
     other_list_every: float | None = None
     """Interval in seconds at which another ground station requests the list. Default: never."""
 
     @property
-    def options(self) -> VehicleOptions:
+    def options(self) -> dict[str, Any]:
         """The arguments for the simulated vehicle."""
         return {
             "dead": [int(each) if each.isdecimal() else each for each in self.dead],
             "list_stops_at": self.list_stops_at,
-            "list_stops": self.list_stops,
             "boot_time": self.boot_time,
-            "high_latency": self.high_latency,
             "armed": self.armed,
             "reboot_down": self.reboot_down,
         }

@@ -18,8 +18,8 @@ every run has the same outcome. A complete session is a loop::
 The vehicles behave as measured on real ones, with the real timing. The docstrings of `PX4Vehicle` and
 `ArduPilotVehicle` describe the differences between the two.
 
-- `px4`, `ardupilot`, `generic`: the vehicles. `camera`: a camera with extended parameters.
-- `vehicle`, `device`: their base classes.
+- `px4`, `ardupilot`: the autopilots. `camera`: a camera with extended parameters.
+- `vehicle`, `device`: their base classes, and the vehicle of the standard.
 - `param_table`, `ftp`, `metadata`: parameter tables, the MAVFTP server, metadata files.
 - `air`, `other_station`: the faulty link, a second ground station.
 """
@@ -29,18 +29,15 @@ from __future__ import annotations
 from paramclient.sim.air import Air, Endpoint, Faults, FaultyLink
 from paramclient.sim.ardupilot import ArduPilotVehicle
 from paramclient.sim.camera import Camera, ExtEntries, camera_table
-from paramclient.sim.device import DeviceOptions
-from paramclient.sim.generic import GenericVehicle
 from paramclient.sim.other_station import OtherStation
 from paramclient.sim.param_table import SimParam, Table, ardupilot_table, px4_table
 from paramclient.sim.px4 import PX4Vehicle
-from paramclient.sim.vehicle import Vehicle, VehicleOptions
+from paramclient.sim.vehicle import GenericVehicle, Vehicle
 
 __all__ = [
     "Air",
     "ArduPilotVehicle",
     "Camera",
-    "DeviceOptions",
     "Endpoint",
     "ExtEntries",
     "Faults",
@@ -51,7 +48,6 @@ __all__ = [
     "SimParam",
     "Table",
     "Vehicle",
-    "VehicleOptions",
     "ardupilot_table",
     "camera_table",
     "px4_table",

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Sequence
+from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import Protocol, TypedDict, Unpack
 
 from paramclient.errors import UsageError
 from paramclient.sim.other_station import OtherStation
+from paramclient.sim.param_table import check_range
 
 __all__ = ["Air", "Endpoint", "FaultyLink"]
 
@@ -52,6 +54,7 @@ class Faults(TypedDict, total=False):
     queue: int | None
 
 
+@dataclass(kw_only=True, eq=False)
 class FaultyLink:
     """One direction of a link with faults, reproducible by its seed.
 
@@ -77,96 +80,76 @@ class FaultyLink:
         sent: datagrams given to `send`.
         lost: the number of them that do not arrive, because of `loss` or a full queue.
         duplicated: the number of them that arrive twice.
-        delivered: datagrams returned by `deliver`; in the end `sent - lost + duplicated`.
+        free_at: when a new datagram would leave without waiting, or earlier.
 
     Raises:
         UsageError: an argument is out of range.
     """
 
-    def __init__(
-        self,
-        *,
-        loss: float = 0.0,
-        loss_burst: float = 1.0,
-        delay: float = 0.0,
-        jitter: float = 0.0,
-        duplicate: float = 0.0,
-        reorder: float = 0.0,
-        bit_errors: float = 0.0,
-        rate: float | None = None,
-        queue: int | None = None,
-        seed: int = 0,
-    ) -> None:
-        shares = {"loss": loss, "duplicate": duplicate, "reorder": reorder, "bit_errors": bit_errors}
-        for name, share in shares.items():
-            if not 0.0 <= share <= 1.0:
-                raise UsageError(f"{name} must be a share between 0 and 1, not {share}")
-        if not (math.isfinite(loss_burst) and loss_burst >= 1.0):
-            raise UsageError(f"loss_burst must be a number of datagrams from 1 up, not {loss_burst}")
-        for name, seconds in {"delay": delay, "jitter": jitter}.items():
-            if not (math.isfinite(seconds) and seconds >= 0.0):
-                raise UsageError(f"{name} must be a number of seconds from 0 up, not {seconds}")
-        if rate is not None and not (math.isfinite(rate) and rate > 0.0):
-            raise UsageError(f"rate must be a number of bytes per second above 0, not {rate}")
-        if queue is not None and (rate is None or queue < 0):
-            raise UsageError("queue must be a number of bytes from 0 up, and needs a rate")
-        self._loss = loss
-        self._loss_burst = loss_burst
+    loss: float = 0.0
+    loss_burst: float = 1.0
+    delay: float = 0.0
+    jitter: float = 0.0
+    duplicate: float = 0.0
+    reorder: float = 0.0
+    bit_errors: float = 0.0
+    rate: float | None = None
+    queue: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_range(
+            *(0.0, 1.0),
+            loss=self.loss,
+            duplicate=self.duplicate,
+            reorder=self.reorder,
+            bit_errors=self.bit_errors,
+        )
+        check_range(1.0, loss_burst=self.loss_burst)
+        check_range(0.0, delay=self.delay, jitter=self.jitter, queue=self.queue or 0)
+        if self.rate is not None and not 0.0 < self.rate < math.inf:
+            raise UsageError(f"rate must be a number of bytes per second above 0, not {self.rate}")
+        if self.queue is not None and self.rate is None:
+            raise UsageError("queue needs a rate")
         self._is_fading = False
-        self._delay = delay
-        self._jitter = jitter
-        self._duplicate = duplicate
-        self._reorder = reorder
-        self._bit_errors = bit_errors
-        self._rate = rate
-        self._queue = queue
-        self._random = random.Random(seed)
+        self._random = random.Random(self.seed)
         self._flying: list[tuple[float, int, bytes]] = []
-        self._number = 0
-        self._free_at = -math.inf
-        self._last_arrival = -math.inf
-        self.sent = 0
-        self.lost = 0
-        self.duplicated = 0
-        self.delivered = 0
+        self._last_arrival = self.free_at = -math.inf
+        self.sent = self.lost = self.duplicated = 0
 
     def send(self, data: bytes, now: float) -> None:
         """Send one datagram."""
         self.sent += 1
         leaves_at = now
-        if self._rate is not None:
-            starts_at = max(now, self._free_at)
-            waiting = (starts_at - now) * self._rate
-            if self._queue is not None and waiting and waiting + len(data) > self._queue:
+        if self.rate is not None:
+            starts_at = max(now, self.free_at)
+            waiting = (starts_at - now) * self.rate
+            if self.queue is not None and waiting and waiting + len(data) > self.queue:
                 self.lost += 1
                 return
-            leaves_at = self._free_at = starts_at + len(data) / self._rate
+            leaves_at = self.free_at = starts_at + len(data) / self.rate
         chance = self._random.random
-        if self._loss and self._loses():
+        if self.loss and self._loses():
             self.lost += 1
             return
-        arrives_at = leaves_at + self._delay
-        if self._jitter:
-            arrives_at += self._jitter * chance()
+        arrives_at = leaves_at + self.delay
+        if self.jitter:
+            arrives_at += self.jitter * chance()
         arrives_at = max(arrives_at, self._last_arrival)
-        if self._reorder and chance() < self._reorder:
+        if self.reorder and chance() < self.reorder:
             arrives_at += _HELD_BACK * chance()
         else:
             self._last_arrival = arrives_at
-        copies = 1
-        if self._duplicate and chance() < self._duplicate:
-            self.duplicated += 1
-            copies = 2
-        for _ in range(copies):
-            self._number += 1
-            heappush(self._flying, (arrives_at, self._number, self._damaged(data)))
+        is_doubled = self.duplicate and chance() < self.duplicate
+        self.duplicated += bool(is_doubled)
+        for copy in range(2 if is_doubled else 1):
+            heappush(self._flying, (arrives_at, 2 * self.sent + copy, self._damaged(data)))
 
     def deliver(self, now: float) -> list[bytes]:
         """Return the datagrams that have arrived by `now`, in order of arrival."""
         arrived = []
         while self._flying and self._flying[0][0] <= now:
             arrived.append(heappop(self._flying)[2])
-        self.delivered += len(arrived)
         return arrived
 
     def next_deadline(self) -> float | None:
@@ -175,17 +158,15 @@ class FaultyLink:
 
     def _loses(self) -> bool:
         """Return whether the next datagram is lost; with bursts, whether the link is in its bad state."""
-        if self._loss_burst == 1.0 or self._loss == 1.0:
-            return self._random.random() < self._loss
-        if self._is_fading:
-            change = 1.0 / self._loss_burst
-        else:
-            change = self._loss / max(1.0 - self._loss, 1e-9) / self._loss_burst
+        if self.loss_burst == 1.0 or self.loss == 1.0:
+            return self._random.random() < self.loss
+        into_fading = self.loss / max(1.0 - self.loss, 1e-9) / self.loss_burst
+        change = 1.0 / self.loss_burst if self._is_fading else into_fading
         self._is_fading ^= self._random.random() < change
         return self._is_fading
 
     def _damaged(self, data: bytes) -> bytes:
-        if not self._bit_errors:
+        if not self.bit_errors:
             return data
         damaged = bytearray(data)
         at = self._gap()
@@ -196,10 +177,10 @@ class FaultyLink:
 
     def _gap(self) -> int:
         """Return the number of undamaged bits before the next damaged one."""
-        if self._bit_errors == 1.0:
+        if self.bit_errors == 1.0:
             return 0
         # 1 - random() is above 0. The limit avoids overflow with tiny error rates.
-        return int(min(math.log(1.0 - self._random.random()) / math.log1p(-self._bit_errors), _FAR))
+        return int(min(math.log(1.0 - self._random.random()) / math.log1p(-self.bit_errors), _FAR))
 
 
 class Air:
@@ -216,7 +197,9 @@ class Air:
             and to the program.
 
     Attributes:
-        vehicles, uplink, downlink, others: as given.
+        vehicles: as given.
+        uplink, downlink: as given; may be replaced.
+        vehicle_count: the number of vehicles; None if an endpoint does not say its number.
     """
 
     def __init__(
@@ -227,18 +210,14 @@ class Air:
         downlink: FaultyLink | None = None,
         others: Sequence[OtherStation] = (),
     ) -> None:
+        self.uplink = uplink or FaultyLink()
+        self.downlink = downlink or FaultyLink()
         self.vehicles = tuple(vehicles)
-        self.others = tuple(others)
-        self.uplink = FaultyLink() if uplink is None else uplink
-        self.downlink = FaultyLink() if downlink is None else downlink
+        self._senders = (*others, *vehicles)
+        self._others = len(others)
+        counts = [getattr(each, "vehicle_count", None) for each in vehicles]
+        self.vehicle_count: int | None = None if None in counts else sum(map(int, filter(None, counts)))
         self._out: list[bytes] = []
-
-    @property
-    def vehicle_count(self) -> int | None:
-        """The number of vehicles; None if an endpoint does not say its number."""
-        counts = [getattr(each, "vehicle_count", None) for each in self.vehicles]
-        known = [count for count in counts if isinstance(count, int)]
-        return sum(known) if len(known) == len(counts) else None
 
     @classmethod
     def symmetric(
@@ -254,26 +233,25 @@ class Air:
         See `FaultyLink` for the faults. The two directions use different random numbers, both derived from
         the seed.
         """
-        uplink = FaultyLink(seed=2 * seed, **faults)
-        downlink = FaultyLink(seed=2 * seed + 1, **faults)
+        uplink, downlink = FaultyLink(seed=2 * seed, **faults), FaultyLink(seed=2 * seed + 1, **faults)
         return cls(vehicles, uplink=uplink, downlink=downlink, others=others)
 
     def receive(self, data: bytes, now: float) -> None:
         """Take one datagram for all vehicles."""
         self.tick(now)
         self.uplink.send(data, now)
-        self._step(now, self._deadlines())
+        self._step(now, [*map(_at, self._senders)])
 
     def tick(self, now: float) -> None:
         """Do all work that is due by `now`, in the order of its deadlines."""
-        due = self._deadlines()
+        due = [*map(_at, self._senders)]
         while (first := min(*due, _at(self.uplink), _at(self.downlink), now)) < now:
             self._step(first, due)
         self._step(now, [now] * len(due))
 
     def next_deadline(self) -> float | None:
         """Return the earliest deadline of the vehicles, stations and links."""
-        first = min(*self._deadlines(), _at(self.uplink), _at(self.downlink))
+        first = min(*map(_at, self._senders), _at(self.uplink), _at(self.downlink))
         return None if first == math.inf else first
 
     def data_to_send(self) -> list[bytes]:
@@ -281,27 +259,21 @@ class Air:
         out, self._out = self._out, []
         return out
 
-    def _deadlines(self) -> list[float]:
-        return [*map(_at, self.vehicles), *map(_at, self.others)]
-
     def _step(self, now: float, due: list[float]) -> None:
         """Advance to `now`; skips vehicles without due work and received data."""
-        for place, station in enumerate(self.others, start=len(self.vehicles)):
-            if due[place] <= now:
-                station.tick(now)
-                for data in station.data_to_send():
-                    self.uplink.send(data, now)
-                    self.downlink.send(data, now)
-                due[place] = _at(station)
-        up = self.uplink.deliver(now)
-        for place, vehicle in enumerate(self.vehicles):
+        up: list[bytes] = []
+        for place, sender in enumerate(self._senders):
+            if place == self._others:
+                up = self.uplink.deliver(now)
             if up or due[place] <= now:
-                vehicle.tick(now)
+                sender.tick(now)
                 for data in up:
-                    vehicle.receive(data, now)
-                for data in vehicle.data_to_send():
+                    sender.receive(data, now)
+                for data in sender.data_to_send():
                     self.downlink.send(data, now)
-                due[place] = _at(vehicle)
+                    if place < self._others:
+                        self.uplink.send(data, now)
+                due[place] = _at(sender)
         arrived = self.downlink.deliver(now)
         self._out += arrived[: OUT_LIMIT - len(self._out)]
 
@@ -315,6 +287,6 @@ _FAR = 1e9
 """Largest gap between bit errors, in bits."""
 
 
-def _at(part: Endpoint | OtherStation | FaultyLink) -> float:
+def _at(part: Endpoint | FaultyLink) -> float:
     deadline = part.next_deadline()
     return math.inf if deadline is None else deadline

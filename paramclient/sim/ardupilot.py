@@ -7,11 +7,12 @@ import re
 import struct
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Literal, Unpack
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 from paramclient.errors import CommandResult, ParamErrorCode, UsageError
-from paramclient.model.values import Encoding, ParamType, WireValue, bits_of, from_bits
+from paramclient.model.values import Encoding, ParamType, WireValue, bits_of
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.param_pck import PARAM_FILE
 from paramclient.sim.ftp import Address, FileServer
@@ -21,15 +22,18 @@ from paramclient.sim.param_table import (
     Table,
     ardupilot_table,
     as_table,
+    check_names,
+    check_range,
     ek2_group,
     with_system_id,
 )
-from paramclient.sim.vehicle import SIMULATED_COMMIT, Vehicle, VehicleOptions
+from paramclient.sim.vehicle import SIMULATED_COMMIT, Vehicle
 from paramclient.wire import frames, messages
 
 __all__ = ["ArduPilotVehicle"]
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class ArduPilotVehicle(Vehicle):
     """An ArduPilot autopilot, ArduCopter 4.6, as measured; with `param_error` as newer versions.
 
@@ -74,7 +78,6 @@ class ArduPilotVehicle(Vehicle):
         table: the parameters (see `Table`), in the order of their indices; None for those of a real quad,
             `ardupilot_table()`. SYSID_THISMAV, if the table has it, is set to `system`.
         kind: "copter", "plane" or "rover".
-        system, component: the vehicle's ids, 1 to 255.
         uid2: the reported hardware id, up to 18 bytes; by default unique for every system.
         groups: by the name of a switch in the table or in another group, the parameters that are shown behind
             it while it is not 0.
@@ -89,93 +92,165 @@ class ArduPilotVehicle(Vehicle):
         ftp: whether MAVFTP is available.
         ftp_rate: bytes per second of a burst: a third of the link. By default UDP as measured; on 57600 baud
             it is 1920.
-        options: those of every `Vehicle`. Within `boot_time`, PARAM_REQUEST_LIST is ignored.
+
+    Other arguments are those of every `Vehicle`. Within `boot_time`, PARAM_REQUEST_LIST is ignored.
 
     Raises:
         UsageError: an argument is invalid.
     """
 
-    _restart_delay = 0.2
-    _clock_delay = 1.4
-    _armed_result = CommandResult.FAILED
-    _read_at: float
-    _answer_at: float
+    encoding: ClassVar = Encoding.C_CAST
+    _restart_delay: ClassVar = 0.2
+    _clock_delay: ClassVar = 1.4
+    _armed_result: ClassVar = CommandResult.FAILED
 
-    def __init__(
-        self,
-        *,
-        kind: Literal["copter", "plane", "rover"] = "copter",
-        system: int = 1,
-        component: int = 1,
-        uid2: bytes | None = None,
-        table: Table | None = None,
-        groups: Mapping[str, Table] | None = None,
-        reboot_groups: Iterable[str] = (),
-        read_only: Iterable[str] | None = None,
-        live: Iterable[str] = ("STAT_RUNTIME", "BARO1_GND_PRESS"),
-        live_period: float = 30.0,
-        burst: int = 10,
-        period: float = 0.00595,
-        ftp: bool = True,
-        ftp_rate: float = 48_500.0,
-        **options: Unpack[VehicleOptions],
-    ) -> None:
-        if kind not in _KINDS:
-            raise UsageError(f"kind must be one of {', '.join(_KINDS)}, not {kind!r}")
-        self._is_copter = kind == "copter"
-        vehicle_type, state, self._start_state = _KINDS[kind]
+    kind: Literal["copter", "plane", "rover"] = "copter"
+    uid2: bytes | None = None
+    table: Table | None = None
+    groups: Mapping[str, Table] | None = None
+    reboot_groups: Iterable[str] = ()
+    read_only: Iterable[str] | None = None
+    live: Iterable[str] = ("STAT_RUNTIME", "BARO1_GND_PRESS")
+    live_period: float = 30.0
+    period: float = 0.00595
+    ftp: bool = True
+    ftp_rate: float = 48_500.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in _KINDS:
+            raise UsageError(f"kind must be one of {', '.join(_KINDS)}, not {self.kind!r}")
+        is_built_in = self.table is None
+        table = ardupilot_table() if self.table is None else as_table(self.table)
+        groups = self.groups
         if groups is None:
-            groups = {"EK2_ENABLE": ek2_group()} if table is None else {}
-        rows = with_system_id(ardupilot_table() if table is None else as_table(table), _SYSTEM_ID, system)
+            groups = {"EK2_ENABLE": ek2_group()} if is_built_in else {}
         members = {switch: as_table(group) for switch, group in groups.items()}
-        if read_only is None:
-            every = (row.name for group in (rows, *members.values()) for row in group)
-            read_only = [name for name in every if _INTERNAL.fullmatch(name)]
-        elif unknown := frozenset(read_only).difference(row.name for row in rows):
-            raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
-        every_row = tuple(_with_groups(rows, dict(members)))
-        if unknown := frozenset(members).difference(row.name for row in every_row):
-            raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
-        if uid2 is None:
-            uid2 = (int.from_bytes(_UID2, "little") + system - 1).to_bytes(18, "little")
-        if len(uid2) > 18:
-            raise UsageError(f"uid2 must have at most 18 bytes, not {len(uid2)}")
-        if not 0.0 <= live_period < math.inf:
-            raise UsageError(f"live_period must be a number of seconds from 0 up, not {live_period}")
-        if ftp:
-            self.file_server = FileServer(self._packed_params, ftp_rate)
+        rows = tuple(_with_groups(with_system_id(table, _SYSTEM_ID, self.system), dict(members)))
         self._in_groups = (
-            frozenset(row.name for row in rows[_NOT_IN_GROUPS:]) if table is None else frozenset()
+            frozenset(row.name for row in table[_NOT_IN_GROUPS:]) if is_built_in else frozenset()
         )
-        self._stored: set[str] = set()
         self._switch_of = {row.name: switch for switch, group in members.items() for row in group}
         self._switches = members.keys()
-        self._late_switches = frozenset(reboot_groups)
+        self._late_switches = frozenset(self.reboot_groups)
+        self._was_on = {row.name for row in rows if row.bits != 0}
+        self._read_only = frozenset(
+            [row.name for row in rows if _INTERNAL.fullmatch(row.name)]
+            if self.read_only is None
+            else self.read_only
+        )
+        self._live = frozenset(self.live)
+        check_names(rows, members, () if self.read_only is None else self.read_only)
         if others := self._late_switches - self._switches:
             raise UsageError(f"reboot_groups that are not switches in groups: {', '.join(sorted(others))}")
-        self._was_on = {row.name: row.bits != 0 for row in every_row if row.name in self._late_switches}
-        self._read_only = frozenset(read_only)
-        self._live = frozenset(live)
-        self._live_period = live_period
-        super().__init__(
-            as_table(every_row),
-            system=system,
-            component=component,
-            encoding=Encoding.C_CAST,
-            heartbeat=messages.Heartbeat(
+        uid2 = (int.from_bytes(_UID2, "little") + self.system - 1).to_bytes(18, "little")
+        uid2 = uid2 if self.uid2 is None else self.uid2.ljust(18, b"\0")
+        check_range(0, 18, **{"the length of uid2": len(uid2)})
+        check_range(0.0, live_period=self.live_period)
+        self._stored: set[Entry] = set()
+        """Parameters that have had another value than at the first start."""
+        self._list_fills_loop = self.burst > _BUSY_RATE * self.period
+        vehicle_type, state, _ = _KINDS[self.kind]
+        self._set_up_table(
+            rows,
+            messages.Heartbeat(
                 vehicle_type, messages.MAV_AUTOPILOT_ARDUPILOTMEGA, base_mode=81, system_status=state
             ),
-            version=messages.AutopilotVersion(
-                64495 if ftp else 64495 & ~messages.CAPABILITY_FTP,
+            messages.AutopilotVersion(
+                64495 if self.ftp else 64495 & ~messages.CAPABILITY_FTP,
                 flight_sw_version=67502080,
                 git_hash=SIMULATED_COMMIT.encode("ascii"),
-                uid2=uid2.ljust(18, b"\0"),
+                uid2=uid2,
             ),
-            burst=burst,
-            period=period,
-            **options,
+            FileServer(self._packed_params, self.ftp_rate) if self.ftp else None,
         )
-        self._list_fills_loop = burst > _BUSY_RATE * period
+
+    def load(self, values: Mapping[str, WireValue]) -> None:
+        """Change values as code on board does that announces nothing.
+
+        Raises:
+            UsageError: the vehicle has no parameter with such a name, or a value does not fit its type.
+        """
+        for name, value in values.items():
+            entry = self._entry(name)
+            self._store(entry, bits_of(value, entry.type))
+
+    # Time
+
+    def _switch_on(self, at: float) -> None:
+        self._waiting: deque[tuple[messages.ParamRequestRead, frames.Frame]] = deque()
+        self._ready: list[messages.ParamValue] = []
+        self._answers: dict[Entry, ParamType | None] = {}
+        """Parameters whose sets are not yet answered, with the type of the answer where it is another one."""
+        self._list_count = 0
+        self._has_answered_in_list = False
+        self._list_pause_at = math.inf
+        self._backlog: deque[frames.Frame] = deque()
+        self._file_answers: list[tuple[Packet, Address]] = []
+        super()._switch_on(at)
+        if not self._is_first_run:
+            self._due[self._measure] = at + self._clock_delay
+        if self.live_period:
+            self._due[self._change_live] = at + self.live_period
+
+    def _tasks(self) -> list[Callable[[float], None]]:
+        first = [
+            self._change_system_id,
+            self._measure,
+            self._change_live,
+            self._end_look_up,
+            self._send_reads,
+        ]
+        return [*first, *super()._tasks(), self._open_window, self._answer_sets]
+
+    def _next(self, period: float, *, after: float | None = None) -> float:
+        """Return the start of the next period; periods are counted from switching on."""
+        if after is None:
+            after = self._now
+        if after < self._on_at:
+            return self._on_at
+        turns = (after - self._on_at) / period
+        return self._on_at + (math.floor(turns + _ROUNDING) + 1) * period
+
+    def _end_all(self) -> None:
+        super()._end_all()
+        self._was_on = {entry.name for entry in self.entries if entry.bits != 0}
+        self._take_system_id(_SYSTEM_ID)
+
+    def _state_after_reboot(self) -> tuple[int, float]:
+        return _KINDS[self.kind][2]
+
+    def _send_clock(self, now: float) -> None:
+        if self.kind != "copter" and now >= self._on_at + self._clock_delay:
+            self._send_system_time(now)
+
+    def _measure(self, at: float) -> None:
+        """Change the values that are measured at a start by 0.1 %, and count the start."""
+        for entry in self.entries:
+            value = entry.value
+            if entry.name == _BOOT_COUNT:
+                entry.store(entry.bits + 1 & 0x7FFF)
+            elif (
+                _MEASURED.fullmatch(entry.name)
+                and isinstance(value, float)
+                and value not in (0.0, _NO_SENSOR)
+            ):
+                entry.store(bits_of(1.001 * value, entry.type))
+
+    def _change_live(self, at: float) -> None:
+        self._due[self._change_live] = self._again(at, self.live_period)
+        for entry in self.entries:
+            if entry.name in self._live:
+                value = entry.value
+                if isinstance(value, int) and isinstance(entry.type, ParamType):
+                    later = value + max(1, int(self.live_period))
+                    self._write(entry, bits_of(later if later <= entry.type.bounds[1] else 0, entry.type))
+                else:
+                    self._write(entry, entry.bits ^ 1)
+
+    def _change_system_id(self, at: float) -> None:
+        self._take_system_id(_SYSTEM_ID)
+
+    # Groups
 
     def _key(self, name: str) -> str:
         return name.upper()
@@ -183,37 +258,13 @@ class ArduPilotVehicle(Vehicle):
     def _is_listed(self, entry: Entry) -> bool:
         switch = self._switch_of.get(entry.name)
         while switch is not None:
-            is_on = self._was_on[switch] if switch in self._late_switches else self._entry(switch).bits != 0
+            is_on = switch in self._was_on if switch in self._late_switches else self._entry(switch).bits != 0
             if not is_on:
                 return False
             switch = self._switch_of.get(switch)
         return True
 
-    def _timers(self) -> tuple[float, ...]:
-        times = (self._read_at, self._look_at, self._answer_at, self._live_at)
-        return *times, self._system_id_at, self._window_at, self._measured_at
-
-    def _take(self, frame: frames.Frame) -> None:
-        if self._window_at == math.inf:
-            super()._take(frame)
-        elif len(self._backlog) < _BACKLOG:
-            self._backlog.append(frame)
-
-    def _on_list(self) -> None:
-        if self._now < self._on_at + self._boot_time:
-            return
-        self._send_banner()
-        self._list_count = len(self._listed)
-        self._has_answered_in_list = False
-        self._list_pause_at = self._now + _LIST_START
-        self._start_list(self._next(_SLOT) if self._position is None else self._next_burst)
-
-    def _on_read(self, request: messages.ParamRequestRead, sender: frames.Frame) -> None:
-        if len(self._waiting) < _READ_QUEUE:
-            self._waiting.append((request, sender))
-            self._look_up()
-            if self._ready and self._read_at == math.inf:
-                self._read_at = self._next(_SLOT)
+    # Sets
 
     def _on_set(self, request: messages.ParamSet, sender: frames.Frame) -> None:
         entry = self._find(request.param_id)
@@ -228,19 +279,116 @@ class ArduPilotVehicle(Vehicle):
             self._refuse(ParamErrorCode.READ_ONLY, request, sender)
         else:
             bits = _converted(value, entry.type)
-            if bits == entry.bits and self._was_never_stored(entry):
-                self._untyped.add(entry.name)
+            is_untyped = bits == entry.bits and self._was_never_stored(entry)
             self._write(entry, bits)
+            if is_untyped:
+                self._answers[entry] = ParamType.REAL32
 
     def _was_never_stored(self, entry: Entry) -> bool:
         """Return whether a parameter of a group has its default and has never had another value."""
         has_default = entry.packed is not None and entry.packed.default is None
-        return has_default and entry.name in self._in_groups and entry.name not in self._stored
+        return has_default and entry.name in self._in_groups and entry not in self._stored
 
     def _write(self, entry: Entry, bits: int) -> None:
-        self._hold(entry, bits)
-        self._answers[entry.name] = entry
-        self._answer_at = min(self._answer_at, self._next(_LOOP))
+        self._store(entry, bits)
+        self._answers.setdefault(entry, None)
+        self._sooner(self._answer_sets, self._next(_LOOP))
+
+    def _store(self, entry: Entry, bits: int) -> None:
+        if bits != entry.bits:
+            self._stored.add(entry)
+        entry.store(bits)
+        if entry.name in self._switches:
+            self._relist()
+        if entry.name == _SYSTEM_ID and self.kind != "copter":
+            self._due[self._change_system_id] = self._next(1.0)
+
+    def _answer_sets(self, at: float) -> None:
+        for entry, kind in self._answers.items():
+            self._send_value(entry, index=messages.NO_INDEX, kind=kind)
+        self._answers.clear()
+
+    # Reads
+
+    def _on_read(self, request: messages.ParamRequestRead, sender: frames.Frame) -> None:
+        if len(self._waiting) < _READ_QUEUE:
+            self._waiting.append((request, sender))
+            self._look_up()
+            if self._due[self._send_reads] == math.inf:
+                self._due[self._send_reads] = self._next_reads()
+
+    def _next_reads(self) -> float:
+        """Return when the looked up responses are sent: with the next slot."""
+        return self._next(_SLOT) if self._ready else math.inf
+
+    def _look_up(self) -> None:
+        """Look up responses to waiting reads until those for the next slot are complete.
+
+        The value is that of the look-up, so a response may be older than a set received before it is sent.
+        """
+        look_up = self._end_look_up
+        while self._waiting and len(self._ready) < _READS_PER_SLOT and self._due[look_up] == math.inf:
+            request, sender = self._waiting.popleft()
+            entry = self._requested(request)
+            if entry is None:
+                self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
+                self._due[look_up] = self._now + _LOOK
+            elif not self._is_dead(entry):
+                index = request.param_index
+                name, index = (request.param_id, messages.NO_INDEX) if index < 0 else (entry.name, index)
+                self._ready.append(messages.ParamValue(name, entry.raw, entry.type, len(self._listed), index))
+
+    def _end_look_up(self, at: float) -> None:
+        self._look_up()
+        if self._due[self._send_reads] == math.inf and not self._is_busy:
+            self._due[self._send_reads] = self._next_reads()
+
+    def _send_reads(self, at: float) -> None:
+        self._answer_reads()
+        self._due[self._send_reads] = at + _SLOT if self._ready else math.inf
+
+    def _answer_reads(self) -> None:
+        """Send the completed responses, and look up those for the next slot."""
+        for answer in self._ready:
+            self.send(answer)
+        self._ready.clear()
+        self._look_up()
+
+    # The list
+
+    @property
+    def _is_busy(self) -> bool:
+        """Whether the list occupies the main loop, until a window opens for what was received meanwhile."""
+        return self._due[self._open_window] < math.inf
+
+    def _take(self, frame: frames.Frame) -> None:
+        if not self._is_busy:
+            super()._take(frame)
+        elif len(self._backlog) < _BACKLOG:
+            self._backlog.append(frame)
+
+    def _on_list(self) -> None:
+        if self._now < self._on_at + self.boot_time:
+            return
+        self._send_banner()
+        self._list_count = len(self._listed)
+        self._has_answered_in_list = False
+        self._list_pause_at = self._now + _LIST_START
+        self._start_list(self._next(_SLOT) if self._position is None else self._due[self._send_list])
+
+    def _send_list(self, at: float) -> None:
+        if self._list_fills_loop and not self._is_busy:
+            if self._list_pause_at <= at:
+                self._list_pause_at = math.inf
+            self._due[self._open_window] = min(self._list_pause_at, at + _LIST_RUN)
+            if self._due[self._send_reads] <= at + _ROUNDING:
+                self._answer_reads()
+            self._due[self._send_reads] = math.inf
+        super()._send_list(at)
+        if self._is_busy and self._position is None:
+            self._due[self._open_window] = self._list_pause_at = math.inf
+            self._take_backlog()
+            self._due[self._send_reads] = self._next_reads()
 
     def _next_place(self, position: int) -> int:
         """Return the place after the last one sent, also if parameters were shown or hidden meanwhile."""
@@ -250,122 +398,10 @@ class ArduPilotVehicle(Vehicle):
     def _count_in_list(self) -> int:
         return self._list_count
 
-    def load(self, values: Mapping[str, WireValue]) -> None:
-        """Change values as code on board does that announces nothing.
-
-        Raises:
-            UsageError: the vehicle has no parameter with such a name, or a value does not fit its type.
-        """
-        for name, value in values.items():
-            entry = self._entry(name)
-            self._hold(entry, bits_of(value, entry.type))
-
-    def _hold(self, entry: Entry, bits: int) -> None:
-        if bits != entry.bits:
-            self._stored.add(entry.name)
-        entry.store(bits)
-        if entry.name in self._switches:
-            self._relist()
-        if entry.name == _SYSTEM_ID and not self._is_copter:
-            self._system_id_at = self._next(1.0)
-
-    def _send_clock(self, now: float) -> None:
-        if not self._is_copter and now >= self._on_at + self._clock_delay:
-            self._send_system_time(now)
-
-    def _end_all(self) -> None:
-        super()._end_all()
-        self._was_on = {name: self._entry(name).bits != 0 for name in self._late_switches}
-        self._take_system_id(self._find(_SYSTEM_ID))
-
-    def _switch_on(self, at: float) -> None:
-        self._waiting: deque[tuple[messages.ParamRequestRead, frames.Frame]] = deque()
-        self._ready: list[messages.ParamValue] = []
-        self._answers: dict[str, Entry] = {}
-        self._untyped: set[str] = set()
-        self._read_at = math.inf
-        self._look_at = math.inf
-        self._answer_at = math.inf
-        self._system_id_at = math.inf
-        self._measured_at = math.inf if self._is_first_run else at + self._clock_delay
-        self._live_at = at + self._live_period if self._live_period else math.inf
-        self._list_count = 0
-        self._has_answered_in_list = False
-        self._list_pause_at = math.inf
-        self._window_at = math.inf
-        self._backlog: list[frames.Frame] = []
-        self._file_answers: list[tuple[Packet, Address]] = []
-        super()._switch_on(at)
-
-    def _work(self, now: float) -> None:
-        if self._system_id_at <= now:
-            self._system_id_at = math.inf
-            self._take_system_id(self._find(_SYSTEM_ID))
-        if self._measured_at <= now:
-            self._measured_at = math.inf
-            self._measure()
-        if self._live_at <= now:
-            self._live_at += self._live_period
-            if self._live_at <= now:
-                self._live_at = now + self._live_period
-            self._change_live()
-        if self._look_at <= now:
-            self._look_at = math.inf
-            self._look_up()
-            if self._ready and self._read_at == math.inf and self._window_at == math.inf:
-                self._read_at = self._next(_SLOT)
-        while self._read_at <= now:
-            self._answer_reads()
-            self._read_at = self._read_at + _SLOT if self._ready else math.inf
-        super()._work(now)
-        self._process_backlog(now)
-        if self._answer_at <= now:
-            self._answer_at = math.inf
-            for entry in self._answers.values():
-                kind = ParamType.REAL32 if entry.name in self._untyped else None
-                self._send_value(entry, index=messages.NO_INDEX, kind=kind)
-            self._answers.clear()
-            self._untyped.clear()
-
-    def _measure(self) -> None:
-        """Change the values that are measured at a start by 0.1 %, and count the start."""
-        for entry in self.entries:
-            if entry.name == _BOOT_COUNT:
-                entry.store(entry.bits + 1 & 0x7FFF)
-            value = from_bits(entry.bits, entry.type)
-            if (
-                _MEASURED.fullmatch(entry.name)
-                and isinstance(value, float)
-                and value not in (0.0, _NO_SENSOR)
-            ):
-                entry.store(bits_of(1.001 * float(value), entry.type))
-
-    def _send_list(self, now: float) -> None:
-        starts_at = self._next_burst
-        if self._list_fills_loop and self._window_at == math.inf and starts_at <= now:
-            if not starts_at < self._list_pause_at:
-                self._list_pause_at = math.inf
-            self._window_at = min(self._list_pause_at, starts_at + _LIST_RUN)
-            if self._read_at <= starts_at + _ROUNDING:
-                self._answer_reads()
-            self._read_at = math.inf
-        super()._send_list(now)
-
-    def _process_backlog(self, now: float) -> None:
-        """Process received messages, after the list has occupied the main loop."""
-        if self._window_at == math.inf:
-            return
-        if self._position is None or self._high_latency:
-            self._window_at = self._list_pause_at = math.inf
-            self._take_backlog()
-            self._read_at = self._next(_SLOT) if self._ready else math.inf
-        elif self._window_at <= now:
-            self._open_window(self._window_at)
-
     def _open_window(self, at: float) -> None:
         """Process the messages received during a run of the list, and decide how the list continues."""
         is_pause_due = self._list_pause_at <= at
-        self._list_pause_at = self._window_at = math.inf
+        self._list_pause_at = math.inf
         self._take_backlog(until_list=not is_pause_due)
         if self._position is None:  # the vehicle has rebooted
             return
@@ -374,42 +410,37 @@ class ArduPilotVehicle(Vehicle):
             self._has_answered_in_list = True
             is_pause_due = not is_first or len(self._ready) + len(self._waiting) > _READS_WITHOUT_PAUSE
             self._answer_reads()
-            self._read_at = self._next(_SLOT) if self._ready and is_pause_due else math.inf
+            self._due[self._send_reads] = self._next_reads() if is_pause_due else math.inf
             if is_pause_due:
-                self._next_burst = self._next(_SLOT, after=at + _LIST_PAUSE)
+                self._due[self._send_list] = self._next(_SLOT, after=at + _LIST_PAUSE)
         elif self._list_pause_at < math.inf:
-            self._window_at = self._list_pause_at
+            self._due[self._open_window] = self._list_pause_at
             return
         elif is_pause_due:
-            self._next_burst = self._next(_SLOT)
+            self._due[self._send_list] = self._next(_SLOT)
         if not is_pause_due:
-            self._window_at = at + _LIST_RUN
+            self._due[self._open_window] = at + _LIST_RUN
 
     def _take_backlog(self, *, until_list: bool = False) -> None:
         """Process the waiting frames, or those up to a request for the list."""
-        backlog, self._backlog = deque(self._backlog), []
-        while backlog and not (until_list and self._list_pause_at < math.inf):
-            super()._take(backlog.popleft())
-        self._backlog.extend(backlog)
-        if not self._high_latency:
-            self._serve_files(self._now)
+        while self._backlog and not (until_list and self._list_pause_at < math.inf):
+            super()._take(self._backlog.popleft())
+        self._serve_files(self._now)
 
-    def _answer_reads(self) -> None:
-        """Send the completed responses, and look up those for the next slot."""
-        for answer in self._ready:
-            self.send(answer)
-        self._ready.clear()
-        self._look_up()
+    # Files
 
-    def _serve_files(self, now: float) -> None:
+    def _serve_files(self, at: float) -> None:
         if self.file_server is None:
             return
-        is_held = self._window_at < math.inf
-        self._file_answers += self.file_server.work(
-            now, _FILE_QUEUE - len(self._file_answers) if is_held else None
-        )
-        if is_held:
+        room = _FILE_QUEUE - len(self._file_answers)
+        if room <= 0 or self._is_busy:  # a server without room waits until now
+            self._file_answers += self.file_server.work(self._now, room)
+        if self._is_busy:
+            is_full = len(self._file_answers) >= _FILE_QUEUE
+            self._due[self._serve_files] = math.inf if is_full else self.file_server.next_deadline()
             return
+        self._file_answers += self.file_server.work(self._now)
+        self._due[self._serve_files] = self.file_server.next_deadline()
         for answer, sender in self._file_answers:
             self.send(messages.FileTransfer(0, *sender, answer.pack()))
             is_opened = answer.requested == Opcode.OPEN_FILE_RO and answer.opcode == Opcode.ACK
@@ -417,50 +448,9 @@ class ArduPilotVehicle(Vehicle):
                 self._send_banner()
         self._file_answers.clear()
 
-    def _next_file_work(self) -> float:
-        is_full = self._window_at < math.inf and len(self._file_answers) >= _FILE_QUEUE
-        return math.inf if is_full else super()._next_file_work()
-
     def _send_banner(self) -> None:
         for text in _BANNER:
             self.send(messages.StatusText(_INFO, text))
-
-    def _next(self, period: float, *, after: float | None = None) -> float:
-        """Return the start of the next period; periods are counted from switching on."""
-        if after is None:
-            after = self._now
-        if after < self._on_at:
-            return self._on_at
-        turns = (after - self._on_at) / period
-        return self._on_at + (math.floor(turns + _ROUNDING) + 1) * period
-
-    def _look_up(self) -> None:
-        """Look up responses to waiting reads until those for the next slot are complete.
-
-        The value is that of the look-up, so a response may be older than a set received before it is sent.
-        """
-        while self._waiting and len(self._ready) < _READS_PER_SLOT and self._look_at == math.inf:
-            request, sender = self._waiting.popleft()
-            if request.param_index == -1:
-                entry, name, index = self._find(request.param_id), request.param_id, messages.NO_INDEX
-            else:
-                entry = self._by_index(request.param_index)
-                name, index = ("" if entry is None else entry.name), request.param_index
-            if entry is None:
-                self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
-                self._look_at = self._now + _LOOK
-            elif not self._is_dead(entry):
-                self._ready.append(messages.ParamValue(name, entry.raw, entry.type, len(self._listed), index))
-
-    def _change_live(self) -> None:
-        for entry in self.entries:
-            if entry.name in self._live:
-                value = entry.value
-                if isinstance(value, int) and isinstance(entry.type, ParamType):
-                    later = value + max(1, int(self._live_period))
-                    self._write(entry, bits_of(later if later <= entry.type.bounds[1] else 0, entry.type))
-                else:
-                    self._write(entry, entry.bits ^ 1)
 
 
 _INTERNAL = re.compile(r"MIS_TOTAL|BARO\d_(GND_PRESS|DEVID)|ARSPD\d?_DEVID|MNT\d_DEVID")
@@ -525,4 +515,4 @@ def _converted(value: float, kind: ParamType | int) -> int:
     if isinstance(kind, ParamType) and kind.is_integer:
         low, high = kind.bounds
         return bits_of(min(max(int(value), low), high), kind)
-    return bits_of(struct.pack("<f", value) if kind != ParamType.REAL64 else value, kind)
+    return bits_of(struct.pack("<f", value), kind)

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
-from typing import Final, TypeAlias, Unpack
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Final, TypeAlias
 
 from paramclient.errors import ExtAckResult, UsageError
 from paramclient.model.ext_values import check_ext_value, encode_ext_value, ext_bytes, ext_param
-from paramclient.model.values import Encoding, Param, ParamType, WireValue, check_name
-from paramclient.sim.generic import BytewiseVehicle
-from paramclient.sim.param_table import Table, as_table
-from paramclient.sim.vehicle import VehicleOptions
+from paramclient.model.values import Param, ParamType, WireValue, check_name
+from paramclient.sim.param_table import Table, as_table, typed
+from paramclient.sim.vehicle import Vehicle
 from paramclient.wire import frames, messages
 
 __all__ = ["Camera", "ExtEntries", "camera_table"]
@@ -49,15 +48,8 @@ def camera_table() -> ExtEntries:
     }
 
 
-@dataclass(slots=True)
-class _Work:
-    """A write that takes time: the value it sets, and when it ends."""
-
-    raw: bytes
-    ends_at: float
-
-
-class Camera(BytewiseVehicle):
+@dataclass(kw_only=True, eq=False, repr=False)
+class Camera(Vehicle):
     """A camera as in the MAVLink guide, "Extended Parameter Protocol".
 
     Requests for names and indices that it does not have are not answered, and a PARAM_EXT_SET of another type
@@ -65,7 +57,6 @@ class Camera(BytewiseVehicle):
 
     Args:
         table: the extended parameters, listed in the given order; by default those of `camera_table`.
-        system, component: the component's ids, 1 to 255.
         supported: for some names, the only values that the camera supports. Others are refused with
             PARAM_ACK_VALUE_UNSUPPORTED.
         failing: names that cannot be set: PARAM_ACK_FAILED.
@@ -74,52 +65,40 @@ class Camera(BytewiseVehicle):
         limits: for some names, the smallest and the largest value. Others are changed to the nearest.
         plain: plain parameters; by default none.
         burst, period: see `Vehicle`, also for the extended list.
-        options: those of every `Vehicle`.
+
+    Other arguments are those of every `Vehicle`.
 
     Raises:
         UsageError: an argument is invalid.
     """
 
-    def __init__(
-        self,
-        table: ExtEntries | None = None,
-        *,
-        system: int = 1,
-        component: int = CAMERA_COMPONENT,
-        supported: Mapping[str, Collection[WireValue]] | None = None,
-        failing: Iterable[str] = (),
-        slow: Mapping[str, float] | None = None,
-        limits: Mapping[str, tuple[float, float]] | None = None,
-        plain: Table = (),
-        burst: int = 5,
-        period: float = 0.01,
-        **options: Unpack[VehicleOptions],
-    ) -> None:
+    table: ExtEntries | None = field(default=None, kw_only=False)
+    component: int = CAMERA_COMPONENT
+    supported: Mapping[str, Collection[WireValue]] = field(default_factory=dict)
+    failing: Iterable[str] = ()
+    slow: Mapping[str, float] = field(default_factory=dict)
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    plain: Table = ()
+    burst: int = 5
+
+    def __post_init__(self) -> None:
         self._ext: dict[str, Param] = {}
-        for index, (name, entry) in enumerate((camera_table() if table is None else table).items()):
-            self._ext[check_name(name)] = _param(name, entry, index)
+        for name, entry in (camera_table() if self.table is None else self.table).items():
+            self.add_ext_param(name, entry)
+        for name in (*self.failing, *self.slow, *self.limits):
+            self.ext_param(name)
         self._supported = {
             name: {encode_ext_value(value, self.ext_param(name).type_number) for value in values}
-            for name, values in (supported or {}).items()
+            for name, values in self.supported.items()
         }
-        self._failing = {self.ext_param(name).name for name in failing}
-        self._slow = {self.ext_param(name).name: seconds for name, seconds in (slow or {}).items()}
-        self._limits = {self.ext_param(name).name: limit for name, limit in (limits or {}).items()}
-        self._at_work: dict[str, _Work] = {}
-        self._ext_position: int | None = None
-        self._ext_burst_at = math.inf
-        super().__init__(
-            as_table(plain),
-            system=system,
-            component=component,
-            encoding=Encoding.BYTEWISE,
-            heartbeat=messages.Heartbeat(
+        self._at_work: dict[str, tuple[float, bytes]] = {}
+        """Writes that take time: when each ends, and the value that it sets."""
+        self._set_up_table(
+            as_table(self.plain),
+            messages.Heartbeat(
                 MAV_TYPE_CAMERA, messages.MAV_AUTOPILOT_INVALID, system_status=messages.MAV_STATE_ACTIVE
             ),
-            version=messages.AutopilotVersion(8192, uid=0xCA3E_0000 + system),
-            burst=burst,
-            period=period,
-            **options,
+            messages.AutopilotVersion(8192, uid=0xCA3E_0000 + self.system),
         )
 
     @property
@@ -160,7 +139,9 @@ class Camera(BytewiseVehicle):
         """
         if check_name(name) in self._ext:
             raise UsageError(f"this camera has an extended parameter {name!r} already")
-        self._ext[name] = _param(name, entry, len(self._ext))
+        number, value = typed(entry)
+        data = encode_ext_value(check_ext_value(value), number)
+        self._ext[name] = ext_param(name, data, number, len(self._ext))
 
     def remove_ext_param(self, name: str) -> None:
         """Remove an extended parameter; the indices of later ones move.
@@ -174,109 +155,73 @@ class Camera(BytewiseVehicle):
     def respond(self, message: messages.Message, sender: frames.Frame) -> None:
         """See `Device.respond`."""
         if isinstance(message, messages.ParamExtRequestRead):
-            self._on_ext_read(message)
+            if message.param_index < 0:
+                self._send_ext(self._ext.get(message.param_id))
+            else:
+                self._send_ext(*list(self._ext.values())[message.param_index : message.param_index + 1])
         elif isinstance(message, messages.ParamExtRequestList):
-            if self._ext:
-                self._ext_position = 0
-                self._ext_burst_at = max(self._now, self._on_at + self._boot_time)
-        elif isinstance(message, messages.ParamExtSet):
-            self._on_ext_set(message)
+            self._ext_position = 0
+            self._due[self._send_ext_list] = max(self._now, self._on_at + self.boot_time)
+        elif isinstance(message, messages.ParamExtSet) and message.param_id in self._ext:
+            self._on_ext_set(self._ext[message.param_id], message)
         else:
             super().respond(message, sender)
 
-    def _on_ext_read(self, request: messages.ParamExtRequestRead) -> None:
-        found = self._ext.get(request.param_id)
-        if request.param_index >= 0:
-            found = next((each for each in self._ext.values() if each.index == request.param_index), None)
-        if found is not None:
-            self._send_ext(found)
-
-    def _on_ext_set(self, request: messages.ParamExtSet) -> None:
-        known = self._ext.get(request.param_id)
-        if known is None:
-            return
-        wanted = ext_param(known.name, request.raw, request.param_type)
-        is_supported = ext_bytes(wanted) in self._supported.get(known.name, (ext_bytes(wanted),))
-        if known.name in self._at_work:
-            self._acknowledge(known, ExtAckResult.IN_PROGRESS)
-        elif wanted.type != known.type or known.name in self._failing:
-            self._acknowledge(known, ExtAckResult.FAILED)
-        elif not is_supported:
-            self._acknowledge(known, ExtAckResult.VALUE_UNSUPPORTED)
-        elif known.name in self._slow and ext_bytes(wanted) != ext_bytes(known):
-            self._at_work[known.name] = _Work(ext_bytes(wanted), self._now + self._slow[known.name])
-            self._acknowledge(known, ExtAckResult.IN_PROGRESS)
+    def _on_ext_set(self, known: Param, request: messages.ParamExtSet) -> None:
+        name, wanted = known.name, ext_bytes(ext_param(known.name, request.raw, request.param_type))
+        is_change = wanted != ext_bytes(known)
+        if name in self._at_work:
+            self._send_ack(name, ExtAckResult.IN_PROGRESS)
+        elif request.param_type != known.type_number or name in self.failing:
+            self._send_ack(name, ExtAckResult.FAILED)
+        elif wanted not in self._supported.get(name, (wanted,)):
+            self._send_ack(name, ExtAckResult.VALUE_UNSUPPORTED)
+        elif name in self.slow and is_change:
+            self._at_work[name] = (self._now + self.slow[name], wanted)
+            self._sooner(self._end_work, self._now + self.slow[name])
+            self._send_ack(name, ExtAckResult.IN_PROGRESS)
         else:
-            self._acknowledge(self._store(known.name, ext_bytes(wanted)), ExtAckResult.ACCEPTED)
+            self._store(name, wanted)
+            self._send_ack(name, ExtAckResult.ACCEPTED)
 
-    def _acknowledge(self, param: Param, result: ExtAckResult) -> None:
-        self.send(messages.ParamExtAck(param.name, ext_bytes(param), param.type_number, result))
+    def _send_ack(self, name: str, result: ExtAckResult) -> None:
+        param = self._ext[name]
+        self.send(messages.ParamExtAck(name, ext_bytes(param), param.type_number, result))
 
-    def _store(self, name: str, raw: bytes) -> Param:
+    def _store(self, name: str, raw: bytes) -> None:
         known = self._ext[name]
         param = ext_param(name, raw, known.type_number, known.index)
-        if name in self._limits and isinstance(param.value, int | float):
-            low, high = self._limits[name]
+        if name in self.limits and isinstance(param.value, int | float):
+            low, high = self.limits[name]
             value = type(param.value)(min(max(param.value, low), high))
-            param = ext_param(
-                name, encode_ext_value(value, known.type_number), known.type_number, known.index
-            )
+            raw = encode_ext_value(value, known.type_number)
+            param = ext_param(name, raw, known.type_number, known.index)
         self._ext[name] = param
-        return param
 
-    def _send_ext(self, param: Param) -> None:
-        index = 0 if param.index is None else param.index
-        self.send(
-            messages.ParamExtValue(param.name, ext_bytes(param), param.type_number, len(self._ext), index)
-        )
+    def _send_ext(self, *params: Param | None) -> None:
+        for each in filter(None, params):
+            data, index = ext_bytes(each), each.index or 0
+            self.send(messages.ParamExtValue(each.name, data, each.type_number, len(self._ext), index))
 
     def _switch_on(self, at: float) -> None:
         self._at_work.clear()
-        self._ext_position = None
-        self._ext_burst_at = math.inf
+        self._ext_position = 0
         super()._switch_on(at)
 
-    def _timers(self) -> tuple[float, ...]:
-        return (*super()._timers(), *(work.ends_at for work in self._at_work.values()))
+    def _tasks(self) -> list[Callable[[float], None]]:
+        return [*super()._tasks(), self._end_work, self._send_ext_list]
 
-    def _next_transmission(self) -> float:
-        return min(super()._next_transmission(), self._ext_burst_at)
-
-    def _skip_suppressed(self) -> None:
-        super()._skip_suppressed()
-        self._ext_burst_at = max(self._now, self._ext_burst_at)
-
-    def _work(self, now: float) -> None:
-        super()._work(now)
-        for name, work in list(self._at_work.items()):
-            if work.ends_at <= now:
+    def _end_work(self, at: float) -> None:
+        for name, (ends_at, raw) in list(self._at_work.items()):
+            if ends_at <= at:
                 del self._at_work[name]
-                self._acknowledge(self._store(name, work.raw), ExtAckResult.ACCEPTED)
-        if self._high_latency:
-            return
-        while self._ext_burst_at <= now:
-            self._ext_burst_at += self._period
-            for _ in range(self._burst):
-                self._send_next_ext()
+                self._store(name, raw)
+                self._send_ack(name, ExtAckResult.ACCEPTED)
+        self._due[self._end_work] = min((ends_at for ends_at, _ in self._at_work.values()), default=math.inf)
 
-    def _send_next_ext(self) -> None:
-        """Send the next value of the extended list, or end the list."""
-        position = self._ext_position
-        entries = list(self._ext.values())
-        if position is None or position >= len(entries):
-            self._ext_position = None
-            self._ext_burst_at = math.inf
-            return
-        self._ext_position = position + 1
-        self._send_ext(entries[position])
-
-
-def _param(name: str, entry: WireValue | tuple[ParamType | int, WireValue], index: int) -> Param:
-    if isinstance(entry, tuple):
-        number, value = entry
-    else:
-        value = check_ext_value(entry)
-        kinds = ParamType
-        number = kinds.INT32 if isinstance(value, int) else kinds.CUSTOM
-        number = kinds.REAL32 if isinstance(value, float) else number
-    return ext_param(name, encode_ext_value(value, number), number, index)
+    def _send_ext_list(self, at: float) -> None:
+        """Send one burst of the extended list."""
+        start, self._ext_position = self._ext_position, self._ext_position + self.burst
+        self._send_ext(*list(self._ext.values())[start : self._ext_position])
+        if self._ext_position < len(self._ext):
+            self._due[self._send_ext_list] = at + self.period

@@ -5,131 +5,76 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
-from dataclasses import replace
-from typing import Final, TypedDict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from operator import itemgetter
+from typing import ClassVar
 
-from paramclient.errors import CommandResult, UsageError
+from paramclient.errors import CommandResult
 from paramclient.sim.air import OUT_LIMIT
+from paramclient.sim.param_table import check_range
 from paramclient.wire import frames, messages, signing
 
-__all__ = ["Device", "DeviceOptions"]
+__all__ = ["Device"]
 
 
-class DeviceOptions(TypedDict, total=False):
-    """Arguments of every kind of component; see `Vehicle`."""
-
-    boot_time: float
-    telemetry: float
-    mavlink_version: int
-    stream: bool
-    high_latency: bool
-    signing_key: signing.SigningKey | None
-    signing_timestamp: int
-    usb: bool
-    armed: bool
-    reboot_ack: bool
-    reboot_down: float
-
-
+@dataclass(kw_only=True, eq=False, repr=False)
 class Device:
     """A simulated component that is switched on and off, sends heartbeats, and executes commands.
 
     `Vehicle` adds the parameters, and documents the arguments and attributes.
+
+    All work is a method with one argument, the time at which it is due. `_due` has them with that time, in
+    the order in which work of one time is done; infinity stands for work that is not due.
     """
 
-    vehicle_count: Final = 1
+    vehicle_count: ClassVar = 1
     """See `Air.vehicle_count`."""
-    _ack_first = True
+    _ack_first: ClassVar = True
     """Whether COMMAND_ACK precedes the requested message."""
-    _restart_delay = 0.3
+    _restart_delay: ClassVar = 0.3
     """Seconds from accepting a reboot command until the vehicle switches off."""
-    _armed_result = CommandResult.DENIED
+    _armed_result: ClassVar = CommandResult.DENIED
     """MAV_RESULT of a reboot command while armed."""
-    _clock_delay = 0.0
+    _clock_delay: ClassVar = 0.0
     """Seconds from the first heartbeat until SYSTEM_TIME is sent, also on request."""
-    _start_state: tuple[int, float] | None = None
-    """MAV_STATE after a reboot, and its duration in seconds."""
-    _next_telemetry: float
 
-    def __init__(
-        self,
-        *,
-        system: int,
-        component: int,
-        heartbeat: messages.Heartbeat,
-        version: messages.AutopilotVersion,
-        boot_time: float = 0.0,
-        telemetry: float = 0.0,
-        mavlink_version: int = 2,
-        stream: bool = False,
-        high_latency: bool = False,
-        signing_key: signing.SigningKey | None = None,
-        signing_timestamp: int = 0,
-        usb: bool = False,
-        armed: bool = False,
-        reboot_ack: bool = True,
-        reboot_down: float = 1.0,
-    ) -> None:
-        for what, number in (("system", system), ("component", component)):
-            if not 1 <= number <= 255:
-                raise UsageError(f"{what} must be a number from 1 to 255, not {number}")
-        if mavlink_version not in (1, 2):
-            raise UsageError(f"mavlink_version must be 1 or 2, not {mavlink_version}")
-        if not boot_time >= 0.0:
-            raise UsageError(f"boot_time must be a number of seconds from 0 up, not {boot_time}")
-        if not 0.0 <= telemetry <= 10_000.0:
-            raise UsageError(f"telemetry must be 0 to 10000 messages per second, not {telemetry}")
-        if not reboot_down >= 0.0:
-            raise UsageError(f"reboot_down must be a number of seconds from 0 up, not {reboot_down}")
-        self.armed = armed
-        self.system = system
-        self.component = component
-        self.requests: Counter[str] = Counter()
-        self._high_latency = high_latency
-        self._reboot_ack = reboot_ack
-        self._reboot_down = reboot_down
+    system: int = 1
+    component: int = 1
+    armed: bool = False
+    boot_time: float = 0.0
+    telemetry: float = 0.0
+    mavlink_version: int = 2
+    stream: bool = False
+    signing_key: signing.SigningKey | None = None
+    signing_timestamp: int = 0
+    usb: bool = False
+    reboot_ack: bool = True
+    reboot_down: float = 1.0
+
+    def _set_up(self, heartbeat: messages.Heartbeat, version: messages.AutopilotVersion) -> None:
+        """Check the arguments, and prepare the first start."""
+        check_range(1, 255, system=self.system, component=self.component)
+        check_range(1, 2, mavlink_version=self.mavlink_version)
+        check_range(0.0, boot_time=self.boot_time)
+        check_range(0.0, 10_000.0, telemetry=self.telemetry)
+        check_range(0.0, math.inf, reboot_down=self.reboot_down)
         self._heartbeat = heartbeat
         self.version = version
-        self._boot_time = boot_time
-        self._telemetry_period = 1.0 / telemetry if telemetry else math.inf
-        self._mavlink_version = mavlink_version
-        self._framer = frames.Framer(messages.DECODED_IDS, stream=stream)
-        self._usb = usb
-        self._signer: signing.Signer | None = None
-        self._verifier: signing.Verifier | None = None
+        self.requests: Counter[str] = Counter()
+        self._framer = frames.Framer(messages.DECODED_IDS, stream=self.stream)
         self._sequence = 0
         self._out: list[bytes] = []
         self._started = False
         self._is_first_run = True
         self._now = -math.inf
+        self._take_key(self.signing_key, self.signing_timestamp)
         self._switch_on(math.inf)
-        self._take_key(signing_key, signing_timestamp)
-
-    @property
-    def signing_key(self) -> signing.SigningKey | None:
-        """The current signing key; None without signing."""
-        return None if self._signer is None else self._signer.key
 
     @property
     def signing_report(self) -> signing.SigningReport | None:
         """The statistics of received signatures; None without a key."""
         return None if self._verifier is None else self._verifier.report()
-
-    @property
-    def high_latency(self) -> bool:
-        """Whether the component is in high-latency mode (PX4's `MAVLINK_MODE_IRIDIUM`); can be changed at any
-        time.
-
-        HIGH_LATENCY2 every 5 s then replaces heartbeat and telemetry; lists, files and pushes wait.
-        """
-        return self._high_latency
-
-    @high_latency.setter
-    def high_latency(self, is_on: bool) -> None:
-        if is_on != self._high_latency:
-            self._high_latency = is_on
-            self._next_heartbeat = max(self._now, self._on_at)
-            self._skip_suppressed()
 
     def reboot(self, now: float | None = None, *, down: float = 0.0) -> None:
         """Switch off at `now`, and on again `down` seconds later, never if that is `math.inf`.
@@ -162,18 +107,12 @@ class Device:
         if not self._started:
             self._started = True
             self._switch_on(now)
-        if self._restart_at <= now:
-            self.reboot(self._restart_at, down=self._reboot_down)
-            self._now = now
-        if now >= self._on_at:
-            self._work(now)
+        self._work(now)
 
     def next_deadline(self) -> float | None:
         """Return the time of the next work; None before the first call, and if switched off permanently."""
-        if self._now < self._on_at:
-            return None if self._on_at == math.inf else self._on_at
-        due = [self._next_heartbeat, self._restart_at, self._clock_due, *self._timers()]
-        return min(due) if self._high_latency else min(self._next_transmission(), *due)
+        due = self._on_at if self._now < self._on_at else min(self._due.values())
+        return None if due == math.inf else due
 
     def data_to_send(self) -> list[bytes]:
         """Return the frames to send, and clear them."""
@@ -195,73 +134,76 @@ class Device:
                 system=self.system,
                 component=self.component,
                 sequence=self._sequence,
-                version=self._mavlink_version,
+                version=self.mavlink_version,
             )
         )
+
+    # Time
+
+    def _switch_on(self, at: float) -> None:
+        """Reset the state, and switch on at the time `at`; `math.inf` leaves the component off."""
+        self._on_at = at
+        self._sequence = 0
+        self._due: dict[Callable[[float], None], float] = dict.fromkeys(self._tasks(), math.inf)
+        self._due[self._send_heartbeat] = at
+        if self.telemetry:
+            self._due[self._send_telemetry] = at + 1.0 / self.telemetry
+        self._forget_streams()
+
+    def _tasks(self) -> list[Callable[[float], None]]:
+        """Return all kinds of work, in the order of work that is due at one time."""
+        return [self._restart, self._send_system_time, self._send_heartbeat, self._send_telemetry]
+
+    def _work(self, now: float) -> None:
+        """Do the due work."""
+        while now >= self._on_at:
+            task, at = min(self._due.items(), key=itemgetter(1))
+            if at > now:
+                return
+            self._due[task] = math.inf
+            task(at)
+
+    def _sooner(self, task: Callable[[float], None], at: float) -> None:
+        """Do the work at this time, if it is not due before."""
+        self._due[task] = min(self._due[task], at)
+
+    def _again(self, at: float, period: float) -> float:
+        """Return when repeated work is due next; a call that is late by more than 1 s skips periods."""
+        return at + period if at + period > self._now - 1.0 else self._now + period
 
     # Implemented by subclasses
 
     def _answers_system(self, target: int) -> bool:
         return target in (0, self.system)
 
-    def _timers(self) -> tuple[float, ...]:
-        """Return deadlines other than those of heartbeat, telemetry and list."""
-        return ()
-
-    def _next_transmission(self) -> float:
-        """Return the time of the next transmission that high-latency mode suppresses."""
-        return self._next_telemetry
-
     def _end_all(self) -> None:
         """End all operations on switching off, and apply values that take effect after a reboot."""
         self._out.clear()
         self._framer.flush()
 
-    def _may_restart(self, mode: int) -> int:
-        """Return the MAV_RESULT of MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN with this first parameter."""
+    def _restart_result(self, mode: int) -> CommandResult:
+        """Return the result of MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN with this first parameter."""
         if self.armed:
             return self._armed_result
         return CommandResult.ACCEPTED if mode == _REBOOT else CommandResult.UNSUPPORTED
 
-    def _skip_suppressed(self) -> None:
-        """Move deadlines that passed in high-latency mode to now, each only once."""
-        self._next_telemetry = max(self._now, self._next_telemetry)
+    def _state_after_reboot(self) -> tuple[int, float]:
+        """Return the MAV_STATE after a reboot, and its duration in seconds."""
+        return messages.MAV_STATE_ACTIVE, 0.0
 
-    def _switch_on(self, at: float) -> None:
-        """Reset the state, and switch on at the time `at`; `math.inf` leaves the component off."""
-        self._on_at = at
-        self._sequence = 0
-        self._restart_at = math.inf
-        self._clock_due = math.inf
-        self._next_heartbeat = at
-        self._next_telemetry = at + self._telemetry_period
-        self._forget_streams()
+    def _send_clock(self, now: float) -> None:
+        """Send the message with the time since boot, once a second."""
+        self._send_system_time(now)
 
-    def _work(self, now: float) -> None:
-        """Do the due work, each part with its own period; a late call skips periods of repeated work."""
-        if self._clock_due <= now:
-            self._clock_due = math.inf
-            self._send_system_time(now)
-        if self._next_heartbeat <= now:
-            pause = _HIGH_LATENCY_PAUSE if self._high_latency else 1.0
-            self._send_heartbeat(now)
-            self._next_heartbeat += pause
-            if self._next_heartbeat <= now:
-                self._next_heartbeat = now + pause
-        if self._high_latency:
-            return
-        if self._next_telemetry <= now:
-            late = now - self._next_telemetry
-            for _ in range(int(min(late, 1.0) / self._telemetry_period) + 1):
-                self._send_attitude(now)
-            self._next_telemetry += (int(late / self._telemetry_period) + 1) * self._telemetry_period
-            if self._next_telemetry <= now:
-                self._next_telemetry = now + self._telemetry_period
+    def _time_boot_ms(self, now: float) -> int:
+        """Return the time since switching on in milliseconds, in 32 bits."""
+        return int((now - self._on_at) * 1000.0) & 0xFFFFFFFF
 
     # Internal
 
     def _take_key(self, key: signing.SigningKey | None, timestamp: int) -> None:
         """Sign with another key from now on, or not at all."""
+        self.signing_key = key
         self._signer = None if key is None else signing.Signer(key, timestamp=timestamp)
         self._forget_streams()
 
@@ -269,51 +211,50 @@ class Device:
         """Forget the timestamps of all signing streams, as after a start."""
         self._verifier = None
         if self._signer is not None:
-            policy = signing.SigningPolicy.ACCEPT_ALL if self._usb else signing.SigningPolicy.UNSIGNED_RADIOS
+            policy = signing.SigningPolicy.ACCEPT_ALL if self.usb else signing.SigningPolicy.UNSIGNED_RADIOS
             self._verifier = signing.Verifier(self._signer, policy, most_streams=_STREAMS_MAX)
         self._framer.guard = None if self._verifier is None else self._verifier.accepts
 
-    def _send_heartbeat(self, now: float) -> None:
-        if self._high_latency:
-            self.send(messages.HighLatency2(self._heartbeat.type, self._heartbeat.autopilot))
-            return
+    def _restart(self, at: float) -> None:
+        now = self._now
+        self.reboot(at, down=self.reboot_down)
+        self._now = now
+
+    def _send_heartbeat(self, at: float) -> None:
+        self._due[self._send_heartbeat] = self._again(at, 1.0)
         self.send(self._beat)
-        self._send_clock(now)
+        self._send_clock(self._now)
 
-    def _send_clock(self, now: float) -> None:
-        """Send the message with the time since boot, once a second."""
-        self._send_system_time(now)
-
-    def _send_system_time(self, now: float) -> None:
-        self.send(messages.SystemTime(0, self._time_boot_ms(now)))
-
-    def _time_boot_ms(self, now: float) -> int:
-        """Return the time since switching on in milliseconds, in 32 bits."""
-        return int((now - self._on_at) * 1000.0) & 0xFFFFFFFF
+    def _send_system_time(self, at: float) -> None:
+        self.send(messages.SystemTime(0, self._time_boot_ms(self._now)))
 
     @property
     def _beat(self) -> messages.Heartbeat:
         """The current heartbeat."""
         beat = self._heartbeat
-        if self._start_state is not None and not self._is_first_run:
-            state, seconds = self._start_state
-            if self._now < self._on_at + seconds:
-                beat = replace(beat, system_status=state)
-        if self._now < self._on_at + self._boot_time:
+        state, seconds = self._state_after_reboot()
+        if self._now < self._on_at + self.boot_time:
             beat = replace(beat, system_status=messages.MAV_STATE_BOOT)
+        elif not self._is_first_run and self._now < self._on_at + seconds:
+            beat = replace(beat, system_status=state)
         if self.armed:
             beat = replace(beat, base_mode=beat.base_mode | messages.MAV_MODE_FLAG_SAFETY_ARMED)
         return beat
 
-    def _send_attitude(self, now: float) -> None:
+    def _send_telemetry(self, at: float) -> None:
+        self._due[self._send_telemetry] = self._again(at, 1.0 / self.telemetry)
+        self._send_attitude()
+
+    def _send_attitude(self) -> None:
+        payload = self._time_boot_ms(self._now).to_bytes(4, "little") + _LEVEL_FLIGHT
         self._queue(
             frames.build_frame(
                 _ATTITUDE,
-                self._time_boot_ms(now).to_bytes(4, "little") + _LEVEL_FLIGHT,
+                payload,
                 system=self.system,
                 component=self.component,
                 sequence=self._sequence,
-                version=self._mavlink_version,
+                version=self.mavlink_version,
             )
         )
 
@@ -328,66 +269,51 @@ class Device:
         message = messages.decode(frame)
         if isinstance(message, messages.Heartbeat):
             self.requests["HEARTBEAT"] += 1
+        name = _REQUESTS.get(type(message))
+        if message is None or name is None:
             return
-        if not isinstance(
-            message,
-            messages.ParamRequestRead
-            | messages.ParamRequestList
-            | messages.ParamSet
-            | messages.ParamExtRequestRead
-            | messages.ParamExtRequestList
-            | messages.ParamExtSet
-            | messages.CommandLong
-            | messages.FileTransfer
-            | messages.SetupSigning,
-        ):
-            return
-        if not self._answers_system(message.target_system):
-            return
-        if message.target_component not in (messages.COMP_ID_ALL, self.component):
-            return
-        self.requests[_NAMES[type(message)]] += 1
-        self.respond(message, frame)
+        system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
+        if self._answers_system(system) and component in (messages.COMP_ID_ALL, self.component):
+            self.requests[name] += 1
+            self.respond(message, frame)
 
     def _on_command(self, request: messages.CommandLong, sender: frames.Frame) -> None:
+        wanted = request.param1 if request.command == messages.MAV_CMD_REQUEST_MESSAGE else math.nan
         if request.command == messages.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN:
-            self._on_restart_command(int(request.param1), sender)
-            return
-        requested: messages.Message | None = None
-        if request.command == messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES:
-            requested = self.version
-        elif request.command == messages.MAV_CMD_REQUEST_MESSAGE:
-            known: dict[float, messages.Message] = {
-                messages.message_id(messages.AutopilotVersion): self.version,
-                messages.message_id(messages.Heartbeat): self._beat,
-            }
-            requested = known.get(request.param1)  # a float, possibly NaN
-            if request.param1 == messages.message_id(messages.SystemTime):
-                self._on_clock_request(sender)
-                return
-        result = CommandResult.UNSUPPORTED if requested is None else CommandResult.ACCEPTED
+            result = self._restart_result(int(request.param1))
+            if result == CommandResult.ACCEPTED and request.param1 == _REBOOT:
+                self._sooner(self._restart, self._now + self._restart_delay)
+                if not self.reboot_ack:
+                    return
+            self._acknowledge(request, sender, result)
+        elif wanted == messages.message_id(messages.SystemTime):
+            self._acknowledge(request, sender)
+            self._due[self._send_system_time] = max(self._now, self._on_at + self._clock_delay)
+        elif wanted == messages.message_id(messages.Heartbeat):
+            self._acknowledge(request, sender, message=self._beat)
+        elif (
+            request.command == messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES
+            or wanted == messages.message_id(messages.AutopilotVersion)
+        ):
+            self._acknowledge(request, sender, message=self.version)
+        else:
+            self._acknowledge(request, sender, CommandResult.UNSUPPORTED)
+
+    def _acknowledge(
+        self,
+        request: messages.CommandLong,
+        sender: frames.Frame,
+        result: CommandResult = CommandResult.ACCEPTED,
+        message: messages.Message | None = None,
+    ) -> None:
+        """Send COMMAND_ACK, with the requested message before or after it."""
         ack = messages.CommandAck(request.command, result, sender.system, sender.component)
-        answers: list[messages.Message] = [ack] if requested is None else [ack, requested]
+        answers = [ack] if message is None else [ack, message]
         for answer in answers if self._ack_first else reversed(answers):
             self.send(answer)
 
-    def _on_clock_request(self, sender: frames.Frame) -> None:
-        """Acknowledge a request for SYSTEM_TIME, and send the message as soon as the main loop runs."""
-        number, result = messages.MAV_CMD_REQUEST_MESSAGE, CommandResult.ACCEPTED
-        self.send(messages.CommandAck(number, result, sender.system, sender.component))
-        self._clock_due = max(self._now, self._on_at + self._clock_delay)
 
-    def _on_restart_command(self, mode: int, sender: frames.Frame) -> None:
-        result = self._may_restart(mode)
-        is_obeyed = result == CommandResult.ACCEPTED and mode == _REBOOT
-        if is_obeyed:
-            self._restart_at = min(self._restart_at, self._now + self._restart_delay)
-        if self._reboot_ack or not is_obeyed:
-            command = messages.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
-            self.send(messages.CommandAck(command, result, sender.system, sender.component))
-
-
-_NAMES = {
+_REQUESTS: dict[type, str] = {
     messages.ParamRequestRead: "PARAM_REQUEST_READ",
     messages.ParamRequestList: "PARAM_REQUEST_LIST",
     messages.ParamSet: "PARAM_SET",
@@ -402,7 +328,5 @@ _REBOOT = 1
 """Value of the command that reboots the autopilot; other values shut down, or stay in the bootloader."""
 _ATTITUDE = 30
 _LEVEL_FLIGHT = struct.pack("<6f", 0.0, 0.0, 0.5, 0.0, 0.0, 0.01)
-_HIGH_LATENCY_PAUSE = 5.0
-"""Seconds between two HIGH_LATENCY2."""
 _STREAMS_MAX = 16
 """MAVLINK_MAX_SIGNING_STREAMS of the C library, which both autopilots use."""

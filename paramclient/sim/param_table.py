@@ -5,20 +5,22 @@ from __future__ import annotations
 import csv
 import math
 import struct
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
-from typing import TypeAlias
+from typing import SupportsIndex, TypeAlias
 
+from paramclient.errors import UsageError
 from paramclient.model.values import (
     Encoding,
     Param,
     ParamType,
     WireValue,
+    as_reported,
     bits_of,
     check_name,
-    check_value,
     from_bits,
     known_type,
 )
@@ -30,8 +32,12 @@ __all__ = [
     "Table",
     "ardupilot_table",
     "as_table",
+    "check_names",
+    "check_range",
+    "distance",
     "ek2_group",
     "px4_table",
+    "typed",
     "with_system_id",
 ]
 
@@ -84,20 +90,16 @@ class Entry:
         raw: the four bytes of the value in a message.
     """
 
-    __slots__ = (
-        *("_encoding", "_packed"),
-        *("bits", "default", "index", "name", "order", "raw", "type", "volatile"),
-    )
+    __slots__ = ("_encoding", "_packed", "bits", "index", "name", "order", "raw", "row", "type")
 
     def __init__(self, row: SimParam, order: int, encoding: Encoding) -> None:
         self._encoding = encoding
+        self.row = row
         self.name = row.name
         self.type = row.type
-        self.volatile = row.volatile
-        self.default = row.default
         self.order = order
-        self._packed: PackedParam | None = None
         self.index: int | None = None
+        self._packed: PackedParam | None = None
         self.store(row.bits)
 
     @property
@@ -111,38 +113,19 @@ class Entry:
     @property
     def packed(self) -> PackedParam | None:
         """The entry in param.pck, with its default if that differs; None for a type that param.pck lacks."""
-        if self._packed is None and isinstance(self.type, ParamType) and self.type in PACKABLE:
-            default = None
-            if self.default is not None and self._differs_from(self.default):
-                is_float = self.type is ParamType.REAL32
-                raw = (
-                    _cast(self.default) if is_float else int(self.default).to_bytes(8, "little", signed=True)
-                )
-                default = int.from_bytes(raw[: self.type.size], "little")
-            self._packed = PackedParam(self.name, self.type, self.bits, default)
+        if self._packed is None and self.type in PACKABLE:
+            kind, default, other = ParamType(self.type), self.row.default, None
+            if default is not None and not distance(self.value, default) < FLT_EPSILON:
+                whole = int(default) & (1 << 8 * kind.size) - 1
+                other = whole if kind.is_integer else bits_of(default, kind)
+            self._packed = PackedParam(self.name, kind, self.bits, other)
         return self._packed
 
     def store(self, bits: int) -> None:
         """Set another value."""
         self.bits = bits
         self._packed = None
-        value = self.value
-        if (
-            self._encoding is Encoding.BYTEWISE
-            or self.type == ParamType.REAL32
-            or isinstance(value, bytes | str)
-        ):
-            self.raw = (bits & 0xFFFFFFFF).to_bytes(4, "little")
-        else:
-            self.raw = _cast(value)
-
-    def _differs_from(self, default: float) -> bool:
-        """Compare as ArduPilot does: as float32, and with a tolerance of FLT_EPSILON."""
-        value = self.value
-        if isinstance(value, bytes | str):
-            return True
-        difference = struct.unpack("<f", _cast(value))[0] - struct.unpack("<f", _cast(default))[0]
-        return not abs(difference) < FLT_EPSILON
+        self.raw = as_reported(bits, self.type, self._encoding)
 
 
 def as_table(table: Table) -> tuple[SimParam, ...]:
@@ -151,9 +134,18 @@ def as_table(table: Table) -> tuple[SimParam, ...]:
     Raises:
         UsageError: a name or value is invalid.
     """
-    if isinstance(table, Mapping):
-        return tuple(_row(name, entry) for name, entry in table.items())
-    return tuple(table)
+    if not isinstance(table, Mapping):
+        return tuple(table)
+    return tuple(SimParam(name, *typed(entry)) for name, entry in table.items())
+
+
+def typed(entry: WireValue | tuple[ParamType | int, WireValue]) -> tuple[ParamType | int, WireValue]:
+    """Return the type and the value of an entry of a mapping."""
+    if isinstance(entry, tuple):
+        return entry
+    if isinstance(entry, bytes | str):
+        return ParamType.CUSTOM, entry
+    return ParamType.INT32 if isinstance(entry, SupportsIndex) else ParamType.REAL32, entry
 
 
 def with_system_id(rows: Iterable[SimParam], name: str, system: int) -> tuple[SimParam, ...]:
@@ -164,13 +156,11 @@ def with_system_id(rows: Iterable[SimParam], name: str, system: int) -> tuple[Si
 @cache
 def px4_table() -> tuple[SimParam, ...]:
     """Return the 903 parameters of a PX4 1.17 quad, read from a real one; 58 of them are volatile."""
-    rows = []
-    for row in _read("px4.csv"):
-        kind = ParamType[row["type"]]
-        rows.append(
-            SimParam(row["name"], kind, from_bits(int(row["bits"], 16), kind), row["volatile"] == "1")
-        )
-    return tuple(rows)
+    kinds = ((row, ParamType[row["type"]]) for row in _read("px4.csv"))
+    return tuple(
+        SimParam(row["name"], kind, from_bits(int(row["bits"], 16), kind), row["volatile"] == "1")
+        for row, kind in kinds
+    )
 
 
 @cache
@@ -185,11 +175,26 @@ def ek2_group() -> tuple[SimParam, ...]:
     return tuple(map(_plain, _read("ardupilot_ek2.csv")))
 
 
-def _row(name: str, entry: WireValue | tuple[ParamType | int, WireValue]) -> SimParam:
-    if isinstance(entry, tuple):
-        return SimParam(name, *entry)
-    value = check_value(entry)
-    return SimParam(name, ParamType.REAL32 if isinstance(value, float) else ParamType.INT32, value)
+def check_range(low: float, high: float = sys.float_info.max, /, **numbers: float) -> None:
+    """Raise UsageError, with the name, unless all these numbers are from `low` to `high`."""
+    for name, number in numbers.items():
+        if not low <= number <= high:
+            limits = f"{low:g} or more" if high == sys.float_info.max else f"{low:g} to {high:g}"
+            raise UsageError(f"{name} must be {limits}, not {number}")
+
+
+def check_names(known: Iterable[SimParam], *names: Iterable[str]) -> None:
+    """Raise UsageError unless all these names are in the table."""
+    if unknown := set().union(*names).difference(row.name for row in known):
+        raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
+
+
+def distance(value: WireValue, other: WireValue) -> float:
+    """Return how far two numbers are apart as float32; infinite for values that are no numbers."""
+    if isinstance(value, bytes | str) or isinstance(other, bytes | str):
+        return math.inf
+    one, two = struct.unpack("<ff", struct.pack("<ff", value, other))
+    return abs(float(one) - float(two))
 
 
 def _plain(row: dict[str, str]) -> SimParam:
@@ -202,11 +207,3 @@ def _plain(row: dict[str, str]) -> SimParam:
 def _read(name: str) -> Iterable[dict[str, str]]:
     text = resources.files(__package__).joinpath("tables", name).read_text(encoding="ascii")
     return csv.DictReader(text.splitlines())
-
-
-def _cast(value: float) -> bytes:
-    """Return a number cast to float as in C; a REAL64 beyond its range becomes infinite."""
-    try:
-        return struct.pack("<f", value)
-    except OverflowError:
-        return struct.pack("<f", math.copysign(math.inf, value))

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-import operator
 import zlib
-from collections.abc import Iterable, Mapping
-from typing import Final, Unpack
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Final
 
-from paramclient.errors import CommandResult, ParamErrorCode, UsageError
+from paramclient.errors import CommandResult, ParamErrorCode
 from paramclient.model.px4_hash import crc32_px4, hash_params
-from paramclient.model.values import Encoding, ParamType, WireValue, bits_of, from_bits
+from paramclient.model.values import ParamType, WireValue, bits_of, from_bits
 from paramclient.sim.ftp import FileServer
-from paramclient.sim.generic import BytewiseVehicle
 from paramclient.sim.metadata import GENERAL_FILE, metadata_files
 from paramclient.sim.param_table import (
     FLT_EPSILON,
@@ -20,40 +19,39 @@ from paramclient.sim.param_table import (
     SimParam,
     Table,
     as_table,
+    check_names,
+    check_range,
+    distance,
     px4_table,
     with_system_id,
 )
-from paramclient.sim.vehicle import SIMULATED_COMMIT, VehicleOptions
+from paramclient.sim.vehicle import SIMULATED_COMMIT, Vehicle
 from paramclient.wire import frames, messages
 
 __all__ = ["PX4Vehicle"]
 
-_UNINIT: Final = 0  # MAV_STATE
-
-UPPER_LIMITS: Final[tuple[tuple[str, str | float], ...]] = (
-    ("MPC_TILTMAX_AIR", 89.0),
-    ("MPC_TILTMAX_LND", "MPC_TILTMAX_AIR"),
-    ("MPC_XY_CRUISE", "MPC_XY_VEL_MAX"),
-    ("MPC_VEL_MANUAL", "MPC_XY_VEL_MAX"),
-    ("MPC_VEL_MAN_BACK", "MPC_VEL_MANUAL"),
-    ("MPC_VEL_MAN_SIDE", "MPC_VEL_MANUAL"),
-    ("MPC_Z_V_AUTO_UP", "MPC_Z_VEL_MAX_UP"),
-    ("MPC_Z_V_AUTO_DN", "MPC_Z_VEL_MAX_DN"),
-    ("MPC_THR_HOVER", "MPC_THR_MAX"),
+LIMITS: Final[tuple[tuple[str, Callable[[float, float], float], str | float], ...]] = (
+    ("MPC_TILTMAX_AIR", min, 89.0),
+    ("MPC_TILTMAX_LND", min, "MPC_TILTMAX_AIR"),
+    ("MPC_XY_CRUISE", min, "MPC_XY_VEL_MAX"),
+    ("MPC_VEL_MANUAL", min, "MPC_XY_VEL_MAX"),
+    ("MPC_VEL_MAN_BACK", min, "MPC_VEL_MANUAL"),
+    ("MPC_VEL_MAN_SIDE", min, "MPC_VEL_MANUAL"),
+    ("MPC_Z_V_AUTO_UP", min, "MPC_Z_VEL_MAX_UP"),
+    ("MPC_Z_V_AUTO_DN", min, "MPC_Z_VEL_MAX_DN"),
+    ("MPC_THR_HOVER", min, "MPC_THR_MAX"),
+    ("MPC_THR_HOVER", max, "MPC_THR_MIN"),
 )
-"""Limits that PX4's position controller enforces from above: parameters, and their largest value or the
-parameter that has it (measured with 1.17)."""
-LOWER_LIMITS: Final = (("MPC_THR_HOVER", "MPC_THR_MIN"),)
-"""Limits that PX4's position controller enforces from below: parameters, and the one with their smallest
-value (measured with 1.17)."""
-
+"""Limits that PX4's position controller enforces: parameters, the choice of the lower or the higher value,
+and the limit or the parameter that has it (measured with 1.17)."""
 RESET_KEEPS: Final = (
     *("SYS_AUTOSTART", "SYS_PARAM_VER", "RC", "CAL_", "COM_FLTMODE", "LND_FLIGHT", "TC_", "COM_FLIGHT"),
 )
 """Prefixes of names that SYS_AUTOCONFIG does not reset (the start script `rcS` of PX4 1.16)."""
 
 
-class PX4Vehicle(BytewiseVehicle):
+@dataclass(kw_only=True, eq=False, repr=False)
+class PX4Vehicle(Vehicle):
     """A PX4 autopilot, version 1.17, as measured; with `param_error` as newer versions.
 
     - PARAM_REQUEST_LIST: `_HASH_CHECK` first (type UINT32, index 65535), then all parameters in use, sorted
@@ -69,7 +67,7 @@ class PX4Vehicle(BytewiseVehicle):
     - Changes by `load`, and by MAV_CMD_PREFLIGHT_STORAGE with 2, which restores all values of the table, are
       never announced.
     - The position controller checks its parameters 0.4 s after one of them has changed, and sets those beyond
-      their limit to the limit (see `UPPER_LIMITS`); a real one takes 10 ms to 1.1 s. These changes are sent
+      their limit to the limit (see `LIMITS`); a real one takes 10 ms to 1.1 s. These changes are sent
       like any other.
     - A change of a float by at most 1.19e-7 does not count as a change: the value is neither sent again nor
       saved on its own. After a reboot the earlier value is back, unless another change caused a save. A value
@@ -90,19 +88,17 @@ class PX4Vehicle(BytewiseVehicle):
       on a real one.
 
     Args:
-        table: the parameters (see `Table`), in any order; None for those of a real quad, `px4_table()`.
-            MAV_SYS_ID, if the table has it, is set to `system`.
-        system, component: the vehicle's ids, 1 to 255.
+        table: the parameters (see `Table`), in any order; None for those of a real quad, `px4_table()`, with
+            some more that are not in use: from the second start on CAL_BARO1_ID to CAL_BARO3_ID, when the
+            firmware has stored the sensors that it found at the first (a real one had 908 parameters, then
+            905), and 16 of CAL_MAG2_* until CAL_MAG2_ID changes. MAV_SYS_ID, if the table has it, is set to
+            `system`.
         uid: the reported hardware id; by default unique for every system.
         hash_check: whether the vehicle has `_HASH_CHECK`; the parameter MAV_HASH_CHK_EN at 0 also disables
             it.
         not_in_use: names in the table that the firmware has not used yet.
-        first_start_only: names that are not in use from the second start on, when the firmware has stored
-            the sensors that it found at the first. None: with the table of the real quad, CAL_BARO1_ID to
-            CAL_BARO3_ID (a real one had 908 parameters, then 905); with another table, nothing.
         late_use: by the name of one parameter, those that come into use 10 ms after it changes. Until then
-            they are not in use. None: with the table of the real quad, CAL_MAG2_ID brings 16 more of
-            CAL_MAG2_*; with another table, nothing.
+            they are not in use.
         unsaved: names that the firmware has changed during boot and not saved.
         autosave: seconds from a change until all unsaved values are saved, if none were saved in the
             last 2 s. With 0, values are saved before they can be sent again.
@@ -112,103 +108,76 @@ class PX4Vehicle(BytewiseVehicle):
         ftp: whether there is a param.pck, as after 1.17; otherwise the response is file not found.
         ftp_rate: bytes per second of a burst of MAVFTP. By default UDP as measured.
         metadata: whether the vehicle serves descriptions of its parameters, as boards with enough memory do.
-        options: those of every `Vehicle`. A list requested within `boot_time` starts after it.
+
+    Other arguments are those of every `Vehicle`. A list requested within `boot_time` starts after it.
 
     Raises:
         UsageError: an argument is invalid.
     """
 
-    _ack_first = False
-    _restart_delay = 0.4
-    _start_state = (_UNINIT, 3.0)
-    _push_at: float
-    _wake_at: float
-    _save_at: float
-    _clamp_at: float
+    _ack_first: ClassVar = False
+    _restart_delay: ClassVar = 0.4
 
-    def __init__(
-        self,
-        *,
-        system: int = 1,
-        component: int = 1,
-        uid: int | None = None,
-        table: Table | None = None,
-        hash_check: bool = True,
-        not_in_use: Iterable[str] = (),
-        first_start_only: Iterable[str] | None = None,
-        late_use: Mapping[str, Iterable[str]] | None = None,
-        unsaved: Iterable[str] = (),
-        autosave: float = 0.3,
-        clamp_delay: float | None = 0.4,
-        burst: int = 20,
-        period: float = 0.020,
-        ftp: bool = False,
-        ftp_rate: float = 1_500_000.0,
-        metadata: bool = False,
-        **options: Unpack[VehicleOptions],
-    ) -> None:
-        built_in = px4_table() if table is None else as_table(table)
-        rows = with_system_id(built_in, _SYSTEM_ID, system)
-        if table is None and late_use is None:
+    table: Table | None = None
+    uid: int | None = None
+    hash_check: bool = True
+    not_in_use: Iterable[str] = ()
+    late_use: Mapping[str, Iterable[str]] | None = None
+    unsaved: Iterable[str] = ()
+    autosave: float = 0.3
+    clamp_delay: float | None = 0.4
+    burst: int = 20
+    period: float = 0.020
+    ftp: bool = False
+    ftp_rate: float = 1_500_000.0
+    metadata: bool = False
+
+    def __post_init__(self) -> None:
+        is_built_in = self.table is None
+        table = px4_table() if self.table is None else as_table(self.table)
+        rows = with_system_id(table, _SYSTEM_ID, self.system)
+        commit = SIMULATED_COMMIT + (SIMULATED_COMMIT if is_built_in else _checksum(rows))
+        late_use = self.late_use or {}
+        if is_built_in and self.late_use is None:
             compass = _third_compass(rows)
             late_use = {"CAL_MAG2_ID": [row.name for row in compass]}
             rows += compass
-        self._late_use = {name: frozenset(more) for name, more in (late_use or {}).items()}
-        self._first_unused = frozenset(not_in_use).union(*self._late_use.values())
-        if first_start_only is None:
-            first_start_only = _FIRST_START_ONLY if table is None else ()
-        self._first_start_only = frozenset(first_start_only)
-        self._has_stored = False  # whether the sensors of the first start are stored
-        self._first_unsaved = frozenset(unsaved)
-        unknown = self._first_unused | self._first_start_only | self._first_unsaved | self._late_use.keys()
-        if unknown := unknown.difference(row.name for row in rows):
-            raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
-        if not autosave >= 0.0:
-            raise UsageError(f"autosave must be a number of seconds from 0 up, not {autosave}")
-        if clamp_delay is not None and not clamp_delay >= 0.0:
-            raise UsageError(f"clamp_delay must be a number of seconds from 0 up, not {clamp_delay}")
-        self._clamp_delay = clamp_delay
-        self.file_server = FileServer(self._packed_params if ftp else lambda: None, ftp_rate, is_px4=True)
-        self._has_metadata = metadata
-        if metadata:
-            if options.get("mavlink_version") == 1:
-                raise UsageError("COMPONENT_METADATA does not exist in MAVLink 1")
-            self.file_server.files |= metadata_files(rows)
-        self._first_bits = {row.name: row.bits for row in rows}
+        self._late_use = {name: frozenset(more) for name, more in late_use.items()}
+        self._never_used = frozenset(self.not_in_use).union(*self._late_use.values())
+        self._used_once = _FIRST_START_ONLY if is_built_in else frozenset()
+        check_names(rows, self._never_used, self._late_use)
+        check_range(0.0, autosave=self.autosave, clamp_delay=self.clamp_delay or 0.0)
+        files = FileServer(self._packed_params if self.ftp else lambda: None, self.ftp_rate, is_px4=True)
+        if self.metadata:
+            check_range(2, mavlink_version=self.mavlink_version)
+            files.files |= metadata_files(rows)
         self._hash: int | None = None
-        self._hash_check = hash_check
-        self._autosave = autosave
-        super().__init__(
+        self._set_up_table(
             sorted(rows, key=lambda row: row.name),
-            system=system,
-            component=component,
-            encoding=Encoding.BYTEWISE,
-            heartbeat=messages.Heartbeat(
+            messages.Heartbeat(
                 _QUADROTOR,
                 messages.MAV_AUTOPILOT_PX4,
                 base_mode=29,
                 custom_mode=50593792,
                 system_status=_STANDBY,
             ),
-            version=messages.AutopilotVersion(
+            messages.AutopilotVersion(
                 59647,
-                flight_sw_version=_MAIN if ftp else _RELEASE,
-                git_hash=bytes.fromhex(SIMULATED_COMMIT + _commit_end(table, built_in))[::-1],
+                flight_sw_version=_MAIN if self.ftp else _RELEASE,
+                git_hash=bytes.fromhex(commit)[::-1],
                 board_version=1,
-                uid=_UID + system - 1 if uid is None else uid,
+                uid=_UID + self.system - 1 if self.uid is None else self.uid,
             ),
-            burst=burst,
-            period=period,
-            **options,
+            files,
         )
 
     def announced_hash(self) -> int | None:
         """Return the current hash of the table; None without `_HASH_CHECK`."""
         switch = self._find("MAV_HASH_CHK_EN")
-        if not self._hash_check or (switch is not None and switch.bits == 0):
+        if not self.hash_check or (switch is not None and switch.bits == 0):
             return None
         if self._hash is None:
-            self._hash = hash_params(entry.param for entry in self._listed if not entry.volatile)
+            self._hash = hash_params(entry.param for entry in self._listed if not entry.row.volatile)
         return self._hash
 
     def use(self, *names: str) -> None:
@@ -226,60 +195,42 @@ class PX4Vehicle(BytewiseVehicle):
         Raises:
             UsageError: the vehicle has no parameter with such a name, or a value does not fit its type.
         """
-        bits = {name: bits_of(value, self._entry(name).type) for name, value in values.items()}
-        self._load_bits(bits)
+        entries = [self._entry(name) for name in values]
+        self._load({entry: bits_of(values[entry.name], entry.type) for entry in entries})
 
-    def _load_bits(self, bits: Mapping[str, int]) -> None:
-        for name, each in bits.items():
-            self._entry(name).store(each)
-            self._unsaved.discard(name)
-            self._unkept.pop(name, None)
+    def _load(self, bits: Mapping[Entry, int]) -> None:
+        for entry, each in bits.items():
+            entry.store(each)
+            self._unsaved.pop(entry, None)
         self._hash = None
 
-    def _send_clock(self, now: float) -> None:
-        self._send_attitude(now)
-
-    def _send_system_time(self, now: float) -> None:
-        pass
-
-    def _time_boot_ms(self, now: float) -> int:
-        return super()._time_boot_ms(now + _CLOCK_LEAD)
+    # Requests
 
     def _answers_system(self, target: int) -> bool:
         return target == self.system
 
-    def _is_listed(self, entry: Entry) -> bool:
-        return entry.name not in self._unused
-
-    def _timers(self) -> tuple[float, ...]:
-        return self._push_at, self._wake_at, self._save_at, self._clamp_at
-
     def _on_list(self) -> None:
         is_running = self._position is not None
         self._hash_next = not is_running and self.announced_hash() is not None
-        soon = max(self._now + _TURN, self._next_burst - 0.5 * self._period)
+        soon = max(self._now + _TURN, self._due[self._send_list] - 0.5 * self.period)
         self._start_list(soon if is_running else self._now)
 
     def _on_command(self, request: messages.CommandLong, sender: frames.Frame) -> None:
-        if request.command == messages.MAV_CMD_PREFLIGHT_STORAGE and request.param1 == _RESET_ALL:
-            self._load_bits(self._first_bits)
-            self.send(
-                messages.CommandAck(request.command, CommandResult.ACCEPTED, sender.system, sender.component)
-            )
-            return
-        general = self.files.get(GENERAL_FILE) if self._has_metadata else None
         is_message = request.command == messages.MAV_CMD_REQUEST_MESSAGE
-        if (
-            general is None
-            or not is_message
-            or request.param1 != messages.message_id(messages.ComponentMetadata)
-        ):
+        if request.command == messages.MAV_CMD_PREFLIGHT_STORAGE and request.param1 == _RESET_ALL:
+            self._load({entry: entry.row.bits for entry in self.entries})
+            self._acknowledge(request, sender)
+        elif is_message and self.metadata and request.param1 == _METADATA:
+            crc = crc32_px4(self.files[GENERAL_FILE])
+            metadata = messages.ComponentMetadata(f"mftp://{GENERAL_FILE}", crc)
+            self._acknowledge(request, sender, message=metadata)
+        else:
             super()._on_command(request, sender)
-            return
-        self.send(messages.ComponentMetadata(f"mftp://{GENERAL_FILE}", crc32_px4(general)))
-        self.send(
-            messages.CommandAck(request.command, CommandResult.ACCEPTED, sender.system, sender.component)
-        )
+
+    def _restart_result(self, mode: int) -> CommandResult:
+        if mode == 0:
+            return CommandResult.ACCEPTED  # without any effect
+        return super()._restart_result(mode) if mode == 1 else CommandResult.DENIED
 
     def _on_read(self, request: messages.ParamRequestRead, sender: frames.Frame) -> None:
         if request.param_index < 0 and request.param_id == messages.HASH_CHECK:
@@ -297,100 +248,101 @@ class PX4Vehicle(BytewiseVehicle):
     def _on_wrong_type(self, entry: Entry, request: messages.ParamSet, sender: frames.Frame) -> None:
         self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
 
+    # Changes
+
     def _write(self, entry: Entry, bits: int) -> None:
-        if bits == entry.bits:
-            return
         before = entry.bits
-        super()._write(entry, bits)
-        self._hash = None
-        self._unsaved.add(entry.name)
-        if _is_near(entry, before):
-            self._unkept.setdefault(entry.name, before)
+        if bits == before:
             return
-        self._unkept.pop(entry.name, None)
+        entry.store(bits)
+        self._hash = None
+        if _is_near(entry, before):
+            kept = self._unsaved.get(entry)
+            self._unsaved[entry] = before if kept is None else kept
+            return
+        self._unsaved[entry] = None
         if late := self._late_use.get(entry.name):
             self._waking |= late
-            self._wake_at = min(self._wake_at, self._now + _PUSH_DELAY)
-        if entry.name in _LIMITED and self._clamp_delay is not None:
-            self._clamp_at = min(self._clamp_at, self._now + self._clamp_delay)
-        if self._push_at == math.inf and self._push_from is None:
-            self._push_at = self._now + _PUSH_DELAY
-        if self._save_at == math.inf:
-            earliest = self._saved_at + _SAVE_INTERVAL if self._autosave else -math.inf
-            self._save_at = max(self._now + self._autosave, earliest)
+            self._sooner(self._wake, self._now + _PUSH_DELAY)
+        if entry.name in _LIMITED and self.clamp_delay is not None:
+            self._sooner(self._clamp, self._now + self.clamp_delay)
+        if self._push_from is None:
+            self._sooner(self._push, self._now + _PUSH_DELAY)
+        self._sooner(self._save, max(self._now + self.autosave, self._save_from))
 
     def _relist(self) -> None:
         super()._relist()
         self._hash = None
 
-    def _may_restart(self, mode: int) -> int:
-        if mode == 0:
-            return CommandResult.ACCEPTED  # without any effect
-        return super()._may_restart(mode) if mode == 1 else CommandResult.DENIED
+    def _is_listed(self, entry: Entry) -> bool:
+        return entry.name not in self._unused
 
     def _end_all(self) -> None:
         super()._end_all()
-        self._has_stored = True
-        for name, bits in self._unkept.items():
-            self._entry(name).store(bits)
+        self._never_used |= self._used_once  # the sensors of the first start are stored
         for entry in self.entries:
-            if entry.default is not None and _is_near(entry, bits_of(entry.default, entry.type)):
-                entry.store(bits_of(entry.default, entry.type))
+            default, kept = entry.row.default, self._unsaved.get(entry)
+            if kept is not None:
+                entry.store(kept)
+            if default is not None and _is_near(entry, bits_of(default, entry.type)):
+                entry.store(bits_of(default, entry.type))
         autoconfig = self._find("SYS_AUTOCONFIG")
         if autoconfig is not None and autoconfig.bits != 0:
             for entry in self.entries:
                 if not entry.name.startswith(RESET_KEEPS):
-                    entry.store(self._first_bits[entry.name])
+                    entry.store(entry.row.bits)
             autoconfig.store(0)
             if (system := self._find(_SYSTEM_ID)) is not None:
                 system.store(1)
-        self._take_system_id(self._find(_SYSTEM_ID))
+        self._take_system_id(_SYSTEM_ID)
 
     def _switch_on(self, at: float) -> None:
-        self._unused = set(self._first_unused)
-        if self._has_stored:
-            self._unused |= self._first_start_only
-        self._unsaved = set(self._first_unsaved)
-        # The saved bits of floats that have since changed by at most FLT_EPSILON.
-        self._unkept: dict[str, int] = {}
+        self._unused = set(self._never_used)
+        self._unsaved: dict[Entry, int | None] = dict.fromkeys(map(self._entry, self.unsaved))
+        """With the saved bits of floats that have since changed by at most FLT_EPSILON."""
         self._waking: frozenset[str] = frozenset()
         self._hash_next = False
         self._push_from: int | None = None
-        self._push_at = math.inf
-        self._wake_at = self._save_at = self._clamp_at = math.inf
-        self._saved_at = -math.inf
+        self._save_from = -math.inf
         super()._switch_on(at)
 
-    def _clamp(self) -> None:
-        """Set values beyond their limits to the limits."""
-        for limits, is_beyond in ((UPPER_LIMITS, operator.gt), (LOWER_LIMITS, operator.lt)):
-            for name, limit in limits:
-                entry = self._find(name)
-                other = self._find(limit) if isinstance(limit, str) else None
-                most = limit if other is None else other.value
-                if entry is None or not isinstance(most, float) or not isinstance(entry.value, float):
-                    continue
-                if is_beyond(entry.value, most):
-                    self._write(entry, bits_of(most, entry.type))
+    def _tasks(self) -> list[Callable[[float], None]]:
+        return [self._clamp, self._wake, self._push, *super()._tasks(), self._save]
 
-    def _work(self, now: float) -> None:
-        if self._clamp_at <= now:
-            self._clamp_at = math.inf
-            self._clamp()
-        if self._wake_at <= now:
-            self._wake_at = math.inf
-            if self._waking & self._unused:
-                self.use(*self._waking)
-        if self._push_at <= now:
-            self._push_at = math.inf
-            self._push_from = 0
-            self._next_burst = min(self._next_burst, now)
-        super()._work(now)
-        if self._save_at <= now:
-            self._save_at = math.inf
-            self._saved_at = now
-            self._unsaved.clear()
-            self._unkept.clear()
+    def _clamp(self, at: float) -> None:
+        """Set values beyond their limits to the limits."""
+        for name, nearer, limit in LIMITS:
+            entry = self._find(name)
+            other = self._find(limit) if isinstance(limit, str) else None
+            bound = limit if other is None else other.value
+            if entry is not None and isinstance(bound, float) and isinstance(entry.value, float):
+                self._write(entry, bits_of(nearer(entry.value, bound), entry.type))
+
+    def _wake(self, at: float) -> None:
+        if self._waking & self._unused:
+            self.use(*self._waking)
+
+    def _push(self, at: float) -> None:
+        self._push_from = 0
+        self._sooner(self._send_list, at)
+
+    def _save(self, at: float) -> None:
+        self._save_from = self._now + _SAVE_INTERVAL if self.autosave else -math.inf
+        self._unsaved.clear()
+
+    # Sending
+
+    def _state_after_reboot(self) -> tuple[int, float]:
+        return _UNINIT, 3.0
+
+    def _send_clock(self, now: float) -> None:
+        self._send_attitude()
+
+    def _send_system_time(self, at: float) -> None:
+        """Send nothing: the clock is never set."""
+
+    def _time_boot_ms(self, now: float) -> int:
+        return super()._time_boot_ms(now + _CLOCK_LEAD)
 
     def _send_next(self) -> bool:
         if self._hash_next:
@@ -403,7 +355,7 @@ class PX4Vehicle(BytewiseVehicle):
         """Send the next unsaved parameter; return False if there is none."""
         if self._push_from is not None:
             for index in range(self._push_from, len(self._listed)):
-                if self._listed[index].name in self._unsaved:
+                if self._listed[index] in self._unsaved:
                     self._push_from = index + 1
                     self._send_value(self._listed[index])
                     return True
@@ -413,33 +365,28 @@ class PX4Vehicle(BytewiseVehicle):
     def _send_hash(self) -> None:
         value = self.announced_hash()
         if value is not None:
-            raw = value.to_bytes(4, "little")
-            self.send(
-                messages.ParamValue(
-                    messages.HASH_CHECK, raw, ParamType.UINT32, len(self._listed), messages.NO_INDEX
-                )
-            )
+            raw, place = value.to_bytes(4, "little"), (len(self._listed), messages.NO_INDEX)
+            self.send(messages.ParamValue(messages.HASH_CHECK, raw, ParamType.UINT32, *place))
 
 
 def _is_near(entry: Entry, bits: int) -> bool:
     """Return whether the entry is a float that PX4 considers equal to another one."""
-    value, other = entry.value, from_bits(bits, entry.type)
-    if not isinstance(value, float) or not isinstance(other, float):
+    if entry.type != ParamType.REAL32 or entry.bits == bits:
         return False
-    return entry.bits != bits and abs(value - other) <= FLT_EPSILON
+    return distance(entry.value, from_bits(bits, entry.type)) <= FLT_EPSILON
 
 
-_LIMITED = frozenset(
-    name for pair in (*UPPER_LIMITS, *LOWER_LIMITS) for name in pair if isinstance(name, str)
-)
-_FIRST_START_ONLY = ("CAL_BARO1_ID", "CAL_BARO2_ID", "CAL_BARO3_ID")
+_LIMITED = frozenset(name for limit in LIMITS for name in limit if isinstance(name, str))
+_FIRST_START_ONLY = frozenset({"CAL_BARO1_ID", "CAL_BARO2_ID", "CAL_BARO3_ID"})
 _SYSTEM_ID = "MAV_SYS_ID"
+_METADATA = messages.message_id(messages.ComponentMetadata)
+_UNINIT = 0
+_STANDBY = 3
 _QUADROTOR = 2
 _RELEASE = 17891392
 """flight_sw_version of 1.17.0."""
 _MAIN = 0x01120000
 """flight_sw_version of 1.18."""
-_STANDBY = 3
 _CLOCK_LEAD = 0.3
 """Seconds on the boot clock at the first message."""
 _UID = 5283920058631409231
@@ -453,11 +400,9 @@ _RESET_ALL = 2.0
 """First parameter of MAV_CMD_PREFLIGHT_STORAGE that resets all parameters."""
 
 
-def _commit_end(table: Table | None, built_in: Iterable[SimParam]) -> str:
+def _checksum(rows: Iterable[SimParam]) -> str:
     """Return the second half of the commit, different for each table: metadata is stored by commit."""
-    if table is None:
-        return SIMULATED_COMMIT
-    content = repr([(row.name, int(row.type), row.bits) for row in built_in])
+    content = repr([(row.name, int(row.type), row.bits) for row in rows])
     return f"{zlib.crc32(content.encode()):08x}"
 
 

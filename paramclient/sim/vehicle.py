@@ -1,40 +1,34 @@
-"""Vehicle, the base of all simulated vehicles: parameter table, list in bursts, identity, heartbeat."""
+"""Simulated vehicles: parameter table, list in bursts, reads and sets, files."""
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
-from typing import Final, Unpack
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, field
+from typing import ClassVar, Final
 
 from paramclient.errors import ParamErrorCode, UsageError
-from paramclient.model.values import Encoding, Param, WireValue, bits_of
+from paramclient.model.values import Encoding, Param, ParamType, WireValue, bits_of
 from paramclient.protocol.param_pck import PackedParam
-from paramclient.sim.device import Device, DeviceOptions
+from paramclient.sim.device import Device
 from paramclient.sim.ftp import FileServer
-from paramclient.sim.param_table import Entry, SimParam
+from paramclient.sim.param_table import Entry, SimParam, Table, as_table, check_range
 from paramclient.wire import frames, messages
 
-__all__ = ["SIMULATED_COMMIT", "Vehicle", "VehicleOptions"]
+__all__ = ["SIMULATED_COMMIT", "GenericVehicle", "Vehicle"]
 
 SIMULATED_COMMIT: Final = "5eed5eed"
 """The commit that simulated autopilots report, in hexadecimal; a simulated PX4 reports it twice, in 16
 digits. Their tables and versions are those of a real firmware, but their descriptions are not: with its
 commit, the stored descriptions of one would be used for the other. A real commit has these first 8 digits
 with a probability of 1 in 4 billion, and all 16 practically never."""
+TABLE_SIZE_MAX: Final = 65535
+"""Parameters of a table: param_count has 16 bits, and index 65535 means none."""
 
 
-class VehicleOptions(DeviceOptions, total=False):
-    """Arguments of every kind of vehicle; see `Vehicle`."""
-
-    param_error: bool
-    dead: Iterable[int | str]
-    list_stops_at: int | None
-    list_stops: float
-
-
-class Vehicle(Device, ABC):
-    """A simulated component with the parameter protocol in bytes; an `Endpoint`.
+@dataclass(kw_only=True, eq=False, repr=False)
+class Vehicle(Device):
+    """A simulated component with the parameter protocol; an `Endpoint`.
 
     Sans-I/O, without a clock. Requests at `now` are answered with the delays of a real vehicle;
     `next_deadline` returns when. The first call of `tick` or `receive` switches the vehicle on.
@@ -46,7 +40,7 @@ class Vehicle(Device, ABC):
             (`requests["PARAM_REQUEST_READ"]`).
         version: its AUTOPILOT_VERSION; can be changed while the vehicle is off.
         entries: all parameters, listed or not.
-        dead: indices and names as in the argument; can be changed at any time.
+        signing_key: the current signing key; None without signing.
         file_server: its MAVFTP, or None; can be taken away and given back at any time.
 
     Args of every vehicle:
@@ -59,10 +53,9 @@ class Vehicle(Device, ABC):
         stream: whether the link is a byte stream, where a frame may be split over several `receive`
             calls; datagrams are never joined.
         dead: indices and names that the list leaves out, and whose reads are not answered. They still count,
-            and a set of them is answered.
-        list_stops_at: number of values after which a list stops; None for never. The list has then ended: a
-            new request starts at the beginning.
-        list_stops: the number of lists that stop; `math.inf` for all.
+            and a set of them is answered. Can be replaced at any time.
+        list_stops_at: number of values after which a list stops, once; None for never. The list has then
+            ended: a new request starts at the beginning.
         reboot_ack: whether a reboot command is acknowledged before the reboot.
         reboot_down: seconds for which the vehicle is off during a reboot.
         signing_key: the key that signs sent frames; only frames signed with it, and RADIO_STATUS, are then
@@ -73,66 +66,43 @@ class Vehicle(Device, ABC):
         usb: whether the link counts as safe: all frames are accepted, as by ArduPilot over USB.
     """
 
-    file_server: FileServer | None = None
-    _position: int | None
-    """The next index of the list, None while no list is being sent."""
-    _last_listed: Entry | None
-    """The last parameter that the list has sent."""
-    _list_sent: int
-    """Values since the start of the list."""
-    _next_burst: float
+    encoding: ClassVar = Encoding.BYTEWISE
 
-    def __init__(
+    burst: int = 10
+    period: float = 0.01
+    param_error: bool = False
+    dead: Collection[int | str] = ()
+    list_stops_at: int | None = None
+
+    def _set_up_table(
         self,
-        table: Iterable[SimParam],
-        *,
-        system: int,
-        component: int,
-        encoding: Encoding,
+        rows: Iterable[SimParam],
         heartbeat: messages.Heartbeat,
         version: messages.AutopilotVersion,
-        burst: int,
-        period: float,
-        param_error: bool = False,
-        dead: Iterable[int | str] = (),
-        list_stops_at: int | None = None,
-        list_stops: float = 1,
-        **options: Unpack[DeviceOptions],
+        file_server: FileServer | None = None,
     ) -> None:
-        rows = tuple(table)
-        if len({row.name for row in rows}) < len(rows):
-            raise UsageError("the table contains a parameter name twice")
-        if len(rows) > _TABLE_SIZE_MAX:
-            raise UsageError(f"a table holds at most {_TABLE_SIZE_MAX} parameters, not {len(rows)}")
-        if param_error and options.get("mavlink_version") == 1:
-            raise UsageError("PARAM_ERROR does not exist in MAVLink 1")
-        if burst < 1 or not (math.isfinite(period) and period > 0.0):
-            raise UsageError("burst must be a number from 1 up, and period a number of seconds above 0")
-        if list_stops_at is not None and list_stops_at < 0:
-            raise UsageError(f"list_stops_at must be a number of values from 0 up, not {list_stops_at}")
-        if not list_stops >= 0:
-            raise UsageError(f"list_stops must be a number of lists from 0 up, not {list_stops}")
-        self.entries = [Entry(row, order, encoding) for order, row in enumerate(rows)]
+        """Check the arguments, and prepare the first start."""
+        self.entries = [Entry(row, order, self.encoding) for order, row in enumerate(rows)]
         self._by_name = {self._key(entry.name): entry for entry in reversed(self.entries)}
+        if len({entry.name for entry in self.entries}) < len(self.entries):
+            raise UsageError("the table contains a parameter name twice")
+        check_range(0, TABLE_SIZE_MAX, **{"the size of a table": len(self.entries)})
+        if self.param_error and self.mavlink_version == 1:
+            raise UsageError("PARAM_ERROR does not exist in MAVLink 1")
+        check_range(1, burst=self.burst, list_stops_at=(self.list_stops_at or 0) + 1)
+        if not 0.0 < self.period < math.inf:
+            raise UsageError(f"period must be a number of seconds above 0, not {self.period}")
+        for each in self.dead:
+            if isinstance(each, str):
+                self._entry(each)
+            else:
+                check_range(0, TABLE_SIZE_MAX - 1, **{"an index in dead": each})
+        self.file_server = file_server
         self._listed: list[Entry] = []
-        self.dead: set[int | str] = set()
-        for each in dead:
-            if isinstance(each, int) and not 0 <= each < _TABLE_SIZE_MAX:
-                raise UsageError(f"an index must be a number from 0 to {_TABLE_SIZE_MAX - 1}, not {each}")
-            self.dead.add(self._entry(each).name if isinstance(each, str) else each)
-        self._list_stops_at = math.inf if list_stops_at is None else list_stops_at
-        self._list_stops = list_stops
         self._when_listed: dict[int, list[Callable[[], object]]] = {}
-        self._burst = burst
-        self._period = period
-        self._param_error = param_error
-        super().__init__(
-            system=system,
-            component=component,
-            heartbeat=heartbeat,
-            version=version,
-            **options,
-        )
+        if self.list_stops_at is not None:
+            self.when_listed(self.list_stops_at, self._stop_list)
+        self._set_up(heartbeat, version)
 
     # Public interface
 
@@ -146,25 +116,19 @@ class Vehicle(Device, ABC):
 
     @property
     def listed(self) -> list[Param]:
-        """The listed parameters in the order of their indices, including repeated names."""
+        """The listed parameters in the order of their indices."""
         return [entry.param for entry in self._listed]
 
     @property
     def params(self) -> dict[str, Param]:
         """The listed parameters by name, in the order of their indices: the expected result of a full
-        download.
-
-        Of a repeated name, the first one.
-        """
-        found: dict[str, Param] = {}
-        for entry in self._listed:
-            found.setdefault(entry.name, entry.param)
-        return found
+        download."""
+        return {param.name: param for param in self.listed}
 
     @property
     def values(self) -> dict[str, WireValue]:
         """The listed values by name, like `params`."""
-        return {name: param.settable for name, param in self.params.items()}
+        return {param.name: param.settable for param in self.listed}
 
     def when_listed(self, count: int, do: Callable[[], object]) -> None:
         """Call a function once, when a list has sent this many values since its start.
@@ -174,10 +138,9 @@ class Vehicle(Device, ABC):
         several functions for one count are called in the given order.
 
         Raises:
-            UsageError: the count is below 1.
+            UsageError: the count is below 0.
         """
-        if count < 1:
-            raise UsageError(f"count must be a number of values from 1 up, not {count}")
+        check_range(0, count=count)
         self._when_listed.setdefault(count, []).append(do)
 
     @property
@@ -215,26 +178,42 @@ class Vehicle(Device, ABC):
             self._on_set(message, sender)
         elif isinstance(message, messages.FileTransfer) and self.file_server is not None:
             self.file_server.receive(message.payload, (sender.system, sender.component), self._now)
+            self._due[self._serve_files] = self.file_server.next_deadline()
         else:
             super().respond(message, sender)
 
-    # Implemented by subclasses
+    # The MAVLink standard; most of it is different in subclasses
 
-    @abstractmethod
     def _on_list(self) -> None:
-        """Handle PARAM_REQUEST_LIST."""
+        self._start_list(self._now)
 
-    @abstractmethod
     def _on_read(self, request: messages.ParamRequestRead, sender: frames.Frame) -> None:
-        """Handle PARAM_REQUEST_READ."""
+        entry = self._requested(request)
+        if entry is None:
+            self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
+        elif not self._is_dead(entry):
+            self._send_value(entry)
 
-    @abstractmethod
     def _on_set(self, request: messages.ParamSet, sender: frames.Frame) -> None:
-        """Handle PARAM_SET."""
+        entry = self._find(request.param_id)
+        if entry is None:
+            self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
+        elif entry.type != request.param_type:
+            self._on_wrong_type(entry, request, sender)
+        else:
+            size = ParamType(entry.type).size if entry.type <= ParamType.CUSTOM else 4
+            self._write(entry, int.from_bytes(request.raw[:size], "little"))
+            self._send_value(entry)
 
-    @abstractmethod
+    def _on_wrong_type(self, entry: Entry, request: messages.ParamSet, sender: frames.Frame) -> None:
+        if self.param_error:
+            self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
+        else:
+            self._send_value(entry)
+
     def _write(self, entry: Entry, bits: int) -> None:
         """Set another value, from any source, and start what follows from the change."""
+        entry.store(bits)
 
     def _is_listed(self, entry: Entry) -> bool:
         return True
@@ -251,13 +230,47 @@ class Vehicle(Device, ABC):
         """Return the param_count of the list's values."""
         return len(self._listed)
 
+    # The list and the files
+
+    def _switch_on(self, at: float) -> None:
+        self._position: int | None = None
+        """The next index of the list, None while no list is being sent."""
+        self._last_listed: Entry | None = None
+        self._list_sent = 0
+        if self.file_server is not None:
+            self.file_server.reset()
+        self._relist()
+        super()._switch_on(at)
+
+    def _tasks(self) -> list[Callable[[float], None]]:
+        return [*super()._tasks(), self._send_list, self._serve_files]
+
+    def _start_list(self, at: float) -> None:
+        """Send the list from its start, from `at` on, and not before the vehicle has booted."""
+        self._position = 0
+        self._last_listed = None
+        self._list_sent = 0
+        self._due[self._send_list] = max(at, self._on_at + self.boot_time)
+
+    def _stop_list(self) -> None:
+        self._position = None
+
+    def _send_list(self, at: float) -> None:
+        """Send one burst of the list."""
+        self._due[self._send_list] = at + self.period
+        for _ in range(self.burst):
+            if not self._send_next():
+                self._due[self._send_list] = math.inf
+                return
+
     def _send_next(self) -> bool:
         """Send the next item of the list; return False if there is none."""
+        self._call_when_listed()
         if self._position is None:
             return False
         index = self._position
         place = self._next_place(index)
-        if place >= len(self._listed) or self._falls_silent():
+        if place >= len(self._listed):
             self._position = None
             return False
         entry = self._last_listed = self._listed[place]
@@ -265,61 +278,19 @@ class Vehicle(Device, ABC):
         if not self._is_dead(entry):
             self._send_value(entry, index=index, count=self._count_in_list())
             self._list_sent += 1
-            for do in self._when_listed.pop(self._list_sent, ()):
-                do()
+            self._call_when_listed()
         return True
 
-    def _falls_silent(self) -> bool:
-        """Return whether the list stops here, with values left to send."""
-        if self._list_sent < self._list_stops_at or self._list_stops < 1:
-            return False
-        self._list_stops -= 1
-        return True
+    def _call_when_listed(self) -> None:
+        for do in self._when_listed.pop(self._list_sent, ()):
+            do()
 
-    def _is_dead(self, entry: Entry) -> bool:
-        return bool(self.dead) and (entry.index in self.dead or entry.name in self.dead)
-
-    def _next_transmission(self) -> float:
-        return min(super()._next_transmission(), self._next_burst, self._next_file_work())
-
-    def _next_file_work(self) -> float:
-        """Return the time of the next work of MAVFTP."""
-        return math.inf if self.file_server is None else self.file_server.next_deadline()
-
-    def _skip_suppressed(self) -> None:
-        super()._skip_suppressed()
-        self._next_burst = max(self._now, self._next_burst)
-
-    def _switch_on(self, at: float) -> None:
-        self._next_burst = math.inf
-        self._position = None
-        self._last_listed = None
-        self._list_sent = 0
-        if self.file_server is not None:
-            self.file_server.reset()
-        self._relist()
-        super()._switch_on(at)
-
-    def _work(self, now: float) -> None:
-        super()._work(now)
-        if not self._high_latency:
-            self._send_list(now)
-            self._serve_files(now)
-
-    def _send_list(self, now: float) -> None:
-        """Send the due part of the list."""
-        while self._next_burst <= now:
-            self._next_burst += self._period
-            for _ in range(self._burst):
-                if not self._send_next():
-                    self._next_burst = math.inf
-                    break
-
-    def _serve_files(self, now: float) -> None:
+    def _serve_files(self, at: float) -> None:
         """Send the due MAVFTP responses."""
         if self.file_server is not None:
-            for answer, sender in self.file_server.work(now):
+            for answer, sender in self.file_server.work(self._now):
                 self.send(messages.FileTransfer(0, *sender, answer.pack()))
+            self._due[self._serve_files] = self.file_server.next_deadline()
 
     # Helpers for subclasses
 
@@ -328,17 +299,14 @@ class Vehicle(Device, ABC):
         packed = [each for entry in self._listed if (each := entry.packed) is not None]
         return packed if len(packed) == len(self._listed) else None
 
-    def _take_system_id(self, entry: Entry | None) -> None:
+    def _take_system_id(self, name: str) -> None:
         """Use the system id in a parameter, if the parameter exists and its value is a valid id."""
+        entry = self._find(name)
         if entry is not None and isinstance(entry.value, int) and 1 <= entry.value <= 255:
             self.system = entry.value
 
-    def _start_list(self, at: float) -> None:
-        """Send the list from its start, from `at` on, and not before the vehicle has booted."""
-        self._position = 0
-        self._last_listed = None
-        self._list_sent = 0
-        self._next_burst = max(at, self._on_at + self._boot_time)
+    def _is_dead(self, entry: Entry) -> bool:
+        return bool(self.dead) and (entry.index in self.dead or entry.name in self.dead)
 
     def _entry(self, name: str) -> Entry:
         entry = self._find(name)
@@ -349,8 +317,10 @@ class Vehicle(Device, ABC):
     def _find(self, name: str) -> Entry | None:
         return self._by_name.get(self._key(name))
 
-    def _by_index(self, index: int) -> Entry | None:
-        return self._listed[index] if 0 <= index < len(self._listed) else None
+    def _requested(self, request: messages.ParamRequestRead) -> Entry | None:
+        if request.param_index < 0:
+            return self._find(request.param_id)
+        return self._listed[request.param_index] if request.param_index < len(self._listed) else None
 
     def _relist(self) -> None:
         """Assign indices to the listed parameters."""
@@ -379,11 +349,40 @@ class Vehicle(Device, ABC):
         sender: frames.Frame,
     ) -> None:
         """Send PARAM_ERROR, if this vehicle supports it."""
-        if self._param_error:
+        if self.param_error:
             index = request.param_index if isinstance(request, messages.ParamRequestRead) else -1
             name = request.param_id if index < 0 else ""
             self.send(messages.ParamError(sender.system, sender.component, name, index, code))
 
 
-_TABLE_SIZE_MAX = 65535
-"""Parameters of a table: param_count has 16 bits, and index 65535 means none."""
+@dataclass(kw_only=True, eq=False, repr=False)
+class GenericVehicle(Vehicle):
+    """A component as in the MAVLink guide: byte-wise, all types, no hash, immediate responses.
+
+    A set with another type changes nothing; the response is the current value or, with `param_error`,
+    PARAM_ERROR. Of a 64-bit type, the lower four bytes are sent.
+
+    Args:
+        table: the parameters (see `Table`), listed in the given order.
+        uid: the reported hardware id; by default unique for every system.
+        autopilot: MAV_AUTOPILOT in the heartbeat.
+        capabilities: as in AUTOPILOT_VERSION; by default MAVLink 2 and byte-wise parameters.
+
+    Other arguments are those of every `Vehicle`.
+
+    Raises:
+        UsageError: an argument is invalid.
+    """
+
+    table: Table = field(kw_only=False)
+    uid: int | None = None
+    autopilot: int = messages.MAV_AUTOPILOT_GENERIC
+    capabilities: int = 8192 | messages.CAPABILITY_PARAM_ENCODE_BYTEWISE
+
+    def __post_init__(self) -> None:
+        uid = 0x5EED_0000 + self.system if self.uid is None else self.uid
+        self._set_up_table(
+            as_table(self.table),
+            messages.Heartbeat(0, self.autopilot, system_status=messages.MAV_STATE_ACTIVE),
+            messages.AutopilotVersion(self.capabilities, uid=uid),
+        )

@@ -172,7 +172,7 @@ async def test_a_value_that_is_not_reported_any_more_is_unproven() -> None:
     def lose(progress: ApplyProgress) -> None:
         if progress.row is not None and progress.row.name == "TUNE_02":
             vehicle.set_param("TUNE_01", 0)
-            vehicle.dead.add("TUNE_01")
+            vehicle.dead = ["TUNE_01"]
 
     async with a_client(vehicle) as client:
         result = await apply(await client.component(), written(another("TUNE_01", "TUNE_02")), progress=lose)

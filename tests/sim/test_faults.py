@@ -22,7 +22,7 @@ from paramclient.sim import (
     Vehicle,
 )
 from paramclient.wire import frames, messages
-from tests.ground_station import LIST, PERIODIC_MESSAGES, Station, cast, indices, names, read, write
+from tests.ground_station import LIST, Station, cast, indices, names, read, write
 
 NO_INDEX = messages.NO_INDEX
 TEN = {f"P{number}": number for number in range(10)}
@@ -44,9 +44,7 @@ def listed(station: Station, seconds: float = 0.5) -> list[int]:
         lambda: GenericVehicle(TEN, dead=[-1]),
         lambda: GenericVehicle(TEN, dead=[65535]),
         lambda: GenericVehicle(TEN, list_stops_at=-1),
-        lambda: GenericVehicle(TEN, list_stops=-1),
-        lambda: GenericVehicle(TEN, list_stops=math.nan),
-        lambda: GenericVehicle(TEN).when_listed(0, list),
+        lambda: GenericVehicle(TEN).when_listed(-1, list),
         lambda: OtherStation(system=0),
         lambda: OtherStation(component=256),
         lambda: OtherStation(list_every=0.0),
@@ -110,17 +108,6 @@ class TestWhenListed:
         encoding = Encoding.C_CAST if kind is ArduPilotVehicle else Encoding.BYTEWISE
         assert first[1] == write("P1", 1, ParamType.INT32, cast=encoding is Encoding.C_CAST).raw
         assert first[8] == write("P8", 800, ParamType.INT32, cast=encoding is Encoding.C_CAST).raw
-
-    def test_when_listed_calls_once_at_its_count(self) -> None:
-        vehicle = GenericVehicle(TEN, burst=1)
-        seen: list[float] = []
-        vehicle.when_listed(3, lambda: seen.append(len(vehicle.data_to_send())))
-        vehicle.receive(messages.encode(LIST, system=255, component=190, sequence=0), 0.0)
-        vehicle.tick(1.0)
-        assert seen == [3 + len(PERIODIC_MESSAGES) * 2]
-        vehicle.receive(messages.encode(LIST, system=255, component=190, sequence=0), 1.0)
-        vehicle.tick(2.0)
-        assert len(seen) == 1
 
     def test_the_count_rises_and_falls(self) -> None:
         vehicle = ArduPilotVehicle(
@@ -238,43 +225,6 @@ class TestClock:
         assert states[0] == first
         assert states[-1] == then
         assert states == sorted(states, key=[first, then].index)
-
-
-class TestHighLatency:
-    @EVERY_KIND
-    def test_one_message_every_5_s(self, kind: Callable[..., Vehicle]) -> None:
-        station = Station(kind(table=TEN, high_latency=True, telemetry=50.0)).wait(12.0)
-        assert [time for time, _, _ in station.log] == [0.0, 5.0, 10.0]
-        ours = Station(kind(table=TEN)).receive(messages.Heartbeat)[0]
-        assert (
-            station.receive(messages.HighLatency2) == [messages.HighLatency2(ours.type, ours.autopilot)] * 3
-        )
-
-    @EVERY_KIND
-    def test_reads_are_answered_and_the_list_waits(self, kind: Callable[..., Vehicle]) -> None:
-        vehicle = kind(table=TEN, high_latency=True)
-        station = Station(vehicle)
-        assert indices(station.ask(read(index=3))) == [3]
-        assert listed(station, 30.0) == []
-        vehicle.high_latency = False
-        found = [index for index in indices(station.ask(seconds=0.5)) if index != NO_INDEX]
-        assert found == list(range(10))
-
-    def test_a_started_list_continues_at_its_rate(self) -> None:
-        vehicle = GenericVehicle(TEN, burst=1, period=0.1)
-        vehicle.when_listed(4, lambda: setattr(vehicle, "high_latency", True))
-        station = Station(vehicle)
-        assert listed(station, 5.0) == [0, 1, 2, 3]
-        vehicle.high_latency = False
-        station.wait(2.0)
-        assert station.times() == pytest.approx([5.0 + step / 10 for step in range(6)])
-
-    def test_px4_sends_no_changes_in_high_latency(self) -> None:
-        vehicle = PX4Vehicle(table=TEN, high_latency=True, autosave=60.0)
-        station = Station(vehicle)
-        assert len(station.ask(write("P1", 5, ParamType.INT32), seconds=20.0)) == 1
-        vehicle.high_latency = False
-        assert names(station.ask()) == ["P1"]
 
 
 class TestOtherStation:

@@ -87,17 +87,3 @@ def test_a_list_pauses_a_file_burst() -> None:
     assert [time for time, _ in at_once] == near([0.23, 0.36, 0.49])
     assert not [time for time in times if 0.1 < time < 0.229]
     assert pauses(station) == []
-
-
-def test_high_latency_processes_waiting_requests_and_pauses_the_list() -> None:
-    vehicle = quiet()
-    station = listing(0.15, vehicle).send(SET)
-    vehicle.high_latency = True
-    station.wait(0.05)
-    assert vehicle.param("RTL_ALT").value == 1234
-    station.log.clear()
-    station.wait(1.0)
-    assert station.times() == []
-    vehicle.high_latency = False
-    station.wait(2.0)
-    assert station.values()[-1].param_index == 1381
