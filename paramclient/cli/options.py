@@ -14,6 +14,7 @@ from typing import Annotated, ClassVar, Final, TypeAlias, TypedDict
 from cyclopts import Group, Parameter
 from cyclopts.validators import Number
 
+from paramclient.client.component import SETTLE_MAX
 from paramclient.client.signing import Signing, key_from_environment, read_key
 from paramclient.errors import UsageError
 from paramclient.model.values import Encoding
@@ -21,13 +22,17 @@ from paramclient.wire.signing import SigningKey, SigningPolicy
 
 __all__ = [
     "CONNECTION",
+    "IN_ID_RANGE",
     "CacheOptions",
     "Id",
     "KeyOptions",
+    "Limit",
     "LinkOptions",
     "Seconds",
+    "Settle",
     "SigningOptions",
     "TrafficOptions",
+    "Verbose",
 ]
 
 SOURCE_SYSTEM: Final = 255
@@ -38,8 +43,10 @@ SOURCE_COMPONENT: Final = 190
 CONNECTION: Final = Parameter(group=Group("Connection", sort_key=9))
 """Options of the link, which stand at the end of the help."""
 
-Id: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=255))]
-"""A system or component id."""
+IN_ID_RANGE: Final = Parameter(validator=Number(gte=1, lte=255))
+"""Of a system or component id."""
+Id: TypeAlias = Annotated[int | None, IN_ID_RANGE]
+"""A system or component id, or none."""
 
 
 class SourceIds(TypedDict):
@@ -56,6 +63,12 @@ def _check_seconds(_: object, seconds: float | None) -> None:
 
 Seconds: TypeAlias = Annotated[float | None, Parameter(validator=_check_seconds)]
 """A timeout in seconds."""
+Settle: TypeAlias = Annotated[float, Parameter(validator=Number(gte=0, lte=SETTLE_MAX))]
+"""Seconds to watch a value after a write."""
+Limit: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1))]
+"""The largest number of rows."""
+Verbose: TypeAlias = Annotated[bool, Parameter(name=("--verbose", "-v"))]
+"""Whether each step is logged on stderr."""
 
 
 @Parameter(name="*")
@@ -142,7 +155,7 @@ class TrafficOptions(SigningOptions):
     json: bool = False
     """Print JSON."""
 
-    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False
+    verbose: Verbose = False
     """Log each step on stderr."""
 
     tlog: Annotated[Path | None, CONNECTION] = None

@@ -7,20 +7,18 @@ from dataclasses import dataclass, field
 from typing import Annotated, Final
 
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
 from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.default_sources import say_sources
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_output import VehicleJson, as_json
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session, request_from_vehicle
-from paramclient.cli.options import LinkOptions
+from paramclient.cli.options import LinkOptions, Settle
 from paramclient.cli.output import Coloured, by_index, report, say
 from paramclient.cli.param_names import check_given
 from paramclient.cli.read_commands import get_chosen, report_all
 from paramclient.cli.session import CommandSession, Done, sessions
 from paramclient.cli.writes import WriteJob, write_all
-from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import NoReply, ParamClientError, UsageError, VehicleError
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import Default, DefaultSource, default_of
@@ -45,7 +43,7 @@ async def reset(
     all_: Annotated[bool, Parameter(name="--all")] = False,
     changed: bool = False,
     dry_run: bool = False,
-    settle: Annotated[float, Parameter(validator=Number(gte=0, lte=SETTLE_MAX))] = 0.0,
+    settle: Settle = 0.0,
     durable: bool = False,
     metadata: MetadataChoice = None,
     yes: bool = False,

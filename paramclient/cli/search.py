@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Annotated, Final
-
-from cyclopts import Parameter
-from cyclopts.validators import Number
+from typing import Final
 
 from paramclient.cache import CachedComponent, HistoryEntry, ParamCache
 from paramclient.cli.cached import load_tables
@@ -20,7 +17,7 @@ from paramclient.cli.metadata import (
     known_of_table,
     print_descriptions,
 )
-from paramclient.cli.options import CacheOptions
+from paramclient.cli.options import CacheOptions, Limit
 from paramclient.cli.output import local_time, print_json, print_line, print_table, report, say
 from paramclient.cli.param_names import unmatched_text
 from paramclient.cli.sources import tables_in
@@ -45,7 +42,7 @@ def search(
     /,
     *words: str,
     vehicle: str | None = None,
-    limit: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
+    limit: Limit = None,
     metadata: MetadataChoice = None,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:

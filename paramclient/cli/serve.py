@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 from paramclient.cli.app import on_end_signal
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.options import SigningOptions
+from paramclient.cli.options import SigningOptions, Verbose
 from paramclient.cli.output import print_line, say
 from paramclient.errors import UsageError
 
@@ -31,7 +31,7 @@ async def serve(
     fetch: Annotated[bool, Parameter(negative="--no-fetch")] = True,
     listen_only: bool = False,
     tokens: Path | None = None,
-    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False,
+    verbose: Verbose = False,
     options: SigningOptions = _UNSIGNED,
 ) -> int:
     """Open links and the cache, and share them with ground stations, programs and browsers.

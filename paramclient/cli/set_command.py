@@ -8,17 +8,15 @@ from collections.abc import AsyncIterator, Iterable, Sequence
 from typing import Annotated, Final
 
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
 from paramclient.cli.confirmation import can_ask, confirm
 from paramclient.cli.metadata import MetadataChoice, from_file, info_of, known_of_session
-from paramclient.cli.options import LinkOptions
+from paramclient.cli.options import LinkOptions, Settle
 from paramclient.cli.output import report
 from paramclient.cli.param_names import learn_spelling, spelling
 from paramclient.cli.read_commands import get_chosen
 from paramclient.cli.session import CommandSession, check_link_argument, sessions, wait_for_firmware
 from paramclient.cli.writes import OUTCOME_COLUMNS, WriteJob, write_all
-from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.metadata.info import number_of
@@ -34,7 +32,7 @@ async def set_(
     url: str,
     /,
     *pairs: Annotated[str, Parameter(name="NAME VALUE", allow_leading_hyphen=True)],
-    settle: Annotated[float, Parameter(validator=Number(gte=0, lte=SETTLE_MAX))] = 0.0,
+    settle: Settle = 0.0,
     force: bool = False,
     durable: bool = False,
     metadata: MetadataChoice = None,

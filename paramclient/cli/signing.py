@@ -12,7 +12,7 @@ from typing import Annotated, Final
 from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.options import CONNECTION, KeyOptions, Seconds
+from paramclient.cli.options import CONNECTION, KeyOptions, Seconds, Verbose
 from paramclient.cli.output import print_json, print_line, printable
 from paramclient.cli.session import VEHICLE_TIMEOUT, ChosenVehicle, Deadline, wait_for_vehicle
 from paramclient.client.client import ParamClient
@@ -46,7 +46,7 @@ class SigningTarget(KeyOptions):
     json: bool = False
     """Print JSON."""
 
-    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False
+    verbose: Verbose = False
     """Log each step on stderr, without the key."""
 
 

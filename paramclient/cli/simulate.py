@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from anyio.abc import TaskStatus
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
+from paramclient.cli.options import IN_ID_RANGE, Id
 from paramclient.cli.output import print_line
 from paramclient.client.signing import read_key, timestamp_now
 from paramclient.errors import UsageError
@@ -117,8 +117,6 @@ class VehicleFaults:
 
 _NO_FAULTS: Final = FaultOptions()
 _NO_VEHICLE_FAULTS: Final = VehicleFaults()
-_Id = Annotated[int, Parameter(validator=Number(gte=1, lte=255))]
-"""A system or component id."""
 
 
 async def sim(
@@ -126,8 +124,8 @@ async def sim(
     /,
     *,
     link: str = "udpout:127.0.0.1:14550",
-    system: _Id = 1,
-    component: Annotated[int | None, Parameter(validator=Number(gte=1, lte=255))] = None,
+    system: Annotated[int, IN_ID_RANGE] = 1,
+    component: Id = None,
     param_error: bool = False,
     signing_key: Path | None = None,
     usb: bool = False,

@@ -26,16 +26,13 @@ import pytest
 import paramclient
 from paramclient import LinkError, ParamCache, ParamType
 from paramclient.cli import run
-from paramclient.cli import watch as watch_command
 from paramclient.cli.exit_codes import ExitCode, code_of
-from paramclient.cli.options import LinkOptions
 from paramclient.errors import ClientClosed, ParamClientError, ParamErrorCode
 from paramclient.links import Peer, SimLink
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.wire import frames, messages
 from tests.commands import Command, Outcome, Put, behind, in_process, leaping, strict
 from tests.conversations.virtual import Tap
-from tests.shell import in_simulated_time
 
 ROOT = Path(__file__).parents[2]
 TIMEOUT = 60.0  # seconds after which a test fails; a passing test never waits that long
@@ -561,15 +558,12 @@ def vehicle_lost_and_found() -> PX4Vehicle:
 
 
 @pytest.mark.parametrize("as_json", [True, False])
-@in_simulated_time
-async def test_watch_prints_events_of_the_vehicle(
-    put: Callable[[Endpoint], str], capsys: pytest.CaptureFixture[str], as_json: bool
+def test_watch_prints_events_of_the_vehicle(
+    command: Command, put: Callable[[Endpoint], str], as_json: bool
 ) -> None:
     url = put(vehicle_lost_and_found())
-    options = LinkOptions(json=as_json, no_cache=True, timeout=20.0)
-    assert await watch_command.watch(url, options=options) == 0
-    printed = capsys.readouterr()
-    assert printed.err == "watching 2 parameters of 1/1 px4\n"
+    printed = command("watch", url, "--no-cache", "--timeout", 20, *(["--json"] if as_json else []))
+    assert (printed.code, printed.err) == (0, "watching 2 parameters of 1/1 px4\n")
     lines = printed.out.splitlines()
     if not as_json:
         reported = [line.partition("Z  ")[2] for line in lines]
