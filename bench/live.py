@@ -391,7 +391,7 @@ async def time_apply(vehicle: Vehicle, seed: int) -> Cost:
         result = await apply(component, vehicle.wanted)
         seconds = time.monotonic() - began
         await put_back(vehicle, component)
-    others = [str(row) for row in result.rows.values() if row.status != "set"]
+    others = [str(row) for row in result.rows.values() if row.status != "accepted"]
     if not result.complete or others:
         raise WrongResult(f"{len(others)} are not set: {'; '.join(others[:3])}")
     return Cost(seconds)

@@ -17,10 +17,9 @@ from paramclient import (
     ParamClientError,
     ParamSet,
     UsageError,
-    WrittenParam,
     read_file,
 )
-from paramclient.provision import apply_all, overlay, restore, verify_all
+from paramclient.provision import apply, for_each, overlay, plan, restore
 
 FILE = Path(__file__).parent / "parameters/ardupilot/copter.param"
 
@@ -36,7 +35,7 @@ async def main(link: str, file: Path) -> bool:
 
     def wanted(vehicle: Component) -> ParamSet:
         own = OWN.get(vehicle.system, {})
-        return overlay(shared, ParamSet({name: WrittenParam(name, value) for name, value in own.items()}))
+        return overlay(shared, ParamSet(own))
 
     def backup(vehicle: Component) -> Path:
         return Path(tempfile.gettempdir()) / f"before-{vehicle.system}-{started}.json"
@@ -46,7 +45,9 @@ async def main(link: str, file: Path) -> bool:
         vehicles = [each for each in await client.find_autopilots() if each.autopilot == "ardupilot"]
         if not vehicles:
             raise UsageError(f"{link} has no ArduPilot")
-        applied = await apply_all(vehicles, wanted, reboot=True, backup=backup)
+        applied = await for_each(
+            vehicles, lambda each: apply(each, wanted(each), reboot=True, backup=backup(each))
+        )
         for (system, _), error in applied.errors.items():
             print(f"{system}: nothing was set: {error}")
         for (system, component), result in applied.results.items():
@@ -63,10 +64,10 @@ async def main(link: str, file: Path) -> bool:
                 if back.complete
                 else f"{system}: NEITHER SET UP NOR RESTORED: {back}"
             )
-        verified = await verify_all(vehicles, wanted)
-        for (system, _), plan in verified.results.items():
-            print(f"{system}: {'set up' if plan.is_met else 'NOT set up'}")
-        return applied.complete and verified.is_met
+        verified = await for_each(vehicles, lambda each: plan(each, wanted(each)))
+        for (system, _), planned in verified.results.items():
+            print(f"{system}: {'set up' if planned.complete else 'NOT set up'}")
+        return applied.complete and verified.complete
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from paramclient import (
     VehicleError,
     read_file,
 )
-from paramclient.provision import ApplyProgress, PlanStatus, apply, prepare, verify
+from paramclient.provision import ApplyProgress, apply, plan
 
 FILE = Path(__file__).parent / "parameters/px4/quad.params"
 
@@ -45,22 +45,22 @@ async def main(link: str, file: Path) -> bool:
         vehicle = await client.component(
             result.system, result.component
         )  # the file may set another system id
-        state = await verify(vehicle, wanted)
-        print("the vehicle matches the file" if state.is_met else "the vehicle does NOT match the file")
-        return state.is_met
+        state = await plan(vehicle, wanted)
+        print("the vehicle matches the file" if state.complete else "the vehicle does NOT match the file")
+        return state.complete
 
 
 async def show(vehicle: Component, wanted: ParamSet) -> bool:
-    """Print the plan; return whether all values are valid."""
-    plan = await prepare(vehicle, wanted)
-    for stage in plan.stages:
+    """Print the plan; return whether `apply` accepts the file."""
+    planned = await plan(vehicle, wanted)
+    for stage in planned.stages:
         print(f"{stage.purpose}:")
-        for step in stage.steps:
-            print(f"  {step}{' (takes effect after a reboot)' if step.needs_reboot else ''}")
-    for row in plan.rows.values():
+        for row in stage.rows:
+            print(f"  {row}{' (takes effect after a reboot)' if row.needs_reboot else ''}")
+    for row in planned.rows.values():
         if row.reason:
             print(row)
-    return not plan.of(PlanStatus.INVALID)
+    return not planned.problems
 
 
 def show_progress(progress: ApplyProgress) -> None:

@@ -12,21 +12,20 @@ from types import ModuleType
 
 from paramclient import metadata, provision
 from paramclient.client import client, component, events, files, streams
-from paramclient.provision import fleet
+from paramclient.provision import inspection
 
 STUB = Path(__file__).parent.parent / "paramclient" / "sync" / "__init__.pyi"
 
 CLASSES: dict[ModuleType, list[str]] = {
     files: ["Ftp"],
     component: ["Component"],
-    fleet: ["Wanted"],
+    inspection: ["Wanted"],
     streams: ["Changes"],
     events: ["Discovered", "Lost", "Found", "Rebooted", "Resynced", "Event", "Events"],
     client: ["ParamClient"],
 }
 FUNCTIONS: list[Callable[..., object]] = [
-    *(provision.prepare, provision.apply, provision.verify, provision.restore),
-    *(provision.apply_all, provision.verify_all, provision.restore_all),
+    *(provision.plan, provision.apply, provision.restore, provision.for_each),
     metadata.metadata_of,
 ]
 STREAMS = {"Changes": "Change", "Events": "Event"}
@@ -124,7 +123,7 @@ def stub() -> str:
         (node,) = ast.parse(inspect.getsource(function)).body
         assert isinstance(node, ast.AsyncFunctionDef)
         parts.append(ast.unparse(ast.fix_missing_locations(without_await(node))))
-    text = "\n\n".join(parts)
+    text = "\n\n".join(parts).replace("Awaitable[Outcome]", "Outcome")
     known |= {
         "Self": "from typing import Self",
         "Iterator": "from collections.abc import Iterator",

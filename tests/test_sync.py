@@ -17,25 +17,23 @@ import pytest
 from paramclient import (
     ClientClosed,
     FileTransferError,
+    InvalidParameters,
     LinkError,
     NoReply,
     ParamCache,
-    ParamSet,
     Progress,
     UnknownParameter,
     UsageError,
     Value,
-    WrittenParam,
 )
 from paramclient.sync import (
     Component,
     Discovered,
     ParamClient,
     apply,
-    apply_all,
-    metadata_of,
+    for_each,
+    plan,
     restore,
-    verify,
 )
 from tests.sync_stub import STUB, meaning, stub
 
@@ -91,28 +89,19 @@ def test_a_whole_session(tmp_path: Path) -> None:
 
 
 def test_a_vehicle_is_set_up_and_restored(tmp_path: Path) -> None:
-    wanted = ParamSet({NAME: WrittenParam(NAME, 6.5)})
     asked: list[Value] = []
     with ParamClient("sim:px4", cache=False) as client:
         vehicle = client.only_component()
-        result = apply(vehicle, wanted, before_writing=lambda: asked.append(vehicle.get(NAME).value))
+        result = apply(vehicle, {NAME: 6.5}, before_writing=lambda: asked.append(vehicle.get(NAME).value))
         assert (result.complete, asked) == (True, [4.0])
-        assert verify(vehicle, wanted).is_met
+        assert plan(vehicle, {NAME: 6.5}).complete
         assert restore(vehicle, result.before).complete
-        seen: list[Component] = []
-        done = apply_all(
-            [vehicle],
-            lambda each: wanted,
-            info=lambda each: metadata_of(each),
-            backup=lambda each: tmp_path / f"{each.get(NAME).index}.params",
-            progress=lambda each, _: seen.append(each),
-            before_writing=lambda each: asked.append(each.get(NAME).value),
-        )
+        done = for_each([vehicle], lambda each: apply(each, {NAME: 6.5}, backup=tmp_path / "1.params"))
         assert done.results[1, 1].complete
-        assert (tmp_path / f"{vehicle.get(NAME).index}.params").exists()
-        assert asked == [4.0, 4.0]
-        assert set(seen) == {vehicle}
-    assert not apply_all([], wanted).results
+        assert (tmp_path / "1.params").exists()
+        failed = for_each([vehicle], lambda each: apply(each, {"NO_SUCH": 6.5}))
+        assert isinstance(failed.errors[1, 1], InvalidParameters)
+    assert not for_each([], lambda each: plan(each, {NAME: 6.5})).results
 
 
 def test_an_error_of_a_callback_ends_the_call() -> None:

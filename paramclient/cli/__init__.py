@@ -8,10 +8,10 @@
 - `sources`: the parameters that an argument names: of a file, a link or the cache. `time_arguments`: times.
 - `param_names`: names and patterns of parameters, and suggestions.
 - `metadata`, `default_sources`: descriptions and defaults that a subcommand uses.
-- `writes`, `setup_results`, `confirmation`: writes and their outcomes, and the question before them.
+- `writes`, `confirmation`: writes and their outcomes, and the question before them.
 - `check_measurements`: what check measures.
 - `output`: tables, lines, progress, what a command waits for. `file_output`: files.
-- `json_output`, `json_cache`, `json_setup`: JSON.
+- `json_output`, `json_cache`, `json_apply`: JSON.
 - `exit_codes`: exit codes.
 """
 

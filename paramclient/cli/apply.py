@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Final, TypeVar
+from typing import Annotated, Any, Final
 
 import anyio
 from cyclopts import Parameter
 
 from paramclient.cli.confirmation import can_confirm, confirm
-from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.exit_codes import ExitCode, code_of
+from paramclient.cli.json_apply import ApplyJson, ApplyRowJson, PlanJson
+from paramclient.cli.json_output import VehicleJson
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import say
-from paramclient.cli.session import CommandSession, Sessions, sessions
-from paramclient.cli.setup_results import Address, SetupOutput
+from paramclient.cli.output import Coloured, Status, report, say
+from paramclient.cli.session import CommandSession, Done, Sessions, sessions
 from paramclient.cli.sources import (
     check_new,
     check_pattern,
@@ -26,16 +29,50 @@ from paramclient.cli.sources import (
     read_rules,
     resolve,
 )
-from paramclient.client.component import Component
 from paramclient.errors import FileError, NoReply, UsageError
-from paramclient.metadata import Metadata
+from paramclient.model.notation import typed
 from paramclient.model.paramset import ParamSet
-from paramclient.provision import ApplyProgress, FleetApplied, FleetVerified, apply_all, overlay, verify_all
+from paramclient.model.values import WireValue, format_value
+from paramclient.model.wording import counted, first_of
+from paramclient.protocol.fetch import Progress
+from paramclient.provision import (
+    CATEGORIES,
+    ApplyProgress,
+    ApplyResult,
+    ApplyRow,
+    ApplyStatus,
+    Plan,
+    overlay,
+    plan,
+)
+from paramclient.provision import apply as apply_to_vehicle
+from paramclient.provision.planning import Rows
 
-__all__ = ["apply", "backups_of", "metadata_of_all", "set_up", "within"]
+__all__ = ["ApplyJob", "apply", "backups_of", "run_jobs"]
 
-Result = TypeVar("Result")
-
+APPLY_NAMES_MAX: Final = 10
+"""Parameters that a line names, so that it stays short; it gives the number of further ones."""
+PLAN_COLUMNS: Final = ("stage", "name", "before", "wanted", "status", "reason")
+"""Columns of a table of plans."""
+APPLIED_COLUMNS: Final = ("name", "before", "wanted", "now", "status", "reason")
+"""Columns of a table of results."""
+APPLY_NUMBERS: Final = "before wanted now stage"
+"""The right-aligned columns of both."""
+_STYLES: Final = {
+    ApplyStatus.SET: "green",
+    ApplyStatus.LATER: "yellow",
+    ApplyStatus.INVALID: "bold red",
+    ApplyStatus.SKIPPED: "dim",
+    ApplyStatus.ACCEPTED: "green",
+    ApplyStatus.ADJUSTED: "yellow",
+    ApplyStatus.REFUSED: "red",
+    ApplyStatus.UNPROVEN: "yellow",
+    ApplyStatus.UNKNOWN: "bold red",
+    ApplyStatus.NOT_TRIED: "dim",
+}
+"""Styles of each status."""
+_WORDS: Final = {ApplyStatus.SET: "to set", ApplyStatus.LATER: "that may be revealed"}
+"""Words for planned actions in the summary, where they differ from the status."""
 _OPTIONS: Final = LinkOptions()
 
 
@@ -45,9 +82,9 @@ async def apply(
     /,
     *,
     include: tuple[str, ...] = (),
+    partial: bool = False,
     reboot: bool = False,
     allow_armed: bool = False,
-    skip_invalid: bool = False,
     force: bool = False,
     durable: bool = False,
     backup: str | None = None,
@@ -62,10 +99,11 @@ async def apply(
 ) -> int:
     """Write the values of a parameter file to a vehicle, in dependency order, and verify each of them.
 
-    The previous state is stored in the cache, for `restore`. On a terminal, the changes are shown and must be
-    confirmed. Exit code 0: the vehicle has all values of the file. Exit code 1: some values differ. After an
-    interruption, run the same command again to continue. If several vehicles are heard, --vehicle must
-    choose one, or all.
+    All or nothing: with an invalid value, or a name that the vehicle does not have, nothing is written (exit
+    code 2), unless --partial is given. The previous state is stored in the cache, for `restore`. On a
+    terminal, the changes are shown and must be confirmed. Exit code 0: the vehicle has all values of the
+    file. Exit code 1: some values differ. After an interruption, run the same command again to continue. If
+    several vehicles are heard, --vehicle must choose one, or all.
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, or sim:ardupilot for a simulated vehicle.
@@ -73,9 +111,9 @@ async def apply(
         include: Include a category that is left out by default (identity, hardware, calibration, measured,
             counter, action, read-only, out-of-range), or a name or pattern such as "COMPASS_OFS*". May be
             given several times.
+        partial: Skip invalid values and names that the vehicle does not have, and write the remaining values.
         reboot: Reboot the vehicle if values take effect only after a reboot.
         allow_armed: Continue if the vehicle is armed.
-        skip_invalid: Skip invalid values and write the remaining ones.
         force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
         durable: End only when the values and their history are on the disk and survive a power loss.
         backup: A new file for the state before the first write; its extension determines the file format.
@@ -94,57 +132,53 @@ async def apply(
     check_pattern("the file of --overlay", over, options)
     check_pattern("the file of --backup", backup, options)
     given, rules = from_file(metadata), read_rules(renames)
-    opened = open_file(file, partial=skip_invalid) if is_file(file) else None
+    opened = open_file(file, partial=partial) if is_file(file) else None
     params = await resolve(file, options, writes=True, extended=extended) if opened is None else None
     extended = extended or (opened is not None and opened.is_extended)
     async with sessions(url, options, writes=True, extended=extended) as found:
-        wanted: dict[Address, ParamSet] = {}
-        for each in found:
-            system, component = each.component.system, each.component.component
+        backups = await backups_of(backup, found)
+
+        async def job(session: CommandSession) -> ApplyJob:
             base = params
             if opened is not None:
-                base = choose(opened, each.choice.component, system)
+                base = choose(opened, session.choice.component, session.component.system)
             assert base is not None
-            wanted[system, component] = base if over is None else await _with_overlay(base, over, each)
-        info = await metadata_of_all(found, metadata, given)
-        backups = await backups_of(backup, found)
-        components = [each.component for each in found]
-        show = SetupOutput(found, full=full)
+            wanted = base if over is None else await _with_overlay(base, over, session)
+            info = given or await known_of_session(session, metadata)
 
-        async def plans() -> FleetVerified:
-            return await verify_all(
-                components, wanted, include=include, info=info, force=force, renames=rules
-            )
+            def write(**running: Any) -> Awaitable[ApplyResult]:
+                return apply_to_vehicle(
+                    session.component,
+                    wanted,
+                    include=include,
+                    info=info,
+                    force=force,
+                    renames=rules,
+                    partial=partial,
+                    reboot=reboot,
+                    allow_armed=allow_armed,
+                    durable=durable,
+                    backup=backups.get(session),
+                    **running,
+                )
 
-        async def write(progress: Callable[[Component, ApplyProgress], None]) -> FleetApplied:
-            return await apply_all(
-                components,
-                wanted,
-                include=include,
-                info=info,
+            def make_plan() -> Awaitable[Plan]:
+                return plan(session.component, wanted, include=include, info=info, force=force, renames=rules)
+
+            return ApplyJob(
+                session,
+                make_plan,
+                write,
+                full=full,
+                partial=partial,
                 reboot=reboot,
                 allow_armed=allow_armed,
-                skip_invalid=skip_invalid,
-                force=force,
-                renames=rules,
-                durable=durable,
-                backup=backups,
-                timeout=found[0].deadline.left(),
-                progress=progress,
-                before_writing=lambda _: found[0].check_only(),
             )
 
-        if dry_run:
-            return show.planned(
-                await within(found, plans()),
-                reboot=reboot,
-                skip_invalid=skip_invalid,
-                allow_armed=allow_armed,
-            )
-        if options.no_cache and backup is None and not url.startswith("sim:"):
+        jobs = [Done(each, result=await job(each)) for each in found]
+        if not dry_run and options.no_cache and backup is None and not url.startswith("sim:"):
             say("the state before is not stored: --no-cache is given, and --backup is not")
-        done = await set_up(found, show, plans, write, verb="setting", reboot=reboot, yes=yes)
-        code = ExitCode.INCOMPLETE if done is None else show.applied(done)
+        code = await run_jobs(found, jobs, dry_run=dry_run, yes=yes)
         return max(code, ExitCode.INCOMPLETE) if opened is not None and opened.left_out else code
 
 
@@ -152,73 +186,272 @@ async def _with_overlay(base: ParamSet, pattern: str, session: CommandSession) -
     path = await fill_pattern(pattern, session)
     if not is_file(path):
         raise FileError(f"no such file, which --overlay names for {session.label}", source=path)
-    own = choose(open_file(path), session.choice.component, session.component.system)
-    return overlay(base, own)
+    return overlay(base, choose(open_file(path), session.choice.component, session.component.system))
 
 
 # Shared with restore
 
 
-async def set_up(
-    found: Sessions,
-    show: SetupOutput,
-    plans: Callable[[], Awaitable[FleetVerified]],
-    write: Callable[[Callable[[Component, ApplyProgress], None]], Awaitable[FleetApplied]],
-    *,
-    verb: str,
-    reboot: bool,
-    yes: bool,
-) -> FleetApplied | None:
-    """Show the changes and ask for confirmation on a terminal, then write; None without confirmation."""
-    if not yes and can_confirm(found[0].options):
-        fleet = await within(found, plans())
-        show.report_errors(fleet.errors)
-        if any(plan.steps or (reboot and plan.awaiting_reboot) for plan in fleet.results.values()):
-            show.show_planned(fleet, reboot=reboot)
-            if not await confirm("go on?"):
-                return None
-    await found.announce_write()
-    with show.progress_until_interrupted(f"{verb} {_title(found)}") as progress:
-        return await write(progress)
-
-
-async def metadata_of_all(
-    found: Sequence[CommandSession], choice: str | None, given: Metadata | None
-) -> Callable[[Component], Metadata | None]:
-    """Return a function that returns the metadata of a vehicle."""
-    known = {each.component.system: given or await known_of_session(each, choice) for each in found}
-    return lambda component: known[component.system]
-
-
-async def backups_of(
-    pattern: str | None, found: Sequence[CommandSession]
-) -> Callable[[Component], Path] | None:
-    """Return a function that returns the backup file of a vehicle; None without a pattern.
+async def backups_of(pattern: str | None, found: Sessions) -> Mapping[CommandSession, Path]:
+    """Return the backup file of each vehicle; none without a pattern.
 
     Raises:
         UsageError: the pattern gives several vehicles one file.
         FileError: one of the files exists.
     """
     if pattern is None:
-        return None
-    names = {each.component.system: await fill_pattern(pattern, each) for each in found}
+        return {}
+    names = {each: await fill_pattern(pattern, each) for each in found}
     if len(set(names.values())) < len(names):
         raise UsageError(f"--backup {pattern} names one file for several vehicles")
-    paths: Mapping[int, Path] = {system: check_new(name) for system, name in names.items()}
-    return lambda component: paths[component.system]
+    return {each: check_new(name) for each, name in names.items()}
 
 
-async def within(found: Sequence[CommandSession], work: Awaitable[Result]) -> Result:
-    """Await `work` until the deadline of the command.
+@dataclass(kw_only=True)
+class _Planned:
+    """The plan for one vehicle, as it is printed."""
 
-    Raises:
-        NoReply: the deadline has passed.
+    job: ApplyJob
+    plan: Plan
+
+    def as_json(self) -> PlanJson:
+        return PlanJson.of(self.plan, **self.job.session.ids, full=self.job.full)
+
+    def rows(self) -> Iterator[Sequence[object]]:
+        has_started = False
+        restart = (None, None, None, Coloured("reboot", "yellow"), "the vehicle reboots")
+        for number, stage in enumerate(self.plan.stages, start=1):
+            for row in stage.rows:
+                purpose = stage.purpose + (", takes effect after a reboot" if row.needs_reboot else "")
+                yield number, *_cells(row, row.reason or purpose)
+            if self.job.reboot and stage.reboot_first:
+                has_started = True
+                yield number, *restart
+        if self.job.reboot and not has_started and (self.plan.reboot_for or self.plan.awaiting_reboot):
+            yield None, *restart
+        for row in self.plan.rows.values():
+            if row.status is not ApplyStatus.SET and (self.job.full or row.is_shown):
+                yield None, *_cells(row, row.why)
+
+    def say_summary(self) -> None:
+        session, made = self.job.session, self.plan
+        if made.firmware_note:
+            say(f"{session.label}: {made.firmware_note}")
+        say(f"{session.receiver}: {_counted(made)}; nothing was sent")
+        self.job.say_notes(made, made)
+        if made.reboot_for and not self.job.reboot:
+            names = first_of(made.reboot_for, APPLY_NAMES_MAX)
+            say(f"{session.label}: would take effect after a reboot: {names}")
+
+    @property
+    def has_work(self) -> bool:
+        """Whether something is written."""
+        is_refused = bool(self.plan.problems) and not self.job.partial
+        waits = self.job.reboot and bool(self.plan.awaiting_reboot)
+        return not is_refused and (bool(self.plan.to_write) or waits)
+
+    def check(self) -> int:
+        """Report that the vehicle is armed; return the exit code that the command is expected to have."""
+        session, code = self.job.session, ExitCode.DONE
+        if self.plan.problems and not self.job.partial:
+            code = ExitCode.USAGE
+        elif any(not row.is_as_wanted for row in self.plan.of(ApplyStatus.SKIPPED, ApplyStatus.INVALID)):
+            code = ExitCode.INCOMPLETE
+        if session.component.is_armed and not self.job.allow_armed:
+            report(f"{session.label} is armed; nothing would be set now without --allow-armed")
+            code = max(code, ExitCode.INCOMPLETE)
+        return code
+
+
+@dataclass(eq=False)
+class ApplyJob:
+    """What apply or restore does with one vehicle, and what became of it.
+
+    Attributes:
+        session: the vehicle.
+        plan: returns the plan.
+        write: writes; takes `timeout`, `progress` and `before_writing` of `apply`.
+        full: whether unchanged and left-out parameters are printed.
+        partial, reboot, allow_armed: as in `apply`.
+        verb: the action for the status line.
+        again: the command that continues after an error, if it is not the given command.
+        done: a sentence on a complete result; "" for none.
+        arrived: the outcomes so far.
+        result: the result at the end.
     """
-    left = found[0].deadline.left()
-    with anyio.move_on_after(left):
-        return await work
-    raise NoReply(f"the parameters of {_title(found)}", attempts=0, waited=left or 0.0)
+
+    session: CommandSession
+    plan: Callable[[], Awaitable[Plan]]
+    write: Callable[..., Awaitable[ApplyResult]]
+    full: bool = False
+    partial: bool = False
+    reboot: bool = False
+    allow_armed: bool = False
+    verb: str = "setting"
+    again: str = ""
+    done: str = ""
+    arrived: dict[str, ApplyRow] = field(default_factory=dict)
+    result: ApplyResult | None = None
+
+    async def planned(self) -> _Planned:
+        """Return the plan, if it is known before the deadline of the command.
+
+        Raises:
+            NoReply: the deadline has passed.
+        """
+        left = self.session.deadline.left()
+        with anyio.move_on_after(left):
+            return _Planned(job=self, plan=await self.plan())
+        raise NoReply(f"the parameters of {self.session.label}", attempts=0, waited=left or 0.0)
+
+    async def run(self) -> ApplyJob:
+        """Write, and return the job with its result."""
+        label, session = self.session.label, self.session
+        began: float | None = None
+
+        def update(state: ApplyProgress) -> None:
+            nonlocal began
+            if state.row is not None:
+                self.arrived[state.row.name] = state.row
+                began = began or anyio.current_time()
+                elapsed = anyio.current_time() - began
+                status.update(Progress.after(state.done, state.total, elapsed))
+
+        async def announce() -> None:
+            await session.check_only()
+            session.announce_write()
+
+        title = f"{self.verb} {label}"
+        with Status(f"{title}: waiting for the first response", title) as status:
+            self.result = await self.write(
+                timeout=session.deadline.left(), progress=update, before_writing=announce
+            )
+        return self
+
+    def as_json(self) -> object:
+        """Return the JSON of the result; after an interruption, of the outcomes so far."""
+        if self.result is None:
+            rows = ApplyRowJson.of_all(self._so_far)
+            return {**self.session.ids, "complete": False, "params": rows, "error": "interrupted"}
+        return ApplyJson.of(self.result, VehicleJson.of(self.session.component), full=self.full)
+
+    def rows(self) -> Iterator[Sequence[object]]:
+        """Yield the cells of `APPLIED_COLUMNS`."""
+        rows: Iterable[ApplyRow] = self._so_far
+        if self.result is not None:
+            rows = self.result.rows.values() if self.full else self.result.shown_rows
+        for row in rows:
+            name, before, wanted, *more = _cells(row, row.why)
+            yield name, before, wanted, _text(row.actual, row), *more
+
+    @property
+    def _so_far(self) -> list[ApplyRow]:
+        """The outcomes before an interruption: no value was read back."""
+        unproven, reason = ApplyStatus.UNPROVEN, "acknowledged, and not read back"
+        return [
+            replace(row, status=unproven, reason=reason) if row.status is ApplyStatus.ACCEPTED else row
+            for row in self.arrived.values()
+        ]
+
+    def say_summary(self) -> int:
+        """Print what became of the vehicle; return the exit code."""
+        result, session = self.result, self.session
+        assert result is not None
+        say(f"{session.receiver}: {_counted(result)} in {result.elapsed:.1f} s")
+        self.say_notes(result, result.plan)
+        if result.system != session.component.system:
+            say(f"{session.address} is {result.system}/{result.component} now")
+        if result.reboot_required:
+            names = first_of(result.reboot_required, APPLY_NAMES_MAX)
+            say(f"{session.label}: takes effect after a reboot: {names}")
+        if result.error is not None:
+            report(f"{session.label}: {result.error}; {self.to_continue}")
+            return max(code_of(result.error), ExitCode.INCOMPLETE)
+        if self.done:
+            say(f"{session.label}: {self.done}")
+        return ExitCode.DONE if result.complete else ExitCode.INCOMPLETE
+
+    def say_notes(self, shown: Rows, made: Plan) -> None:
+        """Print what was left out, with the options that write it, and what was not checked."""
+        left_out = [
+            row for row in shown.of(ApplyStatus.SKIPPED) if row.category in CATEGORIES and row.differs
+        ]
+        if left_out:
+            counts = Counter(row.category for row in left_out)
+            listed = ", ".join(f"{count} {category}" for category, count in counts.items())
+            options = " ".join(f"--include {category}" for category in counts)
+            say(f"{self.session.label}: left out: {listed}; to write them: {options}")
+        if made.unchecked_note:
+            say(f"{self.session.label}: {made.unchecked_note}")
+
+    @property
+    def to_continue(self) -> str:
+        """How to continue after an error, in words."""
+        return f"to continue: `{self.again}`" if self.again else "run it again to continue"
 
 
-def _title(found: Sequence[CommandSession]) -> str:
-    return found[0].label if len(found) == 1 else f"{len(found)} vehicles"
+async def run_jobs(found: Sessions, loaded: Sequence[Done[ApplyJob]], *, dry_run: bool, yes: bool) -> int:
+    """Print the plans, or write and print the results, also those so far after an interruption.
+
+    Args:
+        found: the vehicles.
+        loaded: the job of each vehicle, or the error why there is none.
+        dry_run: print the plans only.
+        yes: do not ask the user.
+
+    Returns:
+        The exit code.
+    """
+    failed = [each for each in loaded if each.error is not None]
+    jobs = {each.session: each.result for each in loaded if each.result is not None}
+    ready = Sessions(jobs)
+    if dry_run or (not yes and can_confirm(found[0].options)):
+        made = await ready.work(lambda session: jobs[session].planned()) if ready else []
+        plans = [each.result for each in made if each.result is not None]
+        if dry_run or any(each.has_work for each in plans):
+            made += [Done(each.session, error=each.error) for each in failed]
+            code = found.show(made, PLAN_COLUMNS, APPLY_NUMBERS)
+            if not found[0].options.json:
+                for each in plans:
+                    each.say_summary()
+        if dry_run:
+            return max([code, *(each.check() for each in plans)])
+        if any(each.has_work for each in plans) and not await confirm("go on?"):
+            return ExitCode.INCOMPLETE
+    await found.report_unheard()
+    try:
+        done = await ready.work(lambda session: jobs[session].run()) if ready else []
+    except anyio.get_cancelled_exc_class():
+        found.show(
+            [Done(session, result=job) for session, job in jobs.items()], APPLIED_COLUMNS, APPLY_NUMBERS
+        )
+        rows = [row for job in jobs.values() for row in job.arrived.values()]
+        unproven = sum(row.status is ApplyStatus.ACCEPTED for row in rows)
+        say(
+            f"interrupted: {counted(unproven, 'value')} acknowledged, not proven, and others may be in "
+            f"flight; {'; '.join(dict.fromkeys(job.to_continue for job in jobs.values()))}"
+        )
+        raise
+    code = found.show([*done, *failed], APPLIED_COLUMNS, APPLY_NUMBERS)
+    return max([code, *(each.result.say_summary() for each in done if each.result is not None)])
+
+
+def _cells(row: ApplyRow, reason: str) -> list[object]:
+    name = "" if row.renamed is None else f"{row.renamed.name} on this vehicle"
+    return [
+        row.name,
+        _text(row.before, row),
+        _text(row.target.settable, row),
+        Coloured(row.status, _STYLES.get(row.status, "")),
+        "; ".join(filter(None, (name, reason))),
+    ]
+
+
+def _text(value: WireValue | None, row: ApplyRow) -> str | None:
+    return None if value is None else format_value(*typed(value, row.type))
+
+
+def _counted(rows: Rows) -> str:
+    counts = rows.counts
+    found = [f"{counts[kind]} {_WORDS.get(kind, kind)}" for kind in ApplyStatus if counts.get(kind)]
+    return ", ".join(found) or "nothing to set"

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.file_output import described, value_text
-from paramclient.cli.json_setup import DiffJson
+from paramclient.cli.json_apply import DiffJson
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Coloured, print_json, print_table, printable, say

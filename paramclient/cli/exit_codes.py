@@ -8,6 +8,7 @@ from typing import Final
 from paramclient.errors import (
     AmbiguousVehicle,
     CacheError,
+    InvalidParameters,
     LinkError,
     NoReply,
     PackError,
@@ -55,6 +56,8 @@ def text_of(error: ParamClientError, *, takes_all: bool) -> str:
         address = error.vehicles[0].partition(" ")[0] if error.vehicles else "1/1"
         all_too = ", or all with --vehicle all" if takes_all and error.choose_by == "system" else ""
         return f"{error.summary} Choose one with --vehicle {address}{all_too}."
+    if isinstance(error, InvalidParameters):
+        return f"{error}\n--partial skips these, and writes the others"
     return str(error)
 
 

@@ -1,6 +1,6 @@
 """JSON of parameters, sets, fetches and writes, as the command prints it and the service sends it.
 
-A class of this module, of `json_cache` and of `json_setup` is the shape of one object. Its `of(…)` builds it
+A class of this module, of `json_cache` and of `json_apply` is the shape of one object. Its `of(…)` builds it
 from an object of the library, and `as_json` serialises it.
 """
 

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import shlex
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Awaitable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import anyio.to_thread
 
 from paramclient.cache import ParamCache
-from paramclient.cli.apply import backups_of, metadata_of_all, set_up, within
-from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.apply import ApplyJob, backups_of, run_jobs
 from paramclient.cli.file_output import described
+from paramclient.cli.metadata import known_of_session
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import local_time, printable, say
+from paramclient.cli.output import local_time, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
-from paramclient.cli.setup_results import Address, SetupOutput
 from paramclient.cli.sources import (
     check_pattern,
     choose,
@@ -27,21 +26,13 @@ from paramclient.cli.sources import (
     open_file,
 )
 from paramclient.cli.time_arguments import parse_when
-from paramclient.client.component import Component
-from paramclient.errors import (
-    AlreadyRestored,
-    CacheError,
-    FileError,
-    NotInCache,
-    ParamClientError,
-    UnknownVehicle,
-    UsageError,
-)
+from paramclient.errors import AlreadyRestored, CacheError, FileError, NotInCache, UnknownVehicle, UsageError
 from paramclient.files import ParamFile
 from paramclient.model.paramset import ParamSet, RestorePoint
 from paramclient.model.wording import age_in_words, first_of
-from paramclient.provision import ApplyProgress, FleetApplied, FleetVerified, restore_all
-from paramclient.provision.fleet import compare_states
+from paramclient.provision import ApplyResult, plan
+from paramclient.provision import restore as restore_state
+from paramclient.provision.apply_restore import restore_categories
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.restore_point import load_restore_point
 
@@ -71,7 +62,9 @@ async def restore(
 ) -> int:
     """Restore an earlier state of a vehicle, with its own identity and calibration.
 
-    Parameters that the state does not have are not changed. On a terminal, the changes are shown and must be
+    Parameters that the state does not have are not changed. Identity and calibration are written if the state
+    is that of this very vehicle: a snapshot, a backup that has its hardware id (as .json files do), or one
+    whose name has it; or if --vehicle names the hardware id. On a terminal, the changes are shown and must be
     confirmed. The exit codes are those of apply.
 
     A time without a time zone is in the time zone of this computer, in which times are printed too, with its
@@ -97,62 +90,42 @@ async def restore(
     loader = _Loader.of(url, when, options)
     extended = extended or (loader.file is not None and loader.file.is_extended)
     async with sessions(url, options, writes=True, extended=extended) as found:
-        states: dict[Address, _State] = {}
-        failed: dict[Address, ParamClientError] = {}
-        for each in found:
-            address = (each.component.system, each.component.component)
-            try:
-                states[address] = await loader.load(each)
-            except ParamClientError as error:
-                if not each.choice.is_all:
-                    raise
-                failed[address] = error
-        by_address = {(each.component.system, each.component.component): each for each in found}
-        commands = {
-            address: _command(url, state.name, by_address[address])
-            for address, state in states.items()
-            if state.name
-        }
-        show = SetupOutput(found, full=full, commands=commands)
-        for address, state in states.items():
-            state.say(by_address[address].prefix)
-        components = [by_address[address].component for address in states]
-        params = {address: state.params for address, state in states.items()}
-        info, backups = await metadata_of_all(found, None, None), await backups_of(backup, found)
+        backups = await backups_of(backup, found)
 
-        async def plans() -> FleetVerified:
-            fleet = await compare_states(components, params, include=include, info=info, force=force)
-            return FleetVerified(fleet.results, {**failed, **fleet.errors})
+        async def job(session: CommandSession) -> ApplyJob:
+            state = await loader.load(session)
+            state.say(session.prefix)
+            component, params = session.component, state.params
+            own = await restore_categories(component, params)
+            info = await known_of_session(session, None)
 
-        async def write(progress: Callable[[Component, ApplyProgress], None]) -> FleetApplied:
-            fleet = await restore_all(
-                components,
-                params,
-                include=include,
-                info=info,
+            def write(**running: Any) -> Awaitable[ApplyResult]:
+                return restore_state(
+                    component,
+                    params,
+                    include=include,
+                    info=info,
+                    force=force,
+                    reboot=reboot,
+                    allow_armed=allow_armed,
+                    backup=backups.get(session),
+                    **running,
+                )
+
+            return ApplyJob(
+                session,
+                lambda: plan(component, params, include=(*own, *include), info=info, force=force),
+                write,
+                full=full,
+                partial=True,
                 reboot=reboot,
                 allow_armed=allow_armed,
-                force=force,
-                backup=backups,
-                timeout=found[0].deadline.left(),
-                progress=progress,
-                before_writing=lambda _: found[0].check_only(),
+                verb="restoring",
+                again=_command(url, state.name, session) if state.name else "",
+                done=f"restored the state {state.point}" if state.point else "",
             )
-            return FleetApplied(fleet.results, {**failed, **fleet.errors})
 
-        if dry_run:
-            return show.planned(
-                await within(found, plans()), reboot=reboot, skip_invalid=True, allow_armed=allow_armed
-            )
-        done = await set_up(found, show, plans, write, verb="restoring", reboot=reboot, yes=yes)
-        if done is None:
-            return ExitCode.INCOMPLETE
-        code = show.applied(done)
-        for address, result in done.results.items():
-            if result.error is None and states[address].point:
-                label = by_address[address].label
-                say(printable(f"{label}: restored the state {states[address].point}"))
-        return code
+        return await run_jobs(found, await found.work(job), dry_run=dry_run, yes=yes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,9 +162,9 @@ class _State:
 
     def say(self, prefix: str) -> None:
         """Print the state, and what its restore undoes, on stderr."""
-        say(printable(f"{prefix}the state: {described(self.params)}"))
+        say(f"{prefix}the state: {described(self.params)}")
         if self.point:
-            say(printable(f"{prefix}the state is that {self.point}; {self.changes}"))
+            say(f"{prefix}the state is that {self.point}; {self.changes}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,9 +219,11 @@ class _Loader:
             path = await fill_pattern(self.pattern, session)
             if not is_file(path):
                 raise FileError("no such file", source=path)
-            return _State(choose(open_file(path), choice.component, session.component.system))
+            return _State(
+                await _as_own(choose(open_file(path), choice.component, session.component.system), session)
+            )
         if self.file is not None:
-            return _State(self.file.choose(choice.component))
+            return _State(await _as_own(self.file.choose(choice.component), session))
         cache = session.client.cache
         if cache is None:
             raise NotInCache("earlier states are in the cache, which cannot be used")
@@ -276,6 +251,19 @@ class _Loader:
                 " can be restored without the cache (--no-cache)"
             ) from error
         return _State.before_apply(point)
+
+
+async def _as_own(params: ParamSet, session: CommandSession) -> ParamSet:
+    """Return the parameters of a backup file; as the vehicle's own, if the user names its hardware id.
+
+    The id is named by --vehicle, or in the name of the file. A file that has another one keeps it.
+    """
+    await wait_for_identity(session.component)
+    own, origin = session.component.identity, params.identity
+    is_named = session.choice.uid is not None or (own.uid is not None and own.uid in params.source)
+    if not is_named or own.uid is None or (origin is not None and origin.uid is not None):
+        return params
+    return replace(params, identity=own if origin is None else replace(origin, uid=own.uid))
 
 
 def _state_at(cache: ParamCache, key: str, component: int, moment: float, *, extended: bool) -> ParamSet:

@@ -251,16 +251,7 @@ class Shown(Protocol):
 
 
 class Sessions(list[CommandSession]):
-    """The vehicles that a subcommand works on: the one of --vehicle, or all of them.
-
-    Args:
-        sessions: the vehicles.
-        writes: whether the subcommand writes, so that each outcome has its own error.
-    """
-
-    def __init__(self, sessions: Iterable[CommandSession], *, writes: bool) -> None:
-        super().__init__(sessions)
-        self._writes = writes
+    """The vehicles that a subcommand works on: the one of --vehicle, or all of them."""
 
     @property
     def is_all(self) -> bool:
@@ -293,13 +284,16 @@ class Sessions(list[CommandSession]):
                 tasks.start_soon(run, place, session)
         return [done[place] for place in sorted(done)]
 
-    def show(self, done: Sequence[Done[S]], columns: Sequence[str], right: str = "") -> int:
+    def show(
+        self, done: Sequence[Done[S]], columns: Sequence[str], right: str = "", *, errors: bool = True
+    ) -> int:
         """Print the results as one table or as JSON, then the failures; return the exit code for these.
 
         Args:
             done: the outcomes.
             columns: the headings of the table.
             right: as in `print_table`.
+            errors: whether JSON of all vehicles has the failures; else each outcome has its own error.
         """
         found = [(each.session, each.result) for each in done if each.result is not None]
         failed = [(each.session, each.error) for each in done if each.error is not None]
@@ -314,19 +308,13 @@ class Sessions(list[CommandSession]):
                 print_table([*(["vehicle"] if named else []), *columns], rows, right=right)
         elif self.is_all:
             vehicles = [session.ids | as_json(result.as_json()) for session, result in found]
-            errors = [session.ids | {"error": str(error)} for session, error in failed]
-            print_json({"vehicles": vehicles} | ({} if self._writes else {"errors": errors}))
+            failures = [session.ids | {"error": str(error)} for session, error in failed]
+            print_json({"vehicles": vehicles} | ({"errors": failures} if errors else {}))
         else:
             print_json(found[0][1].as_json())
         for session, error in failed:
             report(f"{session.label}: {error}")
         return max((code_of(error) for _, error in failed), default=ExitCode.DONE)
-
-    async def announce_write(self) -> None:
-        """Name the vehicles that are written to, and those of the link that were not heard."""
-        for each in self:
-            each.announce_write()
-        await self.report_unheard()
 
     async def report_unheard(self) -> None:
         """Report vehicles of the link in the cache that were not heard, if --vehicle names none."""
@@ -412,8 +400,7 @@ async def sessions(
             if expects_extended(each.identity.vehicle_type, each.component):
                 say(f"{each.system}/{each.component} usually has extended parameters: --extended uses them")
         chosen = [each.ext for each in found] if extended else found
-        found_sessions = (CommandSession(client, each, deadline, options, choice) for each in chosen)
-        yield Sessions(found_sessions, writes=writes)
+        yield Sessions(CommandSession(client, each, deadline, options, choice) for each in chosen)
 
 
 def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> ParamClient:

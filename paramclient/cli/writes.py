@@ -197,7 +197,7 @@ async def write_all(
             lambda session: jobs[session].write(verb, settle=settle, force=force, durable=durable)
         )
     except anyio.get_cancelled_exc_class():
-        found.show(done, columns, right)
+        found.show(done, columns, right, errors=False)
         unknown = sum(each.status is SetStatus.UNKNOWN for job in jobs.values() for each in job.outcomes)
         say(
             f"interrupted: the outcome of {counted(unknown, 'value')} is not known, and the vehicle may "
@@ -205,7 +205,7 @@ async def write_all(
         )
         raise
     elapsed = anyio.current_time() - began
-    found.show(done, columns, right)
+    found.show(done, columns, right, errors=False)
     for job in jobs.values():
         if not found[0].options.json:
             client = job.session.client

@@ -7,16 +7,19 @@ from dataclasses import dataclass, field, replace
 from typing import TypeVar, overload
 
 from paramclient.errors import UsageError
+from paramclient.model.ext_values import check_ext_value
 from paramclient.model.identity import Identity
 from paramclient.model.names import NameChoice, unknown_name
 from paramclient.model.values import (
     WIRE_SIZE,
     Param,
     ParamType,
+    Settable,
     Value,
     WireValue,
     bits_of,
     byte_length,
+    check_value,
     format_value,
     known_type,
     repr_of_param,
@@ -126,12 +129,21 @@ class WrittenParam:
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True)
+def _untyped(name: str, value: WireValue) -> WrittenParam:
+    """Return a plain value; bytes that are not four, and text, are of an extended parameter."""
+    is_raw = isinstance(value, bytes) and len(value) == WIRE_SIZE
+    is_custom = isinstance(value, bytes | str) and not is_raw
+    return WrittenParam(name, value, ParamType.CUSTOM if is_custom else None)
+
+
+@dataclass(frozen=True, slots=True, init=False)
 class ParamSet(Mapping[str, WrittenParam]):
     """The parameters of one component by name, in the order of the source. Immutable.
 
+    `ParamSet({"MC_ROLL_P": 6.0})` holds plain values, as `Component.set_many` takes them.
+
     Attributes:
-        params: the parameters.
+        params: the parameters; as an argument, each may also be a plain value.
         component: component id, or None if the source does not contain it (then the autopilot's is meant).
         system: system id, or None if the source does not contain it.
         identity: the vehicle's identity, or None if the source does not contain it.
@@ -141,12 +153,31 @@ class ParamSet(Mapping[str, WrittenParam]):
     """
 
     params: Mapping[str, WrittenParam]
-    component: int | None = None
-    system: int | None = None
-    identity: Identity | None = None
-    at: float | None = None
-    source: str = ""
-    is_extended: bool = False
+    component: int | None
+    system: int | None
+    identity: Identity | None
+    at: float | None
+    source: str
+    is_extended: bool
+
+    def __init__(
+        self,
+        params: Mapping[str, WrittenParam | Settable],
+        component: int | None = None,
+        system: int | None = None,
+        identity: Identity | None = None,
+        at: float | None = None,
+        source: str = "",
+        is_extended: bool = False,
+    ) -> None:
+        check = check_ext_value if is_extended else check_value
+        written = {
+            name: each if isinstance(each, WrittenParam) else _untyped(name, check(each))
+            for name, each in params.items()
+        }
+        given = {"params": written, "component": component, "system": system, "identity": identity}
+        for attribute, value in {**given, "at": at, "source": source, "is_extended": is_extended}.items():
+            object.__setattr__(self, attribute, value)
 
     @classmethod
     def of(

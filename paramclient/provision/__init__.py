@@ -1,12 +1,12 @@
-"""Setting up vehicles from parameter files: plan, apply, verify and restore, for one vehicle or several.
+"""Parameter files on vehicles: `plan` says what `apply` would write, `restore` writes an earlier state.
 
-A component with extended parameters, `component.ext`, is set up by the same calls.
+They work on one component, or on its extended parameters, `component.ext`; `for_each` makes the same call for
+several vehicles.
 
 - `planning`: the values to write, their order, and the reason for each parameter that is not written.
-- `inspection`: read what a vehicle has; `prepare` and `verify`.
-- `apply_restore`: `apply` and `restore`; `execution` runs them, and stores the
-  snapshot before the first write; `results` holds their results.
-- `fleet`: `apply_all`, `verify_all` and `restore_all` for several vehicles.
+- `inspection`: read what a vehicle has; `plan`.
+- `apply_restore`: `apply` and `restore`; `execution` runs them, and stores the state before the first write.
+- `fleet`: `for_each`.
 - `vehicle_params`: parameters of a vehicle or of the cache as a set.
 - `restore_point`: reads the snapshot that the last `apply` stored, and what has changed since.
 - `apply_rules`: parameters that `apply` leaves out, writes first or last, or reboots for; the list is
@@ -17,27 +17,19 @@ from __future__ import annotations
 
 from paramclient.provision.apply_restore import apply, restore
 from paramclient.provision.apply_rules import CATEGORIES
-from paramclient.provision.fleet import Wanted, apply_all, restore_all, verify_all
-from paramclient.provision.inspection import prepare, verify
+from paramclient.provision.execution import ApplyProgress, ApplyResult
+from paramclient.provision.fleet import FleetResult, for_each
+from paramclient.provision.inspection import plan
 from paramclient.provision.planning import (
     MISSING,
     WRONG,
-    ParamInfo,
-    Plan,
-    PlanRow,
-    PlanStatus,
-    Stage,
-    Step,
-    overlay,
-    plan,
-)
-from paramclient.provision.results import (
-    ApplyProgress,
-    ApplyResult,
     ApplyRow,
     ApplyStatus,
-    FleetApplied,
-    FleetVerified,
+    ParamInfo,
+    Plan,
+    Stage,
+    overlay,
+    plan_from,
 )
 
 __all__ = [
@@ -46,24 +38,16 @@ __all__ = [
     "ApplyRow",
     "ApplyStatus",
     "CATEGORIES",
-    "FleetApplied",
-    "FleetVerified",
+    "FleetResult",
     "MISSING",
     "ParamInfo",
     "Plan",
-    "PlanRow",
-    "PlanStatus",
     "Stage",
-    "Step",
     "WRONG",
-    "Wanted",
     "apply",
-    "apply_all",
+    "for_each",
     "overlay",
     "plan",
-    "prepare",
+    "plan_from",
     "restore",
-    "restore_all",
-    "verify",
-    "verify_all",
 ]

@@ -6,21 +6,19 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from typing import Final
 
-import anyio
-
 from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
 from paramclient.provision.apply_rules import OUT_OF_RANGE
-from paramclient.provision.execution import ApplyOptions, ApplyRun
-from paramclient.provision.inspection import wait_for_identity
-from paramclient.provision.planning import ParamInfo, Plan
-from paramclient.provision.results import ApplyProgress, ApplyResult
-from paramclient.provision.vehicle_params import BEFORE_APPLY
+from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult, run
+from paramclient.provision.inspection import Wanted, wait_for_identity, wanted_set
+from paramclient.provision.planning import ParamInfo
 
-__all__ = ["BEFORE_RESTORE", "apply", "restore", "restore_categories"]
+__all__ = ["BEFORE_APPLY", "BEFORE_RESTORE", "apply", "restore", "restore_categories"]
 
+BEFORE_APPLY: Final = "before apply"
+"""The reason of the snapshot that `apply` stores before its first write."""
 BEFORE_RESTORE: Final = "before restore"
 """The reason of the snapshot that `restore` stores before its first write."""
 
@@ -30,13 +28,13 @@ OWN_STATE_CATEGORIES: Final = ("identity", "hardware", "calibration", OUT_OF_RAN
 
 async def apply(
     component: Component,
-    wanted: ParamSet | Plan,
+    wanted: Wanted,
     *,
     include: str | Iterable[str] = (),
     info: Mapping[str, ParamInfo] | None = None,
     reboot: bool = False,
     allow_armed: bool = False,
-    skip_invalid: bool = False,
+    partial: bool = False,
     force: bool = False,
     renames: Renames | None = None,
     durable: bool = False,
@@ -48,11 +46,14 @@ async def apply(
 ) -> ApplyResult:
     """Write the wanted values to a vehicle, and verify each of them by reading it back at the end.
 
+    All or nothing: if a value is invalid, or the vehicle does not have a name, nothing is written unless
+    `partial` is given.
+
     The call starts from the vehicle's present values; it uses no record of an earlier run. First it stores
     the vehicle's state: as a snapshot in the cache, and in the file `backup`. Then it writes the values stage
-    by stage (see `plan`), concurrently within a stage. Where further parameters may have appeared, and after
-    a reboot, it reads the vehicle again. At the end it reads all values again: by the vehicle's hash if there
-    is one, else as a file or a list.
+    by stage (see `plan_from`), concurrently within a stage. Where further parameters may have appeared, and
+    after a reboot, it reads the vehicle again. At the end it reads all values again: by the vehicle's hash if
+    there is one, else as a file or a list.
 
     A value that the vehicle refuses, adjusts or does not acknowledge is reported in its row; the remaining
     values are still written.
@@ -63,16 +64,13 @@ async def apply(
 
     Args:
         component: the vehicle.
-        wanted: the wanted parameters; or a plan, from which the wanted parameters, `include` and `renames`
-            are used. The plan is computed again from the vehicle's present values.
-        include: as in `plan`; added to the `include` of a plan.
-        info: as in `plan`.
+        wanted: the wanted parameters, or plain values by name.
+        include, info, force: as in `plan_from`.
         reboot: reboot the vehicle if values take effect after a reboot.
         allow_armed: continue if the vehicle is armed.
-        skip_invalid: skip invalid values and write the remaining ones.
-        force: as in `plan`.
-        renames: as in `plan`; None for those of a plan. After each stage that reveals parameters, the other
-            names are looked up again.
+        partial: skip invalid values and names that the vehicle does not have, and write the remaining values.
+        renames: as in `plan_from`. After each stage that reveals parameters, the other names are looked up
+            again.
         durable: return only when the values and their history are on the disk and survive a power loss; if
             that fails, `error` of the result is a CacheError.
         backup: a file for the state before the first write; its name determines the file format, see
@@ -81,24 +79,24 @@ async def apply(
         author: the author of the changes, as in `Component.set`.
         progress: called after each value and at the start of a phase; it must not raise.
         before_writing: called once after the vehicle was read, before its state is stored and the first value
-            is written; awaited if it is asynchronous. Its exceptions end the call.
+            is written, and only if there is something to write; awaited if it is asynchronous. Its exceptions
+            end the call.
 
     Raises:
-        InvalidParameters: some values are invalid, and `skip_invalid` is false.
-        UsageError: as from `plan`; the plan is for another
-            vehicle; SYS_AUTOCONFIG, which resets other parameters at the next start, is included without
-            `reboot`; or `durable` without a cache.
+        InvalidParameters: some values are invalid, or names are not on the vehicle, and `partial` is false.
+        UsageError: as from `plan_from`; SYS_AUTOCONFIG, which resets other parameters at the next start, is
+            included without `reboot`; or `durable` without a cache.
         VehicleArmed: the vehicle is armed, and `allow_armed` is false.
         FileError, CacheError: the state before the first write could not be stored.
         NoReply: the vehicle did not answer before the first write.
         LinkError: the link failed, or the client was closed, before the first write.
     """
     options = ApplyOptions(
-        include=(include,) if isinstance(include, str) else tuple(include),
+        include=include,
         info=info,
         reboot=reboot,
         allow_armed=allow_armed,
-        skip_invalid=skip_invalid,
+        partial=partial,
         force=force,
         renames=renames,
         durable=durable,
@@ -108,7 +106,7 @@ async def apply(
         before_writing=before_writing,
         reason=BEFORE_APPLY,
     )
-    return await _run(ApplyRun(component, wanted, options), timeout)
+    return await run(component, wanted_set(component, wanted), options, timeout)
 
 
 async def restore(
@@ -143,14 +141,17 @@ async def restore(
         UsageError: the state is that of another vehicle.
         ParamClientError: as from `apply`.
     """
+    state = wanted_set(component, state)
     given = (include,) if isinstance(include, str) else tuple(include)
     options = ApplyOptions(
         include=(*await restore_categories(component, state), *given),
         info=info,
         reboot=reboot,
         allow_armed=allow_armed,
-        skip_invalid=True,
+        partial=True,
         force=force,
+        renames=None,
+        durable=False,
         backup=backup,
         author=author,
         progress=progress,
@@ -158,7 +159,7 @@ async def restore(
         reason=BEFORE_RESTORE,
         skips_read_only=True,
     )
-    return await _run(ApplyRun(component, state, options), timeout)
+    return await run(component, state, options, timeout)
 
 
 async def restore_categories(component: Component, state: ParamSet) -> tuple[str, ...]:
@@ -175,11 +176,3 @@ async def restore_categories(component: Component, state: ParamSet) -> tuple[str
     if origin is not None and not is_own and None not in (origin.uid, own.uid) and origin.uid != own.uid:
         raise UsageError(f"the state is that of another vehicle: {origin}; this vehicle is {own}")
     return OWN_STATE_CATEGORIES if is_own else (OUT_OF_RANGE,)
-
-
-async def _run(run: ApplyRun, timeout: float | None) -> ApplyResult:
-    with anyio.move_on_after(timeout):
-        await run.prepare()
-        await run.write_and_verify()
-        return run.result()
-    return run.timed_out_result()

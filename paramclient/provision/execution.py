@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
@@ -25,37 +26,23 @@ from paramclient.errors import (
     UsageError,
     VehicleArmed,
 )
-from paramclient.model.identity import Identity
+from paramclient.files import write_file
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
-from paramclient.model.values import WireValue
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
 from paramclient.provision.inspection import (
     POLL_INTERVAL,
     Inspection,
     inspect,
-    plan_for,
-    read_hidden,
+    planner_for,
     reread,
     wait_for_identity,
     with_other_names,
 )
-from paramclient.provision.planning import (
-    MISSING,
-    WRONG,
-    ParamInfo,
-    Plan,
-    PlanRow,
-    PlanStatus,
-    Stage,
-    Step,
-    check_component,
-    plan,
-)
-from paramclient.provision.results import ApplyProgress, ApplyResult, ApplyRow, ApplyStatus
+from paramclient.provision.planning import WRONG, ApplyRow, ApplyStatus, ParamInfo, Plan, Rows, Stage
 
-__all__ = ["ApplyOptions", "ApplyRun"]
+__all__ = ["ApplyOptions", "ApplyProgress", "ApplyResult", "run"]
 
 WRITE_ATTEMPTS_MAX: Final = 2
 """Times that a value is written if the vehicle acknowledges it and later holds another value: a write of
@@ -75,6 +62,63 @@ changes it after a reboot, as ArduCopter does. ArduPlane and Rover change it wit
 4.6-dev)."""
 
 
+@dataclass(frozen=True, slots=True)
+class ApplyProgress:
+    """The progress of `apply`.
+
+    Attributes:
+        phase: "reading", "writing" or "rebooting".
+        done: number of values written in this run so far.
+        total: number of values to write, as far as known.
+        row: the latest outcome for one parameter; the read-back at the end may change it.
+    """
+
+    phase: str
+    done: int
+    total: int
+    row: ApplyRow | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ApplyResult(Rows):
+    """The result of `apply` or `restore` for one vehicle.
+
+    Attributes:
+        system: system id of the vehicle at the end; it differs from the first one if the system id was set.
+        component: component id of the vehicle.
+        plan: the first plan.
+        before: the state that was stored before the first write.
+        extra: names that the vehicle had when its whole table was last read, and that are not wanted; they
+            were not changed.
+        reboots: number of reboots.
+        reboot_required: names that were written and take effect after a reboot.
+        error: the error that ended the run early, or None. The rows are valid in both cases.
+        elapsed: seconds.
+    """
+
+    system: int
+    component: int
+    plan: Plan
+    before: ParamSet
+    extra: tuple[str, ...]
+    reboots: int
+    reboot_required: tuple[str, ...]
+    error: ParamClientError | None
+    elapsed: float
+
+    @property
+    def complete(self) -> bool:
+        """Whether the vehicle has all wanted values, read back, except those left out on purpose."""
+        return self.error is None and all(row.is_as_wanted for row in self.rows.values())
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{count} {status}" for status, count in self.counts.items())
+        end = f", ended by {self.error}" if self.error is not None else ""
+        return (
+            f"<ApplyResult {self.system}/{self.component} {counts or 'nothing'} in {self.elapsed:.2f} s{end}>"
+        )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ApplyOptions:
     """The arguments of `apply` and `restore`, see there.
@@ -85,14 +129,14 @@ class ApplyOptions:
             refused.
     """
 
-    include: tuple[str, ...]
+    include: str | Iterable[str]
     info: Mapping[str, ParamInfo] | None
     reboot: bool
     allow_armed: bool
-    skip_invalid: bool
+    partial: bool
     force: bool
-    renames: Renames | None = None
-    durable: bool = False
+    renames: Renames | None
+    durable: bool
     backup: str | os.PathLike[str] | None
     author: str | None
     progress: Callable[[ApplyProgress], None] | None
@@ -101,172 +145,211 @@ class ApplyOptions:
     skips_read_only: bool = False
 
 
-class ApplyRun:
+async def run(
+    component: Component, wanted: ParamSet, options: ApplyOptions, timeout: float | None
+) -> ApplyResult:
+    """Apply wanted parameters to a vehicle; see `apply`."""
+    check_author(options.author)
+    began = anyio.current_time()
+    error: ParamClientError | None = None
+    one = _Run(component, wanted, options)
+    with anyio.move_on_after(timeout) as scope:
+        await one.begin()
+        try:
+            with component.watch.held():  # a changed count starts no download besides those of the run
+                start = await one.store_state()
+                await one.write_and_verify()
+            await start.end(one.component)
+        except ParamClientError as failure:
+            if not one.sent:
+                raise
+            error = failure
+    waited = anyio.current_time() - began
+    if scope.cancelled_caught:
+        error = NoReply(f"the apply to {component.system}/{component.component}", attempts=0, waited=waited)
+        if not one.sent:
+            raise error
+    return one.result(error, waited)
+
+
+@dataclass(frozen=True, slots=True)
+class _Start:
+    """The vehicle before the first write.
+
+    Attributes:
+        plan: the first plan.
+        table: the vehicle's parameters.
+        snapshot: number of the snapshot of them in the cache, or None.
+    """
+
+    plan: Plan
+    table: ParamSet
+    snapshot: int | None = None
+
+    async def end(self, component: Component) -> None:
+        """Record in the cache that the run was not interrupted."""
+        writer, number, cache = component.core.cache_writer, self.snapshot, component.core.cache
+        if cache is not None and number is not None:
+            with suppress(CacheError):  # the warning of the cache writer says so
+                await writer.run_in_thread(lambda: cache.end_operation(number))
+
+
+class _Run:
     """One run of `apply` or `restore`.
 
     Args:
         component: the vehicle.
-        wanted: the wanted parameters, or a plan.
+        wanted: the wanted parameters.
         options: the other arguments of the call.
 
     Attributes:
+        component: the vehicle under its present system id.
         inspection: the latest inspection of the vehicle.
         plan: the plan that follows from it.
-        rows: rows of parameters whose outcome is known before the vehicle is read again, by the vehicle's
-            names.
         sent: parameters for which a PARAM_SET may have been sent, as the vehicle names them.
-        written: number of acknowledged writes by parameter, as the vehicle names it.
     """
 
     inspection: Inspection
     plan: Plan
-    _first_identity: Identity
 
-    def __init__(self, component: Component, wanted: ParamSet | Plan, options: ApplyOptions) -> None:
-        check_author(options.author)
-        self._component = component
-        self._plan_identity: Identity | None = None
-        if isinstance(wanted, Plan):
-            self._plan_identity = wanted.identity
-            options = replace(
-                options,
-                include=(*wanted.include, *options.include),
-                force=options.force or wanted.force,
-                renames=wanted.renames if options.renames is None else options.renames,
-            )
-            wanted = wanted.wanted
+    def __init__(self, component: Component, wanted: ParamSet, options: ApplyOptions) -> None:
+        self.component = component
+        self.sent: set[str] = set()
         self._wanted = wanted
         self._options = options
-        self._rules = rules_for("")
-        self._began = anyio.current_time()
-        self.rows: dict[str, ApplyRow] = {}
-        self.sent: set[str] = set()
-        self.written: dict[str, int] = {}
-        self._first: Inspection | None = None
-        self._first_plan: Plan | None = None
-        self._is_verified = True  # nothing was written since the last inspection
-        self._written_at = -math.inf  # when the last write ended
-        self._inspected_at = -math.inf  # when the last inspection began
-        self._notes: dict[str, str] = {}  # notes of the acknowledged writes
+        self._rules = rules_for(component.autopilot, is_extended=component.is_extended)
+        self._start: _Start | None = None
+        self._settled: dict[str, ApplyRow] = {}  # outcomes before the last read, by the vehicle's names
+        self._written: Counter[str] = Counter()  # acknowledged writes
+        self._notes: dict[str, str] = {}  # of the acknowledged writes
+        self._written_at = self._inspected_at = -math.inf  # end of the last write, begin of the last read
         self._reboot_for: dict[str, None] = {}
         self._reboots = 0
-        self._written_before_reboot: set[str] = set()  # values that the last reboot should have kept
+        self._kept_by_reboot: set[str] = set()  # values that the last reboot should have kept
         self._next_system_id: int | None = None  # the vehicle's system id after the next reboot
-        self._error: ParamClientError | None = None
-        self._snapshot: int | None = None  # number of the snapshot of the state before
 
-    async def prepare(self) -> None:
-        """Inspect the vehicle, plan, and store its state. A failure is raised before the first write."""
-        if self._options.durable and self._component.core.cache is None:
+    async def begin(self) -> None:
+        """Inspect the vehicle, and plan."""
+        component, options = self.component, self._options
+        if options.durable and component.core.cache is None:
             raise UsageError("durable needs a cache, and the client keeps none")
-        component = self._component
-        check_component(self._wanted, component.component, is_extended=component.is_extended)
-        plan({}, self._wanted, include=self._options.include, autopilot=self._component.autopilot)
-        await wait_for_identity(self._component)
+        await wait_for_identity(component)
         self._rules = rules_for(component.autopilot, is_extended=component.is_extended)
-        planned, own = self._plan_identity, self._component.identity
-        if planned is not None and not planned.is_same_vehicle(own):
-            raise UsageError(f"the plan is for another vehicle: {planned}; this vehicle is {own}")
-        with self._component.watch.held():
+        self._identity = component.identity
+        self._make_plan = planner_for(
+            component,
+            self._wanted,
+            options.include,
+            options.info,
+            force=options.force,
+            renames=options.renames,
+        )
+        with component.watch.held():
             await self._check_armed()
             await self._inspect()
-            self._first, self._first_plan = self.inspection, self.plan
-            self._first_identity = self._component.identity
-            self._check_plan()
-            if self._options.before_writing is None:
-                await self._store_state()
-        if self._options.before_writing is not None:
-            await _call_and_wait(self._options.before_writing)
-            await self._store_state()
+        if self.plan.problems and not options.partial:
+            raise InvalidParameters(self.plan.problems)
+        for row in self.plan.to_write:
+            if self._rules.is_action(row.target.name) and self._resets(row) and not options.reboot:
+                raise UsageError(
+                    f"{row.target.name} resets other parameters to their defaults at the next start of the "
+                    "vehicle; it can only be set with reboot=True"
+                )
+        if options.before_writing is not None and (self.plan.to_write or self._must_reboot([])):
+            result = options.before_writing()
+            if isinstance(result, Awaitable):
+                await result
 
-    def _check_plan(self) -> None:
-        """Raise the error of a plan that must not be carried out."""
-        invalid = {row.name: row.reason for row in self.plan.of(PlanStatus.INVALID)}
-        if invalid and not self._options.skip_invalid:
-            raise InvalidParameters(invalid)
-        self._check_resets()
+    async def store_state(self) -> _Start:
+        """Store the vehicle's state in the backup file, and in the cache if the plan has values to write."""
+        component, inspection, options = self.component, self.inspection, self._options
+        writer, cache, path = component.core.cache_writer, component.core.cache, options.backup
+        if path is not None:
+            await writer.run_in_thread(lambda: write_file(path, inspection.table))
+        self._start = _Start(self.plan, inspection.table)
+        if cache is None or not self.plan.to_write:
+            return self._start
+        try:
+            # the history then has the values from before the change
+            await writer.write_all()
+            snapshot = await writer.run_in_thread(
+                lambda: cache.store_snapshot(
+                    component.identity,
+                    component.component,
+                    inspection.table,
+                    reason=options.reason,
+                    hash=inspection.hash,
+                    complete=inspection.complete,
+                    is_of_operation=True,
+                    extended=component.is_extended,
+                )
+            )
+        except CacheError as error:
+            raise CacheError(
+                f"nothing was sent, as the state before cannot be stored: {error}. Without a cache"
+                " (--no-cache, or cache=False), no state is stored"
+            ) from error
+        self._start = replace(self._start, snapshot=snapshot.id)
+        return self._start
 
     async def write_and_verify(self) -> None:
-        """Write and verify until no stage is pending. `result` reports a failure after the first write."""
-        with self._component.watch.held():  # a changed count starts no download besides those of the run
-            await self._write_and_verify()
-        await self._record_end()
+        """Write and verify until no stage is pending.
 
-    async def _write_and_verify(self) -> None:
-        """Do what `write_and_verify` says, while no check of the table begins."""
-        try:
-            while True:
-                stages = self._pending_stages()
-                for stage in stages:
-                    await self._check_armed()
-                    await self._write_stage(stage)
-                if self._must_reboot(stages):
-                    await self._reboot_vehicle()
-                    await self._inspect()
-                    self._record_lost_values()
-                elif self._reveals_more(stages):
-                    await self._read_revealed(stages[-1])
-                elif stages or self._inspected_at < self._written_at + VERIFY_DELAY:
-                    await anyio.sleep_until(self._written_at + VERIFY_DELAY)
-                    await self._verify()
-                else:
-                    break
-            if self._options.durable and self.sent:
-                await self._component.core.cache_writer.write_durably(self._component.node)
-        except ParamClientError as error:
-            if not self.sent:
-                raise
-            self._error = error
+        Raises:
+            ParamClientError: the run ended early; `result` has the outcomes so far.
+        """
+        while True:
+            stages = self._pending_stages()
+            for stage in stages:
+                await self._check_armed()
+                await self._write_stage(stage)
+            if self._must_reboot(stages):
+                await self._reboot()
+            elif stages and stages[-1].reveals and self.plan.of(ApplyStatus.LATER):
+                await self._read_revealed(stages[-1])
+            elif stages or self._inspected_at < self._written_at + VERIFY_DELAY:
+                await anyio.sleep_until(self._written_at + VERIFY_DELAY)
+                await self._verify()
+            else:
+                break
+        if self._options.durable and self.sent:
+            await self.component.core.cache_writer.write_durably(self.component.node)
 
-    def result(self) -> ApplyResult:
+    def result(self, error: ParamClientError | None, elapsed: float) -> ApplyResult:
         """Return the result of the run."""
-        assert self._first is not None
-        assert self._first_plan is not None
+        assert self._start is not None
         return ApplyResult(
-            self._component.system,
-            self._component.component,
             {name: self._final_row(row) for name, row in self.plan.rows.items()},
-            self._first_plan,
-            self._first.table,
+            self.component.system,
+            self.component.component,
+            self._start.plan,
+            self._start.table,
             self.plan.extra,
             self._reboots,
             tuple(self._reboot_for),
-            self._error,
-            anyio.current_time() - self._began,
+            error,
+            elapsed,
         )
-
-    def timed_out_result(self) -> ApplyResult:
-        """Return the result of a run that has reached its timeout.
-
-        Raises:
-            NoReply: nothing was sent.
-        """
-        waited = anyio.current_time() - self._began
-        error = NoReply(f"the set-up of {self._address}", attempts=0, waited=waited)
-        if not self.sent:
-            raise error
-        self._error = error
-        return self.result()
 
     # Next stages
 
     def _pending_stages(self) -> list[Stage]:
         """Return the next stages, up to and including the one after which the vehicle must be inspected."""
         stages = []
-        may_appear = bool(self.plan.of(PlanStatus.LATER))
+        may_appear = bool(self.plan.of(ApplyStatus.LATER))
         for stage in self.plan.stages:
-            steps = tuple(step for step in stage.steps if self._may_write(step.name))
-            if steps:
-                stages.append(replace(stage, steps=steps))
+            if rows := tuple(row for row in stage.rows if self._may_write(row.target.name)):
+                stages.append(replace(stage, rows=rows))
                 if (stage.reveals and may_appear) or (stage.reboot_first and self._options.reboot):
                     break
         return stages
 
-    def _reveals_more(self, done: list[Stage]) -> bool:
-        """Return whether the stages that are done may have revealed wanted parameters."""
-        return bool(done) and done[-1].reveals and bool(self.plan.of(PlanStatus.LATER))
+    def _may_write(self, name: str) -> bool:
+        """Return whether a parameter whose value differs is written, or written again."""
+        attempts_max = 1 if self._rules.is_action(name) else WRITE_ATTEMPTS_MAX
+        return name not in self._settled and self._written[name] < attempts_max
 
-    def _must_reboot(self, done: list[Stage]) -> bool:
+    def _must_reboot(self, done: Sequence[Stage]) -> bool:
         """Return whether the vehicle must reboot after the stages that are done."""
         if not self._options.reboot:
             return False
@@ -277,106 +360,85 @@ class ApplyRun:
 
     def _pending_system_id(self) -> int | None:
         """Return the system id that is set and takes effect after a reboot, or None."""
-        for row in self.plan.rows.values():
-            is_set = row.status is PlanStatus.UNCHANGED and self._rules.is_system_id(row.target.name)
-            if is_set and isinstance(row.before, int) and row.before != self._component.system:
-                return row.before
+        for row in self.plan.of(ApplyStatus.UNCHANGED):
+            if self._rules.has("system_id", row.target.name) and row.before != self.component.system:
+                return row.before if isinstance(row.before, int) else None
         return None
 
-    def _may_write(self, name: str) -> bool:
-        """Return whether a parameter whose value differs is written, or written again."""
-        if name in self.rows:
-            return False
-        attempts_max = 1 if self._is_action(name) else WRITE_ATTEMPTS_MAX
-        return self.written.get(name, 0) < attempts_max
+    def _resets(self, row: ApplyRow) -> bool:
+        return self._rules.has("resets", row.target.name)
 
-    def _is_action(self, name: str) -> bool:
-        rule = self._rules.left_out(name)
-        return rule is not None and rule.category == "action"
-
-    # Reads, writes and reboots of the vehicle
+    # Reads
 
     async def _inspect(self) -> None:
-        self._report("reading")
-        absent = self.inspection.absent if self._first is not None else frozenset[str]()
-        self._inspected_at = anyio.current_time()
-        self.inspection = await inspect(
-            self._component,
-            self._wanted,
-            absent,
-            renames=self._options.renames,
-            whole=self._first is None,
-        )
-        self._check_same_vehicle()
-        self._replan()
-        self._is_verified = True
+        absent = frozenset[str]() if self._start is None else self.inspection.absent
+        await self._read(inspect(self.component, self._wanted, self._options.renames, absent), verifies=True)
 
     async def _verify(self) -> None:
         """Read the wanted parameters: by name if that is faster than the whole table, else the table.
 
         Always reads the table if a switch may have revealed parameters whose names are not known.
         """
-        rows = [*self.plan.of(PlanStatus.SET), *self.plan.of(PlanStatus.UNCHANGED)]
-        names = [row.target.name for row in rows]
-        if self.plan.of(PlanStatus.LATER) or not self.inspection.is_reading_faster(len(names)):
+        names = [row.target.name for row in self.plan.of(ApplyStatus.SET, ApplyStatus.UNCHANGED)]
+        if self.plan.of(ApplyStatus.LATER) or not self.inspection.is_reading_faster(len(names)):
             await self._inspect()
-            return
-        self._report("reading")
-        self._inspected_at = anyio.current_time()
-        self.inspection = await reread(self._component, self.inspection, names)
-        self._check_same_vehicle()
-        self._replan()
-        self._is_verified = True
+        else:
+            await self._read(reread(self.component, self.inspection, names, names), verifies=True)
 
     async def _read_revealed(self, done: Stage) -> None:
         """Read by name the parameters that a stage may have revealed. This verifies no write."""
-        self._report("reading")
-        later = [row.name for row in self.plan.of(PlanStatus.LATER)]
+        later = [row.name for row in self.plan.of(ApplyStatus.LATER)]
         names = with_other_names(later, (), self._options.renames)
-        if self._component.autopilot == "ardupilot":  # a switch reveals the names with its own prefix
-            groups = tuple(step.name.rpartition("_")[0] for step in done.steps)
+        if self.component.autopilot == "ardupilot":  # a switch reveals the names with its own prefix
+            groups = tuple(row.target.name.rpartition("_")[0] for row in done.rows)
             names = tuple(name for name in names if name.startswith(groups))
-        self.inspection = await read_hidden(self._component, self.inspection, names)
-        self._check_same_vehicle()
-        self._replan()
+        await self._read(reread(self.component, self.inspection, names))
 
-    def _replan(self) -> None:
-        """Plan again from the latest inspection."""
-        self.plan = plan_for(
-            self._component,
-            self.inspection.table,
-            self._wanted,
-            self._options.include,
-            self._options.info,
-            force=self._options.force,
-            renames=self._options.renames,
-        )
+    async def _read(self, reading: Awaitable[Inspection], *, verifies: bool = False) -> None:
+        """Await a read of the vehicle, and plan again from it."""
+        self._report("reading")
+        began = anyio.current_time()
+        self.inspection = await reading
+        self._check_same_vehicle()
+        self.plan = self._make_plan(self.inspection.table)
+        if verifies:
+            self._inspected_at = began
+
+    def _check_same_vehicle(self) -> None:
+        """Raise `AnotherVehicle` if the identity is not that of the first inspection."""
+        component, found = self.component, self.component.identity
+        if self._start is None:
+            self._identity = found
+        elif not self._identity.is_same_vehicle(found):
+            raise AnotherVehicle(component.system, component.component, str(self._identity), str(found))
+
+    # Writes and reboots
 
     async def _write_stage(self, stage: Stage) -> None:
         """Write the values of a stage: many at a time, or one by one if they may end the connection."""
         if not stage.is_last:
-            await self._write(stage.steps)
+            await self._write(stage.rows)
             return
-        for step in stage.steps:
-            if self._rules.is_system_id(step.name):
-                await self._write_system_id(step)
+        for row in stage.rows:
+            if self._rules.has("system_id", row.target.name):
+                await self._write_system_id(row)
             else:
-                await self._write([step])
+                await self._write([row])
 
-    async def _write(self, steps: Sequence[Step]) -> None:
+    async def _write(self, rows: Sequence[ApplyRow]) -> None:
         """Write values in order, many at a time.
 
         Raises:
             ParamClientError: not all values were tried.
         """
         self._check_same_vehicle()
-        self._is_verified = False
-        by_name = {step.name: step for step in steps}
+        by_name = {row.target.name: row for row in rows}
         before = frozenset(self.sent)
         self.sent.update(by_name)
+        self._written_at = math.inf
         try:
-            done = await self._component.set_many(
-                [(step.name, step.value) for step in steps],
+            done = await self.component.set_many(
+                [(name, row.target.settable) for name, row in by_name.items()],
                 force=self._options.force,
                 author=self._options.author,
                 progress=lambda outcome: self._take(by_name[outcome.name], outcome),
@@ -386,136 +448,124 @@ class ApplyRun:
             raise
         finally:
             self._written_at = anyio.current_time()
-        self.sent -= {outcome.name for outcome in done.of(SetStatus.NOT_TRIED)} - before
+        not_tried = done.of(SetStatus.NOT_TRIED)
+        self.sent -= {outcome.name for outcome in not_tried} - before
         if done.error is not None:
             raise done.error
-        for outcome in done.of(SetStatus.NOT_TRIED):
-            self._record(by_name[outcome.name], ApplyStatus.FAILED, None, str(outcome.error))
+        for outcome in not_tried:
+            self._settle(by_name[outcome.name], ApplyStatus.NOT_TRIED, str(outcome.error))
 
-    def _take(self, step: Step, outcome: SetOutcome) -> None:
+    def _take(self, row: ApplyRow, outcome: SetOutcome) -> None:
         """Record the outcome of a write."""
         done, error = outcome.result, outcome.error
         if done is not None:
-            self._count_write(step)
-            self._notes[step.name] = done.note
-            if self._is_action(step.name) and self._rules.resets(step.name):
+            if self._rules.is_action(outcome.name) and self._resets(row):
                 self._next_system_id = DEFAULT_SYSTEM_ID
             if done.adjusted:
-                self._record(step, ApplyStatus.ADJUSTED, done.param.settable, "the vehicle changed the value")
+                self._count_write(row)
+                self._settle(row, ApplyStatus.ADJUSTED, "the vehicle changed the value")
             else:
-                self._report("writing", self._make_row(step, ApplyStatus.SET, done.param.settable, done.note))
+                self._accept(row, done.note)
+        elif self._options.skips_read_only and _is_read_only(error):
+            reason = "left out: the vehicle reports that it is read-only"
+            self._settle(row, ApplyStatus.SKIPPED, reason, READ_ONLY)
         elif outcome.status is SetStatus.REFUSED:
-            is_read_only = isinstance(error, Refused) and error.code == ParamErrorCode.READ_ONLY
-            if is_read_only and self._options.skips_read_only:
-                reason = "left out: the vehicle reports that it is read-only"
-                self._record(step, ApplyStatus.SKIPPED, step.before, reason, READ_ONLY)
-            else:
-                self._record(step, ApplyStatus.REFUSED, step.before, str(error))
+            self._settle(row, ApplyStatus.REFUSED, str(error))
         elif outcome.status is SetStatus.UNKNOWN:
-            self._record(step, ApplyStatus.FAILED, None, str(error))
+            self._settle(row, ApplyStatus.UNKNOWN, str(error))
 
-    async def _write_system_id(self, step: Step) -> None:
+    async def _write_system_id(self, row: ApplyRow) -> None:
         """Set the system id, and continue with the vehicle under its new one."""
-        system = int(step.value) if not isinstance(step.value, bytes) else 0
-        if any(
-            self._is_other_vehicle_with(system, known) for known in self._component.client.components.values()
-        ):
+        name, system = row.target.name, int(row.target.value)
+        if any(self._is_other_vehicle_with(system, each) for each in self._known):
             reason = f"another vehicle on this link has system id {system}"
-            self._record(step, ApplyStatus.SKIPPED, step.before, reason, WRONG)
+            self._settle(row, ApplyStatus.SKIPPED, reason, WRONG)
             return
-        if self._rules.needs_reboot(step.name):
-            await self._write([step])
-            if step.name in self.written:
+        if self._rules.needs_reboot(name):
+            await self._write([row])
+            if self._written[name]:
                 self._next_system_id = system
             return
-        self._is_verified = False
-        self.sent.add(step.name)
+        self.sent.add(name)
+        self._written_at = math.inf
         failure: ParamClientError | None = None
-        is_id_kept = False
+        is_kept = False
 
         async def cancel_if_id_is_kept() -> None:
-            nonlocal is_id_kept
-            await self._set_and_detect_kept_id(step)
-            is_id_kept = True
+            nonlocal is_kept
+            await self._set_and_detect_kept_id(row)
+            is_kept = True
             sending.cancel_scope.cancel()
 
         async with anyio.create_task_group() as sending:
             sending.start_soon(cancel_if_id_is_kept)
             try:
-                self._component = await self._component.client.successor(
-                    self._component, system, timeout=SYSTEM_CHANGE_TIMEOUT
+                self.component = await self.component.client.successor(
+                    self.component, system, timeout=SYSTEM_CHANGE_TIMEOUT
                 )
             except ParamClientError as error:  # raised here, the task group would wrap it in a group
                 failure = error
             sending.cancel_scope.cancel()
         self._written_at = anyio.current_time()
-        step = replace(step, needs_reboot=is_id_kept)
-        if is_id_kept:
+        if is_kept:
             self._next_system_id = system
         if failure is None:
-            self._count_write(step)
-            self._report("writing", self._make_row(step, ApplyStatus.SET, step.value))
+            self._accept(replace(row, needs_reboot=is_kept))
             return
-        self._record(step, ApplyStatus.FAILED, None, str(failure))
+        self._settle(row, ApplyStatus.UNKNOWN, str(failure))
         if isinstance(failure, LinkError):
             raise failure
+
+    @property
+    def _known(self) -> Sequence[Component]:
+        return list(self.component.client.components.values())
 
     def _is_other_vehicle_with(self, system: int, known: Component) -> bool:
         """Return whether `known` is another vehicle with this system id.
 
         The same vehicle under an earlier id, and a lost vehicle, do not count.
         """
-        own = self._component.identity
+        own = self.component.identity
         is_ours = own.has_own_uid and known.identity.uid == own.uid
         return known.system == system and known.state != "lost" and not is_ours
 
-    async def _set_and_detect_kept_id(self, step: Step) -> None:
+    async def _set_and_detect_kept_id(self, row: ApplyRow) -> None:
         """Set the system id, and return once the vehicle has acknowledged it and still has the old one.
 
         ArduPlane and Rover may change the id before they acknowledge; then this call does not return until
         it is cancelled.
         """
-        component = self._component
+        component = self.component
         with suppress(ParamClientError):
-            await component.set(step.name, step.value, author=self._options.author)
+            await component.set(row.target.name, row.target.settable, author=self._options.author)
             acknowledged_at = anyio.current_time()
             while component.node.presence.beat_at < acknowledged_at + SYSTEM_CHANGE_DELAY:  # noqa: ASYNC110 - no event
                 await anyio.sleep(POLL_INTERVAL)
             return
         await anyio.sleep_forever()
 
-    async def _reboot_vehicle(self) -> None:
-        """Reboot the vehicle and continue with it, under its new system id if one is pending."""
+    async def _reboot(self) -> None:
+        """Reboot the vehicle, continue with it under its new system id if one is pending, and inspect it.
+
+        Values that the vehicle had acknowledged and lost with the reboot are adjusted: they are not written
+        again, as the next reboot would change them again.
+        """
         await self._check_armed()
         self._report("rebooting")
         system = self._pending_system_id() if self._next_system_id is None else self._next_system_id
-        self._component = await self._component.reboot(system=system)
+        self.component = await self.component.reboot(system=system)
         self._next_system_id = None
         self._reboots += 1
         # values that a resetting parameter has reverted are written again
-        is_reset = any(self._rules.resets(name) for name in self._reboot_for)
-        self._written_before_reboot = set() if is_reset else set(self.written)
+        is_reset = any(self._rules.has("resets", name) for name in self._reboot_for)
+        kept = set() if is_reset else set(self._written)
         self._notes.clear()  # they warn of effects of this reboot
         self._reboot_for.clear()
-
-    def _record_lost_values(self) -> None:
-        """Record as adjusted the values that the vehicle had acknowledged and lost with the reboot.
-
-        They are not written again: the next reboot would change them again.
-        """
-        for step in self.plan.steps:
-            if step.name in self._written_before_reboot and step.name not in self.rows:
+        await self._inspect()
+        for row in self.plan.to_write:
+            if row.target.name in kept and row.target.name not in self._settled:
                 reason = "the vehicle acknowledged the value, and has another one after the reboot"
-                self._record(step, ApplyStatus.ADJUSTED, step.before, reason)
-
-    def _check_same_vehicle(self) -> None:
-        """Raise `AnotherVehicle` if the identity is not that of the first inspection."""
-        found = self._component.identity
-        if self._first is not None and not self._first_identity.is_same_vehicle(found):
-            system, component = self._component.system, self._component.component
-            raise AnotherVehicle(system, component, str(self._first_identity), str(found))
-
-    # Checks and storage before a write
+                self._settle(row, ApplyStatus.ADJUSTED, reason)
 
     async def _check_armed(self) -> None:
         """Check that every component of the vehicle is disarmed, and that the component to set reports so.
@@ -523,155 +573,86 @@ class ApplyRun:
         Raises:
             VehicleArmed: a component is armed, or the armed state is unknown.
         """
+        component = self.component
         if self._options.allow_armed:
             return
-        component = self._component
         with anyio.move_on_after(ARMED_STATE_TIMEOUT):
             while component.is_armed is None and component.state != "lost":  # noqa: ASYNC110 - no event
                 await anyio.sleep(POLL_INTERVAL)
-        own = [each for each in component.client.components.values() if each.system == component.system]
-        if any(each.is_armed for each in own):
-            message = f"{self._address} is armed; nothing is set then"
+        if any(each.is_armed for each in self._known if each.system == component.system):
+            problem = "is armed"
         elif component.is_armed is None and component.state != "lost":
-            message = (
-                f"{self._address} does not report whether it is armed (no heartbeat within "
-                f"{ARMED_STATE_TIMEOUT:g} s); nothing is set then"
-            )
+            problem = f"does not report whether it is armed (no heartbeat within {ARMED_STATE_TIMEOUT:g} s)"
         else:
             return
+        message = f"{component.system}/{component.component} {problem}; nothing is set then"
         raise VehicleArmed(message, system=component.system, component=component.component)
 
-    def _check_resets(self) -> None:
-        """Check that parameters that reset others at the next start are set only with `reboot`.
+    # Outcomes
 
-        Raises:
-            UsageError: one of them is to be set without `reboot`.
-        """
-        for step in self.plan.steps:
-            if self._is_action(step.name) and self._rules.resets(step.name) and not self._options.reboot:
-                raise UsageError(
-                    f"{step.name} resets other parameters to their defaults at the next start of the "
-                    "vehicle; it can only be set with reboot=True"
-                )
+    def _count_write(self, row: ApplyRow) -> None:
+        self._written[row.target.name] += 1
+        if row.needs_reboot:
+            self._reboot_for[row.target.name] = None
 
-    async def _store_state(self) -> None:
-        """Store the vehicle's state: in the backup file, and in the cache if the plan has steps."""
-        client, component, inspection = self._component.core, self._component, self.inspection
-        if (path := self._options.backup) is not None:
-            from paramclient.files import write_file
+    def _accept(self, row: ApplyRow, note: str = "") -> None:
+        self._count_write(row)
+        self._notes[row.target.name] = note
+        self._report("writing", self._outcome(row, ApplyStatus.ACCEPTED, note))
 
-            await client.cache_writer.run_in_thread(lambda: write_file(path, inspection.table))
-        cache = client.cache
-        if cache is not None and self.plan.steps:
-            try:
-                # the history then has the values from before the change
-                await client.cache_writer.write_all()
-                snapshot = await client.cache_writer.run_in_thread(
-                    lambda: cache.store_snapshot(
-                        component.identity,
-                        component.component,
-                        inspection.table,
-                        reason=self._options.reason,
-                        hash=inspection.hash,
-                        complete=inspection.complete,
-                        is_of_operation=True,
-                        extended=component.is_extended,
-                    )
-                )
-            except CacheError as error:
-                raise CacheError(
-                    f"nothing was sent, as the state before cannot be stored: {error}. Without a cache"
-                    " (--no-cache, or cache=False), no state is stored"
-                ) from error
-            self._snapshot = snapshot.id
-
-    async def _record_end(self) -> None:
-        """Record in the cache that the run was not interrupted."""
-        client, number = self._component.core, self._snapshot
-        cache = client.cache
-        if cache is not None and number is not None:
-            with suppress(CacheError):  # the warning of the cache writer says so
-                await client.cache_writer.run_in_thread(lambda: cache.end_operation(number))
-
-    # Progress and rows
-
-    @property
-    def _address(self) -> str:
-        return f"{self._component.system}/{self._component.component}"
-
-    def _count_write(self, step: Step) -> None:
-        self.written[step.name] = self.written.get(step.name, 0) + 1
-        if step.needs_reboot:
-            self._reboot_for[step.name] = None
-
-    def _record(
-        self, step: Step, status: ApplyStatus, actual: WireValue | None, reason: str, category: str = ""
-    ) -> None:
+    def _settle(self, row: ApplyRow, status: ApplyStatus, reason: str, category: str = "") -> None:
         """Record an outcome that only the verification may still change, and report it."""
-        row = self._make_row(step, status, actual, reason, category)
-        self.rows[step.name] = row
-        self._report("writing", row)
+        self._settled[row.target.name] = settled = self._outcome(row, status, reason, category)
+        self._report("writing", settled)
 
-    def _make_row(
-        self, step: Step, status: ApplyStatus, actual: WireValue | None, reason: str = "", category: str = ""
-    ) -> ApplyRow:
-        renamed = None if step.name == step.wanted.name else self.plan.rows[step.wanted.name].renamed
-        before = self._before(step.name)
-        return ApplyRow(step.wanted, status, before, actual, step.type, category, reason, (), renamed)
-
-    def _before(self, name: str) -> WireValue | None:
-        current = None if self._first is None else self._first.table.get(name)
-        return None if current is None else current.settable
+    def _outcome(self, row: ApplyRow, status: ApplyStatus, reason: str = "", category: str = "") -> ApplyRow:
+        """Return a row of the plan with its outcome, and with the values before and as last sent."""
+        name = row.target.name
+        before = None if self._start is None else self._start.table.get(name)
+        held = self.component.params.get(name)
+        return replace(
+            row,
+            status=status,
+            before=None if before is None else before.settable,
+            actual=None if held is None else held.settable,
+            reason=reason,
+            category=category,
+        )
 
     def _report(self, phase: str, row: ApplyRow | None = None) -> None:
         if self._options.progress is not None:
-            done = self.rows.keys() | self.written.keys()
-            left = 0 if self._first is None else sum(step.name not in done for step in self.plan.steps)
+            done = self._settled.keys() | self._written.keys()
+            to_write = [] if self._start is None else self.plan.to_write
+            left = sum(each.target.name not in done for each in to_write)
             self._options.progress(ApplyProgress(phase, len(done), len(done) + left, row))
 
-    def _final_row(self, planned: PlanRow) -> ApplyRow:
+    def _final_row(self, planned: ApplyRow) -> ApplyRow:
         """Return the row of a parameter at the end of the run."""
-        name, actual = planned.target.name, planned.before
+        name, reported = planned.target.name, planned.before
+        is_acknowledged, is_sent = bool(self._written[name]), name in self.sent
 
         def row(status: ApplyStatus, reason: str = "", category: str = "") -> ApplyRow:
-            return ApplyRow(
-                planned.wanted,
-                status,
-                self._before(name),
-                actual,
-                planned.type,
-                category,
-                reason,
-                planned.nearest,
-                planned.renamed,
-            )
+            return self._outcome(planned, status, reason, category)
 
-        if planned.status is PlanStatus.UNCHANGED:
-            is_set = name in self.sent
-            return row(ApplyStatus.SET, self._notes.get(name, "")) if is_set else row(ApplyStatus.UNCHANGED)
-        if (settled := self.rows.get(name)) is not None:
-            return replace(settled, actual=actual) if self._is_verified else settled
-        answered = "acknowledged" if name in self.written else "sent, not acknowledged"
-        if name in self.sent and actual is None:
+        if planned.status is ApplyStatus.UNCHANGED:
+            return row(ApplyStatus.ACCEPTED, self._notes.get(name, "")) if is_sent else row(planned.status)
+        if (settled := self._settled.get(name)) is not None:
+            return row(settled.status, settled.reason, settled.category)
+        unread = ApplyStatus.UNPROVEN if is_acknowledged else ApplyStatus.UNKNOWN
+        answered = "acknowledged" if is_acknowledged else "sent, not acknowledged"
+        if is_sent and reported is None:
             reason = f"{answered}, and the vehicle no longer reports it"
-            return replace(row(ApplyStatus.UNPROVEN, reason), nearest=())
-        if planned.status in (PlanStatus.SKIPPED, PlanStatus.INVALID):
+            return replace(row(unread, reason), nearest=())
+        if planned.status is not ApplyStatus.SET:
             return row(ApplyStatus.SKIPPED, planned.reason, planned.category)
-        if planned.status is PlanStatus.LATER:
-            return row(ApplyStatus.SKIPPED, planned.reason_missing, MISSING)
-        if name not in self.sent:
-            return row(ApplyStatus.FAILED, "not reached")
-        if not self._is_verified:
-            held = self._component.params.get(name) if name in self.written else None
-            actual = actual if held is None else held.settable
-            return row(ApplyStatus.UNPROVEN, f"{answered}, and not read back")
-        if self._is_action(name):
-            return row(ApplyStatus.SET, "done by the vehicle")
+        if not is_sent:
+            return row(ApplyStatus.NOT_TRIED, "not reached")
+        if self._inspected_at < self._written_at:
+            return row(unread, f"{answered}, and not read back")
+        if self._rules.is_action(name):
+            return row(ApplyStatus.ACCEPTED, "done by the vehicle")
         return row(ApplyStatus.ADJUSTED, "the vehicle acknowledged it, and changed it afterwards")
 
 
-async def _call_and_wait(function: Callable[[], object]) -> None:
-    """Call a function; if it is asynchronous, wait for its end."""
-    result = function()
-    if isinstance(result, Awaitable):
-        await result
+def _is_read_only(error: ParamClientError | None) -> bool:
+    return isinstance(error, Refused) and error.code == ParamErrorCode.READ_ONLY

@@ -1,11 +1,11 @@
-"""`prepare` and `verify`: read what a vehicle has of the wanted parameters, and plan the changes."""
+"""Read what a vehicle has of the wanted parameters, and plan the changes: `plan`."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeAlias
 
 import anyio
 
@@ -13,27 +13,26 @@ from paramclient.client.component import Component
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Renames
-from paramclient.model.values import Param, ParamType, Trust
-from paramclient.protocol.fetch import FetchResult
-from paramclient.provision.planning import ParamInfo, Plan, check_component, plan
+from paramclient.model.values import Param, ParamType, Settable, Trust
+from paramclient.provision.planning import ParamInfo, Plan, check_component, plan_from
 from paramclient.provision.vehicle_params import set_maker
 
 __all__ = [
     "POLL_INTERVAL",
     "Inspection",
-    "wait_for_identity",
+    "Wanted",
     "inspect",
+    "plan",
+    "planner_for",
     "reread",
-    "read_hidden",
-    "plan_for",
-    "prepare",
-    "verify",
+    "wait_for_identity",
+    "wanted_set",
     "with_other_names",
 ]
 
 READS_IN_PROGRESS_MAX: Final = 64
 """Reads by name that are in progress at once, each in a task. The component itself sends fewer at a time."""
-SETUP_IDENTITY_TIMEOUT: Final = 10.0
+IDENTITY_TIMEOUT: Final = 10.0
 """Seconds to wait for the identity of a vehicle. The identification usually ends sooner, after a few
 requests."""
 POLL_INTERVAL: Final = 0.05
@@ -44,6 +43,83 @@ READ_INTERVAL: Final = 0.025
 """Seconds for one of many reads on a fast link: ArduPilot answers 49 per second (measured)."""
 READ_SIZE_RATIO: Final = 6.0
 """Bytes of a read and its response, 73, over those of one parameter in ArduPilot's file, 13 (measured)."""
+
+Wanted: TypeAlias = ParamSet | Mapping[str, Settable]
+"""The wanted parameters: of a file or a snapshot, or plain values by name."""
+
+
+async def plan(
+    component: Component,
+    wanted: Wanted,
+    *,
+    include: str | Iterable[str] = (),
+    info: Mapping[str, ParamInfo] | None = None,
+    force: bool = False,
+    renames: Renames | None = None,
+) -> Plan:
+    """Return what `apply` would write to a vehicle, and in which order. Only reads.
+
+    The plan is `complete` if the vehicle has all wanted values.
+
+    Args:
+        component: the vehicle.
+        wanted: the wanted parameters, or plain values by name.
+        include, info, force, renames: as in `plan_from`.
+
+    Raises:
+        UsageError: as from `plan_from`.
+        NoReply: the vehicle did not answer.
+        LinkError: the link failed, or the client was closed.
+    """
+    wanted = wanted_set(component, wanted)
+    make_plan = planner_for(component, wanted, include, info, force=force, renames=renames)
+    await wait_for_identity(component)
+    return make_plan((await inspect(component, wanted, renames)).table)
+
+
+def wanted_set(component: Component, wanted: Wanted) -> ParamSet:
+    """Return wanted parameters as a set for a component.
+
+    Raises:
+        UsageError: they are of another component, or a plain value is not valid.
+    """
+    if not isinstance(wanted, ParamSet):
+        wanted = ParamSet(wanted, is_extended=component.is_extended)
+    check_component(wanted, component.component, is_extended=component.is_extended)
+    return wanted
+
+
+def planner_for(
+    component: Component,
+    wanted: ParamSet,
+    include: str | Iterable[str],
+    info: Mapping[str, ParamInfo] | None,
+    *,
+    force: bool,
+    renames: Renames | None,
+) -> Callable[[ParamSet], Plan]:
+    """Return a function that makes a plan from the parameters of a vehicle.
+
+    Raises:
+        UsageError: as from `plan_from`, as far as the vehicle need not be read for it.
+    """
+    include = (include,) if isinstance(include, str) else tuple(include)
+    plan_from({}, wanted, include=include, autopilot=component.autopilot)
+    return lambda table: plan_from(
+        table,
+        wanted,
+        include=include,
+        info=info,
+        autopilot=component.autopilot,
+        encoding=component.encoding,
+        force=force,
+        renames=renames,
+    )
+
+
+async def wait_for_identity(component: Component) -> None:
+    """Wait until the vehicle is identified, at most `IDENTITY_TIMEOUT`, as the cache key requires."""
+    await component.wait_until_identified(IDENTITY_TIMEOUT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,25 +154,21 @@ class Inspection:
 async def inspect(
     component: Component,
     wanted: ParamSet,
-    absent: frozenset[str] = frozenset(),
-    *,
     renames: Renames | None = None,
-    whole: bool = False,
+    absent: frozenset[str] = frozenset(),
 ) -> Inspection:
     """Update the table, and read by name the wanted parameters that it does not have.
 
     Vehicles have parameters that are in no list: those that PX4 does not use yet, and those of a group that
     ArduPilot hides. They can be read and set by name. Values that were received earlier on this link and not
-    confirmed since are read by name too: those that the hash does not cover, or that an incomplete list has
-    left out. A parameter that is not received then either counts as absent. Names that are probably hidden
-    are requested while the list is downloaded.
+    confirmed since are read by name too: those that an incomplete list has left out. A parameter that is not
+    received then either counts as absent.
 
     Args:
         component: the vehicle.
         wanted: the wanted parameters.
-        absent: names that the vehicle is known not to have, unless they are listed by now.
         renames: other names of the wanted parameters, which are read if the table lacks the wanted name.
-        whole: read all unconfirmed parameters, not only the wanted ones.
+        absent: names that the vehicle is known not to have, unless they are listed by now.
 
     Raises:
         UsageError: the vehicle's integers contradict the encoding, so that none of them is known.
@@ -108,147 +180,59 @@ async def inspect(
     if doubt := component.session.encoding_doubt:
         raise UsageError(doubt)
     params = dict(component.params)
-    listed = [name for name, param in params.items() if param.index is not None]
-    table = {name: params[name] for name in listed if params[name].trust is not Trust.CACHED}
+    listed = {name: param for name, param in params.items() if param.index is not None}
+    table = {name: param for name, param in listed.items() if param.trust is not Trust.CACHED}
     complete = fetched.complete and len(table) == len(listed)
     names = with_other_names(wanted, table, renames)
-    hidden: frozenset[str] = frozenset()
     if complete and component.is_extended:  # the list has all of them
-        hidden = frozenset(names).difference(params)
+        absent |= frozenset(names).difference(params)
     elif complete and component.autopilot == "ardupilot":
-        hidden = _in_no_hidden_group(table, names).difference(params)
+        absent |= _in_no_hidden_group(table, names).difference(params)
     missing = frozenset(fetched.missing)
     given_up = {name for name, param in table.items() if param.index in missing}
-    unconfirmed = given_up | before.intersection(table, _not_covered(component, fetched))
-    known = absent | hidden
-    to_read = [name for name in names if name in unconfirmed or (name not in table and name not in known)]
-    if whole:
-        to_read += unconfirmed.difference(to_read)
-    found, unreported = await _read_names(component, to_read, given_up)
-    unknown = hidden.difference(table) | unreported
+    if fetched.source == "cache" and fetched.hash is None:  # the cache policy did not verify it
+        given_up |= before.intersection(table)
+    to_read = [name for name in names if name not in table and name not in absent]
+    found, unreported = await _read_names(component, [*given_up, *to_read], given_up)
     to_set = set_maker(component, f"vehicle {component.system}/{component.component}")
     return Inspection(
-        to_set(param for name, param in (table | found).items() if name not in unknown),
+        to_set(param for name, param in (table | found).items() if name not in unreported),
         complete,
         fetched.hash,
-        (absent | unknown).difference(table),
+        (absent | unreported).difference(table),
         0.0 if fetched.source == "cache" else fetched.elapsed,
     )
 
 
-async def read_hidden(component: Component, inspection: Inspection, names: Iterable[str]) -> Inspection:
-    """Read by name parameters that may have appeared, and add the values received meanwhile.
+async def reread(
+    component: Component, inspection: Inspection, names: Iterable[str], given_up: Collection[str] = ()
+) -> Inspection:
+    """Read parameters by name, and add the values of other parameters received meanwhile.
 
     Args:
         component: the vehicle.
         inspection: its latest inspection.
-        names: param_ids.
+        names: param_ids. Parameters that the vehicle does not report are not in the result.
+        given_up: names that count as not reported if the vehicle does not answer, as long as it answers
+            another one.
 
     Raises:
         NoReply: the vehicle did not answer.
         LinkError: the link failed, or the client was closed.
     """
-    found, unknown = await _read_names(component, names, ())
-    params = {**inspection.table.params, **_current_values(component, inspection, found)}
-    table = replace(inspection.table, params=params, at=time.time())
-    return replace(inspection, table=table, absent=(inspection.absent | unknown).difference(found))
-
-
-async def reread(component: Component, inspection: Inspection, names: Iterable[str]) -> Inspection:
-    """Read parameters again by name, and add the values of other parameters received meanwhile.
-
-    Args:
-        component: the vehicle.
-        inspection: its latest inspection.
-        names: param_ids. Parameters that the vehicle no longer reports are not in the result.
-
-    Raises:
-        NoReply: the vehicle did not answer.
-        LinkError: the link failed, or the client was closed.
-    """
-    names = frozenset(names)
     began = anyio.current_time()
-    found, unknown = await _read_names(component, names, names)
-    if names and not found:
+    found, unknown = await _read_names(component, names, given_up)
+    if given_up and not found:
         subject = f"the values of {component.system}/{component.component}"
         raise NoReply(subject, attempts=0, waited=anyio.current_time() - began)
-    params = {**inspection.table.params, **_current_values(component, inspection, found)}
+    known = {name: component.params[name] for name in inspection.table if name in component.params}
+    current = {name: WrittenParam.of(param) for name, param in (known | found).items()}
+    params = {**inspection.table.params, **current}
     reported = {name: param for name, param in params.items() if name not in unknown}
-    return replace(inspection, table=replace(inspection.table, params=reported, at=time.time()))
-
-
-async def wait_for_identity(component: Component) -> None:
-    """Wait until the vehicle is identified, at most `SETUP_IDENTITY_TIMEOUT`, as the cache key requires."""
-    await component.wait_until_identified(SETUP_IDENTITY_TIMEOUT)
-
-
-async def prepare(
-    component: Component,
-    wanted: ParamSet,
-    *,
-    include: str | Iterable[str] = (),
-    info: Mapping[str, ParamInfo] | None = None,
-    force: bool = False,
-    renames: Renames | None = None,
-) -> Plan:
-    """Return the plan of what `apply` would send to a vehicle, and in which order. Only reads.
-
-    Args:
-        component: the vehicle.
-        wanted, include, info, force, renames: as in `plan`.
-
-    Raises:
-        UsageError: as from `plan`.
-        NoReply: the vehicle did not answer.
-        LinkError: the link failed, or the client was closed.
-    """
-    check_component(wanted, component.component, is_extended=component.is_extended)
-    given = (include,) if isinstance(include, str) else tuple(include)
-    plan({}, wanted, include=given, autopilot=component.autopilot)  # raises errors before the vehicle is read
-    await wait_for_identity(component)
-    inspection = await inspect(component, wanted, renames=renames)
-    return plan_for(component, inspection.table, wanted, given, info, force=force, renames=renames)
-
-
-async def verify(
-    component: Component,
-    wanted: ParamSet,
-    *,
-    include: str | Iterable[str] = (),
-    info: Mapping[str, ParamInfo] | None = None,
-    force: bool = False,
-    renames: Renames | None = None,
-) -> Plan:
-    """Compare a vehicle with the wanted parameters. Only reads.
-
-    The result is the plan that `prepare` returns: `is_met` is true if nothing differs, and the rows with
-    status `set` are the parameters that differ.
-
-    Arguments and errors as in `prepare`.
-    """
-    return await prepare(component, wanted, include=include, info=info, force=force, renames=renames)
-
-
-def plan_for(
-    component: Component,
-    table: ParamSet,
-    wanted: ParamSet,
-    include: tuple[str, ...],
-    info: Mapping[str, ParamInfo] | None,
-    *,
-    force: bool,
-    renames: Renames | None,
-) -> Plan:
-    """Return the plan for a vehicle that has this table."""
-    return plan(
-        table,
-        wanted,
-        include=include,
-        info=info,
-        autopilot=component.autopilot,
-        encoding=component.encoding,
-        force=force,
-        renames=renames,
+    return replace(
+        inspection,
+        table=replace(inspection.table, params=reported, at=time.time()),
+        absent=(inspection.absent | unknown).difference(found),
     )
 
 
@@ -264,30 +248,12 @@ def with_other_names(
     return tuple(found)
 
 
-def _current_values(
-    component: Component, inspection: Inspection, found: Mapping[str, Param]
-) -> dict[str, WrittenParam]:
-    """Return the present values of the inspected parameters, and the parameters that were found."""
-    known = {name: component.params[name] for name in inspection.table if name in component.params}
-    return {name: WrittenParam.of(param) for name, param in (known | dict(found)).items()}
-
-
-def _not_covered(component: Component, fetched: FetchResult) -> Collection[str]:
-    """Return the names whose values a fetch neither received nor confirmed, except missing ones."""
-    if fetched.source != "cache":
-        return ()
-    if fetched.hash is None:  # the cache policy did not verify it
-        return component.params.keys()
-    return [name for name, param in component.params.items() if param.trust is Trust.CACHED]
-
-
 async def _read_names(
-    component: Component, names: Iterable[str], given_up: Collection[str]
+    component: Component, names: Iterable[str], given_up: Container[str]
 ) -> tuple[dict[str, Param], frozenset[str]]:
     """Read parameters by name; return those received and the names that the vehicle does not have or report.
 
-    A timeout ends the reads and is raised, except for names in `given_up`, whose earlier request failed: they
-    count as not reported.
+    A timeout ends the reads and is raised, except for names in `given_up`: they count as not reported.
     """
     names = tuple(names)
     found: dict[str, Param] = {}

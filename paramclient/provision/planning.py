@@ -1,6 +1,6 @@
-"""The plan of a set-up: the values to write, their order, and reasons for parameters that are not written.
+"""The plan of an `apply`: the values to write, their order, and reasons for parameters that are not written.
 
-The parameters that no set-up writes are in `apply_rules.toml`.
+The parameters that no `apply` writes are in `apply_rules.toml`.
 """
 
 from __future__ import annotations
@@ -29,23 +29,22 @@ from paramclient.model.values import (
     type_name,
 )
 from paramclient.protocol.dialect import EXTENDED, PLAIN
-from paramclient.provision.apply_rules import OUT_OF_RANGE, READ_ONLY, ApplyRules, Choice, rules_for
+from paramclient.provision.apply_rules import CATEGORIES, OUT_OF_RANGE, READ_ONLY, Choice, rules_for
 
 __all__ = [
     "MISSING",
     "WRONG",
+    "ApplyRow",
+    "ApplyStatus",
     "ParamInfo",
     "Plan",
-    "PlanRow",
-    "PlanStatus",
+    "Rows",
     "Stage",
-    "Step",
+    "check_component",
     "overlay",
-    "plan",
+    "plan_from",
 ]
 
-NOT_ON_VEHICLE: Final = "not on this vehicle"
-"""The reason of a parameter that the vehicle does not have."""
 MISSING: Final = "missing"
 """The category of a parameter that the vehicle does not have."""
 WRONG: Final = "wrong"
@@ -79,30 +78,43 @@ class ParamInfo(Protocol):
         ...
 
 
-class PlanStatus(StrEnum):
-    """The planned action for a wanted parameter."""
+class ApplyStatus(StrEnum):
+    """The planned action for a wanted parameter, or its outcome."""
 
     SET = "set"
-    """The value differs and is to be written."""
+    """Planned: the value differs and is to be written."""
     LATER = "later"
-    """The vehicle does not have the parameter now; a step of the plan may reveal it, going by its name, and
-    then it is set."""
+    """Planned: the vehicle does not have the parameter now; a step of the plan may reveal it, going by its
+    name, and then it is set."""
+    INVALID = "invalid"
+    """Planned: the value is invalid; `reason` says why."""
+    ACCEPTED = "accepted"
+    """The value was written, and read back at the end."""
+    ADJUSTED = "adjusted"
+    """The value was written, and the vehicle changed it, immediately or within a second."""
+    REFUSED = "refused"
+    """The vehicle refused the value."""
     UNCHANGED = "unchanged"
     """The vehicle has the value already."""
     SKIPPED = "skipped"
-    """The parameter is not written, or the vehicle does not have it; `PlanRow.reason` gives the reason."""
-    INVALID = "invalid"
-    """The value is invalid; `PlanRow.reason` gives the reason."""
+    """Not written: left out, not on this vehicle, or invalid; `reason` says why."""
+    UNPROVEN = "unproven"
+    """The value was acknowledged, and could not be read back at the end."""
+    UNKNOWN = "unknown"
+    """The value was sent and not acknowledged: the vehicle may have it."""
+    NOT_TRIED = "not tried"
+    """The value was not sent: `apply` ended before."""
 
 
 @dataclass(frozen=True, slots=True)
-class PlanRow:
-    """The planned action for one wanted parameter, with the value that the vehicle has.
+class ApplyRow:
+    """What is planned for one wanted parameter, or what became of it.
 
     Attributes:
         wanted: the parameter as the file has it.
-        status: the planned action.
-        before: the value that the vehicle has, or None if it does not have the parameter.
+        status: the planned action, or the outcome.
+        before: the value before `apply`, or None if the vehicle did not have the parameter.
+        actual: the value that the vehicle last sent, or None; None in a plan.
         type: the vehicle's type of the parameter; None if unknown.
         category: for skipped and invalid parameters, the kind of reason: one of `CATEGORIES`, `MISSING`, or
             `WRONG`; else "".
@@ -110,19 +122,19 @@ class PlanRow:
         nearest: for a parameter that the vehicle does not have, the most similar names, most similar first.
         renamed: the wanted parameter under the vehicle's name and with the value for it, if the vehicle has
             the parameter under another name (see `Renames`); else None.
-        rename_note: for a parameter that the vehicle has under none of its names, words that name the other
-            ones; else "".
+        needs_reboot: whether a change takes effect after a reboot.
     """
 
     wanted: WrittenParam
-    status: PlanStatus
+    status: ApplyStatus
     before: WireValue | None = None
+    actual: WireValue | None = None
     type: ParamType | int | None = None
     category: str = ""
     reason: str = ""
     nearest: tuple[str, ...] = ()
     renamed: WrittenParam | None = None
-    rename_note: str = ""
+    needs_reboot: bool = False
 
     @property
     def name(self) -> str:
@@ -135,141 +147,138 @@ class PlanRow:
         return self.wanted if self.renamed is None else self.renamed
 
     @property
-    def reason_missing(self) -> str:
-        """The reason of a parameter that the vehicle does not have."""
-        return "; ".join(filter(None, (NOT_ON_VEHICLE, self.rename_note)))
-
-    @property
     def differs(self) -> bool:
-        """Whether the vehicle has another value than the wanted one, or no such parameter."""
+        """Whether the vehicle had another value than the wanted one, or no such parameter."""
         return self.before is None or not _is_same(self.target.settable, self.before, self.type)
 
     @property
-    def is_met(self) -> bool:
-        """Whether the vehicle has the wanted value, or the parameter is left out."""
-        return self.category != MISSING and self.status in (PlanStatus.UNCHANGED, PlanStatus.SKIPPED)
+    def is_as_wanted(self) -> bool:
+        """Whether the vehicle has the wanted value, or the parameter is left out on purpose."""
+        if self.status is ApplyStatus.SKIPPED:
+            return self.category in _INTENDED_CATEGORIES
+        return self.status in (ApplyStatus.ACCEPTED, ApplyStatus.UNCHANGED)
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether to show the row: not unchanged parameters and left-out ones that do not differ."""
+        return self.differs if self.status is ApplyStatus.SKIPPED else self.status != ApplyStatus.UNCHANGED
+
+    @property
+    def why(self) -> str:
+        """The reason, with the similar names."""
+        return f"{self.reason} (did you mean {', '.join(self.nearest)}?)" if self.nearest else self.reason
 
     def __str__(self) -> str:
         kind = ParamType.REAL32 if self.type is None else self.type
-        wanted = format_value(self.target.settable, kind)
+        now = self.target.settable if self.actual is None else self.actual
+        is_changed = self.before is not None and not _is_same(now, self.before, self.type)
+        before = f"{format_value(self.before, kind)} ->" if self.before is not None and is_changed else "="
         name = self.name if self.renamed is None else f"{self.name} (here {self.renamed.name})"
-        if self.status is PlanStatus.UNCHANGED:
-            return f"{name} = {wanted}"
-        change = wanted if self.before is None else f"{format_value(self.before, kind)} -> {wanted}"
-        like = f" (did you mean {', '.join(self.nearest)}?)" if self.nearest else ""
-        why = f": {self.reason}{like}" if self.reason else ""
-        return f"{name} {change}, {self.status}{why}"
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """One value to write.
-
-    Attributes:
-        name: param_id on the vehicle.
-        value: the value to send.
-        type: the vehicle's type of the parameter, which PARAM_SET carries.
-        before: the value that the vehicle has.
-        needs_reboot: whether the change takes effect after a reboot.
-        wanted: the parameter as the file has it, possibly with another name (see `Renames`).
-    """
-
-    name: str
-    value: WireValue
-    type: ParamType | int
-    before: WireValue
-    needs_reboot: bool
-    wanted: WrittenParam
-
-    def __str__(self) -> str:
-        change = f"{format_value(self.before, self.type)} -> {format_value(self.value, self.type)}"
-        return f"{self.name} {change}"
+        why = f": {self.why}" if self.why else ""
+        return f"{name} {before} {format_value(now, kind)}, {self.status}{why}"
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Steps that are written concurrently, before those of the next stage.
+    """Values that are written concurrently, before those of the next stage.
 
     Attributes:
-        purpose: what the steps have in common, in words.
-        steps: the steps, in the order of the file.
+        purpose: what the values have in common, in words.
+        rows: the values, in the order of the file.
         reveals: whether other parameters may appear afterwards.
         reboot_first: whether the vehicle must reboot before the next stage: values that are set before the
             reboot would be lost, or their parameters do not exist yet.
-        is_last: whether the steps may end the connection. These are written one by one.
+        is_last: whether the values may end the connection. These are written one by one.
     """
 
     purpose: str
-    steps: tuple[Step, ...]
+    rows: tuple[ApplyRow, ...]
     reveals: bool = False
     reboot_first: bool = False
     is_last: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
-    """The planned actions of a set-up; see `plan`.
+class Rows:
+    """Rows of parameters.
 
     Attributes:
-        wanted: the wanted parameters.
-        rows: by name, one row for each wanted parameter, in the order of the file.
-        stages: the steps in the order of writing. After a stage that reveals parameters, and after a reboot,
-            the vehicle is read again and a new plan is made; the later stages are those known so far.
-        extra: names that the vehicle has and `wanted` does not have; they are not changed.
-        include: categories and globs that are included although the list leaves them out.
-        identity: the vehicle of the plan, if `current` names it.
-        force: whether to send values that the autopilot cannot store.
-        renames: the names that firmware versions have changed, or None.
+        rows: by name in the file, one row for each wanted parameter, in the order of the file.
+    """
+
+    rows: Mapping[str, ApplyRow]
+
+    @property
+    def counts(self) -> Mapping[ApplyStatus, int]:
+        """The number of rows with each status."""
+        return Counter(row.status for row in self.rows.values())
+
+    @property
+    def complete(self) -> bool:
+        """Whether the vehicle has all wanted values, except those left out on purpose."""
+        return all(row.is_as_wanted for row in self.rows.values())
+
+    @property
+    def shown_rows(self) -> list[ApplyRow]:
+        """The rows to show: all except unchanged parameters and left-out ones that do not differ."""
+        return [row for row in self.rows.values() if row.is_shown]
+
+    def of(self, *statuses: ApplyStatus) -> list[ApplyRow]:
+        """Return the rows with one of these statuses, in order."""
+        return [row for row in self.rows.values() if row.status in statuses]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan(Rows):
+    """What an `apply` would write, see `plan`; `complete` if it is nothing.
+
+    Attributes:
+        stages: the rows of the values to write, in the order of writing. After a stage that reveals
+            parameters, and after a reboot, the vehicle is read again and a new plan is made; the later stages
+            are those known so far.
+        problems: by name, why `apply` refuses the file: invalid values, and names that the vehicle does not
+            have and no step may reveal.
+        extra: names that the vehicle has and the wanted parameters do not have; they are not changed.
+        unchecked: names of numbers to write whose range was not checked: there is no metadata of them.
+        firmware: the identities of the file and of the vehicle, if both are known; else ().
         awaiting_reboot: switches that are on and whose group is missing: they take effect after a reboot,
             and the vehicle may not have rebooted since they were set.
     """
 
-    wanted: ParamSet
-    rows: Mapping[str, PlanRow]
     stages: tuple[Stage, ...]
+    problems: Mapping[str, str]
     extra: tuple[str, ...] = ()
-    include: tuple[str, ...] = ()
-    identity: Identity | None = None
+    unchecked: tuple[str, ...] = ()
+    firmware: tuple[Identity, ...] = ()
     awaiting_reboot: tuple[str, ...] = ()
-    force: bool = False
-    renames: Renames | None = None
 
     @property
     def firmware_note(self) -> str:
         """The firmware versions of the file and the vehicle, as a sentence; "" unless they differ."""
-        before, own = self.wanted.identity, self.identity
-        return "" if before is None or own is None else version_difference(before, own)
+        return version_difference(*self.firmware) if self.firmware else ""
 
     @property
-    def steps(self) -> list[Step]:
+    def unchecked_note(self) -> str:
+        """The number of values whose range was not checked, as a sentence; "" if there is none."""
+        count, total = len(self.unchecked), len(self.to_write)
+        return f"ranges not checked: {count} of {total} have no metadata" if count else ""
+
+    @property
+    def to_write(self) -> list[ApplyRow]:
         """All values to write, in order."""
-        return [step for stage in self.stages for step in stage.steps]
+        return [row for stage in self.stages for row in stage.rows]
 
     @property
     def reboot_for(self) -> tuple[str, ...]:
-        """The names of steps that take effect after a reboot."""
-        return tuple(step.name for step in self.steps if step.needs_reboot)
-
-    @property
-    def counts(self) -> Mapping[PlanStatus, int]:
-        """The number of rows with each status."""
-        return Counter(row.status for row in self.rows.values())
-
-    def of(self, status: PlanStatus) -> list[PlanRow]:
-        """Return the rows with this status, in order."""
-        return [row for row in self.rows.values() if row.status is status]
-
-    @property
-    def is_met(self) -> bool:
-        """Whether the vehicle has all wanted values, except those left out on purpose."""
-        return all(row.is_met for row in self.rows.values())
+        """The names of values to write that take effect after a reboot."""
+        return tuple(row.target.name for row in self.to_write if row.needs_reboot)
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{count} {status}" for status, count in self.counts.items())
         return f"<Plan {counts or 'nothing'} in {len(self.stages)} stages>"
 
 
-def plan(
+def plan_from(
     current: ParamSet | Mapping[str, Param],
     wanted: ParamSet,
     *,
@@ -280,7 +289,7 @@ def plan(
     force: bool = False,
     renames: Renames | None = None,
 ) -> Plan:
-    """Return what must be set on a vehicle so that it has the wanted values. Sends nothing.
+    """Return what must be written to a vehicle with these parameters so that it has the wanted values.
 
     The order: parameters that select the frame; switches that reveal groups of parameters; all other
     parameters; switches that are turned off; parameters that may end the connection, such as the system id.
@@ -314,29 +323,36 @@ def plan(
             autopilot = autopilot_name(identity.autopilot)
         check_component(wanted, current.component, is_extended=current.is_extended)
     _check_autopilot(wanted, autopilot)
-    given = (include,) if isinstance(include, str) else tuple(include)
     if encoding is None:
         encoding = Encoding.C_CAST if autopilot == "ardupilot" else Encoding.BYTEWISE
-    rules = rules_for(autopilot or "", is_extended=wanted.is_extended)
-    planner = _Planner(
-        current,
-        wanted,
-        rules,
-        Choice(given),
-        info or {},
-        encoding,
-        autopilot or "",
-        vehicle_type=None if identity is None else identity.vehicle_type,
-        force=force,
-        renames=renames or Renames(),
-    )
-    rows = {name: planner.row(each) for name, each in wanted.items()}
+    vehicle_type = None if identity is None else identity.vehicle_type
+    choice, renames = Choice(include), renames or Renames()
+    planner = _Planner(current, wanted, autopilot or "", choice, info or {}, encoding, vehicle_type, renames)
+    rows = planner.settle_missing({name: planner.row(each, force=force) for name, each in wanted.items()})
     awaiting_reboot = planner.awaiting_reboot(rows)
-    rows = planner.settle_missing(rows)
-    stages = planner.stages(rows)
+    may_be_hidden = planner.belongs_to(awaiting_reboot)
     named = {row.target.name for row in rows.values()}
-    extra = tuple(name for name in current if name not in named)
-    return Plan(wanted, rows, stages, extra, given, identity, awaiting_reboot, force, renames)
+    return Plan(
+        rows,
+        planner.stages(rows),
+        problems={
+            name: row.why
+            for name, row in rows.items()
+            if row.status is ApplyStatus.INVALID
+            or (row.status is ApplyStatus.SKIPPED and row.category == MISSING and not may_be_hidden(name))
+        },
+        extra=tuple(name for name in current if name not in named),
+        unchecked=tuple(
+            name
+            for name, row in rows.items()
+            if row.status is ApplyStatus.SET
+            and row.target.name not in planner.info
+            and not isinstance(row.target.settable, str | bytes)
+            and not choice.has((name, row.target.name), OUT_OF_RANGE)
+        ),
+        firmware=() if wanted.identity is None or identity is None else (wanted.identity, identity),
+        awaiting_reboot=awaiting_reboot,
+    )
 
 
 def overlay(base: ParamSet, over: ParamSet) -> ParamSet:
@@ -366,14 +382,13 @@ def check_component(wanted: ParamSet, component: int | None, *, is_extended: boo
     Raises:
         UsageError: they name another component, or are of the other kind.
     """
+    of = f" of {wanted.source}" if wanted.source else ""
     if wanted.is_extended != is_extended:
         kinds = ("extended", "plain") if wanted.is_extended else ("plain", "extended")
-        of = f" of {wanted.source}" if wanted.source else ""
         raise UsageError(f"the parameters{of} are {kinds[0]} ones, and {kinds[1]} ones are needed")
     if wanted.component is not None and component is not None and wanted.component != component:
         raise UsageError(
-            f"the parameters{f' of {wanted.source}' if wanted.source else ''} are those of component "
-            f"{wanted.component}, not of component {component}"
+            f"the parameters{of} are those of component {wanted.component}, not of component {component}"
         )
 
 
@@ -383,154 +398,132 @@ def _check_autopilot(wanted: ParamSet, autopilot: str | None) -> None:
     Raises:
         UsageError: the parameters name another autopilot.
     """
-    if wanted.identity is None:
-        return
-    meant = autopilot_name(wanted.identity.autopilot)
+    meant = None if wanted.identity is None else autopilot_name(wanted.identity.autopilot)
     if {meant, autopilot} == {"px4", "ardupilot"}:
-        raise UsageError(
-            f"the parameters{f' of {wanted.source}' if wanted.source else ''} are those of a vehicle with "
-            f"{meant}, not with {autopilot}"
-        )
+        of = f" of {wanted.source}" if wanted.source else ""
+        raise UsageError(f"the parameters{of} are those of a vehicle with {meant}, not with {autopilot}")
 
 
+@dataclass
 class _Planner:
-    """Makes the rows and stages of one plan; the arguments are those of `plan`, resolved."""
+    """Makes the rows and stages of one plan; the arguments are those of `plan_from`, resolved."""
 
-    def __init__(
-        self,
-        current: ParamSet | Mapping[str, Param],
-        wanted: ParamSet,
-        rules: ApplyRules,
-        choice: Choice,
-        info: Mapping[str, ParamInfo],
-        encoding: Encoding,
-        autopilot: str,
-        *,
-        vehicle_type: int | None,
-        force: bool,
-        renames: Renames,
-    ) -> None:
-        self._current = current
-        self._renames = renames
-        self._renamed = renames.renamed(wanted, current)
-        targets = (self._renamed.get(name, param) for name, param in wanted.items())
-        self._targets = {param.name: param for param in targets}
-        self._vehicle_type = vehicle_type
-        self._rules = rules
-        self._choice = choice
-        self._info = info
-        self._encoding = encoding
-        self._dialect = EXTENDED if wanted.is_extended else PLAIN
-        self._force = force
-        # only ArduPilot sends integers as float32
-        usual = "ardupilot" if encoding is Encoding.C_CAST else ""
-        self._against_non_finite = reason_against_non_finite(autopilot or usual)
+    current: ParamSet | Mapping[str, Param]
+    wanted: ParamSet
+    autopilot: str
+    choice: Choice
+    info: Mapping[str, ParamInfo]
+    encoding: Encoding
+    vehicle_type: int | None
+    renames: Renames
 
-    def row(self, wanted: WrittenParam) -> PlanRow:
+    def __post_init__(self) -> None:
+        self.rules = rules_for(self.autopilot, is_extended=self.wanted.is_extended)
+        self.renamed = self.renames.renamed(self.wanted, self.current)
+        targets = (self.renamed.get(name, param) for name, param in self.wanted.items())
+        self.targets = {param.name: param for param in targets}
+
+    def row(self, wanted: WrittenParam, *, force: bool) -> ApplyRow:
         """Return the row of one parameter; `settle_missing` completes rows of missing parameters."""
-        renamed = self._renamed.get(wanted.name)
+        renamed = self.renamed.get(wanted.name)
         target = wanted if renamed is None else renamed
-        name = target.name
-        current: Param | WrittenParam | None = self._current.get(name)
+        current: Param | WrittenParam | None = self.current.get(target.name)
         before = None if current is None else current.settable
         kind = target.type_number if current is None or current.type_number is None else current.type_number
-        note = self._renames.missing_note(wanted.name) if before is None else ""
+        info = self.info.get(target.name)
+        needs_reboot = self.rules.needs_reboot(target.name, self.vehicle_type)
+        needs_reboot = needs_reboot or (info is not None and info.reboot_required)
+        names = dict.fromkeys((target.name, wanted.name))  # the list may know only one of two names
 
-        def verdict(status: PlanStatus, category: str = "", reason: str = "") -> PlanRow:
-            return PlanRow(wanted, status, before, kind, category, reason, (), renamed, note)
+        def verdict(status: ApplyStatus, category: str = "", reason: str = "") -> ApplyRow:
+            return ApplyRow(
+                wanted, status, before, None, kind, category, reason, (), renamed, needs_reboot=needs_reboot
+            )
 
-        def includes(category: str) -> bool:
-            return any(self._choice.has(each, category) for each in (name, wanted.name))
-
-        for each in dict.fromkeys((name, wanted.name)):  # the list may know only one of two names
-            rule = self._rules.left_out(each, self._value_to_be)
-            if rule is not None and not includes(rule.category):
-                return verdict(PlanStatus.SKIPPED, rule.category, f"left out: it {rule.reason}")
+        for each in names:
+            rule = self.rules.left_out(each, self._value_to_be)
+            if rule is not None and not self.choice.has(names, rule.category):
+                return verdict(ApplyStatus.SKIPPED, rule.category, f"left out: it {rule.reason}")
         if before is None:
-            return verdict(PlanStatus.LATER, MISSING)
+            return verdict(ApplyStatus.LATER, MISSING)
         if _is_same(target.settable, before, kind):
-            return verdict(PlanStatus.UNCHANGED)
-        info = self._info.get(name)
-        if info is not None and info.is_read_only and not includes(READ_ONLY):
-            return verdict(PlanStatus.SKIPPED, READ_ONLY, "left out: it can only be read")
-        wrong = self._find_fault(name, target.settable, kind, info)
-        if wrong is None and target.is_raw and not isinstance(before, bytes):
-            wrong = WRONG, f"{format_value(target.settable)} are raw bytes, and the vehicle has a number"
-        if wrong is None or (wrong[0] == OUT_OF_RANGE and includes(OUT_OF_RANGE)):
-            return verdict(PlanStatus.SET)
+            return verdict(ApplyStatus.UNCHANGED)
+        if info is not None and info.is_read_only and not self.choice.has(names, READ_ONLY):
+            return verdict(ApplyStatus.SKIPPED, READ_ONLY, "left out: it can only be read")
+        wrong = self._find_fault(target, before, kind, force=force)
+        if wrong is None or (wrong[0] == OUT_OF_RANGE and self.choice.has(names, OUT_OF_RANGE)):
+            return verdict(ApplyStatus.SET)
         category, reason = wrong
-        return verdict(PlanStatus.INVALID, category, reason if renamed is None else f"as {name}, {reason}")
+        reason = reason if renamed is None else f"as {target.name}, {reason}"
+        return verdict(ApplyStatus.INVALID, category, reason)
 
-    def stages(self, rows: Mapping[str, PlanRow]) -> tuple[Stage, ...]:
+    def stages(self, rows: Mapping[str, ApplyRow]) -> tuple[Stage, ...]:
         """Return the stages, in order."""
-        steps = [self._step(row) for row in rows.values() if row.status is PlanStatus.SET]
-        is_any_missing = any(row.status is PlanStatus.LATER for row in rows.values())
-        last = _pop_matching(steps, lambda step: self._rules.is_last(step.name))
-        frame = _pop_matching(steps, lambda step: self._rules.chooses_frame(step.name))
-        switches = _pop_matching(steps, lambda step: self._rules.reveals(step.name))
-        turned_off = _pop_matching(switches, lambda step: step.value == 0)
-        stages = []
-        if frame:
-            resets = any(self._rules.resets(step.name) for step in frame)
-            waits = is_any_missing and any(step.needs_reboot for step in frame)
-            stages.append(Stage("frame parameters", tuple(frame), True, resets or waits))
-        if switches:
-            waits = is_any_missing and any(step.needs_reboot for step in switches)
-            stages.append(Stage("switches that reveal parameters", tuple(switches), True, waits))
-        if steps:
-            stages.append(Stage("all other parameters", tuple(steps)))
-        if turned_off:
-            stages.append(Stage("switches that are turned off", tuple(turned_off)))
-        if last:
-            last.sort(key=lambda step: self._rules.is_system_id(step.name))
-            stages.append(Stage("parameters that may end the connection", tuple(last), is_last=True))
-        return tuple(stages)
+        left = [row for row in rows.values() if row.status is ApplyStatus.SET]
 
-    def awaiting_reboot(self, rows: Mapping[str, PlanRow]) -> tuple[str, ...]:
-        """Return switches whose missing group may appear after a reboot."""
-        missing = [
-            each
-            for name, row in rows.items()
-            if row.status is PlanStatus.LATER
-            for each in (name, *self._renames.other_names(name))
+        def pop(fits: Callable[[str], bool]) -> tuple[ApplyRow, ...]:
+            taken = tuple(row for row in left if fits(row.target.name))
+            left[:] = [row for row in left if not fits(row.target.name)]
+            return taken
+
+        last = pop(lambda name: self.rules.has("last", name))
+        frame = pop(lambda name: self.rules.has("frame", name))
+        turned_off = pop(lambda name: self.rules.reveals(name) and self.targets[name].settable == 0)
+        switches = pop(self.rules.reveals)
+        is_any_missing = any(row.status is ApplyStatus.LATER for row in rows.values())
+        waits = [
+            is_any_missing and any(row.needs_reboot for row in revealing) for revealing in (frame, switches)
         ]
+        resets = any(self.rules.has("resets", row.target.name) for row in frame)
+        last = tuple(sorted(last, key=lambda row: self.rules.has("system_id", row.target.name)))
+        stages = (
+            Stage("frame parameters", frame, reveals=True, reboot_first=resets or waits[0]),
+            Stage("switches that reveal parameters", switches, reveals=True, reboot_first=waits[1]),
+            Stage("all other parameters", tuple(left)),
+            Stage("switches that are turned off", turned_off),
+            Stage("parameters that may end the connection", last, is_last=True),
+        )
+        return tuple(stage for stage in stages if stage.rows)
+
+    def belongs_to(self, switches: Iterable[str]) -> Callable[[str], bool]:
+        """Return a function that decides whether a wanted name, or its other name, is of a switch's group."""
+        groups = tuple(switch.rpartition("_")[0] + "_" for switch in switches)
+        return lambda name: any(each.startswith(groups) for each in (name, *self.renames.other_names(name)))
+
+    def awaiting_reboot(self, rows: Mapping[str, ApplyRow]) -> tuple[str, ...]:
+        """Return switches whose missing group may appear after a reboot."""
+        missing = [name for name, row in rows.items() if row.category == MISSING]
         return tuple(
             name
             for name, row in ((row.target.name, row) for row in rows.values())
-            if row.status is PlanStatus.UNCHANGED
+            if row.status is ApplyStatus.UNCHANGED
             and row.before != 0
-            and (self._rules.reveals(name) or self._rules.chooses_frame(name))
-            and self._needs_reboot(name)
-            and any(each.startswith(name.rpartition("_")[0] + "_") for each in missing)
+            and row.needs_reboot
+            and (self.rules.reveals(name) or self.rules.has("frame", name))
+            and any(map(self.belongs_to([name]), missing))
         )
 
-    def settle_missing(self, rows: Mapping[str, PlanRow]) -> dict[str, PlanRow]:
+    def settle_missing(self, rows: Mapping[str, ApplyRow]) -> dict[str, ApplyRow]:
         """Return the rows with missing parameters as later, if a step may reveal them, or skipped.
 
         Adds the similar names that the vehicle has.
         """
-        names = [name for name, row in rows.items() if row.status is PlanStatus.LATER]
-        if len(names) > SUGGESTIONS_MAX:
-            nearest: Mapping[str, tuple[str, ...]] = {}
-        else:
-            unnamed = self._current.keys() - self._targets.keys()
-            spelled = {name.upper(): name for name in self._current}
-            nearest = {
-                name: nearest_names(name, unnamed | {spelled.get(name.upper(), name)}) for name in names
-            }
+        names = [name for name, row in rows.items() if row.status is ApplyStatus.LATER]
+        unnamed = self.current.keys() - self.targets.keys()
+        spelled = {name.upper(): name for name in self.current} if names else {}
         settled = dict(rows)
         may_be_revealed = self._revealed_names(rows)
         for name in names:
-            may_appear = any(map(may_be_revealed, (name, *self._renames.other_names(name))))
-            settled[name] = replace(
-                rows[name],
-                status=PlanStatus.LATER if may_appear else PlanStatus.SKIPPED,
-                reason=rows[name].reason_missing + (", unless a step reveals it" if may_appear else ""),
-                nearest=nearest.get(name, ()),
-            )
+            nearest: tuple[str, ...] = ()
+            if len(names) <= SUGGESTIONS_MAX:
+                nearest = nearest_names(name, unnamed | {spelled.get(name.upper(), name)})
+            may_appear = any(map(may_be_revealed, (name, *self.renames.other_names(name))))
+            reason = "; ".join(filter(None, ("not on this vehicle", self.renames.missing_note(name))))
+            status = ApplyStatus.LATER if may_appear else ApplyStatus.SKIPPED
+            settled[name] = replace(rows[name], status=status, reason=reason, nearest=nearest)
         return settled
 
-    def _revealed_names(self, rows: Mapping[str, PlanRow]) -> Callable[[str], bool]:
+    def _revealed_names(self, rows: Mapping[str, ApplyRow]) -> Callable[[str], bool]:
         """Return a function that decides whether a step may reveal a name that the vehicle does not have.
 
         A switch reveals names that begin like its own: the members of its group, which may end in a digit
@@ -541,12 +534,12 @@ class _Planner:
         groups: set[str] = set()
         for row in rows.values():
             name = row.target.name
-            if row.status is not PlanStatus.SET or self._rules.is_last(name):
+            if row.status is not ApplyStatus.SET or self.rules.has("last", name):
                 continue
-            is_switch = self._rules.reveals(name)
+            is_switch = self.rules.reveals(name)
             if is_switch and row.target.settable == 0:
                 continue
-            if self._rules.brings_any(name) or (not is_switch and self._rules.chooses_frame(name)):
+            if self.rules.has("brings_any", name) or (not is_switch and self.rules.has("frame", name)):
                 return lambda _: True
             if is_switch:
                 groups.add(name.rpartition("_")[0])
@@ -556,57 +549,44 @@ class _Planner:
         return lambda name: name.startswith(prefixes)
 
     def _find_fault(
-        self, name: str, value: WireValue, kind: ParamType | int | None, info: ParamInfo | None
+        self, target: WrittenParam, before: WireValue, kind: ParamType | int | None, *, force: bool
     ) -> tuple[str, str] | None:
         """Return why a value is invalid, as category and sentence, or None."""
-        if self._rules.is_system_id(name) and (isinstance(value, bytes | str) or not 1 <= value <= 255):
+        value, info = target.settable, self.info.get(target.name)
+        if self.rules.has("system_id", target.name) and (
+            isinstance(value, bytes | str) or not 1 <= value <= 255
+        ):
             return WRONG, "a system id is a number from 1 to 255"
         if kind is not None:
             try:
-                self._dialect.encode(value, kind, self._encoding)
+                (EXTENDED if self.wanted.is_extended else PLAIN).encode(value, kind, self.encoding)
             except UsageError as error:
                 return WRONG, str(error)
             if isinstance(value, float) and kind < ParamType.REAL32 and not value.is_integer():
                 return WRONG, f"{value!r} is not a whole number, and the parameter is {type_name(kind)}"
+        if target.is_raw and not isinstance(before, bytes):
+            return WRONG, f"{format_value(value)} are raw bytes, and the vehicle has a number"
         if isinstance(value, bytes | str):
             return None
         if not math.isfinite(value):
-            if self._force:
-                return None
-            if self._against_non_finite:
-                return WRONG, self._against_non_finite
-            return OUT_OF_RANGE, f"{value} is not a finite number"
-        if info is not None:
-            sent = _float32(value) if kind == ParamType.REAL32 else value
-            if info.minimum is not None and sent < _float32(info.minimum):
-                return OUT_OF_RANGE, f"{format_value(value)} is below its minimum, {info.minimum:g}"
-            if info.maximum is not None and sent > _float32(info.maximum):
-                return OUT_OF_RANGE, f"{format_value(value)} is above its maximum, {info.maximum:g}"
+            return None if force else self._fault_of_non_finite(value)
+        sent = _float32(value) if kind == ParamType.REAL32 else value
+        if info is not None and info.minimum is not None and sent < _float32(info.minimum):
+            return OUT_OF_RANGE, f"{format_value(value)} is below its minimum, {info.minimum:g}"
+        if info is not None and info.maximum is not None and sent > _float32(info.maximum):
+            return OUT_OF_RANGE, f"{format_value(value)} is above its maximum, {info.maximum:g}"
         return None
 
-    def _step(self, row: PlanRow) -> Step:
-        assert row.before is not None, "only parameters that the vehicle has are set"
-        kind = ParamType.REAL32 if row.type is None else row.type
-        name, value = row.target.name, row.target.settable
-        return Step(name, value, kind, row.before, self._needs_reboot(name), row.wanted)
+    def _fault_of_non_finite(self, value: float) -> tuple[str, str]:
+        # only ArduPilot sends integers as float32
+        usual = "ardupilot" if self.encoding is Encoding.C_CAST else ""
+        reason = reason_against_non_finite(self.autopilot or usual)
+        return (WRONG, reason) if reason else (OUT_OF_RANGE, f"{value} is not a finite number")
 
     def _value_to_be(self, name: str) -> WireValue | None:
         """Return the wanted value of a parameter, or else its present value."""
-        param: Param | WrittenParam | None = self._targets.get(name) or self._current.get(name)
+        param: Param | WrittenParam | None = self.targets.get(name) or self.current.get(name)
         return None if param is None else param.settable
-
-    def _needs_reboot(self, name: str) -> bool:
-        info = self._info.get(name)
-        if info is not None and info.reboot_required:
-            return True
-        return self._rules.needs_reboot(name, self._vehicle_type)
-
-
-def _pop_matching(steps: list[Step], fits: Callable[[Step], bool]) -> list[Step]:
-    """Remove the steps that fit from the list, and return them."""
-    taken = [step for step in steps if fits(step)]
-    steps[:] = [step for step in steps if not fits(step)]
-    return taken
 
 
 def _is_same(wanted: WireValue, current: WireValue, kind: ParamType | int | None) -> bool:
@@ -630,3 +610,7 @@ def _float32(value: float) -> float:
     except OverflowError:
         return math.copysign(math.inf, value)
     return number
+
+
+_INTENDED_CATEGORIES: Final = frozenset(CATEGORIES) - {OUT_OF_RANGE}
+"""Categories of parameters that are left out on purpose: a skipped row of one is no failure."""

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 from paramclient.errors import AlreadyRestored, NotInCache, UnknownVehicle
 from paramclient.model.paramset import ParamSet, RestorePoint
 from paramclient.model.wording import age_in_words
-from paramclient.provision.apply_restore import BEFORE_RESTORE
-from paramclient.provision.vehicle_params import BEFORE_APPLY
+from paramclient.provision.apply_restore import BEFORE_APPLY, BEFORE_RESTORE
 
 if TYPE_CHECKING:
     from paramclient.cache import ParamCache, SnapshotSummary

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from paramclient.protocol.fetch import FetchResult, Progress
 
 __all__ = [
-    "BEFORE_APPLY",
     "NAMES_SHOWN_MAX",
     "NO_DEFAULTS",
     "FetchedSet",
@@ -35,8 +34,6 @@ __all__ = [
     "fetch_set",
 ]
 
-BEFORE_APPLY: Final = "before apply"
-"""The reason of the snapshot that `apply` stores before its first write."""
 NAMES_SHOWN_MAX: Final = 20
 """Parameters that a message names, so that it stays readable; it gives the number of further ones."""
 NO_DEFAULTS: Final = (

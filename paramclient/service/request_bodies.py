@@ -20,7 +20,7 @@ from paramclient.errors import UsageError
 from paramclient.files import FileFormat, ParamFile, loads
 from paramclient.metadata.info import number_of
 from paramclient.model.ext_values import parse_ext_value
-from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.paramset import ParamSet
 from paramclient.model.values import WireValue, check_name
 from paramclient.service.problems import ServiceError
 
@@ -184,7 +184,7 @@ class SetupOptions(Body):
 class ApplyRequest(SetupOptions, PlanRequest):
     """Wanted parameters with options."""
 
-    skip_invalid: bool = False
+    partial: bool = False
     durable: Durable = False
 
 
@@ -246,6 +246,5 @@ async def values_set(values: dict[str, GivenValue], target: Target) -> ParamSet:
     Raises:
         UsageError, ParamClientError: as from `read_values`.
     """
-    read = (await read_values(values, target)).items()
-    written = {name: WrittenParam(check_name(name), value) for name, value in read}
-    return ParamSet(written, is_extended=target.component.is_extended)
+    read = await read_values(values, target)
+    return ParamSet({check_name(name): read[name] for name in read}, is_extended=target.component.is_extended)

@@ -16,15 +16,16 @@ from fastapi.responses import Response
 from pydantic import AwareDatetime
 
 from paramclient.cache import ParamCache, SnapshotSummary
+from paramclient.cli.json_apply import ApplyJson, PlanJson
 from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson
 from paramclient.cli.json_output import SetJson, VehicleJson, as_json
-from paramclient.cli.json_setup import ApplyJson, PlanJson
 from paramclient.errors import UsageError
 from paramclient.files import FileFormat, dumps, writable
 from paramclient.files.formats import ENDINGS
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
-from paramclient.provision import ApplyProgress, ApplyResult, apply, prepare, restore
+from paramclient.provision import ApplyProgress, ApplyResult, apply, restore
+from paramclient.provision import plan as plan_of
 from paramclient.provision.restore_point import load_state_before_apply
 from paramclient.provision.vehicle_params import fetch_set, select_non_defaults, set_maker
 from paramclient.service.access import author_of, require_write
@@ -116,7 +117,7 @@ async def _only_setup(target: TargetArgument) -> AsyncIterator[None]:
 async def plan(hub: HubArgument, target: TargetArgument, body: PlanRequest) -> PlanJson:
     """Return which values an apply would write, in which order, and which it would skip, and why."""
     component, wanted = target.component, await _wanted(hub, target, body)
-    found = await prepare(component, wanted, include=body.include, info=target.metadata, force=body.force)
+    found = await plan_of(component, wanted, include=body.include, info=target.metadata, force=body.force)
     return PlanJson.of(found, system=component.system, component=component.component)
 
 
@@ -156,8 +157,7 @@ async def _wanted(hub: Hub, target: Target, body: PlanRequest) -> ParamSet:
 
 
 def _applied(target: Target, result: ApplyResult) -> ApplyJson:
-    vehicle = VehicleJson.of(target.component)
-    return ApplyJson.of(result, system=vehicle.system, component=vehicle.component, vehicle=vehicle)
+    return ApplyJson.of(result, VehicleJson.of(target.component))
 
 
 def _context(request: Request, hub: Hub, target: Target) -> dict[str, Any]:

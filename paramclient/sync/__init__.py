@@ -8,7 +8,7 @@ all other classes are those of `paramclient`::
         print(vehicle.get("MC_ROLL_P"))
 
 The functions have the arguments and the results of those in `paramclient.provision` and
-`paramclient.metadata`.
+`paramclient.metadata`; the call of `for_each` blocks.
 
 - `proxy`: the one class behind all of them.
 
@@ -19,8 +19,8 @@ from __future__ import annotations
 
 from paramclient import metadata, provision
 from paramclient.client.events import Discovered, Event, Found, Lost, Rebooted, Resynced
-from paramclient.provision.fleet import Wanted
-from paramclient.sync.proxy import Changes, Component, Events, Ftp, ParamClient, blocking
+from paramclient.provision.inspection import Wanted
+from paramclient.sync.proxy import Changes, Component, Events, Ftp, ParamClient, blocking, for_each
 
 __all__ = [
     "Changes",
@@ -36,20 +36,13 @@ __all__ = [
     "Resynced",
     "Wanted",
     "apply",
-    "apply_all",
+    "for_each",
     "metadata_of",
-    "prepare",
+    "plan",
     "restore",
-    "restore_all",
-    "verify",
-    "verify_all",
 ]
 
-prepare = blocking(provision.prepare)
+plan = blocking(provision.plan)
 apply = blocking(provision.apply)
-verify = blocking(provision.verify)
 restore = blocking(provision.restore)
-apply_all = blocking(provision.apply_all)
-verify_all = blocking(provision.verify_all)
-restore_all = blocking(provision.restore_all)
 metadata_of = blocking(metadata.metadata_of)

@@ -25,8 +25,9 @@ from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.watch import SyncState
+from paramclient.provision.execution import ApplyProgress, ApplyResult
+from paramclient.provision.fleet import FleetResult, Outcome
 from paramclient.provision.planning import ParamInfo, Plan
-from paramclient.provision.results import ApplyProgress, ApplyResult, FleetApplied, FleetVerified
 from paramclient.sim import Endpoint
 from paramclient.wire.signing import SigningKey, SigningReport
 
@@ -44,13 +45,10 @@ __all__ = [
     "Resynced",
     "Wanted",
     "apply",
-    "apply_all",
+    "for_each",
     "metadata_of",
-    "prepare",
+    "plan",
     "restore",
-    "restore_all",
-    "verify",
-    "verify_all",
 ]
 
 class Ftp:
@@ -157,7 +155,7 @@ class Component:
     def changes(self) -> Changes:
         """Return a stream of parameter changes from now on: `async for change in component.changes()`."""
 
-Wanted: TypeAlias = ParamSet | Mapping[tuple[int, int], ParamSet] | Callable[[Component], ParamSet]
+Wanted: TypeAlias = ParamSet | Mapping[str, Settable]
 
 class Changes(Iterator[Change]):
     "Stream of the changes since its creation; see `Component.changes`."
@@ -282,26 +280,26 @@ class ParamClient:
     def signing_report(self) -> SigningReport | None:
         """Return the signing statistics of the link: signed frames, and refused frames with the reasons."""
 
-def prepare(
+def plan(
     component: Component,
-    wanted: ParamSet,
+    wanted: Wanted,
     *,
     include: str | Iterable[str] = (),
     info: Mapping[str, ParamInfo] | None = None,
     force: bool = False,
     renames: Renames | None = None,
 ) -> Plan:
-    """Return the plan of what `apply` would send to a vehicle, and in which order. Only reads."""
+    """Return what `apply` would write to a vehicle, and in which order. Only reads."""
 
 def apply(
     component: Component,
-    wanted: ParamSet | Plan,
+    wanted: Wanted,
     *,
     include: str | Iterable[str] = (),
     info: Mapping[str, ParamInfo] | None = None,
     reboot: bool = False,
     allow_armed: bool = False,
-    skip_invalid: bool = False,
+    partial: bool = False,
     force: bool = False,
     renames: Renames | None = None,
     durable: bool = False,
@@ -312,17 +310,6 @@ def apply(
     before_writing: Callable[[], object] | None = None,
 ) -> ApplyResult:
     """Write the wanted values to a vehicle, and verify each of them by reading it back at the end."""
-
-def verify(
-    component: Component,
-    wanted: ParamSet,
-    *,
-    include: str | Iterable[str] = (),
-    info: Mapping[str, ParamInfo] | None = None,
-    force: bool = False,
-    renames: Renames | None = None,
-) -> Plan:
-    """Compare a vehicle with the wanted parameters. Only reads."""
 
 def restore(
     component: Component,
@@ -341,53 +328,8 @@ def restore(
 ) -> ApplyResult:
     """Restore an earlier state of a vehicle: `apply`, with its own identity and calibration included."""
 
-def apply_all(
-    components: Iterable[Component],
-    wanted: Wanted,
-    *,
-    include: str | Iterable[str] = (),
-    info: Callable[[Component], Mapping[str, ParamInfo] | None] | None = None,
-    reboot: bool = False,
-    allow_armed: bool = False,
-    skip_invalid: bool = False,
-    force: bool = False,
-    renames: Renames | None = None,
-    durable: bool = False,
-    backup: Callable[[Component], str | os.PathLike[str]] | None = None,
-    timeout: float | None = None,
-    author: str | None = None,
-    progress: Callable[[Component, ApplyProgress], None] | None = None,
-    before_writing: Callable[[Component], object] | None = None,
-) -> FleetApplied:
-    """`apply` to several vehicles concurrently. A failure of one vehicle does not stop the others."""
-
-def verify_all(
-    components: Iterable[Component],
-    wanted: Wanted,
-    *,
-    include: str | Iterable[str] = (),
-    info: Callable[[Component], Mapping[str, ParamInfo] | None] | None = None,
-    force: bool = False,
-    renames: Renames | None = None,
-) -> FleetVerified:
-    """`verify` several vehicles concurrently."""
-
-def restore_all(
-    components: Iterable[Component],
-    states: Wanted,
-    *,
-    include: str | Iterable[str] = (),
-    info: Callable[[Component], Mapping[str, ParamInfo] | None] | None = None,
-    reboot: bool = False,
-    allow_armed: bool = False,
-    force: bool = False,
-    backup: Callable[[Component], str | os.PathLike[str]] | None = None,
-    timeout: float | None = None,
-    author: str | None = None,
-    progress: Callable[[Component, ApplyProgress], None] | None = None,
-    before_writing: Callable[[Component], object] | None = None,
-) -> FleetApplied:
-    """`restore` several vehicles concurrently. A failure of one vehicle does not stop the others."""
+def for_each(components: Iterable[Component], call: Callable[[Component], Outcome]) -> FleetResult[Outcome]:
+    """Make a call for each vehicle, concurrently; a failure of one does not stop the others."""
 
 def metadata_of(
     component: Component,

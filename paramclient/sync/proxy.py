@@ -8,8 +8,9 @@ import os
 import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent import futures
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial, wraps
@@ -22,17 +23,15 @@ from anyio.from_thread import BlockingPortal, start_blocking_portal
 
 import paramclient.client.client as asynchronous
 from paramclient.client import component, events, files, streams
-from paramclient.errors import ClientClosed, UsageError
+from paramclient.errors import ClientClosed, ParamClientError, UsageError
+from paramclient.provision.fleet import FleetResult
 
-__all__ = ["Changes", "Component", "Events", "Ftp", "ParamClient", "blocking"]
+__all__ = ["Changes", "Component", "Events", "Ftp", "ParamClient", "blocking", "for_each"]
 
 THREAD_NAME: Final = "paramclient blocking client"
 """Name of the thread of a client, in debuggers."""
 WAIT_INTERVAL: Final = 0.1
 """Seconds after which a waiting thread wakes up: Windows delivers Ctrl-C only then."""
-
-CALLBACKS: Final = ("progress", "before_writing")
-"""Arguments that are called while a call runs, in the thread of the caller."""
 
 
 class _Session:
@@ -51,6 +50,7 @@ class _Session:
             self.client = self._portal.call(make)
             self._thread = thread.pop_all()
         self.proxies: weakref.WeakValueDictionary[object, Proxy] = weakref.WeakValueDictionary()
+        self._running: list[futures.Future[Any]] = []
         self._process = os.getpid()
         self._end = weakref.finalize(self, _end_in_background, self._portal, self.client, self._thread)
         self._end.atexit = False  # `_close_all` ends it
@@ -87,6 +87,7 @@ class _Session:
                 raise UsageError("a blocking call cannot be made in the event loop of its client") from None
             raise ClientClosed("the client was closed", link=self.client.link.name) from None
         future.add_done_callback(lambda _: calls.put(None))
+        self._running.append(future)
         try:
             while (call := _next(calls)) is not None:
                 call()
@@ -96,6 +97,13 @@ class _Session:
         except BaseException:
             future.cancel()
             raise
+        finally:
+            self._running.remove(future)
+
+    def cancel(self) -> None:
+        """Cancel the calls that run in other threads."""
+        for future in list(self._running):
+            future.cancel()
 
     def read(self, function: Callable[..., Any], *args: Any) -> Any:
         """Call a function that also works with a closed client: in the event loop, or after its end, when
@@ -250,30 +258,32 @@ class Events(Stream, of=events.Events):
 
 
 def blocking(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that takes a client or components with calls that block."""
+    """Return a function that takes a client or a component with calls that block."""
 
     @wraps(function)
-    def call(first: Any, *args: Any, **kwargs: Any) -> Any:
-        if isinstance(first, Proxy):
-            return first._session.run(function, first, *args, **kwargs)
-        vehicles = list(first)
-        sessions = {each._session for each in vehicles}
-        if len(sessions) > 1:
-            raise UsageError(
-                f"the vehicles belong to {len(sessions)} clients; make one call for those of each client"
-            )
-
-        def answered(value: Any) -> Any:
-            """Return a function of a vehicle with its results, as it may make calls that block."""
-            return {each._target: value(each) for each in vehicles}.__getitem__ if callable(value) else value
-
-        args = tuple(map(answered, args))
-        kwargs = {name: each if name in CALLBACKS else answered(each) for name, each in kwargs.items()}
-        if not sessions:
-            return anyio.run(partial(function, vehicles, *args, **kwargs))
-        return sessions.pop().run(function, vehicles, *args, **kwargs)
+    def call(first: Proxy, *args: Any, **kwargs: Any) -> Any:
+        return first._session.run(function, first, *args, **kwargs)
 
     return call
+
+
+def for_each(components: Iterable[Any], call: Callable[[Any], Any]) -> FleetResult[Any]:
+    """Make a call for each vehicle, each in a thread; see `paramclient.provision.for_each`."""
+    vehicles = {(each.system, each.component): each for each in components}
+    results, errors = {}, {}
+    with ThreadPoolExecutor(max(len(vehicles), 1)) as threads:
+        calls = {address: threads.submit(call, vehicle) for address, vehicle in vehicles.items()}
+        try:
+            for address, running in calls.items():
+                try:
+                    results[address] = running.result()
+                except ParamClientError as error:
+                    errors[address] = error
+        except BaseException:  # such as Ctrl-C
+            for vehicle in vehicles.values():
+                vehicle._session.cancel()
+            raise
+    return FleetResult(results, errors)
 
 
 def _target_of(value: Any) -> Any:

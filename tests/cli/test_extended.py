@@ -136,7 +136,7 @@ def test_apply_writes_what_differs_and_reads_it_back(command: Command, put: Put,
     )
     assert camera.ext_values["CAM_MODE"] == 9
     done = command("apply", url, file, *CAMERA)
-    assert (done.code, [row[-1] for row in done.rows[1:]]) == (0, ["set"] * 3), done.err
+    assert (done.code, [row[-1] for row in done.rows[1:]]) == (0, ["accepted"] * 3), done.err
     assert camera.ext_values == {"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_KEY": b"\xff\0\xfe", "CAM_EV": 0.5}
     again = command("apply", url, file, *CAMERA)
     assert (again.code, again.out) == (0, "")
@@ -149,7 +149,7 @@ def test_apply_reports_what_it_cannot_do(command: Command, put: Put, tmp_path: P
     url = put(Camera({"CAM_MODE": 2, "CAM_NAME": 5}, supported={"CAM_MODE": [2]}))
     invalid = command("apply", url, file, *CAMERA)
     assert (invalid.code, "CAM_NAME: 'Front' is not a number" in invalid.err) == (2, True)
-    done = command("apply", url, file, *CAMERA, "--skip-invalid")
+    done = command("apply", url, file, *CAMERA, "--partial")
     assert done.code == 1
     assert ("1 refused" in done.err, "3 skipped" in done.err) == (True, True), done.err
     assert "not on this vehicle" in done.out
@@ -196,7 +196,7 @@ def test_restore_from_the_cache(command: Command, put: Put, tmp_path: Path) -> N
     assert "the state: 4 extended parameters of 1/100 no autopilot from snapshot 1 of " in dry.err
     restored = command("restore", url, *CAMERA)
     assert (restored.code, camera.ext_values) == (0, before), restored.err
-    assert restored.rows[1:] == [["CAM_NAME", "Rear", "Front", "Front", "set"]]
+    assert restored.rows[1:] == [["CAM_NAME", "Rear", "Front", "Front", "accepted"]]
     again = command("restore", url, *CAMERA)
     assert again.code == 2
     assert "a restore ran " in again.err

@@ -186,12 +186,12 @@ CASES: Final = {
     "apply": Case(
         copter,
         (
-            "apply URL DATA/json/copter.param --dry-run --json",
-            "apply URL DATA/json/copter.param --json",
-            "apply URL DATA/json/copter.param --full --json",
+            "apply URL DATA/json/copter.param --partial --dry-run --json",
+            "apply URL DATA/json/copter.param --partial --json",
+            "apply URL DATA/json/copter.param --partial --full --json",
         ),
     ),
-    "apply_all": Case(both, ("apply URL DATA/json/copter.param --vehicle all --json",)),
+    "apply_all": Case(both, ("apply URL DATA/json/copter.param --partial --vehicle all --json",)),
     "apply_extended": Case(
         camera,
         (
@@ -205,7 +205,7 @@ CASES: Final = {
         copter,
         (
             FETCH,
-            "apply URL DATA/json/copter.param --json",
+            "apply URL DATA/json/copter.param --partial --json",
             "restore URL --dry-run --json",
             "restore URL --json",
         ),

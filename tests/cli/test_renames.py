@@ -58,7 +58,7 @@ def test_apply_writes_under_the_name_of_the_vehicle(command: Command, put: Calla
     outcome = command("apply", put(vehicle), file(), "--renames", "names.json", "--full")
     assert outcome.code == 0
     assert outcome.rows[1:] == [
-        ["WPNAV_SPEED", "10.0", "7.5", "7.5", "set", "WP_SPD on this vehicle"],
+        ["WPNAV_SPEED", "10.0", "7.5", "7.5", "accepted", "WP_SPD on this vehicle"],
         ["RTL_ALT", "15", "15", "15", "unchanged", "RTL_ALT_M on this vehicle"],
     ]
     assert vehicle.values["WP_SPD"] == 7.5
@@ -78,7 +78,7 @@ def test_a_dry_run_shows_the_steps_under_both_names(command: Command, put: Calla
 
 def test_a_missing_parameter_names_its_other_name(command: Command, put: Callable[[Endpoint], str]) -> None:
     vehicle, wanted = copter(), file("GONE,1\n")
-    outcome = command("apply", put(vehicle), wanted, "--renames", "names.json")
+    outcome = command("apply", put(vehicle), wanted, "--renames", "names.json", "--partial")
     assert outcome.code == 1
     assert outcome.rows[1:] == [["GONE", "1", "skipped", f"not on this vehicle; {NOT_HERE}"]]
 

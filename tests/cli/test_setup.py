@@ -101,14 +101,18 @@ def test_apply_sets_and_verifies_values_that_differ(
     left_out = "left out: it was measured on one vehicle, and is wrong on every other"
     assert outcome.rows == [
         ["name", "before", "wanted", "now", "status", "reason"],
-        ["RTL_ALT", "1500", "2500", "2500", "set"],
-        ["WPNAV_SPEED", "500.0", "750.5", "750.5", "set"],
+        ["RTL_ALT", "1500", "2500", "2500", "accepted"],
+        ["WPNAV_SPEED", "500.0", "750.5", "750.5", "accepted"],
         ["COMPASS_OFS_X", "5.0", "12.5", "5.0", "skipped", left_out],
     ]
-    announced, line = outcome.err.splitlines()
+    announced, line, *notes = outcome.err.splitlines()
     assert announced == "writing to 1/1 ArduPilot quadrotor, firmware 4.6.0-dev on udpin:0.0.0.0:14550"
     receiver = "1/1 ArduPilot quadrotor, firmware 4.6.0-dev"
-    assert re.fullmatch(rf"{receiver}: 2 set, 1 unchanged, 1 skipped in \d\.\d s", line)
+    assert re.fullmatch(rf"{receiver}: 2 accepted, 1 unchanged, 1 skipped in \d\.\d s", line)
+    assert notes == [
+        "1/1 ardupilot: left out: 1 calibration; to write them: --include calibration",
+        "1/1 ardupilot: ranges not checked: 2 of 2 have no metadata",
+    ]
     assert vehicle.values["RTL_ALT"] == 2500
     assert vehicle.values["COMPASS_OFS_X"] == 5.0
     again = command("apply", put(vehicle), file())
@@ -124,22 +128,31 @@ def test_a_name_that_no_vehicle_can_have_is_invalid_too(
     wrong = file("RTL_ALT,2500\nSIM_GPS1_BYTELOSS,0\n")
     assert command("apply", put(vehicle), wrong).code == 2
     assert vehicle.requests["PARAM_SET"] == 0
-    outcome = command("apply", put(vehicle), wrong, "--skip-invalid")
+    outcome = command("apply", put(vehicle), wrong, "--partial")
     assert (outcome.code, vehicle.values["RTL_ALT"]) == (1, 2500)
     assert "line 2: " in outcome.err
 
 
-def test_invalid_values_are_reported_before_anything_is_sent(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+@pytest.mark.parametrize(
+    ("line", "fault"),
+    [
+        ("EK2_ENABLE,300", "EK2_ENABLE: 300"),
+        ("WPNAV_SPEDD,1", "WPNAV_SPEDD: not on this vehicle (did you mean WPNAV_SPEED"),
+    ],
+)
+def test_invalid_values_and_mistyped_names_are_reported_before_anything_is_sent(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], line: str, fault: str
 ) -> None:
     vehicle = copter()
-    wrong = file("RTL_ALT,2500\nEK2_ENABLE,300\n")
+    wrong = file(f"RTL_ALT,2500\n{line}\n")
     outcome = command("apply", put(vehicle), wrong)
     assert outcome.code == 2
-    assert "EK2_ENABLE: 300" in outcome.err
+    assert fault in outcome.err
+    assert "--partial skips these" in outcome.err
+    assert "writing to" not in outcome.err
     assert vehicle.requests["PARAM_SET"] == 0
     assert command("apply", put(vehicle), wrong, "--dry-run").code == 2
-    outcome = command("apply", put(vehicle), wrong, "--skip-invalid")
+    outcome = command("apply", put(vehicle), wrong, "--partial")
     assert outcome.code == 1
     assert vehicle.values["RTL_ALT"] == 2500
 
@@ -151,6 +164,7 @@ def test_armed_vehicles_are_refused(
     outcome = command("apply", put(vehicle), file())
     assert (outcome.code, outcome.out) == (1, "")
     assert "armed" in outcome.err
+    assert "writing to" not in outcome.err
     assert vehicle.requests["PARAM_SET"] == 0
     would = command("apply", put(vehicle), file(), "--dry-run")
     assert would.code == 1
@@ -221,7 +235,7 @@ def test_dry_run_prints_the_stages_in_order(
         ["2", "WPNAV_SPEED", "500.0", "750.5", "set"],
     ]
     assert [row[0] for row in outcome.rows[5:]] == ["COMPASS_OFS_X", "EK2_NO_SUCH"]
-    assert outcome.err.endswith("; nothing was sent\n")
+    assert "; nothing was sent\n" in outcome.err
     assert vehicle.requests["PARAM_SET"] == 0
     assert vehicle.requests["COMMAND_LONG"] <= 2, "its identity may be requested, and no more"
     assert not backup.exists()
@@ -257,6 +271,24 @@ def test_the_backup_file_has_the_state_before(
 
 
 # restore
+
+
+def test_a_backup_restores_the_calibration_of_the_very_same_vehicle(
+    command: Command, put: Put, file: Callable[..., Path], tmp_path: Path
+) -> None:
+    vehicle = copter()
+    assert command("save", put(vehicle), tmp_path / "{uid}.param").code == 0
+    [named] = tmp_path.glob("*.param")
+    anonymous = file(named.read_text())
+    vehicle.set_param("COMPASS_OFS_X", 9.0)
+    left_out = command("restore", put(vehicle), anonymous)
+    assert left_out.code == 0
+    assert "1/1 ardupilot: left out: 1 calibration; to write them: --include calibration\n" in left_out.err
+    assert vehicle.values["COMPASS_OFS_X"] == 9.0
+    for words in ([named], [anonymous, "--vehicle", f"uid:{named.stem}"]):
+        vehicle.set_param("COMPASS_OFS_X", 9.0)
+        assert command("restore", put(vehicle), *words).code == 0
+        assert vehicle.values["COMPASS_OFS_X"] == 5.0
 
 
 def test_restore_reverts_the_last_apply(
@@ -383,7 +415,7 @@ def test_all_vehicles_are_set_concurrently(
     receivers = [f"{system}/1 ArduPilot quadrotor, firmware 4.6.0-dev" for system in (1, 2, 3)]
     lines = outcome.err.splitlines()
     assert lines[:3] == [f"writing to {each} on udpin:0.0.0.0:14550" for each in receivers]
-    assert [line.split(":")[0] for line in lines[3:]] == receivers
+    assert [line.split(":")[0] for line in lines[3:] if " accepted" in line] == receivers
     assert sorted(path.name for path in tmp_path.glob("?.json")) == ["1.json", "2.json", "3.json"]
 
 

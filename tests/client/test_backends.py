@@ -37,7 +37,7 @@ from paramclient.errors import LinkError
 from paramclient.links import Link, create_link, serve_endpoint
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.identity import HEARTBEAT_WAIT
-from paramclient.provision import apply, prepare, restore, verify
+from paramclient.provision import apply, plan, restore
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, Vehicle
 from paramclient.wire import messages
 from tests.cable import TIMEOUT, Cable
@@ -240,10 +240,10 @@ async def test_a_vehicle_is_set_up_and_put_back() -> None:
     before = bits(vehicle.params)
     async with beside(), a_client(vehicle) as client:
         component = await client.component()
-        done = await apply(component, await prepare(component, wanted))
+        done = await apply(component, wanted)
         assert done.complete
         assert {vehicle.params[name].value for name in wanted} == {7}
-        assert (await verify(component, wanted)).is_met
+        assert (await plan(component, wanted)).complete
         assert done.before is not None
         await restore(component, done.before)
         assert bits(vehicle.params) == before

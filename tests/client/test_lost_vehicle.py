@@ -9,8 +9,8 @@ import anyio
 import pytest
 
 from paramclient import Component, ParamCache, ParamClient, SetStatus, SyncState
-from paramclient.cli.json_output import FetchJson, WriteJson, as_json
-from paramclient.cli.json_setup import ApplyJson
+from paramclient.cli.json_apply import ApplyJson
+from paramclient.cli.json_output import FetchJson, VehicleJson, WriteJson, as_json
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType
 from paramclient.provision import ApplyStatus, apply
@@ -180,11 +180,14 @@ async def test_apply(kind: str) -> None:
             result = await apply(component, wanted)
             assert result.error is not None
             assert result.rows.keys() == world.wanted.keys()
-            shown = as_json(ApplyJson.of(result, system=1, component=1, full=True))
+            shown = as_json(ApplyJson.of(result, VehicleJson.of(component), full=True))
             rows = {name: row["actual"] for name, row in shown["params"].items()}
             assert rows == {name: row.actual for name, row in result.rows.items()}
             accepted = {name: value for name, value in rows.items() if value == world.wanted[name]}
             check_acknowledged(world, component, accepted)
-            assert {result.rows[name].status for name in accepted} <= {ApplyStatus.SET, ApplyStatus.UNPROVEN}
+            assert {result.rows[name].status for name in accepted} <= {
+                ApplyStatus.ACCEPTED,
+                ApplyStatus.UNPROVEN,
+            }
 
         await world.until_silent(lambda: world.is_written(40), call)

@@ -431,7 +431,7 @@ async def apply_hidden(session: Session) -> Measured:
             back = await restore(vehicle, done.before)
             await put_back(session, vehicle)
             for result in (done, back):
-                if not result.complete or result.counts[ApplyStatus.SET] != len(values):
+                if not result.complete or result.counts[ApplyStatus.ACCEPTED] != len(values):
                     raise CheckFailed(f"{result}: {'; '.join(map(str, result.shown_rows))}")
             return Measured(f"{switch} and {member.name} in {done.elapsed:.2f} s", done.elapsed)
     raise Skip("no switch of a group with a float is off")
@@ -451,10 +451,12 @@ async def restore_before(session: Session) -> Measured:
         done = await restore(vehicle, state)
         left_out = [row.name for row in done.shown_rows if row.status is ApplyStatus.SKIPPED]
         await put_back(session, vehicle)
-    if not done.complete or any(done.rows[name].status is not ApplyStatus.SET for name in names):
+    if not done.complete or any(done.rows[name].status is not ApplyStatus.ACCEPTED for name in names):
         raise CheckFailed(f"{done}: {'; '.join(map(str, done.shown_rows[:5]))}")
     reported = f", left out {', '.join(left_out)}" if left_out else ""
-    return Measured(f"{done.counts[ApplyStatus.SET]} set in {done.elapsed:.2f} s{reported}", done.elapsed)
+    return Measured(
+        f"{done.counts[ApplyStatus.ACCEPTED]} set in {done.elapsed:.2f} s{reported}", done.elapsed
+    )
 
 
 async def put_back(session: Session, vehicle: Component) -> None:

@@ -17,7 +17,7 @@ from paramclient import (
     WrittenParam,
 )
 from paramclient.files import read_file
-from paramclient.provision import ApplyStatus, apply, prepare, restore, verify
+from paramclient.provision import ApplyStatus, apply, plan, restore
 from paramclient.provision.restore_point import load_restore_point, load_state_before_apply
 from paramclient.sim import Air, Camera, PX4Vehicle
 from tests.shell import a_client, in_simulated_time
@@ -46,18 +46,18 @@ async def test_a_plan_names_what_cannot_be_written() -> None:
         ext = (await client.component(1, 100)).ext
         content = wanted(camera, MODE=2, NAME="Front", KEY=b"\1")
         more = {name: WrittenParam(name, "x", ParamType.CUSTOM) for name in ("LOST", "EV")}
-        plan = await prepare(ext, ParamSet({**content.params, **more}, is_extended=True))
-        assert {name: row.status.value for name, row in plan.rows.items()} == {
+        made = await plan(ext, ParamSet({**content.params, **more}, is_extended=True))
+        assert {name: row.status.value for name, row in made.rows.items()} == {
             "MODE": "set",
             "NAME": "unchanged",
             "KEY": "set",
             "LOST": "skipped",
             "EV": "invalid",
         }
-        assert (await verify(ext, wanted(camera, NAME="Front", KEY=b"\xff\0\xfe"))).is_met
+        assert (await plan(ext, wanted(camera, NAME="Front", KEY=b"\xff\0\xfe"))).complete
         assert camera.ext_values["MODE"] == 1
         with pytest.raises(UsageError, match="of component 101, not of component 100"):
-            await verify(ext, ParamSet({}, component=101, is_extended=True))
+            await plan(ext, ParamSet({}, component=101, is_extended=True))
         with pytest.raises(UsageError, match="are extended ones, and plain ones are needed"):
             await apply(await client.component(1, 100), content)
         with pytest.raises(UsageError, match="are plain ones, and extended ones are needed"):
@@ -74,7 +74,7 @@ async def test_values_are_written_verified_and_restored(tmp_path: Path) -> None:
             content = wanted(camera, MODE=2, NAME="Rear", KEY=b"\1", CLOCK=2**62 + 3)
             result = await apply(ext, content, backup=tmp_path / "before.json")
             assert result.complete
-            assert set(result.counts) == {ApplyStatus.SET}
+            assert set(result.counts) == {ApplyStatus.ACCEPTED}
             assert camera.ext_values == before | {"MODE": 2, "NAME": "Rear", "KEY": b"\1", "CLOCK": 2**62 + 3}
             (backup,) = read_file(tmp_path / "before.json").sets
             assert {name: param.value for name, param in backup.items()} == before
@@ -107,7 +107,7 @@ async def test_adjusted_and_refused_values_are_reported() -> None:
         assert statuses == {
             "MODE": ApplyStatus.ADJUSTED,
             "EV": ApplyStatus.REFUSED,
-            "NAME": ApplyStatus.SET,
+            "NAME": ApplyStatus.ACCEPTED,
         }
         assert (result.complete, result.error, result.rows["MODE"].actual) == (False, None, 5)
 

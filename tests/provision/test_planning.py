@@ -11,7 +11,7 @@ from paramclient.errors import UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Encoding, Param, ParamType, WireValue, bits_of, from_bits
-from paramclient.provision import CATEGORIES, MISSING, WRONG, Plan, PlanStatus, overlay, plan
+from paramclient.provision import CATEGORIES, MISSING, WRONG, ApplyStatus, Plan, overlay, plan_from
 from paramclient.provision.apply_rules import OUT_OF_RANGE, READ_ONLY
 from paramclient.sim.param_table import SimParam, ardupilot_table, px4_table
 
@@ -47,46 +47,52 @@ def copy_of(table: tuple[SimParam, ...]) -> dict[str, Param]:
 
 
 def order(made: Plan) -> list[list[str]]:
-    return [[step.name for step in stage.steps] for stage in made.stages]
+    return [[row.target.name for row in stage.rows] for stage in made.stages]
 
 
-def only_row(made: Plan) -> tuple[PlanStatus, str, str]:
+def only_row(made: Plan) -> tuple[ApplyStatus, str, str]:
     (row,) = made.rows.values()
     return row.status, row.category, row.reason
 
 
 def test_every_wanted_parameter_gets_a_status() -> None:
-    made = plan(
+    made = plan_from(
         held(ROLL_P=4.0, PITCH_P=4.0, STAT_RUNTIME=5, COUNT=(ParamType.INT8, 1), OTHER=1),
         written(ROLL_P=4, PITCH_P=6.5, STAT_RUNTIME=6, COUNT=300, PICTH_P=1),
         autopilot="ardupilot",
     )
     assert {name: row.status for name, row in made.rows.items()} == {
-        "ROLL_P": PlanStatus.UNCHANGED,
-        "PITCH_P": PlanStatus.SET,
-        "STAT_RUNTIME": PlanStatus.SKIPPED,
-        "COUNT": PlanStatus.INVALID,
-        "PICTH_P": PlanStatus.SKIPPED,
+        "ROLL_P": ApplyStatus.UNCHANGED,
+        "PITCH_P": ApplyStatus.SET,
+        "STAT_RUNTIME": ApplyStatus.SKIPPED,
+        "COUNT": ApplyStatus.INVALID,
+        "PICTH_P": ApplyStatus.SKIPPED,
     }
-    (step,) = made.steps
-    assert (step.name, step.value, step.type, step.before) == ("PITCH_P", 6.5, ParamType.REAL32, 4.0)
+    (row,) = made.to_write
+    assert (row.name, row.target.settable, row.type, row.before) == ("PITCH_P", 6.5, ParamType.REAL32, 4.0)
     assert made.extra == ("OTHER",)
-    assert not made.is_met
+    assert not made.complete
     assert repr(made) == "<Plan 1 unchanged, 1 set, 2 skipped, 1 invalid in 1 stages>"
-    assert str(step) == "PITCH_P 4.0 -> 6.5"
-    assert str(made.rows["PICTH_P"]).startswith("PICTH_P 1, skipped: not on this vehicle")
-    assert str(made.rows["ROLL_P"]) == "ROLL_P = 4"
+    assert str(row) == "PITCH_P 4.0 -> 6.5, set"
+    assert str(made.rows["PICTH_P"]) == "PICTH_P = 1, skipped: not on this vehicle"
+    assert str(made.rows["ROLL_P"]) == "ROLL_P = 4, unchanged"
+    assert made.problems == {
+        "COUNT": "300 does not fit INT8, which holds -128 to 127",
+        "PICTH_P": "not on this vehicle",
+    }
 
 
-def test_a_plan_is_met_without_steps_and_not_met_with_a_missing_parameter() -> None:
+def test_a_plan_complete_without_steps_and_not_met_with_a_missing_parameter() -> None:
     table = held(ROLL_P=4.0, STAT_RUNTIME=5)
-    assert plan(table, written(ROLL_P=4, STAT_RUNTIME=6), autopilot="ardupilot").is_met
-    assert not plan(table, written(ROLL_P=4, ROLL_I=6), autopilot="ardupilot").is_met
+    assert plan_from(table, written(ROLL_P=4, STAT_RUNTIME=6), autopilot="ardupilot").complete
+    assert not plan_from(table, written(ROLL_P=4, ROLL_I=6), autopilot="ardupilot").complete
 
 
 def test_a_mistyped_name_gets_the_nearest_names() -> None:
     table = copy_of(ardupilot_table())
-    made = plan(table, written(ATC_RAT_RRL_P=0.1, wpnav_speed=500, NO_SUCH_THING=1), autopilot="ardupilot")
+    made = plan_from(
+        table, written(ATC_RAT_RRL_P=0.1, wpnav_speed=500, NO_SUCH_THING=1), autopilot="ardupilot"
+    )
     assert made.rows["ATC_RAT_RRL_P"].nearest[0] == "ATC_RAT_RLL_P"
     assert made.rows["wpnav_speed"].nearest[0] == "WPNAV_SPEED"
     assert made.rows["NO_SUCH_THING"].nearest == ()
@@ -142,14 +148,14 @@ def test_parameters_that_are_no_settings_are_left_out_unless_included(
     autopilot: str, name: str, category: str
 ) -> None:
     table, wanted = held(**{name: 1}), written(**{name: 2})
-    left_out = plan(table, wanted, autopilot=autopilot)
+    left_out = plan_from(table, wanted, autopilot=autopilot)
     status, kind, reason = only_row(left_out)
-    assert (status, kind) == (PlanStatus.SKIPPED, category)
+    assert (status, kind) == (ApplyStatus.SKIPPED, category)
     assert reason.startswith("left out: it ")
     assert left_out.rows[name].differs
     assert not left_out.stages
     for include in (category, name, name[:5] + "*", (category,)):
-        assert order(plan(table, wanted, autopilot=autopilot, include=include)) == [[name]]
+        assert order(plan_from(table, wanted, autopilot=autopilot, include=include)) == [[name]]
 
 
 @pytest.mark.parametrize(
@@ -166,7 +172,7 @@ def test_a_measured_value_is_a_calibration_if_the_vehicle_does_not_measure_it(
 ) -> None:
     def category(held_value: int, **wanted: WireValue) -> str:
         table = held(**{name: 1, switch: held_value})
-        return plan(table, written(**{name: 2}, **wanted), autopilot=autopilot).rows[name].category
+        return plan_from(table, written(**{name: 2}, **wanted), autopilot=autopilot).rows[name].category
 
     assert category(1) == category(value, **{switch: 1}) == "measured"
     assert category(value) == category(1, **{switch: value}) == "calibration"
@@ -174,8 +180,8 @@ def test_a_measured_value_is_a_calibration_if_the_vehicle_does_not_measure_it(
 
 def test_a_parameter_that_resets_all_others_is_first_and_needs_a_reboot() -> None:
     table, wanted = held(RTL_ALT=1500, FORMAT_VERSION=120), written(RTL_ALT=2000, FORMAT_VERSION=0)
-    assert order(plan(table, wanted, autopilot="ardupilot")) == [["RTL_ALT"]]
-    made = plan(table, wanted, autopilot="ardupilot", include="action")
+    assert order(plan_from(table, wanted, autopilot="ardupilot")) == [["RTL_ALT"]]
+    made = plan_from(table, wanted, autopilot="ardupilot", include="action")
     assert order(made) == [["FORMAT_VERSION"], ["RTL_ALT"]]
     assert made.stages[0].reboot_first
 
@@ -183,7 +189,7 @@ def test_a_parameter_that_resets_all_others_is_first_and_needs_a_reboot() -> Non
 @pytest.mark.parametrize("include", ["compass", "Calibration", "", ["calibration", "ofs*"]])
 def test_include_takes_categories_and_globs(include: str | list[str]) -> None:
     with pytest.raises(UsageError, match=r"neither a glob of parameter names.*identity, hardware"):
-        plan(held(A=1), written(A=2), include=include)
+        plan_from(held(A=1), written(A=2), include=include)
 
 
 @pytest.mark.parametrize(
@@ -201,9 +207,9 @@ def test_a_value_that_the_type_cannot_hold_is_invalid(
     kind: ParamType, value: WireValue, encoding: Encoding, says: str
 ) -> None:
     table = held(P=(kind, 0))
-    made = plan(table, written(P=value), encoding=encoding, include=CATEGORIES)
+    made = plan_from(table, written(P=value), encoding=encoding, include=CATEGORIES)
     status, category, reason = only_row(made)
-    assert (status, category) == (PlanStatus.INVALID, WRONG)
+    assert (status, category) == (ApplyStatus.INVALID, WRONG)
     assert says in reason
     assert not made.stages
 
@@ -212,15 +218,15 @@ def test_a_value_outside_of_the_metadata_range_is_invalid() -> None:
     table = held(P=1.0, Q=7.0)
     info = {"P": Info(minimum=0.1, maximum=2.0), "Q": Info(maximum=2.0)}
     for value, says in ((0.05, "0.05 is below its minimum, 0.1"), (2.5, "2.5 is above its maximum, 2")):
-        status, category, reason = only_row(plan(table, written(P=value), info=info))
-        assert (status, category, reason) == (PlanStatus.INVALID, OUT_OF_RANGE, says)
-        assert plan(table, written(P=value), info=info, include=OUT_OF_RANGE).steps
-        assert plan(table, written(P=value)).steps
+        status, category, reason = only_row(plan_from(table, written(P=value), info=info))
+        assert (status, category, reason) == (ApplyStatus.INVALID, OUT_OF_RANGE, says)
+        assert plan_from(table, written(P=value), info=info, include=OUT_OF_RANGE).to_write
+        assert plan_from(table, written(P=value)).to_write
     for value in (0.1, 2, 0.10000000149011612):
-        assert plan(table, written(P=value), info=info).steps
-    assert plan(table, written(P=3.0), info={"P": Info(minimum=-1e300, maximum=1e300)}).steps
+        assert plan_from(table, written(P=value), info=info).to_write
+    assert plan_from(table, written(P=3.0), info={"P": Info(minimum=-1e300, maximum=1e300)}).to_write
     # what the vehicle has already is no mistake of the file
-    assert only_row(plan(table, written(Q=7), info=info))[0] is PlanStatus.UNCHANGED
+    assert only_row(plan_from(table, written(Q=7), info=info))[0] is ApplyStatus.UNCHANGED
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -229,44 +235,51 @@ def test_a_value_that_the_autopilot_cannot_store_must_be_forced(
     value: float, autopilot: str, says: str
 ) -> None:
     table, wanted = held(P=1.0), written(P=value)
-    made = plan(table, wanted, autopilot=autopilot, include=OUT_OF_RANGE)
+    made = plan_from(table, wanted, autopilot=autopilot, include=OUT_OF_RANGE)
     status, category, reason = only_row(made)
-    assert (status, category) == (PlanStatus.INVALID, WRONG)
+    assert (status, category) == (ApplyStatus.INVALID, WRONG)
     assert says in reason
-    forced = plan(table, wanted, autopilot=autopilot, force=True)
-    assert forced.force
-    assert [step.name for step in forced.steps] == ["P"]
-    assert plan(held(P=math.nan), written(P=math.nan), autopilot="px4").is_met
+    assert order(plan_from(table, wanted, autopilot=autopilot, force=True)) == [["P"]]
+    assert plan_from(held(P=math.nan), written(P=math.nan), autopilot="px4").complete
+
+
+def test_values_without_metadata_are_counted() -> None:
+    table, wanted = held(A=1, B=1, C=1, D=1), written(A=2, B=2, C=2, D=1)
+    made = plan_from(table, wanted, info={"B": Info(maximum=9)})
+    assert made.unchecked == ("A", "C")
+    assert made.unchecked_note == "ranges not checked: 2 of 3 have no metadata"
+    assert plan_from(table, wanted, info={name: Info() for name in "ABC"}).unchecked_note == ""
 
 
 def test_metadata_marks_read_only_and_reboot_parameters() -> None:
     info = {"A": Info(is_read_only=True), "B": Info(reboot_required=True)}
-    made = plan(held(A=1, B=1, C=1), written(A=2, B=2, C=2), info=info)
-    assert (made.rows["A"].status, made.rows["A"].category) == (PlanStatus.SKIPPED, READ_ONLY)
+    made = plan_from(held(A=1, B=1, C=1), written(A=2, B=2, C=2), info=info)
+    assert (made.rows["A"].status, made.rows["A"].category) == (ApplyStatus.SKIPPED, READ_ONLY)
     assert made.reboot_for == ("B",)
-    assert order(plan(held(A=1), written(A=2), info=info, include=READ_ONLY)) == [["A"]]
+    assert order(plan_from(held(A=1), written(A=2), info=info, include=READ_ONLY)) == [["A"]]
 
 
 def test_values_are_compared_in_the_type_of_the_vehicle() -> None:
     table = held(A=0.1, B=(ParamType.UINT8, 3), C=-0.0, D=16777217)
-    assert plan(table, written(A=0.1, B=3.0, C=0, D=16777217), autopilot="px4").is_met
-    assert [step.name for step in plan(table, written(A=0.1, D=16777216), autopilot="px4").steps] == ["D"]
+    assert plan_from(table, written(A=0.1, B=3.0, C=0, D=16777217), autopilot="px4").complete
+    assert order(plan_from(table, written(A=0.1, D=16777216), autopilot="px4")) == [["D"]]
 
 
 def test_a_system_id_is_valid_from_1_to_255() -> None:
     for value in (0, 256, b"abcd"):
-        made = plan(held(MAV_SYS_ID=1), written(MAV_SYS_ID=value), autopilot="px4", include="identity")
-        assert only_row(made) == (PlanStatus.INVALID, WRONG, "a system id is a number from 1 to 255")
+        made = plan_from(held(MAV_SYS_ID=1), written(MAV_SYS_ID=value), autopilot="px4", include="identity")
+        assert only_row(made) == (ApplyStatus.INVALID, WRONG, "a system id is a number from 1 to 255")
 
 
 def test_raw_bytes_are_compared_with_raw_bytes() -> None:
     table = held(ODD=(77, b"\x01\x02\x03\x04"))
-    assert plan(table, written(ODD=b"\x01\x02\x03\x04")).is_met
-    assert plan(table, written(ODD=b"\x01\x02\x03\x05")).steps[0].value == b"\x01\x02\x03\x05"
-    assert plan(table, written(ODD=5)).rows["ODD"].status is PlanStatus.INVALID
-    made = plan(held(NUMBER=1), written(NUMBER=b"\x01\x02\x03\x04"))
+    assert plan_from(table, written(ODD=b"\x01\x02\x03\x04")).complete
+    (row,) = plan_from(table, written(ODD=b"\x01\x02\x03\x05")).to_write
+    assert row.target.settable == b"\x01\x02\x03\x05"
+    assert plan_from(table, written(ODD=5)).rows["ODD"].status is ApplyStatus.INVALID
+    made = plan_from(held(NUMBER=1), written(NUMBER=b"\x01\x02\x03\x04"))
     assert only_row(made) == (
-        PlanStatus.INVALID,
+        ApplyStatus.INVALID,
         WRONG,
         "0x04030201 are raw bytes, and the vehicle has a number",
     )
@@ -282,7 +295,7 @@ def test_the_order_of_stages_works_on_ardupilot() -> None:
         FENCE_ENABLE=1,
         SYSID_THISMAV=1,
     )
-    made = plan(
+    made = plan_from(
         table,
         written(
             SYSID_THISMAV=7,
@@ -311,20 +324,22 @@ def test_the_order_of_stages_works_on_ardupilot() -> None:
 def test_a_parameter_that_a_step_may_reveal_is_set_later() -> None:
     table = held(EK2_ENABLE=0, WPNAV_SPEED=500.0)
     wanted = written(EK2_ALT_M_NSE=3.0, EK2_ENABLE=1, WPNAV_SPEED=600)
-    made = plan(table, wanted, autopilot="ardupilot")
+    made = plan_from(table, wanted, autopilot="ardupilot")
     row = made.rows["EK2_ALT_M_NSE"]
-    assert (row.status, row.category, row.before) == (PlanStatus.LATER, MISSING, None)
+    assert (row.status, row.category, row.before) == (ApplyStatus.LATER, MISSING, None)
     assert order(made) == [["EK2_ENABLE"], ["WPNAV_SPEED"]]
     assert made.stages[0].reboot_first
-    shown = plan(table | held(EK2_ENABLE=1, EK2_ALT_M_NSE=2.0), wanted, autopilot="ardupilot")
+    shown = plan_from(table | held(EK2_ENABLE=1, EK2_ALT_M_NSE=2.0), wanted, autopilot="ardupilot")
     assert order(shown) == [["EK2_ALT_M_NSE", "WPNAV_SPEED"]]
-    hidden = plan(table | held(EK2_ENABLE=1), wanted, autopilot="ardupilot")
-    assert hidden.rows["EK2_ALT_M_NSE"].status is PlanStatus.SKIPPED
+    hidden = plan_from(table | held(EK2_ENABLE=1), wanted, autopilot="ardupilot")
+    assert hidden.rows["EK2_ALT_M_NSE"].status is ApplyStatus.SKIPPED
+    assert not made.problems
+    assert not hidden.problems, "a reboot may reveal it"
 
 
 def test_px4_reboots_between_the_frame_and_the_parameters_it_resets() -> None:
     table = held(SYS_AUTOSTART=4001, MC_ROLL_P=6.5, SYS_AUTOCONFIG=0, MAV_SYS_ID=1)
-    made = plan(
+    made = plan_from(
         table, written(MC_ROLL_P=7, MAV_SYS_ID=3, SYS_AUTOSTART=4050), autopilot="px4", include="identity"
     )
     assert order(made) == [["SYS_AUTOSTART"], ["MC_ROLL_P"], ["MAV_SYS_ID"]]
@@ -337,13 +352,13 @@ def test_a_plan_for_the_saved_table_of_a_vehicle_has_no_steps() -> None:
     for table, autopilot in ((px4_table(), "px4"), (ardupilot_table(), "ardupilot")):
         current = copy_of(table)
         wanted = ParamSet.of(current.values())
-        made = plan(current, wanted, autopilot=autopilot)
-        assert made.is_met
-        assert not made.steps
-        left_out = made.of(PlanStatus.SKIPPED)
+        made = plan_from(current, wanted, autopilot=autopilot)
+        assert made.complete
+        assert not made.to_write
+        left_out = made.of(ApplyStatus.SKIPPED)
         assert 30 < len(left_out) < 170
-        everything = plan(current, wanted, autopilot=autopilot, include=CATEGORIES)
-        assert everything.counts == {PlanStatus.UNCHANGED: len(current)}
+        everything = plan_from(current, wanted, autopilot=autopilot, include=CATEGORIES)
+        assert everything.counts == {ApplyStatus.UNCHANGED: len(current)}
 
 
 def test_a_file_of_another_component_is_refused() -> None:
@@ -352,7 +367,7 @@ def test_a_file_of_another_component_is_refused() -> None:
     with pytest.raises(
         UsageError, match=r"parameters of cam.params are those of component 100, not of component 1"
     ):
-        plan(autopilot, camera)
+        plan_from(autopilot, camera)
     with pytest.raises(UsageError, match="component 100"):
         overlay(camera, autopilot)
 
@@ -363,10 +378,10 @@ def test_a_file_of_another_autopilot_is_refused() -> None:
             {"A": WrittenParam("A", 2)}, identity=Identity(1, "sim:", autopilot=number), source="f"
         )
         with pytest.raises(UsageError, match=f"of f are those of a vehicle with {other}, not with {own}"):
-            plan(held(A=1), wanted, autopilot=own)
-        assert plan(held(A=1), wanted, autopilot=other).steps
-        assert plan(held(A=1), wanted, autopilot="generic").steps
-        assert plan(held(A=1), wanted).steps
+            plan_from(held(A=1), wanted, autopilot=own)
+        assert plan_from(held(A=1), wanted, autopilot=other).to_write
+        assert plan_from(held(A=1), wanted, autopilot="generic").to_write
+        assert plan_from(held(A=1), wanted).to_write
 
 
 def test_overlay_replaces_and_extends_the_base() -> None:

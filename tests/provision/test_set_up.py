@@ -32,13 +32,10 @@ from paramclient.provision import (
     ApplyProgress,
     ApplyStatus,
     apply,
-    apply_all,
+    for_each,
     overlay,
-    prepare,
+    plan,
     restore,
-    restore_all,
-    verify,
-    verify_all,
 )
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, SimParam
 from paramclient.wire import frames, messages
@@ -159,7 +156,7 @@ async def test_all_values_are_written_and_verified(make: Callable[[], Any], loss
     assert result.complete
     for name, value in wanted.items():
         assert (vehicle.param(name).value == value) is (name not in left_out), name
-    assert statuses(result)["TUNE_03"] == "set"
+    assert statuses(result)["TUNE_03"] == "accepted"
     assert result.rows["TUNE_03"].before == 3
     assert result.rows["TUNE_03"].actual == 4
     assert "FRAME_CLASS" in result.extra
@@ -176,7 +173,7 @@ async def test_a_value_that_is_not_reported_any_more_is_unproven() -> None:
 
     async with a_client(vehicle) as client:
         result = await apply(await client.component(), written(another("TUNE_01", "TUNE_02")), progress=lose)
-    assert statuses(result) == {"TUNE_01": "unproven", "TUNE_02": "set"}
+    assert statuses(result) == {"TUNE_01": "unproven", "TUNE_02": "accepted"}
     assert "no longer reports it" in str(result.rows["TUNE_01"])
     assert not result.complete
 
@@ -192,12 +189,15 @@ def downloads(tap: Tap) -> int:
 
 
 @in_simulated_time
-async def test_a_missing_parameter_is_reported_and_not_written() -> None:
+async def test_a_name_that_the_vehicle_does_not_have_refuses_all_unless_partial() -> None:
     tap = Tap(ardupilot())
+    wanted = {"TUNE_X1": 1, "TUNE_01": 7, "a name too long!!": 1}
     async with a_client(tap) as client:
-        result = await apply(
-            await client.component(), written({"TUNE_X1": 1, "TUNE_01": 7, "a name too long!!": 1})
-        )
+        component = await client.component()
+        with pytest.raises(InvalidParameters, match=r"TUNE_X1: not on this vehicle \(did you mean TUNE_10"):
+            await apply(component, wanted)
+        assert sets(tap) == []
+        result = await apply(component, wanted, partial=True)
     assert result.rows["TUNE_X1"].status is ApplyStatus.SKIPPED
     assert result.rows["TUNE_X1"].nearest == ("TUNE_10", "TUNE_11", "TUNE_12")
     assert str(result.rows["TUNE_X1"]).startswith(
@@ -215,7 +215,7 @@ async def test_a_refused_or_adjusted_value_does_not_stop_the_others() -> None:
         component = await client.component()
         result = await apply(component, wanted)
         again = await apply(component, wanted)
-    expected = dict.fromkeys(SETTINGS, "set") | {
+    expected = dict.fromkeys(SETTINGS, "accepted") | {
         "TUNE_01": "adjusted",
         "TUNE_02": "refused",
         "TUNE_04": "refused",
@@ -243,8 +243,8 @@ async def test_invalid_values_are_raised_before_anything_is_sent() -> None:
             await apply(component, wanted)
         assert set(caught.value.problems) == {"SMALL", "TUNE_03"}
         assert tap.messages(messages.ParamSet) == []
-        result = await apply(component, wanted, skip_invalid=True)
-    assert statuses(result) == {"TUNE_01": "set", "SMALL": "skipped", "TUNE_03": "skipped"}
+        result = await apply(component, wanted, partial=True)
+    assert statuses(result) == {"TUNE_01": "accepted", "SMALL": "skipped", "TUNE_03": "skipped"}
     assert "cannot be sent exactly" in result.rows["TUNE_03"].reason
     assert not result.complete
 
@@ -256,10 +256,10 @@ async def test_left_out_parameters_can_be_included() -> None:
         component = await client.component()
         wanted = written({"COMPASS_OFS_X": 7.0, "STAT_RUNTIME": 9})
         result = await apply(component, wanted, include="calibration")
-        assert statuses(result) == {"COMPASS_OFS_X": "set", "STAT_RUNTIME": "skipped"}
+        assert statuses(result) == {"COMPASS_OFS_X": "accepted", "STAT_RUNTIME": "skipped"}
         assert result.complete
-        assert (await verify(component, wanted, include="calibration")).is_met
-        assert not (await verify(component, wanted, include=["STAT_*"])).is_met
+        assert (await plan(component, wanted, include="calibration")).complete
+        assert not (await plan(component, wanted, include=["STAT_*"])).complete
 
 
 @in_simulated_time
@@ -339,9 +339,9 @@ async def test_a_silent_vehicle_ends_the_run_and_the_next_run_continues() -> Non
         assert not result.complete
         counts = result.counts
         assert counts[ApplyStatus.UNPROVEN] >= 5
-        assert counts[ApplyStatus.FAILED] > 0
+        assert counts[ApplyStatus.UNKNOWN] > 0
         assert sum(counts.values()) == len(SETTINGS)
-        (last,) = (row.reason for row in result.of(ApplyStatus.FAILED) if row.name == "TUNE_29")
+        (last,) = (row.reason for row in result.of(ApplyStatus.UNKNOWN) if row.name == "TUNE_29")
         assert last.startswith("no reply: the acknowledgement of TUNE_29 by 1/1")  # all 30 were in flight
         assert "ended by no reply" in repr(result)
         tap.is_deaf = tap.is_mute = False
@@ -366,7 +366,7 @@ async def test_a_failed_link_ends_the_run_with_the_rows_so_far() -> None:
 
             result = await apply(component, written(another()), progress=cut)
         assert isinstance(result.error, LinkError)
-        assert result.counts[ApplyStatus.FAILED] > 0
+        assert result.counts[ApplyStatus.NOT_TRIED] > 0
         with pytest.raises(LinkError):  # nothing was sent this time
             await apply(component, written(another()))
         link.is_offline = False
@@ -379,16 +379,16 @@ async def test_the_timeout_ends_the_run() -> None:
     vehicle = ardupilot()
     async with a_client(Air.symmetric([vehicle], rate=1000.0)) as client:
         component = await client.component()
-        with pytest.raises(NoReply, match="the set-up of 1/1"):
+        with pytest.raises(NoReply, match="the apply to 1/1"):
             await apply(component, written(another()), timeout=0.1)
-        await prepare(component, written(another()))
+        await plan(component, written(another()))
         began = anyio.current_time()
-        await prepare(component, written(another()))  # as the run will begin: the table is proven
+        await plan(component, written(another()))  # as the run will begin: the table is proven
         took = anyio.current_time() - began
         result = await apply(component, written(another()), timeout=took + 0.5)
         assert result.elapsed < took + 1
         assert isinstance(result.error, NoReply)
-        assert "sent, not acknowledged" in {row.reason[:22] for row in result.of(ApplyStatus.UNPROVEN)}
+        assert "sent, not acknowledged" in {row.reason[:22] for row in result.of(ApplyStatus.UNKNOWN)}
         assert residue(component) == []
 
 
@@ -405,7 +405,7 @@ async def test_restore_writes_an_earlier_state_of_the_vehicle() -> None:
         assert first.complete
         undone = await restore(component, first.before)
     assert undone.complete
-    assert undone.rows["COMPASS_OFS_X"].status is ApplyStatus.SET
+    assert undone.rows["COMPASS_OFS_X"].status is ApplyStatus.ACCEPTED
     assert undone.rows["STAT_RUNTIME"].category == "counter"
     vehicle.set_param("STAT_RUNTIME", 5)
     assert vehicle.values == original
@@ -449,16 +449,15 @@ async def test_restore_skips_measured_and_read_only_parameters() -> None:
 
 
 @in_simulated_time
-async def test_the_state_or_plan_of_another_vehicle_is_refused() -> None:
+async def test_the_state_of_another_vehicle_is_refused() -> None:
     async with a_client(ardupilot(uid2=b"another")) as client:
         component = await client.component()
-        plan = await prepare(component, written(another()))
+        await component.fetch_all()
+        await component.wait_until_identified(10.0)
         state = ParamSet.of(component.params.values(), identity=component.identity)
     async with a_client(ardupilot()) as client:
         component = await client.component()
         await component.fetch_all()
-        with pytest.raises(UsageError, match="the plan is for another vehicle: the ardupilot 616e6f74686572"):
-            await apply(component, plan)
         with pytest.raises(
             UsageError, match="the state is that of another vehicle: the ardupilot 616e6f74686572"
         ):
@@ -466,61 +465,25 @@ async def test_the_state_or_plan_of_another_vehicle_is_refused() -> None:
 
 
 @in_simulated_time
-async def test_several_vehicles_are_set_up_concurrently() -> None:
-    vehicles = [ardupilot(), px4(system=2), ardupilot(system=3, read_only=["TUNE_01"])]
-    base = written(another())
+async def test_several_vehicles_are_set_and_restored_concurrently() -> None:
+    vehicles = [ardupilot(), px4(system=2), ardupilot(system=3)]
+    own: dict[int, dict[str, WireValue]] = {1: {}, 2: {"TUNE_02": 42.0}, 3: {"SMALL": 1000}}
     async with a_client(Air(vehicles)) as client:
         await client.fetch_all()
         components = [client.components[vehicle.system, 1] for vehicle in vehicles]
-        over = {
-            (1, 1): base,
-            (2, 1): overlay(base, written({"TUNE_02": 42.0})),
-            (3, 1): overlay(base, written({"SMALL": 1000})),
-        }
-        with pytest.raises(UsageError, match="no wanted parameters are given for vehicle 3/1"):
-            await apply_all(components, {address: over[address] for address in [(1, 1), (2, 1)]})
-        reported: list[tuple[int, str]] = []
-        applied = await apply_all(
-            components, over, progress=lambda component, how: reported.append((component.system, how.phase))
-        )
+        wanted = {system: overlay(written(another()), written(more)) for system, more in own.items()}
+        applied = await for_each(components, lambda each: apply(each, wanted[each.system]))
         assert list(applied.results) == [(1, 1), (2, 1)]
         assert isinstance(applied.errors[3, 1], InvalidParameters)
         assert not applied.complete
-        assert {system for system, phase in reported if phase == "writing"} == {1, 2}
-        assert vehicles[1].param("TUNE_02").value == 42.0
-        verified = await verify_all(components, lambda component: over[component.system, 1])
-        assert [plan.is_met for plan in verified.results.values()] == [True, True, False]
-        assert not verified.is_met
-        assert (await verify_all(components[:1], base)).is_met
-        assert (await apply_all(components[:1], base)).complete
-
-
-@in_simulated_time
-async def test_several_vehicles_are_restored_each_to_its_own_state() -> None:
-    vehicles = [ardupilot(system=system) for system in (1, 2, 3)]
-    for vehicle in vehicles:
-        vehicle.set_param("TUNE_02", 10.0 + vehicle.system)
-    async with a_client(Air(vehicles)) as client:
-        await client.fetch_all()
-        components = [client.components[vehicle.system, 1] for vehicle in vehicles]
-        applied = await apply_all(components, written({"TUNE_02": 42.0}))
-        before = {address: result.before for address, result in applied.results.items()}
-        with pytest.raises(UsageError, match="no wanted parameters are given for vehicle 3/1"):
-            await restore_all(components, {address: before[address] for address in [(1, 1), (2, 1)]})
-        assert [vehicle.param("TUNE_02").value for vehicle in vehicles] == [42.0] * 3
-        reported: set[int] = set()
-        restored = await restore_all(
-            components,
-            before | {(2, 1): before[1, 1]},
-            progress=lambda component, _: reported.add(component.system),
-        )
-        assert list(restored.results) == [(1, 1), (3, 1)]
-        assert str(restored.errors[2, 1]).startswith("the state is that of another vehicle")
-        assert not restored.complete
-        assert reported == {1, 3}
-        assert [vehicle.param("TUNE_02").value for vehicle in vehicles] == [11.0, 42.0, 13.0]
-        assert (await restore_all(components, lambda each: before[each.system, 1])).complete
-        assert vehicles[1].param("TUNE_02").value == 12.0
+        assert [vehicle.param("TUNE_02").value for vehicle in vehicles] == [1.5, 42.0, 0.5]
+        planned = await for_each(components, lambda each: plan(each, wanted[each.system]))
+        assert [made.complete for made in planned.results.values()] == [True, True, False]
+        assert (await for_each(components[:1], lambda each: apply(each, wanted[1]))).complete
+        before = {system: result.before for (system, _), result in applied.results.items()}
+        restored = await for_each(components[:2], lambda each: restore(each, before[each.system]))
+        assert restored.complete
+        assert [vehicle.param("TUNE_02").value for vehicle in vehicles] == [0.5, 0.5, 0.5]
 
 
 @EVERY_KIND
@@ -533,13 +496,13 @@ async def test_an_armed_vehicle_is_refused_unless_allowed(make: Callable[..., An
         with pytest.raises(VehicleArmed, match="1/1 is armed"):
             await apply(component, written(another()))
         assert tap.messages(messages.ParamSet) == []
-        assert (await prepare(component, written(another()))).steps
+        assert (await plan(component, written(another()))).to_write
         assert (await apply(component, written(another("TUNE_01")), allow_armed=True)).complete
         # an armed vehicle refuses to reboot, which ends the run
         result = await apply(component, written({"FRAME_CLASS": 2}), allow_armed=True, reboot=True)
         if make is ardupilot:
             assert isinstance(result.error, VehicleArmed)
-            assert statuses(result) == {"FRAME_CLASS": "set"}
+            assert statuses(result) == {"FRAME_CLASS": "accepted"}
 
 
 @in_simulated_time
@@ -554,7 +517,7 @@ async def test_a_vehicle_armed_during_the_run_ends_it() -> None:
         wanted = written({"EK2_ENABLE": 1, "EK2_NO_SUCH": 1})
         component = await client.component()
         result = await apply(component, wanted, progress=arm)
-        assert statuses(result)["EK2_ENABLE"] == "set"
+        assert statuses(result)["EK2_ENABLE"] == "accepted"
         await anyio.sleep(2)
         with pytest.raises(VehicleArmed):
             await apply(component, written(another()))
@@ -571,8 +534,8 @@ async def test_a_reboot_follows_values_that_take_effect_after_it() -> None:
         assert awaiting_reboot.reboots == 0
         assert awaiting_reboot.reboot_required == ("FRAME_CLASS", "EK2_ENABLE")
         assert awaiting_reboot.rows["EK2_ALT_M_NSE"].category == MISSING
-        plan = await prepare(component, wanted)
-        assert plan.awaiting_reboot == ("EK2_ENABLE",)
+        made = await plan(component, wanted)
+        assert made.awaiting_reboot == ("EK2_ENABLE",)
         reported: list[str] = []
         result = await apply(component, wanted, reboot=True, progress=lambda how: reported.append(how.phase))
     assert result.complete
@@ -641,7 +604,7 @@ async def test_copter_keeps_its_system_id_until_it_reboots() -> None:
         result = await apply(component, written({"SYSID_THISMAV": 7}), include="identity")
         assert (result.system, vehicle.system) == (1, 1)
         assert result.plan.reboot_for == result.reboot_required == ("SYSID_THISMAV",)
-        assert statuses(result) == {"SYSID_THISMAV": "set"}
+        assert statuses(result) == {"SYSID_THISMAV": "accepted"}
         started = await apply(component, written({"SYSID_THISMAV": 7}), include="identity", reboot=True)
     assert (started.reboots, started.system, vehicle.system) == (1, 7, 7)
 
@@ -814,7 +777,11 @@ async def test_a_value_clamped_within_a_second_is_adjusted(delay: float) -> None
     wanted = {"MPC_TILTMAX_LND": 80.0, "TUNE_01": 9.5, "MPC_XY_CRUISE": 6.0}
     async with a_client(vehicle) as client:
         result = await apply(await client.component(), written(wanted))
-    assert statuses(result) == {"MPC_TILTMAX_LND": "adjusted", "TUNE_01": "set", "MPC_XY_CRUISE": "set"}
+    assert statuses(result) == {
+        "MPC_TILTMAX_LND": "adjusted",
+        "TUNE_01": "accepted",
+        "MPC_XY_CRUISE": "accepted",
+    }
     row = result.rows["MPC_TILTMAX_LND"]
     assert (row.before, row.actual) == (12.0, 45.0)
     assert "changed it afterwards" in row.reason
@@ -871,7 +838,7 @@ async def test_twenty_values_over_a_radio_take_one_download_and_are_verified_by_
         component = await client.component()
         result = await apply(component, wanted)
     assert result.complete
-    assert statuses(result) == {**dict.fromkeys(changed, "set"), first: "unchanged"}
+    assert statuses(result) == {**dict.fromkeys(changed, "accepted"), first: "unchanged"}
     assert result.elapsed <= 6.5
     assert downloads(tap) == 1
     assert sorted(reads_after_the_last_set(tap)) == sorted(wanted)

@@ -85,9 +85,11 @@ async def test_a_plan_writes_nothing_and_an_apply_what_was_planned(cache: str) -
         assert plan["counts"]["set"] == 1
         assert plan["params"]["NO_SUCH"]["category"] == "missing"
         assert vehicle.param("PARAM_04").value == 4
-        done = (await browser.post(f"{V}/apply", json=wanted)).json()
-        assert done["counts"]["set"] == 1
-        assert done["params"]["PARAM_04"]["status"] == "set"
+        problem(await browser.post(f"{V}/apply", json=wanted), 422, "invalid-parameters")
+        assert vehicle.param("PARAM_04").value == 4
+        done = (await browser.post(f"{V}/apply", json=wanted | {"partial": True})).json()
+        assert (done["counts"]["accepted"], done["unchecked"]) == (1, 1)
+        assert done["params"]["PARAM_04"]["status"] == "accepted"
         assert vehicle.param("PARAM_04").value == 44
 
 
@@ -104,7 +106,7 @@ async def test_an_apply_is_limited_to_names_and_refuses_values_out_of_range(cach
         done = (await browser.post(f"{V}/apply", json={**body, "only": ["MC_PITCH*"]})).json()
         assert list(done["params"]) == ["MC_PITCH_P"]
         done = (await browser.post(f"{V}/apply", json={**body, "include": ["MC_ROLL_P"]})).json()
-        assert done["params"]["MC_ROLL_P"]["status"] == "set"
+        assert done["params"]["MC_ROLL_P"]["status"] == "accepted"
 
 
 @in_simulated_time

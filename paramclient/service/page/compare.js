@@ -204,7 +204,7 @@ export async function takeOver() {
       only: chosen.map((line) => exactly(line.name)),
       include,
       allow_armed: armed.isNeeded,
-      skip_invalid: true,
+      partial: true,
     };
     const timeout = APPLY_TIMEOUT + chosen.length * APPLY_TIMEOUT_PER_VALUE;
     try {
@@ -228,7 +228,7 @@ export async function takeOver() {
         el("b", { class: `outcome ${word.kind}`, text: word.text }),
         ` ${made}${row.reason ?? ""}`,
       );
-      const isTaken = ["set", "adjusted", "unproven"].includes(row.status);
+      const isTaken = ["accepted", "adjusted", "unproven"].includes(row.status);
       outcomes.push({
         name: line.name,
         status: row.status,

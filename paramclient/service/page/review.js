@@ -16,7 +16,6 @@ const WRITE_TIMEOUT_PER_VALUE = 400;
 
 export const OUTCOMES = {
   accepted: { text: "accepted", kind: "good" },
-  set: { text: "accepted", kind: "good" },
   unchanged: { text: "had it already", kind: "good" },
   adjusted: { text: "adjusted", kind: "warn" },
   unproven: { text: "sent, not proven", kind: "warn" },
@@ -24,7 +23,6 @@ export const OUTCOMES = {
   unknown: { text: "sent, not acknowledged", kind: "warn" },
   "not tried": { text: "not tried", kind: "quiet" },
   refused: { text: "refused", kind: "bad" },
-  failed: { text: "failed", kind: "bad" },
 };
 
 /** A confirmation of what may be dangerous, shown while it is needed. `change` is called when its box changes. */

@@ -1,36 +1,26 @@
-"""JSON of comparisons and of set-ups: differences, plans, and results of apply and restore."""
+"""JSON of comparisons, of plans, and of results of apply and restore."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from paramclient.cli.json_output import Json, OriginJson, VehicleJson, WrittenJson, short_text
 from paramclient.model.comparison import ChangedSide, DifferenceStatus
 from paramclient.model.defaults import DefaultSource
 from paramclient.model.identity import version_text
 from paramclient.model.notation import Scalar, typed, value_json
-from paramclient.model.values import WireValue, type_name
-from paramclient.provision.planning import PlanStatus
-from paramclient.provision.results import ApplyStatus
+from paramclient.model.values import ParamType, WireValue, type_name
+from paramclient.provision.planning import ApplyStatus
 
 if TYPE_CHECKING:
     from paramclient.metadata import Metadata
     from paramclient.model.comparison import Comparison, Difference
-    from paramclient.provision import ApplyResult, ApplyRow, Plan, PlanRow
-    from paramclient.provision.planning import Stage
+    from paramclient.provision import ApplyResult, ApplyRow, Plan, Stage
+    from paramclient.provision.planning import Rows
 
-__all__ = [
-    "ApplyJson",
-    "AppliedRowJson",
-    "DiffJson",
-    "DifferenceJson",
-    "PlanJson",
-    "PlanRowJson",
-    "StageJson",
-    "applied_rows",
-]
+__all__ = ["ApplyJson", "ApplyRowJson", "DiffJson", "DifferenceJson", "PlanJson", "StageJson"]
 
 
 # Comparisons
@@ -141,7 +131,7 @@ class DiffJson(Json):
         )
 
 
-# Set-ups
+# Plans and results of apply and restore
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,86 +156,19 @@ class StageJson(Json):
     @classmethod
     def of(cls, stage: Stage) -> StageJson:
         """Return a stage of a plan."""
-        steps = [
-            StepJson.take(
-                step,
-                value=value_json(step.value, step.type),
-                type=type_name(step.type),
-                before=value_json(step.before, step.type),
-            )
-            for step in stage.steps
-        ]
+        steps = []
+        for row in stage.rows:
+            kind = ParamType.REAL32 if row.type is None else row.type
+            assert row.before is not None, "only parameters that the vehicle has are set"
+            value, before = value_json(row.target.settable, kind), value_json(row.before, kind)
+            name, number = row.target.name, type_name(kind)
+            steps.append(StepJson.take(row, name=name, value=value, type=number, before=before))
         return cls.take(stage, steps=steps)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PlanRowJson(Json):
-    """The planned action for one parameter."""
-
-    status: str
-    type: str | None
-    before: Scalar | None
-    wanted: Scalar
-    category: str
-    reason: str
-    nearest: list[str]
-    vehicle_name: str | None = None
-
-    @classmethod
-    def of(cls, row: PlanRow) -> PlanRowJson:
-        """Return a row of a plan."""
-        return cls(status=row.status.value, **_members(row))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FirmwareJson(Json):
-    """The firmware versions of a file and a vehicle that differ."""
-
-    file: str
-    vehicle: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlanJson(Json):
-    """The plan of a set-up. `extra` is the number of the vehicle's other parameters."""
-
-    system: int
-    component: int
-    dry_run: bool
-    counts: dict[str, int]
-    stages: list[StageJson]
-    params: dict[str, PlanRowJson]
-    extra: int
-    reboot_for: list[str]
-    firmware: FirmwareJson | None = None
-
-    @classmethod
-    def of(cls, plan: Plan, *, system: int, component: int, full: bool = False) -> PlanJson:
-        """Return the plan for the vehicle at this address, with unchanged parameters only if `full`."""
-        before, own = plan.wanted.identity, plan.identity
-        firmware = None
-        if before is not None and own is not None and plan.firmware_note:
-            firmware = FirmwareJson(file=version_text(before.firmware), vehicle=version_text(own.firmware))
-        return cls(
-            system=system,
-            component=component,
-            dry_run=True,
-            counts=_counts(plan.counts, PlanStatus),
-            stages=[StageJson.of(stage) for stage in plan.stages],
-            params={
-                row.name: PlanRowJson.of(row)
-                for row in plan.rows.values()
-                if full or row.status is not PlanStatus.UNCHANGED
-            },
-            extra=len(plan.extra),
-            reboot_for=list(plan.reboot_for),
-            firmware=firmware,
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AppliedRowJson(Json):
-    """The outcome for one parameter."""
+class ApplyRowJson(Json):
+    """What is planned for one parameter, or what became of it; `actual` is null in a plan."""
 
     status: str
     type: str | None
@@ -258,9 +181,74 @@ class AppliedRowJson(Json):
     vehicle_name: str | None = None
 
     @classmethod
-    def of(cls, row: ApplyRow) -> AppliedRowJson:
-        """Return an outcome."""
-        return cls(status=row.status.value, actual=_value(row.actual, row), **_members(row))
+    def of_all(cls, rows: Iterable[ApplyRow]) -> dict[str, ApplyRowJson]:
+        """Return rows by name in the file."""
+        return {row.name: cls.of(row) for row in rows}
+
+    @classmethod
+    def of(cls, row: ApplyRow) -> ApplyRowJson:
+        """Return a row."""
+
+        def value(given: WireValue | None) -> Scalar | None:
+            return None if given is None else value_json(*typed(given, row.type))
+
+        return cls(
+            status=row.status.value,
+            type=None if row.type is None else type_name(row.type),
+            before=value(row.before),
+            wanted=value_json(*typed(row.target.settable, row.type)),
+            actual=value(row.actual),
+            category=row.category,
+            reason=row.reason,
+            nearest=list(row.nearest),
+            vehicle_name=None if row.renamed is None else row.renamed.name,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FirmwareJson(Json):
+    """The firmware versions of a file and a vehicle that differ."""
+
+    file: str
+    vehicle: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanJson(Json):
+    """A plan. `extra` is the number of the vehicle's other parameters, `unchecked` that of values to write
+    without metadata."""
+
+    system: int
+    component: int
+    dry_run: bool
+    counts: dict[str, int]
+    stages: list[StageJson]
+    params: dict[str, ApplyRowJson]
+    extra: int
+    unchecked: int
+    reboot_for: list[str]
+    firmware: FirmwareJson | None = None
+
+    @classmethod
+    def of(cls, plan: Plan, *, system: int, component: int, full: bool = False) -> PlanJson:
+        """Return the plan for the vehicle at this address, with unchanged parameters only if `full`."""
+        firmware = None
+        if plan.firmware_note:
+            file, vehicle = (version_text(each.firmware) for each in plan.firmware)
+            firmware = FirmwareJson(file=file, vehicle=vehicle)
+        rows = [row for row in plan.rows.values() if full or row.status is not ApplyStatus.UNCHANGED]
+        return cls(
+            system=system,
+            component=component,
+            dry_run=True,
+            counts=_counts(plan),
+            stages=[StageJson.of(stage) for stage in plan.stages],
+            params=ApplyRowJson.of_all(rows),
+            extra=len(plan.extra),
+            unchecked=len(plan.unchecked),
+            reboot_for=list(plan.reboot_for),
+            firmware=firmware,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -273,7 +261,7 @@ class AddressJson(Json):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ApplyJson(Json):
-    """The result of a set-up. The first address is that at the start, `now` the one at the end."""
+    """The result of apply or restore. The first address is that at the start, `now` the one at the end."""
 
     system: int
     component: int
@@ -281,36 +269,30 @@ class ApplyJson(Json):
     now: AddressJson
     complete: bool
     counts: dict[str, int]
-    params: dict[str, AppliedRowJson]
+    params: dict[str, ApplyRowJson]
     extra: int
+    unchecked: int
     reboots: int
     reboot_required: list[str]
     error: str | None
     elapsed_s: float
 
     @classmethod
-    def of(
-        cls,
-        result: ApplyResult,
-        *,
-        system: int,
-        component: int,
-        vehicle: VehicleJson | None = None,
-        full: bool = False,
-    ) -> ApplyJson:
-        """Return the result for a vehicle that had this address at the start.
+    def of(cls, result: ApplyResult, vehicle: VehicleJson, *, full: bool = False) -> ApplyJson:
+        """Return the result for a vehicle with its address at the start.
 
         Unchanged parameters, and left-out ones that do not differ, are included only if `full`.
         """
         return cls(
-            system=system,
-            component=component,
+            system=vehicle.system,
+            component=vehicle.component,
             vehicle=vehicle,
-            now=AddressJson(system=result.system, component=result.component),
+            now=AddressJson.take(result),
             complete=result.complete,
-            counts=_counts(result.counts, ApplyStatus),
-            params=applied_rows(result.rows.values() if full else result.shown_rows),
+            counts=_counts(result),
+            params=ApplyRowJson.of_all(result.rows.values() if full else result.shown_rows),
             extra=len(result.extra),
+            unchecked=len(result.plan.unchecked),
             reboots=result.reboots,
             reboot_required=list(result.reboot_required),
             error=None if result.error is None else str(result.error),
@@ -318,27 +300,5 @@ class ApplyJson(Json):
         )
 
 
-def applied_rows(rows: Iterable[ApplyRow]) -> dict[str, AppliedRowJson]:
-    """Return outcomes by name."""
-    return {row.name: AppliedRowJson.of(row) for row in rows}
-
-
-def _counts(counts: Mapping[Any, int], kinds: Iterable[Any]) -> dict[str, int]:
-    return {kind.value: counts.get(kind, 0) for kind in kinds}
-
-
-def _members(row: ApplyRow | PlanRow) -> dict[str, Any]:
-    """Return the members of all rows."""
-    return {
-        "type": None if row.type is None else type_name(row.type),
-        "before": _value(row.before, row),
-        "wanted": value_json(*typed(row.target.settable, row.type)),
-        "category": row.category,
-        "reason": row.reason,
-        "nearest": list(row.nearest),
-        "vehicle_name": None if row.renamed is None else row.renamed.name,
-    }
-
-
-def _value(value: WireValue | None, row: ApplyRow | PlanRow) -> Scalar | None:
-    return None if value is None else value_json(*typed(value, row.type))
+def _counts(rows: Rows) -> dict[str, int]:
+    return {status.value: count for status in ApplyStatus if (count := rows.counts.get(status, 0))}
