@@ -1,4 +1,4 @@
-"""The interface of links, and the base class of links over sockets.
+"""The interface of links, and their base classes.
 
 The sockets are non-blocking and used with `anyio.wait_readable`, because anyio's own UDP socket keeps 100
 datagrams and drops all others silently. `close` takes effect immediately: it wakes waiting tasks and frees
@@ -18,9 +18,9 @@ import anyio
 
 from paramclient.errors import LinkError
 from paramclient.links.names import LinkSpec
-from paramclient.links.refusals import host_refusal, socket_refusal
+from paramclient.links.refusals import host_refusal, reason, socket_refusal
 
-__all__ = ["Address", "Link", "Peer", "SocketLink", "claim", "close_socket"]
+__all__ = ["Address", "BaseLink", "Link", "Peer", "SocketLink", "claim", "close_socket"]
 
 Peer: TypeAlias = Hashable
 """The sender of data: an address on UDP, a connection on TCP, a constant on links with one remote end."""
@@ -74,95 +74,78 @@ class Link(Protocol):
         """Close the link and release its resources. A waiting `receive` raises LinkError. Idempotent."""
 
 
-class SocketLink(ABC):
-    """Base class of the links over sockets: opening and closing, name, and errors.
+class BaseLink(ABC):
+    """Base class of all links here: name, opening and closing, and errors.
 
     Attributes:
         name: the canonical name.
         is_stream: see `Link.is_stream`.
-        address: the local host and port while the link is open, else None. With port 0, shows the port that
-            the operating system chose.
+        reconnects: see `Link.reconnects`.
     """
 
-    is_stream: bool
+    is_stream = False
+    reconnects = True
 
-    def __init__(self, spec: LinkSpec) -> None:
-        self.name = spec.name
-        self._host = spec.host
-        self._port = spec.port
-        self._socket: socket.socket | None = None
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._is_open = False
         self._openings = 0
         self._close_reason: tuple[str, OSError | None] = ("closed", None)
 
-    @property
-    def address(self) -> tuple[str, int] | None:
-        if self._socket is None:
-            return None
-        host, port, *_ = self._socket.getsockname()
-        return host, port
-
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.name} {'closed' if self._socket is None else 'open'}>"
+        return f"<{type(self).__name__} {self.name} {'open' if self._is_open else 'closed'}>"
 
     async def open(self) -> None:
         """See `Link.open`; an open link is closed first."""
-        self._discard()
+        await self._end("closed")
         opening = self._openings
         try:
             with anyio.fail_after(OPEN_TIMEOUT):
                 await self._open(opening)
         except BaseException as error:
             if opening == self._openings:
-                self._discard()
+                await self._end("closed")
             if isinstance(error, OSError) and not isinstance(error, LinkError):
-                problem = socket_refusal(
-                    error, self._host, self._port, self._target, is_stream=self.is_stream
-                )
-                raise self._error(problem) from error
+                raise self._error(self._refusal(error)) from error
             raise
+        self._is_open = True
 
     async def close(self) -> None:
         """See `Link.close`."""
-        self._discard()
+        await self._end("closed")
 
     @abstractmethod
     async def _open(self, opening: int) -> None:
-        """Make the sockets; an OSError becomes a LinkError. Pass `opening` to `_adopt` and `_check`."""
+        """Open the link; an OSError becomes a LinkError with the text of `_refusal`.
 
-    def _adopt(self, sock: socket.socket, opening: int) -> None:
-        """Replace the current socket, unless the link was closed while the new socket was opened."""
-        if opening != self._openings:
-            sock.close()
-        self._check(opening)
-        if self._socket is not None:
-            close_socket(self._socket)
-        self._socket = sock
+        `_check` of `opening` fails once the link has been closed meanwhile.
+        """
 
-    def _discard(self) -> None:
-        """Close the socket and wake waiting tasks. An `open` in progress fails from now on."""
+    @abstractmethod
+    async def _release(self) -> None:
+        """Release what `_open` has opened, and wake waiting tasks. Idempotent."""
+
+    def _refusal(self, error: OSError) -> str:
+        return f"cannot open: {reason(error)}"
+
+    async def _end(self, problem: str, cause: OSError | None = None) -> None:
+        """Close the link. An `open` in progress fails from now on."""
         self._openings += 1
-        self._close_reason = ("closed", None)
-        if self._socket is not None:
-            close_socket(self._socket)
-            self._socket = None
-
-    def _fail(self, problem: str, cause: OSError | None = None) -> NoReturn:
-        """Close the link because of an error; tasks that wait elsewhere get the same LinkError."""
-        self._discard()
         self._close_reason = (problem, cause)
+        self._is_open = False
+        await self._release()
+
+    async def _fail(self, opening: int, problem: str, cause: OSError | None = None) -> NoReturn:
+        """Close the link because of an error, unless already closed; waiting tasks get the same LinkError."""
+        self._check(opening)
+        await self._end(problem, cause)
         raise self._error(problem) from cause
 
-    def _open_socket(self) -> socket.socket:
-        if self._socket is None:
+    def _opened(self) -> int:
+        """Return the number of this opening; LinkError if the link is not open."""
+        if not self._is_open:
             raise self._error("not open")
-        return self._socket
-
-    async def _readable(self, waitable: socket.socket | int) -> None:
-        """Wait until there is data to read; LinkError if the link is closed meanwhile."""
-        opening = self._openings
-        with suppress(anyio.ClosedResourceError):
-            await anyio.wait_readable(waitable)
-        self._check(opening)
+        return self._openings
 
     def _check(self, opening: int) -> None:
         """Raise LinkError if the link has been closed since it was opened as `opening`."""
@@ -170,12 +153,61 @@ class SocketLink(ABC):
             problem, cause = self._close_reason
             raise self._error(problem) from cause
 
+    def _error(self, problem: str) -> LinkError:
+        return LinkError(f"{self.name}: {problem}", link=self.name)
+
+
+class SocketLink(BaseLink):
+    """Base class of the links over sockets.
+
+    Attributes:
+        address: the local host and port while the link is open, else None. With port 0, shows the port that
+            the operating system chose.
+    """
+
+    def __init__(self, spec: LinkSpec) -> None:
+        super().__init__(spec.name)
+        self._host = spec.host
+        self._port = spec.port
+        self._open_socket: socket.socket | None = None
+
+    @property
+    def address(self) -> tuple[str, int] | None:
+        if self._open_socket is None:
+            return None
+        host, port, *_ = self._open_socket.getsockname()
+        return host, port
+
+    @property
+    def _socket(self) -> socket.socket:
+        if self._open_socket is None:
+            raise self._error("not open")
+        return self._open_socket
+
+    def _adopt(self, sock: socket.socket, opening: int) -> None:
+        """Replace the current socket, unless the link was closed while the new socket was opened."""
+        if opening != self._openings:
+            sock.close()
+        self._check(opening)
+        close_socket(self._open_socket)
+        self._open_socket = sock
+
+    async def _release(self) -> None:
+        close_socket(self._open_socket)
+        self._open_socket = None
+
+    async def _readable(self, waitable: socket.socket | int, opening: int) -> None:
+        """Wait until there is data to read; LinkError if the link is closed meanwhile."""
+        with suppress(anyio.ClosedResourceError):
+            await anyio.wait_readable(waitable)
+        self._check(opening)
+
+    def _refusal(self, error: OSError) -> str:
+        return socket_refusal(error, self._host, self._port, self._target, is_stream=self.is_stream)
+
     @property
     def _target(self) -> str:
         return f"[{self._host}]:{self._port}" if ":" in self._host else f"{self._host}:{self._port}"
-
-    def _error(self, problem: str) -> LinkError:
-        return LinkError(f"{self.name}: {problem}", link=self.name)
 
     async def _resolve(self, kind: socket.SocketKind) -> list[tuple[socket.AddressFamily, Address]]:
         """Return the addresses of the host, IPv4 first, because most MAVLink programs listen on IPv4."""
@@ -198,10 +230,11 @@ def claim(sock: socket.socket) -> None:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
 
 
-def close_socket(sock: socket.socket) -> None:
+def close_socket(sock: socket.socket | None) -> None:
     """Close a socket; tasks that wait for it get ClosedResourceError."""
-    anyio.notify_closing(sock)
-    sock.close()
+    if sock is not None:
+        anyio.notify_closing(sock)
+        sock.close()
 
 
 _NUMERIC = socket.AI_NUMERICHOST | socket.AI_NUMERICSERV

@@ -8,8 +8,7 @@ from typing import BinaryIO, Final
 import anyio
 import anyio.lowlevel
 
-from paramclient.errors import LinkError
-from paramclient.links.link import Peer
+from paramclient.links.link import BaseLink, Peer
 from paramclient.links.names import LinkSpec
 from paramclient.links.refusals import reason
 from paramclient.links.tlog import Record, open_log, read_records
@@ -24,7 +23,7 @@ PAUSE_MAX: Final = 60.0
 """Seconds of the log after which a pause is shortened: joined logs may be days apart."""
 
 
-class ReplayLink:
+class ReplayLink(BaseLink):
     """Delivers the frames of a log, of both directions, at the times in the log.
 
     Data that is sent is discarded. Opening the link again starts at the beginning of the log.
@@ -37,11 +36,10 @@ class ReplayLink:
         at: the time of the last delivered frame, as a Unix time in seconds; None before the first.
     """
 
-    is_stream = False
     reconnects = False
 
     def __init__(self, spec: LinkSpec) -> None:
-        self.name = spec.name
+        super().__init__(spec.name)
         self.at: float | None = None
         self._path = spec.host
         self._speed = dict(spec.options).get("speed", 1.0)
@@ -52,20 +50,6 @@ class ReplayLink:
         self._is_over = False
         self._closed = anyio.Event()
 
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.name} {'closed' if self._file is None else 'open'}>"
-
-    async def open(self) -> None:
-        """See `Link.open`."""
-        await anyio.lowlevel.checkpoint()
-        await self.close()
-        self._file = open_log(self._path, self.name)
-        self._records = read_records(self._file)
-        self._closed = anyio.Event()
-        self._due = anyio.current_time()
-        self._is_over = False
-        self._next = next(self._records, None)
-
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`."""
         await anyio.lowlevel.checkpoint()
@@ -74,8 +58,7 @@ class ReplayLink:
                 await self._closed.wait()
         elif self._is_over:
             await self._closed.wait()
-        if self._file is None:
-            raise LinkError(f"{self.name}: not open", link=self.name)
+        self._opened()
         found: list[tuple[Peer, bytes]] = []
         while self._next is not None and self._due <= anyio.current_time() and len(found) < RECORDS_PER_READ:
             found.append((LOG_PEER, self._next.data))
@@ -88,8 +71,16 @@ class ReplayLink:
         """See `Link.send`; discards the data."""
         await anyio.lowlevel.checkpoint()
 
-    async def close(self) -> None:
-        """See `Link.close`."""
+    async def _open(self, opening: int) -> None:
+        await anyio.lowlevel.checkpoint()
+        self._file = open_log(self._path, self.name)
+        self._records = read_records(self._file)
+        self._closed = anyio.Event()
+        self._due = anyio.current_time()
+        self._is_over = False
+        self._next = next(self._records, None)
+
+    async def _release(self) -> None:
         self._closed.set()
         self._records = iter(())
         if self._file is not None:
@@ -100,6 +91,6 @@ class ReplayLink:
         try:
             self._next = next(self._records, None)
         except OSError as error:
-            raise LinkError(f"{self.name}: cannot read: {reason(error)}", link=self.name) from error
+            raise self._error(f"cannot read: {reason(error)}") from error
         if self._next is not None and self._speed:
             self._due += min(max(self._next.at - before.at, 0.0), PAUSE_MAX) / self._speed

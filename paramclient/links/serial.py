@@ -20,14 +20,14 @@ import os
 import sys
 import threading
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 import anyio
 import anyio.lowlevel
 import anyio.to_thread
 
-from paramclient.errors import LinkError, UsageError
-from paramclient.links.link import OPEN_TIMEOUT, Peer
+from paramclient.errors import UsageError
+from paramclient.links.link import OPEN_TIMEOUT, BaseLink, Peer
 from paramclient.links.names import LinkSpec
 from paramclient.links.ports import need_serialx
 from paramclient.links.refusals import device_refusal, reason
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     import serialx
 
 __all__ = ["SerialDevice", "SerialLink", "open_port"]
-
-T = TypeVar("T")
 
 READ_SIZE: Final = 65536
 """Bytes per read. Linux holds 4,095 for a reader, and bytes that arrive meanwhile in the driver."""
@@ -68,7 +66,7 @@ class SerialDevice(NamedTuple):
     path: str
 
 
-class SerialLink:
+class SerialLink(BaseLink):
     """`serial`: one serial port. `open` restores the link after the device was unplugged.
 
     The link has no queue. If the operating system's buffer is full, a frame waits for space, so a slow port
@@ -76,7 +74,6 @@ class SerialLink:
     the user gets an error, and opening the port again empties the buffer.
 
     Attributes:
-        name: the canonical name.
         device: the path, or the name on Windows.
         baud: bits per second; ignored by devices that are themselves USB.
 
@@ -85,50 +82,21 @@ class SerialLink:
     """
 
     is_stream = True
-    reconnects = True
 
     def __init__(self, spec: LinkSpec) -> None:
         need_serialx(spec.name)
-        self.name = spec.name
+        super().__init__(spec.name)
         self.device = spec.host
         self.baud = spec.port
         self._port: _Port | None = None
         self._peer = SerialDevice(0, spec.host)
-        self._openings = 0
-        self._close_reason: tuple[str, OSError | None] = ("closed", None)
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.name} {'closed' if self._port is None else 'open'}>"
-
-    async def open(self) -> None:
-        """See `Link.open`; an open link is closed first.
-
-        Raises:
-            UsageError: the system does not support the baud rate.
-        """
-        await self._discard("closed")
-        opening = self._openings
-        try:
-            with anyio.fail_after(OPEN_TIMEOUT):
-                port = await open_port(self.device, self.baud)
-        except OSError as error:
-            self._check(opening)
-            if isinstance(error, TimeoutError):
-                problem = f"{self.device} did not open within {OPEN_TIMEOUT:g} s"
-            else:
-                problem = device_refusal(self.device, self.baud, error)
-            raise self._error(problem) from error
-        if opening != self._openings:
-            await port.close()
-        self._check(opening)
-        self._port = port
-        self._peer = self._peer._replace(number=self._peer.number + 1)
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`: one chunk of up to `READ_SIZE` bytes."""
-        port, opening = self._opened(), self._openings
+        opening = self._opened()
+        assert self._port is not None
         try:
-            data = await port.read()
+            data = await self._port.read()
         except OSError as error:
             await self._fail(opening, f"lost {self.device}: unplugged, or reset ({reason(error)})", error)
         if not data:
@@ -141,50 +109,37 @@ class SerialLink:
         After cancellation, a part may have been sent.
         """
         await anyio.lowlevel.checkpoint()
-        port, opening = self._opened(), self._openings
-        if peer is not None and peer != self._peer:
+        opening = self._opened()
+        assert self._port is not None
+        if peer not in (None, self._peer):
             return
         timeout = STALL_TIMEOUT + SYSTEM_BUFFER * BITS_PER_BYTE / self.baud
         with anyio.move_on_after(timeout) as wait:
             try:
-                await port.write(data)
+                await self._port.write(data)
             except OSError as error:
                 await self._fail(opening, f"lost {self.device}: unplugged, or reset ({reason(error)})", error)
         if wait.cancelled_caught:
             await self._fail(opening, f"{self.device} has accepted no data for {timeout:.0f} s")
         self._check(opening)
 
-    async def close(self) -> None:
-        """See `Link.close`. Unsent bytes are dropped."""
-        await self._discard("closed")
+    async def _open(self, opening: int) -> None:
+        port = await open_port(self.device, self.baud)
+        if opening != self._openings:
+            await port.close()
+        self._check(opening)
+        self._port = port
+        self._peer = self._peer._replace(number=self._peer.number + 1)
 
-    async def _discard(self, problem: str, cause: OSError | None = None) -> None:
-        """Close the port and wake waiting tasks. An `open` in progress fails from now on."""
-        self._openings += 1
-        self._close_reason = (problem, cause)
+    async def _release(self) -> None:
         port, self._port = self._port, None
         if port is not None:
             await port.close()
 
-    async def _fail(self, opening: int, problem: str, cause: OSError | None = None) -> NoReturn:
-        """Close the link because of an error, unless already closed; waiting tasks get the same LinkError."""
-        self._check(opening)
-        await self._discard(problem, cause)
-        raise self._error(problem) from cause
-
-    def _check(self, opening: int) -> None:
-        """Raise LinkError if the link has been closed since it was opened as `opening`."""
-        if opening != self._openings:
-            problem, cause = self._close_reason
-            raise self._error(problem) from cause
-
-    def _opened(self) -> _Port:
-        if self._port is None:
-            raise self._error("not open")
-        return self._port
-
-    def _error(self, problem: str) -> LinkError:
-        return LinkError(f"{self.name}: {problem}", link=self.name)
+    def _refusal(self, error: OSError) -> str:
+        if isinstance(error, TimeoutError):
+            return f"{self.device} did not open within {OPEN_TIMEOUT:g} s"
+        return device_refusal(self.device, self.baud, error)
 
 
 class _Port(Protocol):
@@ -226,28 +181,25 @@ if sys.platform != "win32":
         @classmethod
         async def opened(cls, device: str, baud: int) -> _Descriptor:
             """Open a port in a thread. A port that opens after cancellation is closed again."""
-            lock = threading.Lock()
-            opened: list[_Descriptor] = []
-            is_wanted = True
+            ports: list[_Descriptor] = []
+            is_abandoned = threading.Event()
 
-            def work() -> _Descriptor:
-                port = cls._open(device, baud)
-                with lock:
-                    opened.append(port)
-                    if is_wanted:
-                        return port
-                port._release()
-                return port
+            def release() -> None:
+                with suppress(IndexError):  # the thread and the caller may both come here
+                    ports.pop()._release()
+
+            def work() -> None:
+                ports.append(cls._open(device, baud))
+                if is_abandoned.is_set():
+                    release()
 
             try:
-                return await anyio.to_thread.run_sync(work, abandon_on_cancel=True)
+                await anyio.to_thread.run_sync(work, abandon_on_cancel=True)
             except BaseException:
-                with lock:
-                    is_wanted = False
-                    found = list(opened)
-                for port in found:
-                    port._release()
+                is_abandoned.set()
+                release()
                 raise
+            return ports.pop()
 
         async def read(self) -> bytes:
             with suppress(anyio.ClosedResourceError):

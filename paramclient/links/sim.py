@@ -13,11 +13,10 @@ import anyio
 import anyio.abc
 import anyio.lowlevel
 
-from paramclient.errors import LinkError
+from paramclient.links.link import BaseLink, Link, Peer
 from paramclient.links.names import LinkSpec
 
 if TYPE_CHECKING:
-    from paramclient.links.link import Link, Peer
     from paramclient.sim import Endpoint, Vehicle
 
 __all__ = ["SimLink", "serve_endpoint", "simulated"]
@@ -29,7 +28,7 @@ LISTEN_TIME_MIN: Final = 0.001
 """Seconds for which `serve_endpoint` listens at least, also when the vehicle is behind schedule."""
 
 
-class SimLink:
+class SimLink(BaseLink):
     """A link whose remote end is an object in this process.
 
     Args:
@@ -38,34 +37,23 @@ class SimLink:
         name: the link's name; the cache uses it to identify vehicles without a hardware id.
     """
 
-    is_stream = False
     reconnects = False
 
     def __init__(self, endpoint: Endpoint, name: str = "sim:custom") -> None:
-        self.name = name
+        super().__init__(name)
         self.endpoint = endpoint
-        self._wake: anyio.Event | None = None
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.name} {'closed' if self._wake is None else 'open'}>"
+        self._wake = anyio.Event()
 
     @property
     def has_one_vehicle(self) -> bool:
         """Whether the remote end is certain to be a single vehicle, so that looking for others is useless."""
         return getattr(self.endpoint, "vehicle_count", None) == 1
 
-    async def open(self) -> None:
-        """See `Link.open`; starts the vehicle."""
-        await anyio.lowlevel.checkpoint()
-        self._wake = anyio.Event()
-        self.endpoint.tick(anyio.current_time())
-
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`."""
         while True:
             await anyio.lowlevel.checkpoint()
-            if self._wake is None:
-                raise self._not_open()
+            self._opened()
             wait = _work(self.endpoint)
             data = self.endpoint.data_to_send()
             if data:
@@ -77,20 +65,17 @@ class SimLink:
     async def send(self, data: bytes, peer: Peer | None) -> None:
         """See `Link.send`."""
         await anyio.lowlevel.checkpoint()
-        if self._wake is None:
-            raise self._not_open()
+        self._opened()
         if peer in (None, SIM_PEER):
             self.endpoint.receive(data, anyio.current_time())
             self._wake.set()
 
-    async def close(self) -> None:
-        """See `Link.close`."""
-        if self._wake is not None:
-            self._wake.set()
-            self._wake = None
+    async def _open(self, opening: int) -> None:
+        await anyio.lowlevel.checkpoint()
+        self.endpoint.tick(anyio.current_time())
 
-    def _not_open(self) -> LinkError:
-        return LinkError(f"{self.name}: not open", link=self.name)
+    async def _release(self) -> None:
+        self._wake.set()
 
 
 async def serve_endpoint(
@@ -124,21 +109,14 @@ async def serve_endpoint(
 
 def simulated(spec: LinkSpec) -> SimLink:
     """Return the vehicle of a `sim:` name, behind a faulty link with the faults of its options."""
-    from paramclient.sim import (
-        Air,
-        ArduPilotVehicle,
-        Camera,
-        PX4Vehicle,
-    )  # imported here: loads parameter tables
+    from paramclient import sim  # imported here: loads parameter tables
 
+    kinds: dict[str, Callable[..., Vehicle]]
+    kinds = {"px4": sim.PX4Vehicle, "ardupilot": sim.ArduPilotVehicle, "camera": sim.Camera}
     faults: dict[str, Any] = dict(spec.options)
-    kinds = {"px4": PX4Vehicle, "ardupilot": ArduPilotVehicle, "camera": Camera}
-    make: Callable[..., Vehicle] = kinds[spec.host]
-    metadata_option: dict[str, Any] = {"metadata": True} if faults.pop("metadata", 0) else {}
-    vehicle = make(
-        system=faults.pop("system", 1), param_error=bool(faults.pop("param_error", 0)), **metadata_option
-    )
-    return SimLink(Air.symmetric([vehicle], **faults) if faults else vehicle, spec.name)
+    options = {key: faults.pop(key) for key in ("system", "param_error", "metadata") if key in faults}
+    vehicle = kinds[spec.host](**options)
+    return SimLink(sim.Air.symmetric([vehicle], **faults) if faults else vehicle, spec.name)
 
 
 def _work(endpoint: Endpoint) -> float | None:

@@ -47,7 +47,6 @@ class TcpOut(SocketLink):
     """`tcp`: one outgoing connection. `open` makes a new one after it has dropped."""
 
     is_stream = True
-    reconnects = True
 
     def __init__(self, spec: LinkSpec) -> None:
         super().__init__(spec)
@@ -55,17 +54,17 @@ class TcpOut(SocketLink):
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`: one chunk of up to `READ_SIZE` bytes."""
-        sock = self._open_socket()
+        sock, opening = self._socket, self._openings
         while True:
-            await self._readable(sock)
+            await self._readable(sock, opening)
             try:
                 data = sock.recv(READ_SIZE)
             except BlockingIOError:
                 continue
             except OSError as error:
-                self._fail(f"connection to {self._target} lost: {reason(error)}", error)
+                await self._fail(opening, f"connection to {self._target} lost: {reason(error)}", error)
             if not data:
-                self._fail(f"connection closed by {self._target}")
+                await self._fail(opening, f"connection closed by {self._target}")
             return [(self._peer, data)]
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
@@ -74,15 +73,12 @@ class TcpOut(SocketLink):
         After cancellation, a part may have been sent.
         """
         await anyio.lowlevel.checkpoint()
-        sock = self._open_socket()
-        opening = self._openings
-        if peer is not None and peer != self._peer:
-            return
-        try:
-            await _send_all(sock, data)
-        except OSError as error:
-            self._check(opening)
-            self._fail(f"connection to {self._target} lost: {reason(error)}", error)
+        sock, opening = self._socket, self._openings
+        if peer in (None, self._peer):
+            try:
+                await _send_all(sock, data)
+            except OSError as error:
+                await self._fail(opening, f"connection to {self._target} lost: {reason(error)}", error)
 
     async def _open(self, opening: int) -> None:
         candidates = await self._resolve(socket.SOCK_STREAM)
@@ -114,21 +110,22 @@ class TcpIn(SocketLink):
 
     def __init__(self, spec: LinkSpec) -> None:
         super().__init__(spec)
-        self._selector: selectors.DefaultSelector | None = None
+        self._selector: selectors.BaseSelector | None = None
         self._clients: dict[Peer, socket.socket] = {}
         self.accepted: Callable[[Peer], object] = lambda peer: None
         self._accepted = 0
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`: up to `READ_SIZE` bytes from each readable connection."""
-        listener, selector = self._open_socket(), self._selector
+        listener, selector, opening = self._socket, self._selector, self._openings
         assert selector is not None
         batch: list[tuple[Peer, bytes]] = []
         while not batch:
             if (file := _file_of(selector)) is not None:
-                await self._readable(file)
+                await self._readable(file, opening)
             else:
                 await self._any_readable([listener, *self._clients.values()])
+                self._check(opening)
             for key, _ in selector.select(0):
                 if key.data is None:
                     self._accept(listener, selector)
@@ -142,8 +139,7 @@ class TcpIn(SocketLink):
         After cancellation, a part may have been sent.
         """
         await anyio.lowlevel.checkpoint()
-        self._open_socket()
-        opening = self._openings
+        opening = self._opened()
         for client in self._destinations(peer):
             try:
                 await _send_all(client, data)
@@ -166,8 +162,8 @@ class TcpIn(SocketLink):
         self._selector = selectors.DefaultSelector()
         self._selector.register(listener, selectors.EVENT_READ)
 
-    def _discard(self) -> None:
-        super()._discard()
+    async def _release(self) -> None:
+        await super()._release()
         if self._selector is not None:
             if (file := _file_of(self._selector)) is not None:
                 anyio.notify_closing(file)
@@ -178,8 +174,7 @@ class TcpIn(SocketLink):
             close_socket(client)
 
     async def _any_readable(self, sockets: list[socket.socket]) -> None:
-        """Wait for any of the sockets; LinkError if the link is closed meanwhile."""
-        opening = self._openings
+        """Wait for any of the sockets."""
         async with anyio.create_task_group() as tasks:
 
             async def wait(sock: socket.socket) -> None:
@@ -189,14 +184,13 @@ class TcpIn(SocketLink):
 
             for sock in sockets:
                 tasks.start_soon(wait, sock)
-        self._check(opening)
 
     def _destinations(self, peer: Peer | None) -> list[socket.socket]:
         if peer is None:
             return list(self._clients.values())
         return [self._clients[peer]] if peer in self._clients else []
 
-    def _accept(self, listener: socket.socket, selector: selectors.DefaultSelector) -> None:
+    def _accept(self, listener: socket.socket, selector: selectors.BaseSelector) -> None:
         try:
             client, (host, port, *_) = listener.accept()
         except (BlockingIOError, ConnectionError):
@@ -213,7 +207,7 @@ class TcpIn(SocketLink):
         selector.register(client, selectors.EVENT_READ, peer)
         self.accepted(peer)
 
-    def _read(self, peer: Peer, selector: selectors.DefaultSelector) -> list[tuple[Peer, bytes]]:
+    def _read(self, peer: Peer, selector: selectors.BaseSelector) -> list[tuple[Peer, bytes]]:
         client = self._clients[peer]
         try:
             data = client.recv(READ_SIZE)
@@ -228,7 +222,7 @@ class TcpIn(SocketLink):
         return [(peer, data)]
 
 
-def _file_of(selector: selectors.DefaultSelector) -> int | None:
+def _file_of(selector: selectors.BaseSelector) -> int | None:
     """Return the selector's file descriptor, readable when any of its files is; None on Windows."""
     number = getattr(selector, "fileno", None)
     return None if number is None else int(number())

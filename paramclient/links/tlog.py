@@ -10,6 +10,7 @@ import re
 import stat
 import struct
 from collections.abc import Iterator
+from contextlib import ExitStack
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
@@ -66,25 +67,25 @@ def open_log(path: str, name: str) -> BinaryIO:
         LinkError: the file cannot be read, is not a log, or is not a regular file, which may be endless or
             block the reader.
     """
+
+    def error(problem: str) -> LinkError:
+        return LinkError(f"{name}: {problem}", link=name)
+
     try:
         mode = Path(path).stat().st_mode
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-            raise LinkError(f"{name}: {path} is not a regular file", link=name)
-        file = Path(path).open("rb")  # noqa: SIM115 - the caller closes it
+            raise error(f"{path} is not a regular file")
+        with ExitStack() as stack:
+            file = stack.enter_context(Path(path).open("rb"))
+            if next(read_records(BytesIO(file.read(FIRST_FRAME_OFFSET_MAX))), None) is None:
+                raise error(f"{path} is not a telemetry log, or contains no frames")
+            file.seek(0)
+            stack.pop_all()
+            return file
     except LinkError:
         raise
-    except OSError as error:
-        raise LinkError(f"{name}: cannot open {path}: {error.strerror}", link=name) from error
-    try:
-        if next(read_records(BytesIO(file.read(FIRST_FRAME_OFFSET_MAX))), None) is None:
-            raise LinkError(f"{name}: {path} is not a telemetry log, or contains no frames", link=name)
-        file.seek(0)
-    except OSError as error:
-        file.close()
-        if isinstance(error, LinkError):
-            raise
-        raise LinkError(f"{name}: cannot read {path}: {error.strerror}", link=name) from error
-    return file
+    except OSError as problem:
+        raise error(f"cannot open {path}: {problem.strerror}") from problem
 
 
 def read_records(file: BinaryIO) -> Iterator[Record]:

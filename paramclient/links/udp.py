@@ -25,6 +25,8 @@ import errno
 import math
 import socket
 import sys
+from abc import abstractmethod
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Final
 from zlib import crc32
@@ -81,15 +83,12 @@ class UdpLink(SocketLink):
             protocol's retries replace them, like datagrams lost on the way.
     """
 
-    is_stream = False
-    reconnects = True
-
     def __init__(self, spec: LinkSpec) -> None:
         super().__init__(spec)
         self.receive_buffer = 0
         self.lost_sends = 0
         self._local_port = 0  # of the previous opening
-        self._buffer_size = memoryview(bytearray(_LARGEST_DATAGRAM))
+        self._data = memoryview(bytearray(_LARGEST_DATAGRAM))
         self._no_route_since: float | None = None
         # The senders of valid frames and the time of the last one, the latest sender last.
         self._peers: dict[Address, float] = {}
@@ -97,14 +96,14 @@ class UdpLink(SocketLink):
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`. Returns at most `DATAGRAMS_PER_READ` datagrams; skips empty ones."""
-        sock = self._open_socket()
-        into, buffer_size = sock.recvfrom_into, self._buffer_size
+        sock, opening, data = self._socket, self._openings, self._data
+        receive_into = sock.recvfrom_into
         batch: list[tuple[Address, bytes]] = []
         while not batch:
-            await self._readable(sock)
+            await self._readable(sock, opening)
             for _ in range(DATAGRAMS_PER_READ):
                 try:
-                    size, address = into(buffer_size)
+                    size, address = receive_into(data)
                 except BlockingIOError:
                     break
                 except OSError as error:
@@ -112,23 +111,22 @@ class UdpLink(SocketLink):
                         raise self._error(f"cannot receive: {reason(error)}") from error
                     continue  # an ICMP error for an earlier datagram
                 if size:
-                    batch.append((address, bytes(buffer_size[:size])))
+                    batch.append((address, bytes(data[:size])))
         self._learn(batch)
         return [*batch]
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
         """See `Link.send`. Does not wait for the network: drops and counts datagrams that cannot be sent."""
         await anyio.lowlevel.checkpoint()
-        sock = self._open_socket()
-        for address in self._broadcast_addresses() if peer is None else self._destinations(peer):
+        for address in self._destinations(self._socket, peer):
             try:
-                self._transmit(sock, data, address)
+                self._transmit(self._socket, data, address)
             except OSError as error:
                 if error.errno not in _TRANSIENT:
                     raise self._error(f"cannot send: {reason(error)}") from error
                 self.lost_sends += 1
-                if error.errno in _NO_ROUTE and self._has_own_address:
-                    self._note_no_route(error)
+                if error.errno in _NO_ROUTE and self._host not in _ANY_ADDRESS:
+                    await self._note_no_route(error)
             else:
                 self._no_route_since = None
 
@@ -137,21 +135,14 @@ class UdpLink(SocketLink):
         await super().close()
         self._local_port = 0
 
-    @property
-    def _has_own_address(self) -> bool:
-        """Whether the socket sends from one fixed address, which this computer may lose."""
-        return True
-
-    def _note_no_route(self, error: OSError) -> None:
+    async def _note_no_route(self, error: OSError) -> None:
+        """Drop a socket that sends from one fixed address, which this computer may have lost."""
         now = anyio.current_time()
         if self._no_route_since is None:
             self._no_route_since = now
         elif now - self._no_route_since >= UNREACHABLE_TIMEOUT:
-            self._fail(f"no route from {self._own_host} any more: {reason(error)}", error)
-
-    @property
-    def _own_host(self) -> str:
-        return self.address[0] if self.address else self._host
+            host = self._socket.getsockname()[0]
+            await self._fail(self._openings, f"no route from {host} any more: {reason(error)}", error)
 
     def _learn(self, batch: list[tuple[Address, bytes]]) -> None:
         """Remember the senders of valid frames, the latest last; forget the one silent for longest."""
@@ -167,13 +158,9 @@ class UdpLink(SocketLink):
             if len(peers) > PEERS_MAX:
                 del peers[next(iter(peers))]
 
-    def _broadcast_addresses(self) -> list[Address]:
-        oldest = anyio.current_time() - PEER_TIMEOUT
-        self._peers = {address: at for address, at in self._peers.items() if at > oldest}
-        return [*self._peers]
-
-    def _destinations(self, peer: Peer) -> list[Address]:
-        return [each for each in (peer,) if each in self._peers]
+    @abstractmethod
+    def _destinations(self, sock: socket.socket, peer: Peer | None) -> Sequence[Address]:
+        """Return the addresses to send to: of a peer, or for None of all."""
 
     def _transmit(self, sock: socket.socket, data: bytes, address: Address) -> None:
         sock.sendto(data, address)
@@ -206,12 +193,12 @@ class UdpIn(UdpLink):
         sock.bind((host, port or self._local_port, *more))
         self._local_port = sock.getsockname()[1]
 
-    @property
-    def _has_own_address(self) -> bool:
-        return self._host not in _ANY_ADDRESS
-
-    def _destinations(self, peer: Peer) -> list[Address]:
-        return [peer] if isinstance(peer, tuple) else []
+    def _destinations(self, sock: socket.socket, peer: Peer | None) -> Sequence[Address]:
+        if peer is not None:
+            return [peer] if isinstance(peer, tuple) else []
+        oldest = anyio.current_time() - PEER_TIMEOUT
+        self._peers = {address: at for address, at in self._peers.items() if at > oldest}
+        return [*self._peers]
 
 
 class UdpOut(UdpLink):
@@ -231,61 +218,48 @@ class UdpOut(UdpLink):
     address has changed, the link counts as dropped.
     """
 
-    def __init__(self, spec: LinkSpec) -> None:
-        super().__init__(spec)
-        self._group: Address | None = None
-        self._far: Address | None = None
-        self._near: Address | None = None  # _far, as datagrams from it are labelled
+    _is_group = False
+    _remote: Address
+    """The address as `_resolve` returned it."""
 
     async def _open(self, opening: int) -> None:
-        family, address = (await self._resolve(socket.SOCK_DGRAM))[0]
+        family, self._remote = (await self._resolve(socket.SOCK_DGRAM))[0]
         sock = self._new_socket(family, opening)
         try:
-            sock.bind(("", self._local_port or _usual_port(address)))
+            sock.bind(("", self._local_port or _usual_port(self._remote)))
         except OSError:  # another program uses the port
             sock.bind(("", 0))
         self._local_port = sock.getsockname()[1]
-        self._far = address
-        self._group = self._near = None
+        self._is_group = False
         try:
-            sock.connect(address)
+            sock.connect(self._remote)
         except PermissionError:  # the operating system's error for a broadcast address
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-            self._group = address
-        else:
-            self._near = sock.getpeername()
+            self._is_group = True
 
-    async def _readable(self, waitable: socket.socket | int) -> None:
+    async def _readable(self, waitable: socket.socket | int, opening: int) -> None:
         while True:
             with anyio.move_on_after(RESOLVE_INTERVAL):
-                await super()._readable(waitable)
+                await super()._readable(waitable, opening)
                 return
-            await self._check_address()
-
-    async def _check_address(self) -> None:
-        """Raise LinkError if the name's address is no longer the one in use."""
-        opening = self._openings
-        found: list[Address] = []
-        with suppress(LinkError, TimeoutError), anyio.fail_after(OPEN_TIMEOUT):
-            found = [address for _, address in await self._resolve(socket.SOCK_DGRAM)]
-        self._check(opening)
-        if found and self._far not in found:
-            self._fail(f"the address of {self._host} changed to {found[0][0]}")
+            found = [self._remote]
+            with suppress(LinkError, TimeoutError), anyio.fail_after(OPEN_TIMEOUT):
+                found = [address for _, address in await self._resolve(socket.SOCK_DGRAM)]
+            self._check(opening)
+            if self._remote not in found:
+                await self._fail(opening, f"the address of {self._host} changed to {found[0][0]}")
 
     def _learn(self, batch: list[tuple[Address, bytes]]) -> None:
-        if self._group is not None:
+        if self._is_group:
             super()._learn(batch)
 
-    def _broadcast_addresses(self) -> list[Address]:
-        return [each for each in (self._group or self._near,) if each is not None]
-
-    def _destinations(self, peer: Peer) -> list[Address]:
-        if self._group is not None:
-            return super()._destinations(peer)
-        return [] if self._near is None or peer != self._near else [self._near]
+    def _destinations(self, sock: socket.socket, peer: Peer | None) -> Sequence[Address]:
+        if self._is_group:
+            return [self._remote] if peer is None else [each for each in (peer,) if each in self._peers]
+        return [self._remote] if peer in (None, sock.getpeername()) else []
 
     def _transmit(self, sock: socket.socket, data: bytes, address: Address) -> None:
-        if self._group is not None:
+        if self._is_group:
             sock.sendto(data, address)
             return
         try:
