@@ -36,6 +36,8 @@ _DAMAGE: Final = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
 _UNWRITABLE: Final = frozenset(
     {sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_IOERR_SHMSIZE, sqlite3.SQLITE_READONLY_DIRECTORY}
 )
+_CAUSES: Final = {sqlite3.SQLITE_IOERR_SHMSIZE: "the disk is full"}
+"""Words for error codes of which SQLite says less."""
 _SYNTAX: Final = {"id": "INTEGER PRIMARY KEY AUTOINCREMENT", "clustered": " WITHOUT ROWID"}
 
 logger = logging.getLogger("paramclient.cache")
@@ -110,7 +112,8 @@ class SqliteStore(Store):
             case sqlite3.DatabaseError() if code in _UNWRITABLE and not writing and not self._is_read_only:
                 self._is_read_only = True
             case sqlite3.DatabaseError() | OSError():
-                raise CacheError(f"the cache {self.place} cannot be used: {error}") from error
+                cause = _CAUSES.get(code, error)
+                raise CacheError(f"the cache {self.place} cannot be used: {cause}") from error
             case Exception() if not isinstance(error, ParamClientError):
                 # a value that this program cannot have written, or cannot write
                 if self._is_sound():

@@ -10,17 +10,17 @@ from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Final, TypeAlias
 
-from paramclient.errors import FileError, UsageError
-from paramclient.files import json_format, lists, packed
+from paramclient.errors import FileError, PackError, UsageError
+from paramclient.files import json_format, lists
 from paramclient.files.disk import LARGEST_FILE, read_bytes, replace_file
 from paramclient.files.formats import AUTOPILOT, ENDINGS, FileFormat, ParamFile, address, format_of_name
 from paramclient.files.other_files import kind_of
 from paramclient.files.reading import Reading, time_of
 from paramclient.model.identity import autopilot_name, version_text
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import check_name
+from paramclient.model.values import ParamType, bits_of, check_name, from_bits, same_bits, type_name
 from paramclient.model.wording import counted, first_of
-from paramclient.protocol.param_pck import MAGICS
+from paramclient.protocol import param_pck
 
 __all__ = ["Content", "dumps", "loads", "read_file", "writable", "write_file"]
 
@@ -50,6 +50,60 @@ class _Format:
     holds_several: bool = False
 
 
+# param.pck: types, exact values and defaults, without vehicle and component
+
+
+def _read_packed(reading: Reading, file_format: FileFormat) -> ParamFile:
+    """Read a packed file in the format that a vehicle serves.
+
+    Raises:
+        FileError: the file is invalid.
+    """
+    try:
+        pack = param_pck.decode(reading.data)
+    except PackError as error:
+        raise FileError(f"invalid packed parameter file: {error}", source=reading.source) from error
+    if pack.total > len(pack.entries):
+        reading.notes.append(
+            f"The file contains {len(pack.entries)} of the vehicle's {pack.total} parameters."
+        )
+    for name, kind, bits, default in pack.entries:
+        known = bits if default is None and pack.with_defaults else default
+        value, own = from_bits(bits, kind), None if known is None else from_bits(known, kind)
+        reading.add(WrittenParam(name, value, kind, own), "")
+    return reading.file(file_format)
+
+
+def _write_packed(params: ParamSet) -> bytes:
+    """Return the bytes of a packed file, with defaults if all of them are known.
+
+    Raises:
+        UsageError: the format cannot express a parameter: it has four types, and only numbers.
+    """
+    with_defaults = all(param.default is not None for param in params.values())
+    entries = [_pack_entry(params, param) for param in params.values()]
+    return param_pck.encode(entries, with_defaults=with_defaults)
+
+
+def _pack_entry(_: ParamSet, param: WrittenParam) -> param_pck.PackedParam:
+    """Return the entry of a parameter, or raise UsageError if the format cannot express it."""
+    kind = param.type_number
+    if not isinstance(kind, ParamType) or kind not in param_pck.PACKABLE:
+        known = ", ".join(each.name for each in sorted(param_pck.PACKABLE))
+        has = "no type" if kind is None else f"the type {type_name(kind)}"
+        raise UsageError(f"{param.name} has {has}, and a packed file holds {known}")
+    if param.is_raw:
+        raise UsageError(f"{param.name} is not a number; json can keep it")
+    bits = param.bits_as(kind)
+    default = None if param.default is None else bits_of(param.default, kind)
+    if default is not None and same_bits(kind, bits, default):
+        default = None  # as vehicles write it: an entry without a default has its default value
+    return param_pck.PackedParam(param.name, kind, bits, default)
+
+
+# The table of formats
+
+
 def _pairs(separator: str) -> _Format:
     line = functools.partial(lists.pair_line, separator)
     return _Format(lambda _: False, lists.read_pairs, functools.partial(lists.write_list, line), line)
@@ -57,10 +111,10 @@ def _pairs(separator: str) -> _Format:
 
 _FORMATS: Final = {
     FileFormat.PCK: _Format(
-        lambda reading: reading.data.startswith(MAGICS),
-        packed.read_packed,
-        lambda sets, _: packed.write_packed(sets[0]),
-        packed.pack_entry,
+        lambda reading: reading.data.startswith(param_pck.MAGICS),
+        _read_packed,
+        lambda sets, _: _write_packed(sets[0]),
+        _pack_entry,
     ),
     FileFormat.JSON: _Format(
         lambda reading: reading.first.startswith("{"),

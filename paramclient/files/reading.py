@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import FileFormat, ParamFile
+from paramclient.model.notation import value_written
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, WireValue, bits_of, format_value, from_bits, type_name
 from paramclient.model.wording import first_of
@@ -299,13 +300,10 @@ def value_text(param: WrittenParam) -> str:
     """
     value = param.settable
     if isinstance(value, bytes | str):
-        raw = format_value(value)
-        raise UsageError(f"{param.name} is {raw}, which is not a number; json can keep it")
-    if math.isfinite(value):
-        return format_value(value, ParamType.REAL64 if param.type_number is None else param.type_number)
+        raise UsageError(f"{param.name} is {format_value(value)}, which is not a number; json can keep it")
     if not is_plain(value):
         raise UsageError(f"{param.name} is a NaN with payload bits; json can keep them")
-    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    return str(value_written(value, param))
 
 
 def time_of(at: float, digits: str = "auto") -> str:
