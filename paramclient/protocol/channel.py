@@ -215,8 +215,6 @@ class Timing:
             unsupported request is no loss.
     """
 
-    __slots__ = ("_is_bound", "_lost", "_sent", "_variation", "round_trip", "slowest")
-
     def __init__(self) -> None:
         self.round_trip: float | None = None
         self.slowest = 0.0
@@ -358,11 +356,6 @@ class Channel:
             self._ftp_sequence = int(anyio.current_time() * FTP_SEQUENCES_PER_SECOND)
         self._ftp_sequence = (self._ftp_sequence + 2) & 0xFFFF
         return self._ftp_sequence
-
-    @property
-    def is_waiting(self) -> bool:
-        """Whether a conversation waits for a message."""
-        return bool(self.inboxes)
 
     def dispatch(self, message: Message) -> None:
         """Wake the conversations that wait for a message."""

@@ -229,12 +229,13 @@ class Identification:
         refused: set[int] = set()
 
         def accept(message: Message) -> bool | None:
-            if isinstance(message, messages.CommandAck):
-                if message.result not in (CommandResult.ACCEPTED, CommandResult.IN_PROGRESS):
-                    refused.add(message.command)
-                    return False
+            if not isinstance(message, messages.CommandAck):
+                return True
+            is_refusal = message.result not in (CommandResult.ACCEPTED, CommandResult.IN_PROGRESS)
+            if not is_refusal or message.command in refused:
                 return None
-            return True
+            refused.add(message.command)
+            return False
 
         def request_of(attempt: int) -> messages.CommandLong:
             if ways[0].command in refused or (attempt >= 2 and attempt % 2):
@@ -244,7 +245,6 @@ class Identification:
         with channel.inbox(*keys) as inbox, suppress(NoReply):
             attempts = VERSION_ATTEMPTS_MAX
             while len(refused) < len(ways):
-                before = len(refused)
                 if await channel.exchange(
                     request_of,
                     inbox,
@@ -254,8 +254,6 @@ class Identification:
                     copies=lambda attempt: VERSION_COPIES if attempt else 1,
                 ):
                     return
-                if len(refused) == before:  # both refusals are of one command
-                    break
                 attempts = VERSION_ATTEMPTS_REFUSED
         self.settle()
 

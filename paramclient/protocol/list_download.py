@@ -230,7 +230,7 @@ class _Download:
         return self._tried.get(index, 0) >= self._attempts_max()
 
     def _attempts_max(self) -> int:
-        return 1 if self.session.reads_indices is False else self.channel.timing.attempts_max
+        return 1 if self.session.serves_reads.get(int) is False else self.channel.timing.attempts_max
 
     async def _read(self, index: int) -> None:
         """Read one index, or give it up."""

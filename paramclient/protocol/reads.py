@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Final
@@ -19,7 +20,7 @@ from paramclient.errors import (
 )
 from paramclient.model.names import did_you_mean, nearest_names
 from paramclient.model.values import Param, Trust
-from paramclient.protocol.channel import ATTEMPTS_MAX, Inbox
+from paramclient.protocol.channel import ATTEMPTS_MAX, BACKOFF_FROM, PATIENCE_MIN, Inbox
 from paramclient.protocol.dialect import ReportedValue
 from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.protocol.list_download import download_list
@@ -29,9 +30,9 @@ from paramclient.wire.messages import HASH_CHECK, Message, ParamError
 __all__ = ["queue_time", "read", "read_many", "read_param", "refusal"]
 
 CONTROL_LOST: Final = 1e-4
-"""Probability that all attempts of the control read are lost, which decides whether a component answers
+"""Probability that all requests of the control read are lost, which decides whether a component answers
 reads at all."""
-CONTROL_ATTEMPTS_MIN: Final = 8
+CONTROL_REQUESTS_MIN: Final = 8
 FIRST_ATTEMPTS: Final = 5
 """Attempts of a read before anything was answered: 3.3 s, and the list answers where reads do not."""
 SLOT_ARDUPILOT: Final = 0.1
@@ -81,7 +82,7 @@ async def _read(session: Session, which: str | int) -> ReportedValue:
                         answer = None if channel.is_lost else await _read_list(session, inbox, which)
                         if answer is None:
                             raise
-                        _miss(session, which)
+                        session.serves_reads.setdefault(type(which), False)
                         return answer
                 if control.param_id == which:
                     return control
@@ -94,43 +95,51 @@ async def _read(session: Session, which: str | int) -> ReportedValue:
 
 
 async def _ask(
-    session: Session, inbox: Inbox, which: str | int, attempts: int = 0, *, is_asked: bool = False
+    session: Session, inbox: Inbox, which: str | int, requests: int = 0, *, is_asked: bool = False
 ) -> ReportedValue:
     """Request a parameter until it is received, and learn whether such reads are answered.
 
     Few attempts suffice where another way is left: before anything was ever answered, where such reads were
     not answered before, and for a hash beside other answers. One that is asked for already is awaited first.
+    Where the round trip is long and silence would mean something, several copies are sent at once.
     """
     channel, dialect = session.channel, session.dialect
-    is_served = session.reads_names if isinstance(which, str) else session.reads_indices
+    is_served = session.serves_reads.get(type(which))
 
     def accept(message: Message) -> ReportedValue | None:
         if isinstance(message, ParamError):
             raise refusal(session, which, message.error)
         return message if isinstance(message, dialect.value) else None
 
-    def attempts_max() -> int:  # of this moment: the loss is better known with each answer
+    def requests_max() -> int:  # of this moment: the loss is better known with each answer
+        most = requests or timing.attempts_max
+        return min(most, FIRST_ATTEMPTS) if is_first else most
+
+    def copies(attempt: int) -> int:
+        if is_certain or attempt < BACKOFF_FROM:
+            return 1
+        return max(1, min(int(requests_max() * timing.timeout(0) / PATIENCE_MIN), timing.copies))
+
+    def attempts_max() -> int:
         if channel.is_streaming:  # on a slow link, the answer is queued behind the list
             return ATTEMPTS_MAX
-        return attempts or channel.timing.attempts_max
+        if is_served is False:
+            return 1
+        most = requests_max()
+        return min(most, BACKOFF_FROM) + math.ceil(max(most - BACKOFF_FROM, 0) / copies(BACKOFF_FROM))
 
-    wait = queue_time(session)
-    if is_served is False:
-        attempts = 1
-    elif is_served is None and (channel.timing.round_trip is None) != (which == HASH_CHECK):
-        attempts = min(attempts or FIRST_ATTEMPTS, FIRST_ATTEMPTS)
+    wait, timing = queue_time(session), channel.timing
+    is_certain = bool(is_served) and not requests
+    is_first = is_served is None and (timing.round_trip is None) != (which == HASH_CHECK)
     if is_asked:
         answer: ReportedValue | None = await channel.wait_for(inbox, accept, anyio.current_time(), 0, wait)
         if answer is not None:
             return answer
     request, what = dialect.request_read(channel.reads_from, which), _what(session, which)
     received: ReportedValue = await channel.exchange(
-        request, inbox, accept, what=what, attempts=attempts_max, timeout_min=wait
+        request, inbox, accept, what=what, attempts=attempts_max, timeout_min=wait, copies=copies
     )
-    if isinstance(which, str):
-        session.reads_names = True
-    else:
-        session.reads_indices = True
+    session.serves_reads[type(which)] = True
     return received
 
 
@@ -219,30 +228,26 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
     control = await _try(session, HASH_CHECK if px4 else other)
     if control is None and px4 and session.channel.answered.is_set():  # it may only call itself a PX4
         control = await _try(session, other)
-    if control is None or not isinstance(which, str) or session.reads_names or control.param_id == which:
+    is_proven = not isinstance(which, str) or session.serves_reads.get(str)
+    if control is None or is_proven or control.param_id == which:
         return control
+    await anyio.sleep(
+        session.channel.timing.timeout(0)
+    )  # for its other answers, which would be taken for one
     return await _try(session, control.param_id)
 
 
 async def _try(session: Session, which: str | int) -> ReportedValue | None:
     """Read a parameter that the component has; return None, and remember it, if that is not answered."""
     channel = session.channel
-    attempts = max(channel.timing.attempts_for(CONTROL_LOST), CONTROL_ATTEMPTS_MIN)
+    requests = max(channel.timing.attempts_for(CONTROL_LOST), CONTROL_REQUESTS_MIN)
     with channel.inbox((session.dialect.value, which)) as inbox:
         try:
-            return await _ask(session, inbox, which, attempts)
+            return await _ask(session, inbox, which, requests)
         except (NoReply, VehicleError):
             if which != HASH_CHECK:
-                _miss(session, which)
+                session.serves_reads.setdefault(type(which), False)
             return None
-
-
-def _miss(session: Session, which: str | int) -> None:
-    """Remember that such a read was not answered."""
-    if isinstance(which, str):
-        session.reads_names = session.reads_names or False
-    else:
-        session.reads_indices = session.reads_indices or False
 
 
 async def _read_list(session: Session, inbox: Inbox, which: str | int) -> ReportedValue | None:

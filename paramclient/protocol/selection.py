@@ -76,12 +76,7 @@ def vehicle_of(nodes: Iterable[Node], node: Node) -> Node:
 
 
 def only_vehicle(
-    nodes: Iterable[Node],
-    system: int | None,
-    component: int | None,
-    now: float,
-    *,
-    listening_since: float,
+    nodes: Iterable[Node], system: int | None, component: int | None, now: float, *, listening_since: float
 ) -> Node | float | None:
     """Return the only component that an address fits, or when that may be certain; None before one is heard.
 

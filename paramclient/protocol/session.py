@@ -147,7 +147,7 @@ class Session:
         written_at: when the last write ended; minus infinity before the first.
         replaced: by name, the values before writes that have just ended.
         contradicted: called when a hash is received that is not the table's.
-        reads_names, reads_indices: whether reads by name, and by index, are answered; None while unknown.
+        serves_reads: whether reads by name (str), and by index (int), are answered, as far as known.
         listing: the list that is downloaded in place of reads that are not answered.
         seeking: the reads for evidence of the encoding.
         acknowledging: names whose next value may acknowledge a set, in another type than the parameter's.
@@ -178,8 +178,7 @@ class Session:
         self.written_at = -math.inf
         self.replaced: defaultdict[str, list[ReplacedValue]] = defaultdict(list)
         self.contradicted: Callable[[], None] = lambda: None
-        self.reads_names: bool | None = None
-        self.reads_indices: bool | None = None
+        self.serves_reads: dict[type[str | int], bool] = {}
         self.listing: Shared[Any] = Shared(spawn, channel.gate)
         self.seeking: Shared[None] = Shared(spawn, channel.gate)
         self.acknowledging: set[str] = set()

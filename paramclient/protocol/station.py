@@ -112,7 +112,7 @@ class Station:
     @property
     def is_waiting(self) -> bool:
         """Whether a conversation waits for a message."""
-        return any(node.channel.is_waiting for node in self.nodes.values())
+        return any(node.channel.inboxes for node in self.nodes.values())
 
     @property
     def framing(self) -> tuple[int, int, int]:

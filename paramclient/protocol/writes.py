@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext, suppress
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import anyio
@@ -258,7 +259,7 @@ class _Write:
         self.value = value
         self.attempts = 0
         self._began = anyio.current_time()
-        self._vehicles = vehicles
+        self._confirm = partial(session.confirm, vehicles)
         self._sending = sending
         self._raw = b""
         self._has_other_value = False
@@ -341,9 +342,6 @@ class _Write:
         if not self._is_wanted(answer):
             raise self._not_applied(answer)
         return self._result(answer)
-
-    async def _confirm(self) -> None:
-        await self.session.confirm(self._vehicles)
 
     def _request(self, attempt: int) -> Message:
         """Return the set, and count it as sent."""

@@ -105,7 +105,7 @@ async def test_a_session_on_a_faulty_link_is_right(kind: str, faults: str) -> No
             assert (await write(session, name, value)).actual == value == vehicle.param(name).value
         await fetch_all(session)
         check_right(vehicle, session.table.params)
-        assert not session.channel.is_waiting
+        assert not session.channel.inboxes
 
 
 def check_right(vehicle: Vehicle, params: object) -> None:
@@ -235,7 +235,7 @@ async def test_calls_go_on_after_the_computer_was_suspended(kind: str, at: float
             assert anyio.current_time() - resumed_at < 3.0
             await anyio.sleep(3.0)
         assert not node.presence.is_lost
-        assert not node.channel.is_waiting
+        assert not node.channel.inboxes
         check_right(vehicle, dict(node.plain.table.params))
 
 

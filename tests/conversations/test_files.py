@@ -102,7 +102,7 @@ async def test_refusals_say_why_and_leave_nothing_open() -> None:
             assert caught.value.code == FileErrorCode.INVALID_DATA_SIZE
             await anyio.sleep(3.0)
             assert vehicle.open_files == []
-            assert not channel.is_waiting
+            assert not channel.inboxes
 
 
 @pytest.mark.parametrize("path", ["", "a\0b", "x" * 239])
@@ -198,7 +198,7 @@ async def test_cancelled_at_any_moment_a_session_is_closed_on_board(make: Maker)
             began = anyio.current_time()
             await anyio.sleep(0.3)
             assert vehicle.open_files == []
-            assert not channel.is_waiting
+            assert not channel.inboxes
             assert await read_file(channel, "a.bin") == CONTENT[:20_000]
             assert anyio.current_time() - began < 3.0
 
@@ -228,7 +228,7 @@ async def test_a_cancelled_transfer_ends_within_2_s_although_its_closing_is_lost
         with anyio.move_on_after(0.5):
             await read_file(channel, "a.bin")
         assert anyio.current_time() - endpoint.at < 2.5
-        assert not channel.is_waiting
+        assert not channel.inboxes
 
 
 @virtual_on_both

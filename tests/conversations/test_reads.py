@@ -89,7 +89,7 @@ async def test_silence_is_no_reply_and_not_an_unknown_parameter() -> None:
             await read(node.plain, "MC_ROLL_P")
         assert caught.value.attempts >= 5
         assert anyio.current_time() < 7.0
-        assert not node.channel.is_waiting
+        assert not node.channel.inboxes
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.05, 0.3])
@@ -251,7 +251,7 @@ async def test_a_cancelled_read_leaves_nothing_behind() -> None:
         await node.identification.settled()
         with anyio.move_on_after(0.3):
             await read(node.plain, "NO_SUCH")
-        assert not node.channel.is_waiting
+        assert not node.channel.inboxes
         conversation.sent.clear()
         await anyio.sleep(5.0)
         assert not conversation.sent_of(ParamRequestRead)

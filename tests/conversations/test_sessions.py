@@ -162,7 +162,7 @@ class Sessions(RuleBasedStateMachine):
                     if not result.missing:
                         break
             await node.identified()  # is requested whenever the component is heard again
-            assert not session.channel.is_waiting
+            assert not session.channel.inboxes
             assert not session.writing
             held = {name: each.bits for name, each in session.table.params.items()}
             assert held == {name: each.bits for name, each in vehicle.params.items()}

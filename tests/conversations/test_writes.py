@@ -385,7 +385,7 @@ async def test_silence_is_no_reply_within_7_s_and_a_cancelled_write_sends_no_mor
             with pytest.raises(NoReply, match=f"acknowledgement of {name} by 1/1"):
                 await write(session, name, 2.5)
             assert anyio.current_time() - began < 8.5
-            assert not session.channel.is_waiting
+            assert not session.channel.inboxes
             assert not session.writing
 
 
