@@ -206,9 +206,10 @@ class ParamJson(Json):
         *,
         described: int | float | None = None,
         heard_at: float | None = None,
+        whole: bool = False,
     ) -> ParamJson:
         """Return a parameter with its name, its trust, and the unix time in seconds of its reception."""
-        shown = cls.of(param, info, described=described)
+        shown = cls.of(param, info, described=described, whole=whole)
         is_changed = add_default(param, described if info is None else info.default).is_changed
         return replace(
             shown,

@@ -1,30 +1,37 @@
-"""JSON of the service itself; parameters and results are as the command prints them."""
+"""What the service tells of itself: JSON, and metrics in the text format of Prometheus.
+
+Parameters and results are as the command prints them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from paramclient.cli.json_output import (
-    InfoJson,
-    Json,
-    ParamJson,
-    VehicleJson,
-    WriteJson,
-    WrittenJson,
-    as_json,
-)
-from paramclient.model.notation import hash_text, rounded
+from paramclient.cli.json_output import Json, ParamJson, WriteJson, WrittenJson
 from paramclient.model.values import ParamType
+from paramclient.version import __version__
 
 if TYPE_CHECKING:
-    from paramclient.metadata import ParamInfo
-    from paramclient.model.values import Param
-    from paramclient.protocol.events import Change
     from paramclient.protocol.set_results import SetOutcome
+    from paramclient.service.hub import Hub, Target
     from paramclient.service.stations import GroundStation
-    from paramclient.service.targets import Target
+
+METRICS_MEDIA_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
+"""Media type of the metrics."""
+STATION_SUMS: Final = {
+    "relayed": "Frames of vehicles.",
+    "answered": "Answers from the tables.",
+    "saved": "Bytes of answers that were not sent over the link of a vehicle.",
+    "dropped": "Frames dropped because a station did not read.",
+}
+"""Help texts of the sums over the connected stations of an endpoint, by attribute of `GroundStation`."""
+_ESCAPES: Final = str.maketrans({"\\": r"\\", "\n": r"\n", '"': r"\""})
+
+Sample: TypeAlias = tuple[Mapping[str, object], float]
+"""Labels and a value."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,54 +43,11 @@ class ParamsJson(Json):
     params: Mapping[str, ParamJson | WrittenJson]
 
 
-def param(known: Param, info: ParamInfo | None, *, whole: bool = True) -> ParamJson:
-    """Return a parameter of a table, with its metadata, or if not `whole`, with the meaning of its value."""
-    shown = ParamJson.of_table(known, info)
-    return replace(shown, metadata=InfoJson.of(info)) if whole and info is not None else shown
-
-
 def write(outcome: SetOutcome, target: Target) -> WriteJson:
     """Return the outcome of a write."""
     known = target.component.params.get(outcome.name)
     kind = ParamType.REAL64 if known is None else known.type_number
     return WriteJson.of(outcome, kind, target.info(outcome.name))
-
-
-def vehicle(target: Target) -> dict[str, Any]:
-    """Return the state of the parameters of a component on a link.
-
-    `params` is the number of known parameters, `count` the number that the component announces, `fetch` the
-    progress of a running fetch, `fetches` the number of ended ones.
-    """
-    component, now = target.component, target.progress
-    return {
-        **target.address,
-        **as_json(VehicleJson.of(component)),
-        "link_state": target.link.state,
-        "encoding": component.encoding.value,
-        "count": component.count,
-        "params": len(component.params),
-        "hash": hash_text(component.hash),
-        "state": component.state,
-        "sync_state": component.sync_state.value,
-        "is_armed": component.is_armed,
-        "is_lost": component.sync_state == "lost",
-        "silence_s": round(component.silence, 3),
-        "round_trip_s": rounded(component.round_trip),
-        "fetch": None if now is None else {**asdict(now), "rate": round(now.rate, 1)},
-        "fetches": target.fetches,
-        "has_metadata": target.metadata is not None,
-    }
-
-
-def change(found: Change, info: ParamInfo | None) -> dict[str, Any]:
-    """Return the members of an event about a changed, added or removed parameter."""
-
-    def shown(each: Param | None) -> dict[str, Any] | None:
-        return None if each is None else as_json(param(each, info, whole=False))
-
-    old, new = shown(found.old), shown(found.new)
-    return {"name": found.name, "old": old, "new": new, "by": found.by, "kind": found.kind}
 
 
 def station(found: GroundStation) -> dict[str, Any]:
@@ -100,3 +64,47 @@ def station(found: GroundStation) -> dict[str, Any]:
         "dropped": found.dropped,
         "saved_bytes": found.saved,
     }
+
+
+# metrics
+
+
+def metrics_text(hub: Hub) -> str:
+    """Return the current metrics."""
+    lines = []
+    for name, text, samples in _metrics(hub):
+        kind = "counter" if name.endswith("_total") else "gauge"
+        lines += [f"# HELP paramclient_{name} {text}", f"# TYPE paramclient_{name} {kind}"]
+        for labels, value in samples:
+            pairs = [f'{label}="{str(each).translate(_ESCAPES)}"' for label, each in labels.items()]
+            lines.append(f"paramclient_{name}{{{','.join(pairs)}}} {float(value)}")
+    return "\n".join([*lines, ""])
+
+
+def _metrics(hub: Hub) -> Iterator[tuple[str, str, Sequence[Sample]]]:
+    """Yield name, help text and samples of each metric. The name of a counter ends with `_total`."""
+    yield "info", "Version of paramclient.", [({"version": __version__}, 1)]
+    yield "uptime_seconds", "Seconds since the start.", [({}, time.monotonic() - hub.started)]
+    yield "events_total", "Published events.", [({}, hub.feed.seq)]
+
+    links = [({"link": link.name}, link) for link in hub.links.values()]
+    yield "link_open", "1 if the link is open.", [(at, link.state == "open") for at, link in links]
+    opened = [(at, link.client) for at, link in links if link.client is not None]
+    yield "link_bytes_received_total", "Received bytes.", [(at, each.bytes_received) for at, each in opened]
+    yield "link_bytes_sent_total", "Sent bytes.", [(at, each.bytes_sent) for at, each in opened]
+
+    tables = [(target.address, target.component) for target in hub.targets]
+    is_up = [(at, each.sync_state != "lost") for at, each in tables]
+    yield "component_up", "1 if the vehicle is not lost.", is_up
+    is_synced = [(at, each.sync_state == "synced") for at, each in tables]
+    yield "component_synced", "1 if the table matches that of the vehicle.", is_synced
+    sizes = [(at, len(each.params)) for at, each in tables]
+    yield "component_parameters", "Parameters in the table.", sizes
+    times = [(at, each.round_trip) for at, each in tables if each.round_trip is not None]
+    yield "component_round_trip_seconds", "Smoothed round-trip time in seconds.", times
+
+    endpoints = [({"endpoint": each.name}, each.stations.values()) for each in hub.gateway.endpoints]
+    yield "stations", "Connected ground stations.", [(at, len(stations)) for at, stations in endpoints]
+    for name, text in STATION_SUMS.items():
+        sums = [(at, sum(getattr(each, name) for each in stations)) for at, stations in endpoints]
+        yield f"stations_{name}", text, sums

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Final, TypeAlias
 
 import anyio
@@ -242,6 +242,7 @@ class VehicleLink(Tap):
     Attributes:
         systems: the system ids that were heard.
         signing: the components that sign.
+        file: returns the parameter file of a table.
     """
 
     def __init__(self, gateway: Gateway, client: ParamClient) -> None:
@@ -250,7 +251,7 @@ class VehicleLink(Tap):
         self._gateway = gateway
         self._client = client
         self._tables: dict[Session, KeptTable] = {}
-        self._files: dict[KeptTable, KeptFile] = {}
+        self.file = cache(KeptFile)
 
     @property
     def _own_address(self) -> Source:
@@ -320,12 +321,6 @@ class VehicleLink(Tap):
             is_meant = system in (0, node.system) and component in (COMP_ID_ALL, node.component)
             if is_meant and node.identification.has_parameters:
                 yield self._table(node, extended=extended)
-
-    def file(self, table: KeptTable) -> KeptFile:
-        """Return the parameter file of a component."""
-        if table not in self._files:
-            self._files[table] = KeptFile(table)
-        return self._files[table]
 
     def table_of_answer(self, seen: SeenFrame, peer: Hashable) -> KeptTable | None:
         """Return the table to which a value or an answer belongs; None for another frame."""

@@ -1,4 +1,4 @@
-"""The hub: the links of the service, the components on them, and the cache."""
+"""The hub: the links of the service, the parameters of the components on them, and the cache."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import os
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from functools import partial
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Concatenate, Final, TypeAlias, TypeVar
 
 import anyio
@@ -17,27 +17,32 @@ import anyio.abc
 import anyio.to_thread
 
 from paramclient.cache import ParamCache
+from paramclient.cli.json_output import ParamJson, VehicleJson, as_json
 from paramclient.client.cache_writer import choose_cache
 from paramclient.client.client import ParamClient
+from paramclient.client.component import Component
 from paramclient.client.events import Discovered, Event, Found, Rebooted, Resynced
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.links import Link, create_link
-from paramclient.metadata import MetadataStore, metadata_of
+from paramclient.metadata import Metadata, MetadataStore, ParamInfo, metadata_of
+from paramclient.model.identity import Identity
+from paramclient.model.notation import hash_text, rounded
 from paramclient.model.paramset import ParamSet
+from paramclient.model.values import Param
+from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Progress
+from paramclient.protocol.identity import expects_extended
 from paramclient.protocol.watch import SyncState
 from paramclient.provision.inspection import wait_for_identity
-from paramclient.service import documents
 from paramclient.service.event_feed import EventFeed
 from paramclient.service.gateway import Gateway
 from paramclient.service.problems import ServiceError
 from paramclient.service.stations import MavlinkEndpoint, parse_endpoint
-from paramclient.service.targets import ServiceLink, Target
 
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint
 
-__all__ = ["Hub"]
+__all__ = ["Hub", "ServiceLink", "Target"]
 
 CHECK_INTERVAL: Final = 0.2
 """Seconds between two checks for changes of states, among them the progress of a fetch."""
@@ -53,6 +58,106 @@ Result = TypeVar("Result")
 LinkChoice: TypeAlias = "str | Link | Endpoint"
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass(eq=False)
+class Target:
+    """The plain or the extended parameters of one component on a link.
+
+    Attributes:
+        link: its link.
+        component: the component.
+        setup: held by the running apply or restore of plain or extended parameters.
+        metadata: the metadata of its parameters, or None: extended ones have none.
+        described: the identity to which `metadata` belongs.
+        progress: the progress of a running fetch, or None.
+        fetches: number of ended fetches: a page loads the table again when it has changed.
+        published: the last published state.
+    """
+
+    link: ServiceLink
+    component: Component
+    setup: anyio.Lock
+    metadata: Metadata | None = None
+    described: Identity | None = None
+    progress: Progress | None = None
+    fetches: int = 0
+    published: object = None
+
+    @property
+    def address(self) -> dict[str, Any]:
+        """The members that name it in an event."""
+        each = self.component
+        ids = {"system": each.system, "component": each.component, "extended": each.is_extended}
+        return {"link": self.link.name, **ids}
+
+    @property
+    def is_listed(self) -> bool:
+        """Whether it is in lists: extended parameters are if there are some, or usually."""
+        component = self.component
+        is_usual = expects_extended(component.identity.vehicle_type, component.component)
+        return not component.is_extended or is_usual or bool(component.params)
+
+    def info(self, name: str) -> ParamInfo | None:
+        """Return the metadata of a parameter, or None."""
+        return None if self.metadata is None else self.metadata.find(name)
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """The state of the parameters, as JSON.
+
+        `params` is the number of known parameters, `count` the number that the component announces, `fetch`
+        the progress of a running fetch, `fetches` the number of ended ones.
+        """
+        component, now = self.component, self.progress
+        return {
+            **self.address,
+            **as_json(VehicleJson.of(component)),
+            "link_state": self.link.state,
+            "encoding": component.encoding.value,
+            "count": component.count,
+            "params": len(component.params),
+            "hash": hash_text(component.hash),
+            "state": component.state,
+            "sync_state": component.sync_state.value,
+            "is_armed": component.is_armed,
+            "is_lost": component.sync_state == "lost",
+            "silence_s": round(component.silence, 3),
+            "round_trip_s": rounded(component.round_trip),
+            "fetch": None if now is None else {**asdict(now), "rate": round(now.rate, 1)},
+            "fetches": self.fetches,
+            "has_metadata": self.metadata is not None,
+        }
+
+    def change(self, found: Change) -> dict[str, Any]:
+        """Return the members of an event about a changed, added or removed parameter."""
+
+        def shown(each: Param | None) -> dict[str, Any] | None:
+            return None if each is None else as_json(ParamJson.of_table(each, self.info(each.name)))
+
+        old, new = shown(found.old), shown(found.new)
+        return {"name": found.name, "old": old, "new": new, "by": found.by, "kind": found.kind}
+
+
+@dataclass(eq=False)
+class ServiceLink:
+    """One link: `opening`, `open`, `failed` (opened again after a delay) or `ended` (of a log).
+
+    Attributes:
+        name: its name in the service.
+        make: creates a client for it.
+        state: its state.
+        error: the reason of `failed`, or None.
+        client: the open client, or None.
+        targets: the parameters on it, by system and component id, and whether they are extended.
+    """
+
+    name: str
+    make: Callable[[], ParamClient]
+    state: str = "opening"
+    error: str | None = None
+    client: ParamClient | None = None
+    targets: dict[tuple[int, int, bool], Target] = field(default_factory=dict)
 
 
 class Hub:
@@ -121,14 +226,12 @@ class Hub:
         for link in self.links.values():
             self._tasks.start_soon(self._run_link, link)
         self._tasks.start_soon(self.gateway.run)
+        self._tasks.start_soon(self._check_regularly)
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        tasks = self._tasks
+    async def __aexit__(self, *error: Any) -> None:
+        tasks, self._tasks = self._tasks, None
         assert tasks is not None, "the hub is open"
-        self._tasks = None
         self.feed.end()
         tasks.cancel_scope.cancel()
         await tasks.__aexit__(None, None, None)
@@ -154,8 +257,7 @@ class Hub:
         links = [each for each in self.links.values() if link in (None, each.name)]
         found = [each.targets[key] for each in links if key in each.targets]
         if not found:
-            on = "any link" if link is None else link
-            detail = f"No message of {system}/{component} was received on {on}."
+            detail = f"No message of {system}/{component} was received on {link or 'any link'}."
             raise ServiceError(404, "unknown-vehicle", detail)
         if len(found) > 1:
             names = [each.link.name for each in found]
@@ -163,16 +265,14 @@ class Hub:
             raise ServiceError(409, "ambiguous", detail, links=names)
         return found[0]
 
-    async def fetch(
-        self, target: Target, *, refresh: bool = False, timeout: float | None = None
-    ) -> FetchResult:
+    async def fetch(self, target: Target, **options: Any) -> FetchResult:
         """Fetch the parameters of a component; see `Component.fetch_all`. The progress is published."""
 
         def note(progress: Progress) -> None:
             target.progress = progress
 
         try:
-            result = await target.component.fetch_all(refresh=refresh, timeout=timeout, progress=note)
+            result = await target.component.fetch_all(**options, progress=note)
         finally:
             target.progress = None
             target.fetches += 1
@@ -224,15 +324,19 @@ class Hub:
         return await self.read_cache(ParamCache.state_at, target, when)
 
     async def _run_link(self, link: ServiceLink) -> None:
-        """Keep a link open until cancelled."""
+        """Keep a link open until cancelled. At the end of a log, its components stay."""
         attempts = 0
         while True:
             try:
-                async with link.make() as client, anyio.create_task_group() as tasks:
+                client = link.make()
+                events = client.events()
+                async with client, anyio.create_task_group() as tasks:
                     link.client, attempts = client, 0
                     self._set_state(link, "open")
-                    tasks.start_soon(self._check_regularly, link)
-                    await self._follow(link, client, tasks)
+                    async for event in events:
+                        self._take(link, event, tasks)
+                    self._set_state(link, "ended")
+                    await anyio.sleep_forever()
             except* (LinkError, UsageError) as group:  # UsageError: a missing library
                 self._set_state(link, "failed", str(_first(group)))
             finally:
@@ -242,16 +346,6 @@ class Hub:
                 link.targets.clear()
             await anyio.sleep(REOPEN_DELAYS[min(attempts, len(REOPEN_DELAYS) - 1)])
             attempts += 1
-
-    async def _follow(self, link: ServiceLink, client: ParamClient, tasks: anyio.abc.TaskGroup) -> None:
-        """Follow the components of a link until it fails. At the end of a log, its components stay."""
-        events = client.events()
-        for component in client.components.values():
-            self._take(link, Discovered(component), tasks)
-        async for event in events:
-            self._take(link, event, tasks)
-        self._set_state(link, "ended")
-        await anyio.sleep_forever()
 
     def _take(self, link: ServiceLink, event: Event, tasks: anyio.abc.TaskGroup) -> None:
         """Handle an event of a client."""
@@ -267,13 +361,13 @@ class Hub:
         if isinstance(event, Resynced):
             target.fetches += 1
         self._check(target)
-        listens_only = link.client is not None and link.client.listens_only
-        if isinstance(event, Discovered | Found | Rebooted) and not listens_only:
+        may_fetch = self._fetches and not component.core.station.listens_only
+        if may_fetch and isinstance(event, Discovered | Found | Rebooted):
             tasks.start_soon(self._load, target)
 
     async def _load(self, target: Target) -> None:
         """Fetch the table of a component that was heard, again if that ends without all of it."""
-        for delay in (0.0, *REFETCH_DELAYS) if self._fetches else ():
+        for delay in (0.0, *REFETCH_DELAYS):
             await anyio.sleep(delay)
             if delay and target.component.sync_state in (SyncState.SYNCED, SyncState.LOST):
                 return
@@ -297,20 +391,19 @@ class Hub:
         with suppress(ParamClientError):
             async for change in target.component.changes():
                 if change.kind != "first":
-                    members = documents.change(change, target.info(change.name))
-                    self.feed.publish("change", **target.address, **members)
+                    self.feed.publish("change", **target.address, **target.change(change))
 
-    async def _check_regularly(self, link: ServiceLink) -> None:
+    async def _check_regularly(self) -> None:
         while True:
             await anyio.sleep(CHECK_INTERVAL)
-            for target in list(link.targets.values()):
+            for target in self.targets:
                 self._check(target)
 
     def _check(self, target: Target) -> None:
         """Publish the state of a component if it has changed."""
-        vehicle = documents.vehicle(target)
+        vehicle = target.state
         state = {**vehicle, **dict.fromkeys(CHANGING_MEMBERS)}
-        if target.is_listed and state != target.published:
+        if state != target.published:
             target.published = state
             self.feed.publish("vehicle", **target.address, vehicle=vehicle)
 

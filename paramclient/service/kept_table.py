@@ -8,19 +8,10 @@ from typing import Final, NamedTuple, TypeAlias
 
 import anyio
 
+from paramclient import errors
 from paramclient.client.component import Component
 from paramclient.client.streams import Stream
-from paramclient.errors import (
-    AmbiguousVehicle,
-    ExtAckResult,
-    ParamClientError,
-    ParamErrorCode,
-    Refused,
-    TypeMismatch,
-    UnknownParameter,
-    UsageError,
-    ValueNotApplied,
-)
+from paramclient.errors import ExtAckResult, ParamClientError, ParamErrorCode
 from paramclient.model.ext_values import EXT_VALUE_SIZE, ext_bytes, ext_param
 from paramclient.model.values import WIRE_SIZE, Encoding, Param, ParamType, Trust, as_reported, decode_value
 from paramclient.protocol.dialect import ReportedValue
@@ -60,6 +51,17 @@ UNKNOWN_TIME: Final = 30.0
 """Seconds for which a name that the vehicle does not have is remembered."""
 UNKNOWN_NAMES_MAX: Final = 4_096
 """Names that are remembered as unknown, at most."""
+
+CODES: Final = (
+    (errors.UnknownParameter, ParamErrorCode.DOES_NOT_EXIST),
+    (errors.TypeMismatch, ParamErrorCode.TYPE_MISMATCH),
+    (errors.AmbiguousVehicle, ParamErrorCode.PERMISSION_DENIED),
+    ((errors.UsageError, errors.ValueNotApplied), ParamErrorCode.VALUE_OUT_OF_RANGE),
+)
+"""The codes of PARAM_ERROR by exception; the first class that matches counts."""
+
+NO_ANSWER: Final = ParamErrorCode.COMPONENT_NOT_FOUND
+"""The code for a component that does not answer."""
 
 Which: TypeAlias = "str | int"
 SetKey: TypeAlias = tuple[str, bytes, int]
@@ -118,13 +120,19 @@ def digest_of(session: Session) -> messages.ParamValue | None:
 
 def listed(session: Session) -> list[ReportedValue]:
     """Return the values of the list that are known to be the vehicle's, by index."""
-    table = session.table
-    known = ((index, table.params.get(name)) for index, name in sorted(table.names.items()))
-    return [
-        value_of(session, param, index=index)
-        for index, param in known
-        if param is not None and param.trust is not Trust.CACHED
-    ]
+    known = ((index, known_param(session, name)) for index, name in sorted(session.table.names.items()))
+    return [value_of(session, param, index=index) for index, param in known if param is not None]
+
+
+def known_param(session: Session, name: str | None) -> Param | None:
+    """Return a parameter whose value is known to be the vehicle's.
+
+    Until the encoding is certain, the bytes that the vehicle has sent cannot be told from a value.
+    """
+    param = None if name is None else session.table.params.get(name)
+    is_known = param is not None and param.trust is not Trust.CACHED
+    is_certain = session.dialect.has_ack or session.identification.is_encoding_certain
+    return param if is_known and is_certain else None
 
 
 class _Announcer(Stream[Change]):
@@ -322,10 +330,9 @@ class KeptTable:
         if which == HASH_CHECK:
             return None if self.state_key is None else digest_of(self.session)
         name = table.names.get(which) if isinstance(which, int) else which
-        param = None if name is None else table.params.get(name)
-        if param is None or param.trust is Trust.CACHED:
-            return None
-        return value_of(self.session, param, index=which if isinstance(which, int) else None)
+        param = known_param(self.session, name)
+        by_index = which if isinstance(which, int) else None
+        return None if param is None else value_of(self.session, param, index=by_index)
 
     def _is_unknown(self, which: Which) -> bool:
         is_beyond = isinstance(which, int) and which not in self.session.table.names
@@ -338,7 +345,7 @@ class KeptTable:
                 value = await self._find(which)
                 for asker in self._reads[which]:
                     asker.station.say(value, self.source)
-        except (UnknownParameter, Refused) as error:
+        except (errors.UnknownParameter, errors.Refused) as error:
             if len(self._unknown) >= UNKNOWN_NAMES_MAX:
                 self._unknown.clear()
             self._unknown[which] = anyio.current_time() + UNKNOWN_TIME
@@ -377,7 +384,7 @@ class KeptTable:
             self.component.core.spawn(self._set, key, f"station {asker.system}/{asker.component}")
 
     async def _set(self, key: SetKey, author: str) -> None:
-        askers, code = self._sets[key], int(ParamErrorCode.COMPONENT_NOT_FOUND)  # it does not answer
+        askers, code = self._sets[key], int(NO_ANSWER)
         try:
             with anyio.move_on_after(SET_TIMEOUT):
                 await self._write(*key, author)
@@ -404,7 +411,7 @@ class KeptTable:
         if number != known and (is_extended or session.table.encoding is not Encoding.C_CAST):
             system, component = self.source
             what = f"{name} of {system}/{component} has another type"
-            raise TypeMismatch(what, system=system, component=component, name=name)
+            raise errors.TypeMismatch(what, system=system, component=component, name=name)
         if is_extended:
             value = ext_param(name, raw, number).settable
         else:
@@ -443,16 +450,6 @@ class KeptTable:
 
 def _code_of(error: ParamClientError) -> int:
     """Return the PARAM_ERROR of an error."""
-    match error:
-        case UnknownParameter():
-            return ParamErrorCode.DOES_NOT_EXIST
-        case Refused(code=code):
-            return code
-        case TypeMismatch():
-            return ParamErrorCode.TYPE_MISMATCH
-        case AmbiguousVehicle():
-            return ParamErrorCode.PERMISSION_DENIED
-        case UsageError() | ValueNotApplied():
-            return ParamErrorCode.VALUE_OUT_OF_RANGE
-        case _:
-            return ParamErrorCode.COMPONENT_NOT_FOUND
+    if isinstance(error, errors.Refused):
+        return error.code
+    return next((code for kinds, code in CODES if isinstance(error, kinds)), NO_ANSWER)

@@ -15,43 +15,23 @@ from pydantic_core import to_json
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from paramclient.errors import (
-    AlreadyRestored,
-    AmbiguousVehicle,
-    CacheError,
-    FileTransferError,
-    LinkError,
-    NoReply,
-    NotInCache,
-    PackError,
-    ParamClientError,
-    UnknownParameter,
-    UnknownVehicle,
-    UsageError,
-    VehicleError,
-)
+from paramclient import errors
+from paramclient.errors import ParamClientError
 
 __all__ = ["ERRORS", "RESPONSES", "Problem", "ServiceError", "problem_response", "respond"]
 
 MEDIA_TYPE: Final = "application/problem+json"
 FAULTS_MAX: Final = 20
 """Maximum number of listed errors of one request."""
-STATUSES: Final[dict[type[ParamClientError], int]] = {
-    UnknownParameter: 404,
-    NotInCache: 404,
-    UnknownVehicle: 404,
-    AlreadyRestored: 409,
-    AmbiguousVehicle: 409,
-    UsageError: 422,
-    PackError: 422,
-    FileTransferError: 502,
-    VehicleError: 409,
-    NoReply: 504,
-    LinkError: 503,
-    CacheError: 503,
-    ParamClientError: 500,
+STATUSES: Final[dict[int, tuple[type[ParamClientError], ...]]] = {
+    404: (errors.UnknownParameter, errors.NotInCache, errors.UnknownVehicle),
+    502: (errors.FileTransferError,),
+    409: (errors.AlreadyRestored, errors.AmbiguousVehicle, errors.VehicleError),
+    503: (errors.LinkError, errors.CacheError),
+    504: (errors.NoReply,),
+    422: (errors.UsageError, errors.PackError),
 }
-"""HTTP status of each exception; the first class that matches counts."""
+"""Exceptions by HTTP status; the first class that matches counts, and others have 500."""
 
 logger = logging.getLogger(__name__)
 
@@ -108,7 +88,7 @@ def problem_response(error: Exception) -> Response:
     if isinstance(error, ServiceError):
         status, kind, detail, members = error.status, error.kind, str(error), error.members
     elif isinstance(error, ParamClientError):
-        status = next(status for each, status in STATUSES.items() if isinstance(error, each))
+        status = next((status for status, kinds in STATUSES.items() if isinstance(error, kinds)), 500)
         name = type(error).__name__
         kind, detail = re.sub("(?<=[a-z])([A-Z])", r"-\1", name).lower(), str(error)
         public = {key: value for key, value in vars(error).items() if not key.startswith("_")}

@@ -1,45 +1,64 @@
-"""Routes of the service itself, of vehicles and their parameters.
+"""Routes: the service, vehicles and their parameters, files, plan, apply, restore, snapshots, history.
 
 With `?ext=true`, the routes of parameters are about the extended parameters of a component.
 """
 
 from __future__ import annotations
 
+import math
+import re
 import time
-from collections.abc import AsyncIterator
-from typing import Annotated, Any, Final, TypeVar
+from collections.abc import AsyncIterator, Callable
+from functools import partial
+from typing import Annotated, Any, Final
 
+import anyio
 import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Path, Query, Request
-from fastapi.responses import PlainTextResponse
+from fastapi.responses import PlainTextResponse, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
+from pydantic import AwareDatetime
 
-from paramclient.cli.json_output import FetchJson, ParamJson, VehicleJson, WriteJson, WrittenJson, as_json
-from paramclient.model.names import NameChoice
-from paramclient.protocol.set_results import SetOutcome, SetStatus
-from paramclient.service import documents
-from paramclient.service.access import author_of, require_write
-from paramclient.service.documents import ParamsJson
-from paramclient.service.hub import Hub
-from paramclient.service.metrics import METRICS_MEDIA_TYPE, metrics_text
-from paramclient.service.request_bodies import (
-    FetchRequest,
-    Moment,
-    WriteManyRequest,
-    WriteRequest,
-    values_in_range,
+from paramclient.cache import ParamCache, SnapshotSummary
+from paramclient.cli.json_apply import ApplyJson, PlanJson
+from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson
+from paramclient.cli.json_output import (
+    FetchJson,
+    ParamJson,
+    SetJson,
+    VehicleJson,
+    WriteJson,
+    WrittenJson,
+    as_json,
 )
-from paramclient.service.targets import Target
+from paramclient.errors import UsageError
+from paramclient.files import FileFormat, dumps, writable
+from paramclient.files.formats import ENDINGS
+from paramclient.model.identity import autopilot_name
+from paramclient.model.names import NameChoice
+from paramclient.model.paramset import ParamSet
+from paramclient.protocol.set_results import SetOutcome, SetStatus
+from paramclient.provision import ApplyProgress, ApplyResult, apply, restore
+from paramclient.provision import plan as plan_of
+from paramclient.provision.restore_point import load_state_before_apply
+from paramclient.provision.vehicle_params import fetch_set, select_non_defaults, set_maker
+from paramclient.service import bodies, documents
+from paramclient.service.access import author_of, require_write
+from paramclient.service.documents import METRICS_MEDIA_TYPE, ParamsJson, metrics_text
+from paramclient.service.hub import Hub, Target
+from paramclient.service.problems import ServiceError
 from paramclient.version import __version__
 
-__all__ = ["ROUTERS", "VEHICLE", "At", "HubArgument", "TargetArgument"]
+__all__ = ["ROUTERS"]
 
 VEHICLE: Final = "/api/vehicles/{system}/{component}"
+HISTORY_ENTRIES: Final = 100
+"""Default number of entries of a history."""
+PROGRESS_INTERVAL: Final = 0.25
+"""Seconds between two progress events of an apply or restore."""
 
-Result = TypeVar("Result")
-
-reading = APIRouter(tags=["vehicles and parameters"])
-writing = APIRouter(tags=["vehicles and parameters"], dependencies=[Depends(require_write)])
+reading = APIRouter()
+writing = APIRouter(dependencies=[Depends(require_write)])
 ROUTERS: Final = (reading, writing)
 
 
@@ -54,7 +73,7 @@ ComponentId = Annotated[int, Path(ge=0, le=255)]
 LinkName = Annotated[
     str | None, Query(max_length=200, description="Name of the link, if several have the ids.")
 ]
-At = Annotated[Moment | None, Query(description="An earlier state: a snapshot's number, or a time.")]
+At = Annotated[bodies.Moment | None, Query(description="An earlier state: a snapshot's number, or a time.")]
 Names = Annotated[list[str] | None, Query(max_length=64, description="Names, or patterns such as MC_*.")]
 Ext = Annotated[bool, Query(description="The extended parameters (PARAM_EXT_*).")]
 
@@ -107,7 +126,7 @@ async def stations(hub: HubArgument) -> list[dict[str, Any]]:
 @reading.get("/api/vehicles")
 async def vehicles(hub: HubArgument) -> dict[str, Any]:
     """Return the components on the links, the lowest ids first."""
-    return {**hub.feed.position, "vehicles": [documents.vehicle(target) for target in hub.targets]}
+    return {**hub.feed.position, "vehicles": [target.state for target in hub.targets]}
 
 
 # parameters
@@ -131,7 +150,9 @@ async def params(
     known = [each for name, each in target.component.params.items() if choice.has(name)]
 
     def encode() -> ParamsJson:
-        found = {each.name: documents.param(each, target.info(each.name), whole=metadata) for each in known}
+        found = {
+            each.name: ParamJson.of_table(each, target.info(each.name), whole=metadata) for each in known
+        }
         return ParamsJson(**position, params=found)
 
     return await anyio.to_thread.run_sync(encode)
@@ -146,34 +167,39 @@ async def param(
     """Return one parameter: the known value, else that of the vehicle."""
     known = None if live else target.component.params.get(name)
     found = await target.component.get(name) if known is None else known
-    return documents.param(found, target.info(name))
+    return ParamJson.of_table(found, target.info(name), whole=True)
 
 
 @writing.put(f"{VEHICLE}/params/{{name:path}}")
-async def set_param(request: Request, target: TargetArgument, name: str, body: WriteRequest) -> WriteJson:
+async def set_param(
+    request: Request, target: TargetArgument, name: str, body: bodies.WriteRequest
+) -> WriteJson:
     """Write one parameter, and verify the value that the vehicle reports."""
-    ((_, value),) = (await values_in_range({name: body.value}, target, force=body.force)).items()
+    ((_, value),) = (await bodies.values_in_range({name: body.value}, target, force=body.force)).items()
     options = body.model_dump(exclude={"value"})
     result = await target.component.set(name, value, **options, author=author_of(request))
     return documents.write(SetOutcome(name, value, SetStatus(result.status), result), target)
 
 
 @writing.patch(f"{VEHICLE}/params")
-async def set_params(request: Request, target: TargetArgument, body: WriteManyRequest) -> dict[str, Any]:
+async def set_params(
+    request: Request, target: TargetArgument, body: bodies.WriteManyRequest
+) -> dict[str, Any]:
     """Write several parameters in order, many at a time, and verify each.
 
     If a value is invalid or out of range, nothing is written. A value that the vehicle refuses does not stop
-    the others. `error` says why not all could be tried.
+    the others. `error` says why not all could be tried, if so.
     """
-    values = await values_in_range(body.values, target, force=body.force)
+    values = await bodies.values_in_range(body.values, target, force=body.force)
     options = body.model_dump(exclude={"values"})
     result = await target.component.set_many(values, **options, author=author_of(request))
-    found = {"vehicle": VehicleJson.of(target.component), "error": result.error and str(result.error)}
-    return dict(as_json(found | {"results": [documents.write(each, target) for each in result.outcomes]}))
+    results = [documents.write(each, target) for each in result.outcomes]
+    error = {} if result.error is None else {"error": str(result.error)}
+    return dict(as_json({"vehicle": VehicleJson.of(target.component), "results": results} | error))
 
 
 @reading.post(f"{VEHICLE}/fetch")
-async def fetch(hub: HubArgument, target: TargetArgument, body: FetchRequest) -> FetchJson:
+async def fetch(hub: HubArgument, target: TargetArgument, body: bodies.FetchRequest) -> FetchJson:
     """Fetch all parameters. Simultaneous requests share one download; the progress is in the events."""
     component, client = target.component, target.link.client
     result = await hub.fetch(target, refresh=body.refresh, timeout=body.timeout_s)
@@ -188,3 +214,175 @@ async def fetch(hub: HubArgument, target: TargetArgument, body: FetchRequest) ->
         bytes_sent=0 if client is None else client.bytes_sent,
         described={} if target.metadata is None else target.metadata.defaults_of(known),
     )
+
+
+# files
+
+
+@reading.post("/api/files")
+async def read_file(body: bodies.UploadedFile) -> dict[str, Any]:
+    """Parse a parameter file of any format, without names that no vehicle can have. It is not stored."""
+    file = await anyio.to_thread.run_sync(partial(body.read, partial=True))
+    sets = as_json([SetJson.with_sources(each, {}) for each in file.sets])
+    return {"file": file.source, "format": file.file_format, "notes": file.notes, "components": sets}
+
+
+@reading.get(f"{VEHICLE}/file", response_class=Response)
+async def file(
+    hub: HubArgument,
+    target: TargetArgument,
+    file_format: Annotated[FileFormat, Query(alias="format")] = FileFormat.QGC,
+    changed: Annotated[bool, Query(description="Only parameters that differ from the defaults.")] = False,
+    at: At = None,
+) -> Response:
+    """Return the parameters as a file. They are fetched first, unless they are in sync."""
+    described: dict[str, int | float] = {}
+    if at is not None:
+        found = await hub.state_at(target, at)
+    else:
+        found = (await fetch_set(target.component, source=f"link {target.link.name}")).set
+        described = {} if target.metadata is None else target.metadata.defaults_of(found)
+    if changed:
+        found = select_non_defaults(found, described)
+    name = _file_name(found, file_format)
+    found, _ = writable(found, file_format)
+    data = await anyio.to_thread.run_sync(lambda: dumps(found, file_format=file_format, target=name))
+    headers = {"content-disposition": f'attachment; filename="{name}"'}
+    return Response(data, media_type="application/octet-stream", headers=headers)
+
+
+def _file_name(params: ParamSet, file_format: FileFormat) -> str:
+    """Return a name with firmware, ids and time, in characters that are safe in headers and files."""
+    autopilot = "params" if params.identity is None else autopilot_name(params.identity.autopilot)
+    at = time.strftime("%Y%m%d-%H%M%S", time.gmtime(time.time() if params.at is None else params.at))
+    parts = [str(each) for each in (autopilot, params.system, params.component, at) if each is not None]
+    ending = next((ending for ending, each in ENDINGS.items() if each is file_format), ".txt")
+    return re.sub(r"[^A-Za-z0-9._-]", "_", "-".join(parts))[:100] + ending
+
+
+# set-ups
+
+
+async def _only_setup(target: TargetArgument) -> AsyncIterator[None]:
+    """Run one apply or restore of a component at a time: two would undo each other's changes."""
+    try:
+        target.setup.acquire_nowait()
+    except anyio.WouldBlock:
+        raise ServiceError(409, "busy", "Another request is setting up this vehicle.") from None
+    try:
+        yield
+    finally:
+        target.setup.release()
+
+
+@reading.post(f"{VEHICLE}/plan")
+async def plan(hub: HubArgument, target: TargetArgument, body: bodies.PlanRequest) -> PlanJson:
+    """Return which values an apply would write, in which order, and which it would skip, and why."""
+    component, wanted = target.component, await _wanted(hub, target, body)
+    found = await plan_of(component, wanted, include=body.include, info=target.metadata, force=body.force)
+    return PlanJson.of(found, system=component.system, component=component.component)
+
+
+@writing.post(f"{VEHICLE}/apply", dependencies=[Depends(_only_setup)])
+async def apply_(
+    request: Request, hub: HubArgument, target: TargetArgument, body: bodies.ApplyRequest
+) -> ApplyJson:
+    """Write the wanted values in a working order, and verify each of them.
+
+    The progress is in the events. If the client disconnects, the apply ends; written values stay.
+    """
+    wanted = await _wanted(hub, target, body)
+    options = body.model_dump(exclude={"values", "file", "at", "only"}) | _context(request, hub, target)
+    return _applied(target, await apply(target.component, wanted, **options))
+
+
+@writing.post(f"{VEHICLE}/restore", dependencies=[Depends(_only_setup)])
+async def restore_(
+    request: Request, hub: HubArgument, target: TargetArgument, body: bodies.RestoreRequest
+) -> ApplyJson:
+    """Restore an earlier state, with the vehicle's own identity and calibration."""
+    if body.at is None:
+        state = await hub.read_cache(load_state_before_apply, target)
+    else:
+        state = await hub.state_at(target, body.at)
+    options = body.model_dump(exclude={"at"}) | _context(request, hub, target)
+    return _applied(target, await restore(target.component, state, **options))
+
+
+async def _wanted(hub: Hub, target: Target, body: bodies.PlanRequest) -> ParamSet:
+    """Return the wanted parameters of a request."""
+    if body.file is not None:
+        found = await anyio.to_thread.run_sync(body.file.read_set, target)
+    elif body.at is not None:
+        found = await hub.state_at(target, body.at)
+    else:
+        found = await bodies.values_set(body.values or {}, target)
+    return found if body.only is None else found.only(body.only)
+
+
+def _applied(target: Target, result: ApplyResult) -> ApplyJson:
+    return ApplyJson.of(result, VehicleJson.of(target.component))
+
+
+def _context(request: Request, hub: Hub, target: Target) -> dict[str, Any]:
+    """Return the arguments of `apply` and `restore` that are not in the body."""
+    progress = _publisher(partial(hub.feed.publish, "setup", **target.address))
+    return {"info": target.metadata, "author": author_of(request), "progress": progress}
+
+
+def _publisher(publish: Callable[..., None]) -> Callable[[ApplyProgress], None]:
+    """Return a function that publishes each phase of a set-up, and its progress at an interval."""
+    phase, due_at = "", 0.0
+
+    def progress(now: ApplyProgress) -> None:
+        nonlocal phase, due_at
+        if now.phase != phase or time.monotonic() >= due_at:
+            phase, due_at = now.phase, time.monotonic() + PROGRESS_INTERVAL
+            publish(phase=now.phase, done=now.done, total=now.total)
+
+    return progress
+
+
+# the past
+
+
+@reading.get(f"{VEHICLE}/snapshots")
+async def snapshots(hub: HubArgument, target: TargetArgument) -> dict[str, list[SnapshotJson]]:
+    """Return the snapshots, the newest last."""
+    found = await hub.read_cache(ParamCache.snapshots, target)
+    return {"snapshots": [SnapshotJson.of(each) for each in found]}
+
+
+@writing.post(f"{VEHICLE}/snapshots", status_code=201)
+async def create_snapshot(
+    hub: HubArgument, target: TargetArgument, body: bodies.SnapshotRequest
+) -> SnapshotJson:
+    """Store a snapshot of the known table."""
+    component = target.component
+    known = list(component.params.values())
+    if not known:
+        raise UsageError("no parameter of the vehicle is known")
+    table = set_maker(component, f"link {target.link.name}")(known)
+    is_whole, crc = len(known) >= (component.count or math.inf), component.hash
+
+    def store(cache: ParamCache, _: str, number: int, **which: bool) -> SnapshotSummary:
+        vehicle, reason = component.identity, body.reason
+        return cache.store_snapshot(
+            vehicle, number, table, reason=reason, hash=crc, complete=is_whole, **which
+        )
+
+    return SnapshotJson.of(await hub.read_cache(store, target))
+
+
+@reading.get(f"{VEHICLE}/history")
+async def history(
+    hub: HubArgument,
+    target: TargetArgument,
+    name: Annotated[str | None, Query(max_length=16)] = None,
+    limit: Annotated[int, Query(ge=1, le=1_000)] = HISTORY_ENTRIES,
+    since: Annotated[AwareDatetime | None, Query(description="Only from this time on.")] = None,
+) -> dict[str, list[HistoryLineJson]]:
+    """Return the newest changes of values, the newest last."""
+    begin = None if since is None else since.timestamp()
+    entries = await hub.read_cache(ParamCache.history, target, name, limit, begin)
+    return {"history": [HistoryLineJson.of(each) for each in entries]}

@@ -383,16 +383,11 @@ def parse_endpoint(text: str) -> MavlinkEndpoint:
     kind, _, port = link.partition(":")
     if kind in ("udpin", "udp", "tcpin") and port.isdecimal():
         link = f"{kind}:127.0.0.1:{port}"
-    options = [each for each in query.split("&") if each]
-    keys = [each.removeprefix("sign=") for each in options if each.startswith("sign=")]
-    for each in options:
-        if each not in ("readonly", "trusted") and not each.startswith("sign="):
+    options = dict(each.partition("=")[::2] for each in query.split("&") if each)
+    for each, value in options.items():
+        if each not in ("readonly", "trusted", "sign") or bool(value) != (each == "sign"):
             raise UsageError(
                 f"{each!r} is not an option of an endpoint; these are readonly, trusted and sign=KEYFILE"
             )
-    return MavlinkEndpoint(
-        link,
-        is_readonly="readonly" in options,
-        is_trusted="trusted" in options,
-        key=read_key(keys[0]) if keys else None,
-    )
+    key = read_key(options["sign"]) if "sign" in options else None
+    return MavlinkEndpoint(link, is_readonly="readonly" in options, is_trusted="trusted" in options, key=key)

@@ -77,7 +77,7 @@ async def test_reads_that_are_answered_behind_a_whole_list_are_not_given_up(seed
 @pytest.mark.parametrize("seed", [8, 23])
 @virtual
 async def test_gaps_of_a_file_are_read_when_all_its_bursts_are_over(seed: int) -> None:
-    """At 57600 baud the first block is late: the burst is requested again, and served behind the first one."""
+    """At 57600 baud the first block is late, so that the burst is requested again."""
     vehicle = ArduPilotVehicle()
     air = Air.symmetric([vehicle], loss=0.05, delay=0.02, rate=5_760, seed=seed)
     async with converse(air) as conversation:

@@ -10,8 +10,8 @@ import socket
 import struct
 import sys
 import tracemalloc
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -48,7 +48,7 @@ from paramclient.wire.messages import (
 )
 from paramclient.wire.signing import SigningKey
 from tests.conversations.virtual import Puppet
-from tests.service.ground_stations import Partner, StationsLink, free_port, gateway_over
+from tests.service.ground_stations import Partner, Served, StationsLink, free_port, gateway_over
 from tests.service.hub import service, synced
 from tests.shell import PeersLink, Radio, Tap, a_client, bits, generic, in_simulated_time, small_px4, until
 
@@ -73,6 +73,17 @@ def askers(vehicle: Tap) -> set[int]:
 
 def by_name(station: Partner) -> dict[str, bytes]:
     return {each.param_id: each.raw for each in station.of(ParamValue)}
+
+
+@asynccontextmanager
+async def in_sync(vehicle: Endpoint, **options: Any) -> AsyncIterator[tuple[Served, Tap, Partner]]:
+    """A gateway whose table is in sync, its vehicle, and a station."""
+    tap = Tap(vehicle)
+    async with gateway_over(tap, **options) as served:
+        await served.synced()
+        station = served.partner()
+        tap.received.clear()
+        yield served, tap, station
 
 
 # 1: frames pass
@@ -177,11 +188,7 @@ def directly(vehicle: Endpoint, *requests: messages.Message, seconds: float = 4.
 @pytest.mark.parametrize("kind", [PX4Vehicle, ArduPilotVehicle, generic])
 async def test_rule_2_a_list_has_the_bytes_of_the_vehicle(kind: Callable[..., Endpoint]) -> None:
     wanted = [each for each in directly(kind(), LIST) if isinstance(each, ParamValue)]
-    vehicle = Tap(kind())
-    async with gateway_over(vehicle) as served:
-        await served.synced()
-        station = served.partner()
-        vehicle.received.clear()
+    async with in_sync(kind()) as (_, vehicle, station):
         await station.ask(LIST)
         assert station.of(ParamValue) == wanted
         assert not requested(vehicle)
@@ -189,11 +196,7 @@ async def test_rule_2_a_list_has_the_bytes_of_the_vehicle(kind: Callable[..., En
 
 @in_simulated_time
 async def test_rule_2_px4_answers_its_hash_and_goes_on_with_its_list() -> None:
-    vehicle = Tap(small_px4())
-    async with gateway_over(vehicle) as served:
-        await served.synced()
-        station = served.partner()
-        vehicle.received.clear()
+    async with in_sync(small_px4()) as (served, vehicle, station):
         await station.ask(ParamRequestRead(1, 1, "_HASH_CHECK", -1), seconds=0.1)
         [answer] = station.of(ParamValue)
         component = await served.clients[0].component()
@@ -208,11 +211,7 @@ async def test_rule_2_px4_answers_its_hash_and_goes_on_with_its_list() -> None:
 async def test_rule_2_reads_by_name_and_index(kind: Callable[..., Endpoint]) -> None:
     reads = [ParamRequestRead(1, 1, "PARAM_03", -1), ParamRequestRead(1, 1, "", 1)]
     wanted = [each for each in directly(kind(), *reads) if isinstance(each, ParamValue)]
-    vehicle = Tap(kind())
-    async with gateway_over(vehicle) as served:
-        await served.synced()
-        station = served.partner()
-        vehicle.received.clear()
+    async with in_sync(kind()) as (_, vehicle, station):
         await station.ask(*reads)
         assert station.of(ParamValue) == wanted
         assert not requested(vehicle)
@@ -237,10 +236,8 @@ async def test_rule_2_an_unknown_name_is_asked_of_the_vehicle_once() -> None:
 @in_simulated_time
 @pytest.mark.parametrize("seed", range(4))
 async def test_rule_2_an_unknown_name_is_known_to_be_unknown_in_3_seconds_also_with_losses(seed: int) -> None:
-    vehicle = Tap(Air.symmetric([PX4Vehicle()], loss=0.2, delay=0.05, seed=seed))
-    async with gateway_over(vehicle) as served:
-        await served.synced()
-        station = served.partner()
+    air = Air.symmetric([PX4Vehicle()], loss=0.2, delay=0.05, seed=seed)
+    async with in_sync(air) as (_, vehicle, station):
         await station.ask(ParamRequestRead(1, 1, "NONE", -1), seconds=3.0)
         asked = len(requested(vehicle))
         await station.ask(ParamRequestRead(1, 1, "NONE", -1), seconds=3.0)
@@ -348,10 +345,7 @@ async def test_rule_2_the_checksum_of_the_parameter_file() -> None:
 
 @in_simulated_time
 async def test_rule_2_other_files_pass_and_an_upload_has_the_table_proven() -> None:
-    vehicle = Tap(ArduPilotVehicle())
-    async with gateway_over(vehicle) as served:
-        await served.synced()
-        station = served.partner()
+    async with in_sync(ArduPilotVehicle()) as (served, vehicle, station):
         component = await served.clients[0].component()
         [answer] = await station.ask_file(Opcode.OPEN_FILE_RO, data=b"nothing.txt")
         assert answer.opcode == Opcode.NAK
@@ -434,10 +428,7 @@ async def test_rule_3_a_file_that_is_opened_during_a_long_fetch_is_none() -> Non
 @in_simulated_time
 async def test_rule_3_an_old_proof_is_renewed_behind_the_answer_and_differences_are_announced() -> None:
     model = small_px4()
-    vehicle = Tap(model)
-    async with gateway_over(vehicle, watch_interval=0) as served:
-        await served.synced()
-        station = served.partner()
+    async with in_sync(model, watch_interval=0) as (_, vehicle, station):
         station.send(GCS)
         await anyio.sleep(6.0)
         model.load({"PARAM_01": 77})  # announces nothing
@@ -465,6 +456,24 @@ async def test_rule_3_the_hash_is_answered_in_under_a_second_before_the_table_is
 
 
 @in_simulated_time
+async def test_rule_3_no_value_is_served_before_its_encoding_is_certain() -> None:
+    """A list for another station may run when the gateway starts; 120 as a float is 0 as an INT16."""
+    vehicle = Puppet(lambda message: (), heartbeat=None)
+    float_120 = struct.pack("<f", 120)
+    async with gateway_over(vehicle) as served:
+        station = served.partner()
+        station.send(GCS)
+        vehicle.say(ParamValue("FORMAT_VERSION", float_120, ParamType.INT16, 2, 0))
+        await anyio.sleep(0.5)
+        station.send(LIST, ParamRequestRead(1, 1, "", 0), ParamRequestRead(1, 1, "FORMAT_VERSION", -1))
+        await anyio.sleep(0.5)
+        assert not station.of(ParamValue)
+        vehicle.say(Heartbeat(2, 3))
+        await station.ask(LIST, ParamRequestRead(1, 1, "", 0))
+        assert {each.raw for each in station.of(ParamValue)} == {float_120}
+
+
+@in_simulated_time
 async def test_rule_3_cached_values_are_never_served(tmp_path: Path) -> None:
     cache = tmp_path / "cache.db"
     async with gateway_over(small_px4(), cache=cache) as served:
@@ -481,10 +490,7 @@ async def test_rule_3_cached_values_are_never_served(tmp_path: Path) -> None:
 
 @in_simulated_time
 async def test_rule_3_a_lost_vehicle_is_silent() -> None:
-    vehicle = Tap(small_px4())
-    async with gateway_over(vehicle) as served:
-        await served.synced()
-        station = served.partner()
+    async with in_sync(small_px4()) as (_, vehicle, station):
         vehicle.is_mute = True
         await anyio.sleep(6.0)
         vehicle.received.clear()
@@ -519,10 +525,7 @@ async def test_rule_3_a_vehicle_that_is_lost_during_the_fetch_is_served_when_it_
 
 @in_simulated_time
 async def test_rule_3_a_vehicle_that_is_lost_during_an_answer_ends_it() -> None:
-    vehicle = Tap(PX4Vehicle())
-    async with gateway_over(vehicle) as served:
-        await served.synced()
-        station = served.partner()
+    async with in_sync(PX4Vehicle()) as (served, _, station):
         station.send(LIST)
         await anyio.sleep(0.01)
         served.clients[0].core.station.nodes[1, 1].presence.is_lost = True
@@ -536,9 +539,7 @@ async def test_rule_3_a_vehicle_that_is_lost_during_an_answer_ends_it() -> None:
 @in_simulated_time
 async def test_rule_3_a_change_during_an_answer_is_in_it() -> None:
     vehicle = PX4Vehicle()
-    async with gateway_over(vehicle) as served:
-        await served.synced()
-        station = served.partner()
+    async with in_sync(vehicle) as (served, _, station):
         component = await served.clients[0].component()
         name = component.session.table.names[900]
         station.send(LIST)
@@ -617,9 +618,7 @@ async def test_rule_4_an_error_goes_to_the_asker_alone_within_3_seconds() -> Non
 @in_simulated_time
 async def test_rule_5_changes_by_others_are_announced() -> None:
     radio = Radio(small_px4())
-    async with gateway_over(radio) as served:
-        await served.synced()
-        station = served.partner()
+    async with in_sync(radio) as (_, _, station):
         await station.ask(GCS)
         radio.other.append(messages.encode(set_to("PARAM_02", 8), system=7, component=1, sequence=0))
         await anyio.sleep(2.0)
@@ -631,9 +630,7 @@ async def test_rule_5_changes_by_others_are_announced() -> None:
 
 @in_simulated_time
 async def test_rule_6_frames_are_packed() -> None:
-    async with gateway_over(PX4Vehicle()) as served:
-        await served.synced()
-        station = served.partner()
+    async with in_sync(PX4Vehicle()) as (_, _, station):
         await station.ask(LIST, seconds=0.1)
         values = [data for data in station.datagrams if len(data) > 100]
         assert len(station.of(ParamValue)) == 904
@@ -660,9 +657,7 @@ async def test_rule_6_queues_are_bounded(monkeypatch: pytest.MonkeyPatch) -> Non
 @in_simulated_time
 async def test_rule_6_telemetry_holds_no_list_up() -> None:
     vehicle = Puppet(lambda message: ())
-    async with gateway_over(Air([small_px4(), vehicle])) as served:
-        await served.synced()
-        station = served.partner()
+    async with in_sync(Air([small_px4(), vehicle])) as (_, _, station):
         await station.ask(GCS)
         frame = frames.build_frame(30, bytes(range(28)), system=1, component=1, sequence=1)
         for _ in range(2_000):
@@ -807,10 +802,7 @@ async def test_rule_9_the_gateway_has_the_id_of_no_station() -> None:
 @in_simulated_time
 async def test_rule_10_a_list_of_all_components() -> None:
     silent = Puppet(lambda message: (), component=5)
-    vehicle = Tap(Air([small_px4(), silent]))
-    async with gateway_over(vehicle) as served:
-        await served.synced()
-        station = served.partner()
+    async with in_sync(Air([small_px4(), silent])) as (_, vehicle, station):
         station.send(ParamRequestList(1, 5))
         await anyio.sleep(30.0)
         vehicle.received.clear()
@@ -957,11 +949,7 @@ async def test_rule_12_mavlink_1_only_to_a_station_of_it() -> None:
 
 @in_simulated_time
 async def test_rule_13_a_readonly_endpoint() -> None:
-    vehicle = Tap(small_px4())
-    async with gateway_over(vehicle, endpoint={"is_readonly": True}) as served:
-        await served.synced()
-        station = served.partner()
-        vehicle.received.clear()
+    async with in_sync(small_px4(), endpoint={"is_readonly": True}) as (_, vehicle, station):
         mission = frames.build_frame(44, bytes(4), system=255, component=190, sequence=1)
         station.send_bytes(mission)
         await station.ask(
@@ -1081,9 +1069,7 @@ async def _start(endpoint: str) -> None:
 @in_simulated_time
 async def test_a_silent_reset_by_a_station_is_found() -> None:
     model = small_px4()
-    async with gateway_over(model) as served:
-        await served.synced()
-        station = served.partner()
+    async with in_sync(model) as (_, _, station):
         await station.ask(set_to("PARAM_01", 9), seconds=3.0)
         model.load({"PARAM_01": 1})
         await station.ask(CommandLong(1, 1, 245, 2.0), seconds=3.0)
@@ -1093,9 +1079,7 @@ async def test_a_silent_reset_by_a_station_is_found() -> None:
 @in_simulated_time
 async def test_a_restart_during_a_list() -> None:
     model = PX4Vehicle()
-    async with gateway_over(model) as served:
-        await served.synced()
-        station = served.partner()
+    async with in_sync(model) as (served, _, station):
         station.send(GCS, LIST)
         await anyio.sleep(0.01)
         model.reboot(down=2.0)
@@ -1113,9 +1097,7 @@ async def test_a_switch_of_a_group_during_a_list() -> None:
     hidden = {f"GRP_{number}": float(number) for number in range(20)}
     table = {f"P_{number:03}": float(number) for number in range(300)} | {"GRP_ENABLE": 0.0}
     model = ArduPilotVehicle(table=table, groups={"GRP_ENABLE": hidden})
-    async with gateway_over(model) as served:
-        await served.synced()
-        station = served.partner()
+    async with in_sync(model) as (served, _, station):
         station.send(GCS, LIST)
         await anyio.sleep(0.004)
         component = await served.clients[0].component()

@@ -11,6 +11,7 @@ import pytest
 
 from paramclient.files import FileFormat, loads
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle
+from tests.commands import behind, in_process, leaping
 from tests.service.hub import V, problem, service, synced, until
 from tests.shell import VALUES, Tap, generic, in_simulated_time, small_px4
 
@@ -232,3 +233,58 @@ async def test_a_client_that_leaves_ends_its_apply_and_frees_the_vehicle(cache: 
         tap.is_mute = False
         await asyncio.sleep(2)
         assert (await browser.post(f"{V}/apply", json=body)).json()["complete"]
+
+
+def test_what_is_returned_is_what_the_command_prints(
+    cache: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """But for times, bytes and authors."""
+    file = tmp_path / "a.parm"
+    file.write_text("PARAM_04 44\nPARAM_05 5\nNONE 1\n")
+    with monkeypatch.context() as patches:
+        leaping(patches)
+        url = behind(patches, "sim:px4")(small_px4())
+        command = in_process(capsys, "--cache", f"{cache}-of-the-command", "--json")
+        printed = [
+            command("fetch", url).json,
+            command("set", url, "PARAM_03", 9, "NONE", 1).json,
+            command("apply", url, file, "--dry-run", "--partial").json,
+            command("apply", url, file, "--partial").json,
+            command("history", "1", "--snapshots").json,
+            command("restore", url).json,
+            command("history", "1").json,
+        ]
+        printed += command("get", url, "PARAM_03").json["params"].values()
+
+    @in_simulated_time
+    async def requested() -> list[Any]:
+        async with service(small_px4(), cache=cache, fetches=False) as (_, browser):
+            await until(browser, V, lambda found: found["firmware"] is not None)
+            wanted = {"file": {"text": file.read_text(), "name": "a.parm"}}
+            values = {"values": {"PARAM_03": 9, "NONE": 1}}
+            answers = [
+                await browser.post(f"{V}/fetch", json={}),
+                await browser.patch(f"{V}/params", json=values),
+                await browser.post(f"{V}/plan", json=wanted),
+                await browser.post(f"{V}/apply", json=wanted | {"partial": True}),
+                await browser.get(f"{V}/snapshots"),
+                await browser.post(f"{V}/restore", json={}),
+                await browser.get(f"{V}/history"),
+                await browser.get(f"{V}/params/PARAM_03"),
+            ]
+            return [each.json() for each in answers]
+
+    *documents, param = requested()
+    *others, read = printed
+    assert [*map(lasting, documents)] == [*map(lasting, others)]
+    assert param == {"name": "PARAM_03", "trust": "live", **read}
+
+
+def lasting(document: Any) -> Any:
+    """A document without what differs from one time to another."""
+    if isinstance(document, list):
+        return [lasting(each) for each in document]
+    left_out = {"elapsed_s", "round_trip_s", "bytes_received", "bytes_sent", "time", "at", "by"}
+    if isinstance(document, dict):
+        return {key: lasting(each) for key, each in document.items() if key not in left_out}
+    return document

@@ -5,16 +5,9 @@ from __future__ import annotations
 from base64 import b64decode
 from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
-from pydantic import (
-    AwareDatetime,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    StrictFloat,
-    StrictInt,
-    model_validator,
-)
+from pydantic import AwareDatetime, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import StrictFloat as Real
+from pydantic import StrictInt as Whole
 
 from paramclient.errors import UsageError
 from paramclient.files import FileFormat, ParamFile, loads
@@ -25,21 +18,7 @@ from paramclient.model.values import WireValue, check_name
 from paramclient.service.problems import ServiceError
 
 if TYPE_CHECKING:
-    from paramclient.service.targets import Target
-
-__all__ = [
-    "ApplyRequest",
-    "FetchRequest",
-    "Moment",
-    "PlanRequest",
-    "RestoreRequest",
-    "SnapshotRequest",
-    "UploadedFile",
-    "WriteManyRequest",
-    "WriteRequest",
-    "values_in_range",
-    "values_set",
-]
+    from paramclient.service.hub import Target
 
 FILE_BYTES_MAX: Final = 2 * 2**20
 """Maximum size of a parameter file in bytes; a table of 10,000 parameters takes 1 MB."""
@@ -71,7 +50,7 @@ GivenValue: TypeAlias = int | float | str
 """A value as a request gives it."""
 Name = Annotated[str, Field(min_length=1, max_length=16)]
 Value = Annotated[
-    StrictInt | Annotated[StrictFloat, Field(allow_inf_nan=False)] | Annotated[str, Field(max_length=400)],
+    Whole | Annotated[Real, Field(allow_inf_nan=False)] | Annotated[str, Field(max_length=400)],
     Field(
         description='A number, also as text such as "NaN", or the name of a value in the metadata; of an '
         "extended parameter also text, or bytes as hex:00ff."
@@ -83,7 +62,7 @@ Patterns = Annotated[
     tuple[Annotated[str, Field(min_length=1, max_length=64)], ...], Field(max_length=VALUES_MAX)
 ]
 Moment = Annotated[
-    Annotated[StrictInt, Field(ge=1, lt=1 << 62)] | Annotated[AwareDatetime, BeforeValidator(_check_text)],
+    Annotated[Whole, Field(ge=1, lt=1 << 62)] | Annotated[AwareDatetime, BeforeValidator(_check_text)],
     BeforeValidator(_parse_number),
     Field(description="The number of a snapshot, or a time with its zone."),
 ]
@@ -211,11 +190,11 @@ async def read_values(values: dict[str, GivenValue], target: Target) -> dict[str
     component = target.component
     for name, given in values.items():
         info = target.info(name)
-        if component.is_extended:
-            known = component.params.get(name) or await component.get(name)
-            found[name] = parse_ext_value(name, given, known.type_number) if isinstance(given, str) else given
-        elif not isinstance(given, str):
+        if not isinstance(given, str):
             found[name] = given
+        elif component.is_extended:
+            known = component.params.get(name) or await component.get(name)
+            found[name] = parse_ext_value(name, given, known.type_number)
         elif (value := number_of(given) if info is None else info.parse(given)) is not None:
             found[name] = value
         else:
@@ -232,8 +211,8 @@ async def values_in_range(
         ServiceError: 422, values are outside the range in the metadata.
     """
     found = await read_values(values, target)
-    infos = [(value, info) for name, value in found.items() if (info := target.info(name)) is not None]
-    faults = {} if force else {info.name: fault for value, info in infos if (fault := info.problem(value))}
+    infos = {name: info for name in found if not force and (info := target.info(name)) is not None}
+    faults = {name: fault for name, info in infos.items() if (fault := info.problem(found[name]))}
     if faults:
         detail = f"{'; '.join(list(faults.values())[:5])}. Nothing was written; `force` writes it anyway."
         raise ServiceError(422, "out-of-range", detail, names=list(faults))
@@ -241,10 +220,6 @@ async def values_in_range(
 
 
 async def values_set(values: dict[str, GivenValue], target: Target) -> ParamSet:
-    """Return values as a set.
-
-    Raises:
-        UsageError, ParamClientError: as from `read_values`.
-    """
+    """Return values as a set; see `read_values`."""
     read = await read_values(values, target)
     return ParamSet({check_name(name): read[name] for name in read}, is_extended=target.component.is_extended)
