@@ -90,6 +90,7 @@ NO_LIMITS: Final = (
 """Suffixes of names of members that are a choice, not a limit."""
 GETS: Final = 100
 """Number of sequential reads."""
+RUN_TIME: Final = "STAT_RUNTIME"
 RESTART_TIME: Final = 8.0
 """Seconds after a reboot until an ArduPilot has calibrated its sensors."""
 COMMAND_TIMEOUT: Final = 30.0
@@ -235,6 +236,7 @@ def warm_rows() -> Iterator[Row]:
     slow = Conditions(round_trip=ROUND_TRIP)
     for name, conditions, change, median, worst, most in (
         ("unchanged", CLEAN, None, 0.05, 0.05, 600),
+        ("run time passed", CLEAN, pass_run_time, 0.05, 0.05, 600),
         ("after a restart", CLEAN, restart, 0.4, 0.4, 3000),
         ("two values changed", CLEAN, change_two, 0.3, 0.3, 3000),
         ("unchanged, 100 ms", slow, None, 0.3, 0.3, None),
@@ -306,6 +308,14 @@ async def change_two(vehicle: Vehicle, seed: int, component: Component) -> None:
     single = list(choice.by_type.values())
     for name in (single[seed % len(single)], choice.many[seed % len(choice.many)]):
         await vehicle.journal.set(component, name, another_value(vehicle.journal.before[name]))
+
+
+async def pass_run_time(_vehicle: Vehicle, _seed: int, component: Component) -> None:
+    """Wait until the vehicle stores its run time, which it does every 30 s."""
+    before = await component.get(RUN_TIME)
+    async for change in component.changes():
+        if change.name == RUN_TIME and change.new is not None and change.new.value != before.value:
+            return
 
 
 async def restart(_vehicle: Vehicle, _seed: int, component: Component) -> None:

@@ -146,11 +146,12 @@ class _Proof:
         Raises:
             TableDiffers: the tables are too different.
         """
-        rows = self._rows
-        whole, learnt = range(len(rows)), self._session.table.volatile
+        rows, volatile = self._rows, self._session.table.volatile
+        whole = range(len(rows))
         moving = {at for at, row in enumerate(rows) if MOVING.fullmatch(row.name) or may_be_rounded(row)}
         measured = {at for at, row in enumerate(rows) if MEASURED.fullmatch(row.name) and row.bits}
-        suspects = {at for at, row in enumerate(rows) if row.name in learnt} - moving - measured
+        learnt = {at for at, row in enumerate(rows) if row.name in volatile} - moving - measured
+        suspects: set[int] = set()
         await self._request({len(whole), *(self._ends_of(moving, whole) if self._is_slow else ())})
         while places := self._places():
             if any(len(place) == 1 and rows[place.start].name == BOOT_COUNT for place in places):
@@ -158,11 +159,14 @@ class _Proof:
             guesses: dict[int, int] = {}
             numbers: set[int] = set()
             for place, difference in places.items():
-                suspected = {at: rows[at].bits for at in suspects if at in place}
                 if ends := self._ends_of(moving, place):
                     numbers |= ends
-                elif guessed := suspected or self._guess(place, difference):
-                    guesses |= guessed
+                elif suspected := suspects.intersection(place):
+                    guesses.update((at, rows[at].bits) for at in suspected)
+                elif guess := self._guess(place, difference):
+                    guesses |= guess
+                elif suspected := learnt.intersection(place):
+                    guesses.update((at, rows[at].bits) for at in suspected)
                 elif len(place) > 1:
                     numbers |= self._parts(place)
                 else:
@@ -173,6 +177,7 @@ class _Proof:
             else:
                 await self._read(guesses)
                 suspects -= guesses.keys()
+                learnt -= guesses.keys()
 
     @property
     def _is_slow(self) -> bool:
@@ -309,7 +314,10 @@ class _Proof:
         if table.count != len(self._rows):
             return False
         for at, moment in self._changed.items():
-            table.store_entry(self._rows[at], at, moment, with_defaults=False)
+            row = self._rows[at]
+            default = table.params[row.name].default
+            bits = None if default is None else bits_of(default, row.type)
+            table.store_entry(row._replace(default=bits), at, moment, with_defaults=False)
         if _rows(table) != self._rows:
             return False
         if self._changed:
@@ -340,8 +348,7 @@ def _row(table: Table, name: str) -> PackedParam:
     param = table.params[name]
     if param.is_raw or param.type_number not in PACKABLE:
         raise ChecksumUnavailable(f"the exact value of {name} is not known")
-    default = None if param.default is None else bits_of(param.default, param.type_number)
-    return PackedParam(name, ParamType(param.type_number), param.bits, default)
+    return PackedParam(name, ParamType(param.type_number), param.bits)
 
 
 def may_be_rounded(row: PackedParam) -> bool:

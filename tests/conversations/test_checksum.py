@@ -154,12 +154,15 @@ async def test_a_restart_is_recognized_by_the_boot_count() -> None:
 async def test_two_values_changed_by_others_are_found_and_named() -> None:
     vehicle = ArduPilotVehicle()
     async with converse(vehicle) as conversation:
-        node = await with_cached_table(conversation, vehicle.params)
+        cached = vehicle.params
+        cached["ATC_RAT_RLL_P"] = replace(cached["ATC_RAT_RLL_P"], default=0.135)
+        node = await with_cached_table(conversation, cached)
         vehicle.load({"ATC_RAT_RLL_P": 0.25, "FORMAT_VERSION": 121})
         sent, began = len(conversation.sent), anyio.current_time()
         result = await fetch_all(node.plain)
         assert (result.source, set(result.changed)) == ("cache", {"ATC_RAT_RLL_P", "FORMAT_VERSION"})
         assert "ATC_RAT_RLL_P" in result.notes[0]
+        assert result.params["ATC_RAT_RLL_P"].default == 0.135
         check(vehicle, node, result)
         assert sum(map(len, conversation.sent[sent:])) < 1_000
         assert anyio.current_time() - began < 0.2
