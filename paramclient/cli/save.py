@@ -35,7 +35,7 @@ from paramclient.cli.sources import (
     source_of,
     whole_table,
 )
-from paramclient.errors import UsageError, VehicleError
+from paramclient.errors import NotInCache, UsageError, VehicleError
 from paramclient.files import FileFormat, writable, write_file
 from paramclient.files.formats import AUTOPILOT, address, format_of_name
 from paramclient.metadata import Metadata
@@ -46,7 +46,7 @@ from paramclient.model.wording import counted, first_of
 from paramclient.provision.vehicle_params import (
     NAMES_SHOWN_MAX,
     NO_DEFAULTS,
-    cached_param_set,
+    cached_set,
     select_non_defaults,
 )
 
@@ -217,14 +217,10 @@ def _add_offline(
             tables = pilots
         sets = []
         for table in tables:
-            each = cached_param_set(table, extended=extended)
-            of = "" if table.count is None else f" of {table.count}"
-            are = f"{table.size}{of} parameters are in the cache"
-            if table.complete or incomplete:
-                sets.append(each if table.complete else replace(each, source=f"{each.source}: {are}"))
-            else:
-                fault = f"{table.system}/{table.component} is incomplete: {are}; {INCOMPLETE_HINT}"
-                selection.faults.append(fault)
+            try:
+                sets.append(cached_set(table, extended=extended, partial=incomplete))
+            except NotInCache as error:
+                selection.faults.append(f"{error}; {INCOMPLETE_HINT}")
     metadata = [given] * len(sets)
     if selection.is_changed and given is None:
         metadata = known_of_sets(sets, options)

@@ -13,7 +13,6 @@ import difflib
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Final
 
@@ -31,14 +30,8 @@ from paramclient.links import FORMS, parse_link
 from paramclient.logs.onboard import is_onboard_log, read_onboard_log
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
-from paramclient.model.wording import first_of
 from paramclient.provision.inspection import wait_for_identity
-from paramclient.provision.vehicle_params import (
-    NAMES_SHOWN_MAX,
-    collect_set,
-    incomplete_error,
-    load_cached_set,
-)
+from paramclient.provision.vehicle_params import cached_set, fetched_set
 
 __all__ = [
     "check_link",
@@ -159,14 +152,7 @@ async def whole_table(session: CommandSession, *, refresh: bool = False, partial
     result = await session.fetch(refresh=refresh)
     for note in result.notes:
         report(f"{session.label} on {link}: {note}")
-    found = await collect_set(component, result, source=f"link {link}")
-    if found.missing and not partial:
-        raise incomplete_error(component, found.missing)
-    left_out = [*found.missing, *map(repr, sorted(component.session.table.left_out))]
-    if not left_out:
-        return found.set
-    missing = first_of(left_out, NAMES_SHOWN_MAX)
-    return replace(found.set, source=f"{found.set.source}, without {missing}")
+    return fetched_set(component, result, source=f"link {link}", partial=partial)
 
 
 def is_file(text: str) -> bool:
@@ -319,7 +305,10 @@ def _from_cache(vehicle: str, options: LinkOptions, component: int | None, *, ex
         if len(tables) > 1 and table.component != AUTOPILOT:
             known = ", ".join(f"{each.system}/{each.component}" for each in tables)
             raise UsageError(f"no autopilot is among {known}; name one of them instead of {vehicle}")
-        return load_cached_set(cache, table.key, table.component, extended=extended)
+        found = cache.load(table.key, table.component, extended=extended)
+        if found is None:  # removed since the line above
+            raise NotInCache(f"the cache has no table of {vehicle}")
+        return cached_set(found, extended=extended)
 
 
 # File names for several vehicles

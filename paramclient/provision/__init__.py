@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from paramclient.provision.apply_restore import apply, restore
 from paramclient.provision.apply_rules import CATEGORIES
-from paramclient.provision.execution import ApplyProgress, ApplyResult
+from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult, RestoreOptions
 from paramclient.provision.fleet import FleetResult, for_each
 from paramclient.provision.inspection import plan
 from paramclient.provision.planning import (
@@ -27,12 +27,14 @@ from paramclient.provision.planning import (
     ApplyStatus,
     ParamInfo,
     Plan,
+    PlanOptions,
     Stage,
     overlay,
     plan_from,
 )
 
 __all__ = [
+    "ApplyOptions",
     "ApplyProgress",
     "ApplyResult",
     "ApplyRow",
@@ -42,6 +44,8 @@ __all__ = [
     "MISSING",
     "ParamInfo",
     "Plan",
+    "PlanOptions",
+    "RestoreOptions",
     "Stage",
     "WRONG",
     "apply",

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable, Mapping
-from typing import Final
+from typing import Final, Unpack
 
 from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.model.paramset import ParamSet
-from paramclient.model.renames import Renames
 from paramclient.provision.apply_rules import OUT_OF_RANGE
-from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult, run
+from paramclient.provision.execution import ApplyOptions, ApplyResult, RestoreOptions, run
 from paramclient.provision.inspection import Wanted, wait_for_identity, wanted_set
-from paramclient.provision.planning import ParamInfo
 
 __all__ = ["BEFORE_APPLY", "BEFORE_RESTORE", "apply", "restore", "restore_categories"]
 
@@ -26,24 +22,7 @@ OWN_STATE_CATEGORIES: Final = ("identity", "hardware", "calibration", OUT_OF_RAN
 """Categories that `restore` includes if the state is the vehicle's own."""
 
 
-async def apply(
-    component: Component,
-    wanted: Wanted,
-    *,
-    include: str | Iterable[str] = (),
-    info: Mapping[str, ParamInfo] | None = None,
-    reboot: bool = False,
-    allow_armed: bool = False,
-    partial: bool = False,
-    force: bool = False,
-    renames: Renames | None = None,
-    durable: bool = False,
-    backup: str | os.PathLike[str] | None = None,
-    timeout: float | None = None,
-    author: str | None = None,
-    progress: Callable[[ApplyProgress], None] | None = None,
-    before_writing: Callable[[], object] | None = None,
-) -> ApplyResult:
+async def apply(component: Component, wanted: Wanted, **options: Unpack[ApplyOptions]) -> ApplyResult:
     """Write the wanted values to a vehicle, and verify each of them by reading it back at the end.
 
     All or nothing: if a value is invalid, or the vehicle does not have a name, nothing is written unless
@@ -65,22 +44,7 @@ async def apply(
     Args:
         component: the vehicle.
         wanted: the wanted parameters, or plain values by name.
-        include, info, force: as in `plan_from`.
-        reboot: reboot the vehicle if values take effect after a reboot.
-        allow_armed: continue if the vehicle is armed.
-        partial: skip invalid values and names that the vehicle does not have, and write the remaining values.
-        renames: as in `plan_from`. After each stage that reveals parameters, the other names are looked up
-            again.
-        durable: return only when the values and their history are on the disk and survive a power loss; if
-            that fails, `error` of the result is a CacheError.
-        backup: a file for the state before the first write; its name determines the file format, see
-            `paramclient.files`.
-        timeout: seconds, after which the result reports the progress of the run.
-        author: the author of the changes, as in `Component.set`.
-        progress: called after each value and at the start of a phase; it must not raise.
-        before_writing: called once after the vehicle was read, before its state is stored and the first value
-            is written, and only if there is something to write; awaited if it is asynchronous. Its exceptions
-            end the call.
+        options: as in `ApplyOptions`.
 
     Raises:
         InvalidParameters: some values are invalid, or names are not on the vehicle, and `partial` is false.
@@ -91,39 +55,10 @@ async def apply(
         NoReply: the vehicle did not answer before the first write.
         LinkError: the link failed, or the client was closed, before the first write.
     """
-    options = ApplyOptions(
-        include=include,
-        info=info,
-        reboot=reboot,
-        allow_armed=allow_armed,
-        partial=partial,
-        force=force,
-        renames=renames,
-        durable=durable,
-        backup=backup,
-        author=author,
-        progress=progress,
-        before_writing=before_writing,
-        reason=BEFORE_APPLY,
-    )
-    return await run(component, wanted_set(component, wanted), options, timeout)
+    return await run(component, wanted_set(component, wanted), BEFORE_APPLY, **options)
 
 
-async def restore(
-    component: Component,
-    state: ParamSet,
-    *,
-    include: str | Iterable[str] = (),
-    info: Mapping[str, ParamInfo] | None = None,
-    reboot: bool = False,
-    allow_armed: bool = False,
-    force: bool = False,
-    backup: str | os.PathLike[str] | None = None,
-    timeout: float | None = None,
-    author: str | None = None,
-    progress: Callable[[ApplyProgress], None] | None = None,
-    before_writing: Callable[[], object] | None = None,
-) -> ApplyResult:
+async def restore(component: Component, state: Wanted, **options: Unpack[RestoreOptions]) -> ApplyResult:
     """Restore an earlier state of a vehicle: `apply`, with its own identity and calibration included.
 
     Parameters that the vehicle measures at each start, counts, or does not let clients write are not changed:
@@ -134,32 +69,18 @@ async def restore(
         component: the vehicle.
         state: the earlier state, such as a snapshot or a backup file. Identity and calibration are left out
             unless the state names this vehicle as its own.
-        include, info, reboot, allow_armed, force, backup, timeout, author, progress, before_writing: as in
-            `apply`.
+        options: as in `RestoreOptions`.
 
     Raises:
         UsageError: the state is that of another vehicle.
         ParamClientError: as from `apply`.
     """
-    state = wanted_set(component, state)
+    state, include = wanted_set(component, state), options.pop("include", ())
     given = (include,) if isinstance(include, str) else tuple(include)
-    options = ApplyOptions(
-        include=(*await restore_categories(component, state), *given),
-        info=info,
-        reboot=reboot,
-        allow_armed=allow_armed,
-        partial=True,
-        force=force,
-        renames=None,
-        durable=False,
-        backup=backup,
-        author=author,
-        progress=progress,
-        before_writing=before_writing,
-        reason=BEFORE_RESTORE,
-        skips_read_only=True,
+    included = (*await restore_categories(component, state), *given)
+    return await run(
+        component, state, BEFORE_RESTORE, skips_read_only=True, partial=True, include=included, **options
     )
-    return await run(component, state, options, timeout)
 
 
 async def restore_categories(component: Component, state: ParamSet) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final, TypedDict
 
 import anyio
 
@@ -18,7 +18,6 @@ from paramclient.errors import (
     AnotherVehicle,
     CacheError,
     InvalidParameters,
-    LinkError,
     NoReply,
     ParamClientError,
     ParamErrorCode,
@@ -29,20 +28,29 @@ from paramclient.errors import (
 from paramclient.files import write_file
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
+from paramclient.model.values import Param
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
 from paramclient.provision.inspection import (
     POLL_INTERVAL,
     Inspection,
     inspect,
-    planner_for,
     reread,
     wait_for_identity,
     with_other_names,
 )
-from paramclient.provision.planning import WRONG, ApplyRow, ApplyStatus, ParamInfo, Plan, Rows, Stage
+from paramclient.provision.planning import (
+    WRONG,
+    ApplyRow,
+    ApplyStatus,
+    ParamInfo,
+    Plan,
+    Rows,
+    Stage,
+    plan_from,
+)
 
-__all__ = ["ApplyOptions", "ApplyProgress", "ApplyResult", "run"]
+__all__ = ["ApplyOptions", "ApplyProgress", "ApplyResult", "RestoreOptions", "run"]
 
 WRITE_ATTEMPTS_MAX: Final = 2
 """Times that a value is written if the vehicle acknowledges it and later holds another value: a write of
@@ -54,7 +62,7 @@ VERIFY_DELAY: Final = 1.2
 parameters, up to 1.1 s after the acknowledgement (measured)."""
 ARMED_STATE_TIMEOUT: Final = 3.0
 """Seconds to wait for a heartbeat with the armed flag: heartbeats arrive once a second, and some are lost."""
-SYSTEM_CHANGE_TIMEOUT: Final = 10.0
+SYSTEM_CHANGE_TIMEOUT: Final = 5.0
 """Seconds to wait for the vehicle under its new system id; ArduPilot sends its next heartbeat under it."""
 SYSTEM_CHANGE_DELAY: Final = 2.5
 """Seconds after the acknowledgement of SYSID_THISMAV: a vehicle whose heartbeats still have the old id then
@@ -119,47 +127,78 @@ class ApplyResult(Rows):
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ApplyOptions:
-    """The arguments of `apply` and `restore`, see there.
+class RestoreOptions(TypedDict, total=False):
+    """Options of `restore`, and of `apply`.
 
     Attributes:
-        reason: the reason of the snapshot of the state before the first write.
-        skips_read_only: skip a parameter that the vehicle refuses as read-only, rather than report it as
-            refused.
+        include, info, force: as in `PlanOptions`.
+        reboot: reboot the vehicle if values take effect after a reboot.
+        allow_armed: continue if the vehicle is armed.
+        backup: a file for the state before the first write; its name determines the file format, see
+            `paramclient.files`.
+        timeout: seconds, after which the result reports the progress of the run.
+        author: the author of the changes, as in `Component.set`.
+        progress: called after each value and at the start of a phase; it must not raise.
+        before_writing: called once after the vehicle was read, before its state is stored and the first value
+            is written, and only if there is something to write; awaited if it is asynchronous. Its exceptions
+            end the call.
     """
 
     include: str | Iterable[str]
     info: Mapping[str, ParamInfo] | None
+    force: bool
     reboot: bool
     allow_armed: bool
-    partial: bool
-    force: bool
-    renames: Renames | None
-    durable: bool
     backup: str | os.PathLike[str] | None
+    timeout: float | None
     author: str | None
     progress: Callable[[ApplyProgress], None] | None
     before_writing: Callable[[], object] | None
-    reason: str
-    skips_read_only: bool = False
+
+
+class ApplyOptions(RestoreOptions, total=False):
+    """Options of `apply`: those of `restore`, and more.
+
+    Attributes:
+        partial: skip invalid values and names that the vehicle does not have, and write the remaining values.
+        renames: as in `PlanOptions`. After each stage that reveals parameters, the other names are looked up
+            again.
+        durable: return only when the values and their history are on the disk and survive a power loss; if
+            that fails, `error` of the result is a CacheError.
+    """
+
+    partial: bool
+    renames: Renames | None
+    durable: bool
 
 
 async def run(
-    component: Component, wanted: ParamSet, options: ApplyOptions, timeout: float | None
+    component: Component,
+    wanted: ParamSet,
+    reason: str,
+    *,
+    skips_read_only: bool = False,
+    timeout: float | None = None,
+    **options: Any,
 ) -> ApplyResult:
-    """Apply wanted parameters to a vehicle; see `apply`."""
-    check_author(options.author)
+    """Apply wanted parameters to a vehicle; see `apply`.
+
+    Args:
+        component, wanted, timeout, options: as in `apply`.
+        reason: the reason of the snapshot of the state before the first write.
+        skips_read_only: skip a parameter that the vehicle refuses as read-only, rather than report it as
+            refused.
+    """
     began = anyio.current_time()
     error: ParamClientError | None = None
-    one = _Run(component, wanted, options)
+    one = _Run(component, wanted, reason, skips_read_only, **options)
     with anyio.move_on_after(timeout) as scope:
         await one.begin()
         try:
             with component.watch.held():  # a changed count starts no download besides those of the run
-                start = await one.store_state()
+                await one.store_state()
                 await one.write_and_verify()
-            await start.end(one.component)
+            await one.record_end()
         except ParamClientError as failure:
             if not one.sent:
                 raise
@@ -172,103 +211,81 @@ async def run(
     return one.result(error, waited)
 
 
-@dataclass(frozen=True, slots=True)
-class _Start:
-    """The vehicle before the first write.
-
-    Attributes:
-        plan: the first plan.
-        table: the vehicle's parameters.
-        snapshot: number of the snapshot of them in the cache, or None.
-    """
-
-    plan: Plan
-    table: ParamSet
-    snapshot: int | None = None
-
-    async def end(self, component: Component) -> None:
-        """Record in the cache that the run was not interrupted."""
-        writer, number, cache = component.core.cache_writer, self.snapshot, component.core.cache
-        if cache is not None and number is not None:
-            with suppress(CacheError):  # the warning of the cache writer says so
-                await writer.run_in_thread(lambda: cache.end_operation(number))
-
-
+@dataclass(eq=False)
 class _Run:
-    """One run of `apply` or `restore`.
-
-    Args:
-        component: the vehicle.
-        wanted: the wanted parameters.
-        options: the other arguments of the call.
+    """One run of `apply` or `restore`; the arguments are theirs.
 
     Attributes:
         component: the vehicle under its present system id.
-        inspection: the latest inspection of the vehicle.
-        plan: the plan that follows from it.
         sent: parameters for which a PARAM_SET may have been sent, as the vehicle names them.
     """
 
-    inspection: Inspection
-    plan: Plan
+    component: Component
+    wanted: ParamSet
+    reason: str
+    skips_read_only: bool
+    include: str | Iterable[str] = ()
+    info: Mapping[str, ParamInfo] | None = None
+    force: bool = False
+    renames: Renames | None = None
+    partial: bool = False
+    reboot: bool = False
+    allow_armed: bool = False
+    durable: bool = False
+    backup: str | os.PathLike[str] | None = None
+    author: str | None = None
+    progress: Callable[[ApplyProgress], None] | None = None
+    before_writing: Callable[[], object] | None = None
 
-    def __init__(self, component: Component, wanted: ParamSet, options: ApplyOptions) -> None:
-        self.component = component
+    def __post_init__(self) -> None:
+        check_author(self.author)
         self.sent: set[str] = set()
-        self._wanted = wanted
-        self._options = options
-        self._rules = rules_for(component.autopilot, is_extended=component.is_extended)
-        self._start: _Start | None = None
+        self._rules = rules_for(self.component.autopilot, is_extended=self.component.is_extended)
+        self._before: ParamSet | None = None  # the state before the first write
+        self._snapshot: int | None = None  # its number in the cache
         self._settled: dict[str, ApplyRow] = {}  # outcomes before the last read, by the vehicle's names
         self._written: Counter[str] = Counter()  # acknowledged writes
         self._notes: dict[str, str] = {}  # of the acknowledged writes
         self._written_at = self._inspected_at = -math.inf  # end of the last write, begin of the last read
         self._reboot_for: dict[str, None] = {}
         self._reboots = 0
-        self._kept_by_reboot: set[str] = set()  # values that the last reboot should have kept
         self._next_system_id: int | None = None  # the vehicle's system id after the next reboot
 
     async def begin(self) -> None:
         """Inspect the vehicle, and plan."""
-        component, options = self.component, self._options
-        if options.durable and component.core.cache is None:
+        component = self.component
+        if self.durable and component.core.cache is None:
             raise UsageError("durable needs a cache, and the client keeps none")
+        self._replan({})  # its errors are raised before the vehicle is read
         await wait_for_identity(component)
         self._rules = rules_for(component.autopilot, is_extended=component.is_extended)
         self._identity = component.identity
-        self._make_plan = planner_for(
-            component,
-            self._wanted,
-            options.include,
-            options.info,
-            force=options.force,
-            renames=options.renames,
-        )
         with component.watch.held():
             await self._check_armed()
             await self._inspect()
-        if self.plan.problems and not options.partial:
-            raise InvalidParameters(self.plan.problems)
-        for row in self.plan.to_write:
-            if self._rules.is_action(row.target.name) and self._resets(row) and not options.reboot:
+        self._first_plan = self._plan
+        if self._plan.problems and not self.partial:
+            raise InvalidParameters(self._plan.problems)
+        for row in self._plan.to_write:
+            if self._rules.is_action(row.target.name) and self._resets(row) and not self.reboot:
                 raise UsageError(
                     f"{row.target.name} resets other parameters to their defaults at the next start of the "
                     "vehicle; it can only be set with reboot=True"
                 )
-        if options.before_writing is not None and (self.plan.to_write or self._must_reboot([])):
-            result = options.before_writing()
+        if self.before_writing is not None and (self._plan.to_write or self._must_reboot([])):
+            result = self.before_writing()
             if isinstance(result, Awaitable):
                 await result
 
-    async def store_state(self) -> _Start:
+    async def store_state(self) -> None:
         """Store the vehicle's state in the backup file, and in the cache if the plan has values to write."""
-        component, inspection, options = self.component, self.inspection, self._options
-        writer, cache, path = component.core.cache_writer, component.core.cache, options.backup
+        component, inspection, path = self.component, self._inspection, self.backup
+        writer, cache = component.core.cache_writer, component.core.cache
         if path is not None:
             await writer.run_in_thread(lambda: write_file(path, inspection.table))
-        self._start = _Start(self.plan, inspection.table)
-        if cache is None or not self.plan.to_write:
-            return self._start
+        self._before = inspection.table
+        if cache is None or not self._plan.to_write:
+            return
         try:
             # the history then has the values from before the change
             await writer.write_all()
@@ -277,7 +294,7 @@ class _Run:
                     component.identity,
                     component.component,
                     inspection.table,
-                    reason=options.reason,
+                    reason=self.reason,
                     hash=inspection.hash,
                     complete=inspection.complete,
                     is_of_operation=True,
@@ -289,8 +306,14 @@ class _Run:
                 f"nothing was sent, as the state before cannot be stored: {error}. Without a cache"
                 " (--no-cache, or cache=False), no state is stored"
             ) from error
-        self._start = replace(self._start, snapshot=snapshot.id)
-        return self._start
+        self._snapshot = snapshot.id
+
+    async def record_end(self) -> None:
+        """Record in the cache that the run was not interrupted."""
+        number, cache = self._snapshot, self.component.core.cache
+        if cache is not None and number is not None:
+            with suppress(CacheError):  # the warning of the cache writer says so
+                await self.component.core.cache_writer.run_in_thread(lambda: cache.end_operation(number))
 
     async def write_and_verify(self) -> None:
         """Write and verify until no stage is pending.
@@ -305,26 +328,26 @@ class _Run:
                 await self._write_stage(stage)
             if self._must_reboot(stages):
                 await self._reboot()
-            elif stages and stages[-1].reveals and self.plan.of(ApplyStatus.LATER):
+            elif stages and stages[-1].reveals and self._plan.of(ApplyStatus.LATER):
                 await self._read_revealed(stages[-1])
             elif stages or self._inspected_at < self._written_at + VERIFY_DELAY:
                 await anyio.sleep_until(self._written_at + VERIFY_DELAY)
                 await self._verify()
             else:
                 break
-        if self._options.durable and self.sent:
+        if self.durable and self.sent:
             await self.component.core.cache_writer.write_durably(self.component.node)
 
     def result(self, error: ParamClientError | None, elapsed: float) -> ApplyResult:
         """Return the result of the run."""
-        assert self._start is not None
+        assert self._before is not None
         return ApplyResult(
-            {name: self._final_row(row) for name, row in self.plan.rows.items()},
+            {name: self._final_row(row) for name, row in self._plan.rows.items()},
             self.component.system,
             self.component.component,
-            self._start.plan,
-            self._start.table,
-            self.plan.extra,
+            self._first_plan,
+            self._before,
+            self._plan.extra,
             self._reboots,
             tuple(self._reboot_for),
             error,
@@ -336,11 +359,11 @@ class _Run:
     def _pending_stages(self) -> list[Stage]:
         """Return the next stages, up to and including the one after which the vehicle must be inspected."""
         stages = []
-        may_appear = bool(self.plan.of(ApplyStatus.LATER))
-        for stage in self.plan.stages:
+        may_appear = bool(self._plan.of(ApplyStatus.LATER))
+        for stage in self._plan.stages:
             if rows := tuple(row for row in stage.rows if self._may_write(row.target.name)):
                 stages.append(replace(stage, rows=rows))
-                if (stage.reveals and may_appear) or (stage.reboot_first and self._options.reboot):
+                if (stage.reveals and may_appear) or (stage.reboot_first and self.reboot):
                     break
         return stages
 
@@ -351,16 +374,16 @@ class _Run:
 
     def _must_reboot(self, done: Sequence[Stage]) -> bool:
         """Return whether the vehicle must reboot after the stages that are done."""
-        if not self._options.reboot:
+        if not self.reboot:
             return False
         if done:
             return done[-1].reboot_first and bool(self._reboot_for)
-        is_reboot_due = bool(self.plan.awaiting_reboot) or self._pending_system_id() is not None
+        is_reboot_due = bool(self._plan.awaiting_reboot) or self._pending_system_id() is not None
         return bool(self._reboot_for) or (is_reboot_due and not self._reboots)
 
     def _pending_system_id(self) -> int | None:
         """Return the system id that is set and takes effect after a reboot, or None."""
-        for row in self.plan.of(ApplyStatus.UNCHANGED):
+        for row in self._plan.of(ApplyStatus.UNCHANGED):
             if self._rules.has("system_id", row.target.name) and row.before != self.component.system:
                 return row.before if isinstance(row.before, int) else None
         return None
@@ -371,45 +394,55 @@ class _Run:
     # Reads
 
     async def _inspect(self) -> None:
-        absent = frozenset[str]() if self._start is None else self.inspection.absent
-        await self._read(inspect(self.component, self._wanted, self._options.renames, absent), verifies=True)
+        absent = frozenset[str]() if self._before is None else self._inspection.absent
+        await self._read(inspect(self.component, self.wanted, self.renames, absent), verifies=True)
 
     async def _verify(self) -> None:
         """Read the wanted parameters: by name if that is faster than the whole table, else the table.
 
         Always reads the table if a switch may have revealed parameters whose names are not known.
         """
-        names = [row.target.name for row in self.plan.of(ApplyStatus.SET, ApplyStatus.UNCHANGED)]
-        if self.plan.of(ApplyStatus.LATER) or not self.inspection.is_reading_faster(len(names)):
+        names = [row.target.name for row in self._plan.of(ApplyStatus.SET, ApplyStatus.UNCHANGED)]
+        if self._plan.of(ApplyStatus.LATER) or not self._inspection.is_reading_faster(len(names)):
             await self._inspect()
         else:
-            await self._read(reread(self.component, self.inspection, names, names), verifies=True)
+            await self._read(reread(self.component, self._inspection, names, names), verifies=True)
 
     async def _read_revealed(self, done: Stage) -> None:
         """Read by name the parameters that a stage may have revealed. This verifies no write."""
-        later = [row.name for row in self.plan.of(ApplyStatus.LATER)]
-        names = with_other_names(later, (), self._options.renames)
+        later = [row.name for row in self._plan.of(ApplyStatus.LATER)]
+        names = with_other_names(later, (), self.renames)
         if self.component.autopilot == "ardupilot":  # a switch reveals the names with its own prefix
             groups = tuple(row.target.name.rpartition("_")[0] for row in done.rows)
             names = tuple(name for name in names if name.startswith(groups))
-        await self._read(reread(self.component, self.inspection, names))
+        await self._read(reread(self.component, self._inspection, names))
 
     async def _read(self, reading: Awaitable[Inspection], *, verifies: bool = False) -> None:
         """Await a read of the vehicle, and plan again from it."""
         self._report("reading")
         began = anyio.current_time()
-        self.inspection = await reading
+        self._inspection = await reading
         self._check_same_vehicle()
-        self.plan = self._make_plan(self.inspection.table)
+        self._replan(self._inspection.table)
         if verifies:
             self._inspected_at = began
+
+    def _replan(self, table: ParamSet | Mapping[str, Param]) -> None:
+        self._plan = plan_from(
+            table,
+            self.wanted,
+            autopilot=self.component.autopilot,
+            encoding=self.component.encoding,
+            include=self.include,
+            info=self.info,
+            force=self.force,
+            renames=self.renames,
+        )
 
     def _check_same_vehicle(self) -> None:
         """Raise `AnotherVehicle` if the identity is not that of the first inspection."""
         component, found = self.component, self.component.identity
-        if self._start is None:
-            self._identity = found
-        elif not self._identity.is_same_vehicle(found):
+        if not self._identity.is_same_vehicle(found):
             raise AnotherVehicle(component.system, component.component, str(self._identity), str(found))
 
     # Writes and reboots
@@ -439,8 +472,8 @@ class _Run:
         try:
             done = await self.component.set_many(
                 [(name, row.target.settable) for name, row in by_name.items()],
-                force=self._options.force,
-                author=self._options.author,
+                force=self.force,
+                author=self.author,
                 progress=lambda outcome: self._take(by_name[outcome.name], outcome),
             )
         except ParamClientError:
@@ -466,7 +499,7 @@ class _Run:
                 self._settle(row, ApplyStatus.ADJUSTED, "the vehicle changed the value")
             else:
                 self._accept(row, done.note)
-        elif self._options.skips_read_only and _is_read_only(error):
+        elif self.skips_read_only and _is_read_only(error):
             reason = "left out: the vehicle reports that it is read-only"
             self._settle(row, ApplyStatus.SKIPPED, reason, READ_ONLY)
         elif outcome.status is SetStatus.REFUSED:
@@ -476,73 +509,40 @@ class _Run:
 
     async def _write_system_id(self, row: ApplyRow) -> None:
         """Set the system id, and continue with the vehicle under its new one."""
-        name, system = row.target.name, int(row.target.value)
-        if any(self._is_other_vehicle_with(system, each) for each in self._known):
-            reason = f"another vehicle on this link has system id {system}"
-            self._settle(row, ApplyStatus.SKIPPED, reason, WRONG)
-            return
+        component, name, system = self.component, row.target.name, int(row.target.value)
+        own = component.identity
+        for known in component.client.components.values():
+            is_ours = own.has_own_uid and known.identity.uid == own.uid  # under an earlier id
+            if known.system == system and known.state != "lost" and not is_ours:
+                reason = f"another vehicle on this link has system id {system}"
+                self._settle(row, ApplyStatus.SKIPPED, reason, WRONG)
+                return
         if self._rules.needs_reboot(name):
             await self._write([row])
-            if self._written[name]:
-                self._next_system_id = system
+            self._next_system_id = system if self._written[name] else None
             return
         self.sent.add(name)
         self._written_at = math.inf
-        failure: ParamClientError | None = None
-        is_kept = False
-
-        async def cancel_if_id_is_kept() -> None:
-            nonlocal is_kept
-            await self._set_and_detect_kept_id(row)
-            is_kept = True
-            sending.cancel_scope.cancel()
-
-        async with anyio.create_task_group() as sending:
-            sending.start_soon(cancel_if_id_is_kept)
-            try:
-                self.component = await self.component.client.successor(
-                    self.component, system, timeout=SYSTEM_CHANGE_TIMEOUT
-                )
-            except ParamClientError as error:  # raised here, the task group would wrap it in a group
-                failure = error
-            sending.cancel_scope.cancel()
-        self._written_at = anyio.current_time()
-        if is_kept:
+        is_kept, acknowledged_at = False, math.inf
+        try:
+            with suppress(NoReply):  # it may have its new id before it acknowledges
+                await component.set(name, system, timeout=SYSTEM_CHANGE_DELAY, author=self.author)
+                acknowledged_at = anyio.current_time()
+            self.component = await component.client.successor(
+                component, system, timeout=SYSTEM_CHANGE_TIMEOUT
+            )
+        except Refused as error:
+            self._settle(row, ApplyStatus.REFUSED, str(error))
+            return
+        except NoReply as error:
+            is_kept = component.node.presence.beat_at >= acknowledged_at + SYSTEM_CHANGE_DELAY
+            if not is_kept:
+                self._settle(row, ApplyStatus.UNKNOWN, str(error))
+                return
             self._next_system_id = system
-        if failure is None:
-            self._accept(replace(row, needs_reboot=is_kept))
-            return
-        self._settle(row, ApplyStatus.UNKNOWN, str(failure))
-        if isinstance(failure, LinkError):
-            raise failure
-
-    @property
-    def _known(self) -> Sequence[Component]:
-        return list(self.component.client.components.values())
-
-    def _is_other_vehicle_with(self, system: int, known: Component) -> bool:
-        """Return whether `known` is another vehicle with this system id.
-
-        The same vehicle under an earlier id, and a lost vehicle, do not count.
-        """
-        own = self.component.identity
-        is_ours = own.has_own_uid and known.identity.uid == own.uid
-        return known.system == system and known.state != "lost" and not is_ours
-
-    async def _set_and_detect_kept_id(self, row: ApplyRow) -> None:
-        """Set the system id, and return once the vehicle has acknowledged it and still has the old one.
-
-        ArduPlane and Rover may change the id before they acknowledge; then this call does not return until
-        it is cancelled.
-        """
-        component = self.component
-        with suppress(ParamClientError):
-            await component.set(row.target.name, row.target.settable, author=self._options.author)
-            acknowledged_at = anyio.current_time()
-            while component.node.presence.beat_at < acknowledged_at + SYSTEM_CHANGE_DELAY:  # noqa: ASYNC110 - no event
-                await anyio.sleep(POLL_INTERVAL)
-            return
-        await anyio.sleep_forever()
+        finally:
+            self._written_at = anyio.current_time()
+        self._accept(replace(row, needs_reboot=is_kept))
 
     async def _reboot(self) -> None:
         """Reboot the vehicle, continue with it under its new system id if one is pending, and inspect it.
@@ -562,7 +562,7 @@ class _Run:
         self._notes.clear()  # they warn of effects of this reboot
         self._reboot_for.clear()
         await self._inspect()
-        for row in self.plan.to_write:
+        for row in self._plan.to_write:
             if row.target.name in kept and row.target.name not in self._settled:
                 reason = "the vehicle acknowledged the value, and has another one after the reboot"
                 self._settle(row, ApplyStatus.ADJUSTED, reason)
@@ -574,12 +574,13 @@ class _Run:
             VehicleArmed: a component is armed, or the armed state is unknown.
         """
         component = self.component
-        if self._options.allow_armed:
+        if self.allow_armed:
             return
         with anyio.move_on_after(ARMED_STATE_TIMEOUT):
             while component.is_armed is None and component.state != "lost":  # noqa: ASYNC110 - no event
                 await anyio.sleep(POLL_INTERVAL)
-        if any(each.is_armed for each in self._known if each.system == component.system):
+        own = [each for each in component.client.components.values() if each.system == component.system]
+        if any(each.is_armed for each in own):
             problem = "is armed"
         elif component.is_armed is None and component.state != "lost":
             problem = f"does not report whether it is armed (no heartbeat within {ARMED_STATE_TIMEOUT:g} s)"
@@ -608,7 +609,7 @@ class _Run:
     def _outcome(self, row: ApplyRow, status: ApplyStatus, reason: str = "", category: str = "") -> ApplyRow:
         """Return a row of the plan with its outcome, and with the values before and as last sent."""
         name = row.target.name
-        before = None if self._start is None else self._start.table.get(name)
+        before = None if self._before is None else self._before.get(name)
         held = self.component.params.get(name)
         return replace(
             row,
@@ -620,11 +621,11 @@ class _Run:
         )
 
     def _report(self, phase: str, row: ApplyRow | None = None) -> None:
-        if self._options.progress is not None:
+        if self.progress is not None:
             done = self._settled.keys() | self._written.keys()
-            to_write = [] if self._start is None else self.plan.to_write
+            to_write = [] if self._before is None else self._plan.to_write
             left = sum(each.target.name not in done for each in to_write)
-            self._options.progress(ApplyProgress(phase, len(done), len(done) + left, row))
+            self.progress(ApplyProgress(phase, len(done), len(done) + left, row))
 
     def _final_row(self, planned: ApplyRow) -> ApplyRow:
         """Return the row of a parameter at the end of the run."""

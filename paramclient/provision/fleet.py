@@ -4,26 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import anyio
 
 from paramclient.client.component import Component
 from paramclient.errors import ParamClientError
+from paramclient.provision.planning import Rows
 
 __all__ = ["FleetResult", "for_each"]
 
 
-class Completable(Protocol):
-    """A result that tells whether all was done."""
-
-    @property
-    def complete(self) -> bool:
-        """Whether nothing is missing."""
-        ...
-
-
-Outcome = TypeVar("Outcome", bound=Completable)
+Outcome = TypeVar("Outcome", bound=Rows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +41,7 @@ async def for_each(
 ) -> FleetResult[Outcome]:
     """Make a call for each vehicle, concurrently; a failure of one does not stop the others.
 
-    The call is any that has a result with `complete`: `apply`, `restore`, `plan`, `Component.fetch_all`::
+    The call is `plan`, `apply` or `restore`::
 
         fleet = await for_each(vehicles, lambda vehicle: apply(vehicle, {"RTL_ALT": 2500}, reboot=True))
     """

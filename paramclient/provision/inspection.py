@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Final, TypeAlias
+from typing import Final, TypeAlias, Unpack
 
 import anyio
 
@@ -14,8 +14,8 @@ from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Renames
 from paramclient.model.values import Param, ParamType, Settable, Trust
-from paramclient.provision.planning import ParamInfo, Plan, check_component, plan_from
-from paramclient.provision.vehicle_params import set_maker
+from paramclient.provision.planning import Plan, PlanOptions, check_component, plan_from
+from paramclient.provision.vehicle_params import component_set
 
 __all__ = [
     "POLL_INTERVAL",
@@ -23,7 +23,6 @@ __all__ = [
     "Wanted",
     "inspect",
     "plan",
-    "planner_for",
     "reread",
     "wait_for_identity",
     "wanted_set",
@@ -48,15 +47,7 @@ Wanted: TypeAlias = ParamSet | Mapping[str, Settable]
 """The wanted parameters: of a file or a snapshot, or plain values by name."""
 
 
-async def plan(
-    component: Component,
-    wanted: Wanted,
-    *,
-    include: str | Iterable[str] = (),
-    info: Mapping[str, ParamInfo] | None = None,
-    force: bool = False,
-    renames: Renames | None = None,
-) -> Plan:
+async def plan(component: Component, wanted: Wanted, **options: Unpack[PlanOptions]) -> Plan:
     """Return what `apply` would write to a vehicle, and in which order. Only reads.
 
     The plan is `complete` if the vehicle has all wanted values.
@@ -64,7 +55,7 @@ async def plan(
     Args:
         component: the vehicle.
         wanted: the wanted parameters, or plain values by name.
-        include, info, force, renames: as in `plan_from`.
+        options: as in `PlanOptions`.
 
     Raises:
         UsageError: as from `plan_from`.
@@ -72,9 +63,16 @@ async def plan(
         LinkError: the link failed, or the client was closed.
     """
     wanted = wanted_set(component, wanted)
-    make_plan = planner_for(component, wanted, include, info, force=force, renames=renames)
+    plan_from({}, wanted, autopilot=component.autopilot, **options)  # errors before the vehicle is read
     await wait_for_identity(component)
-    return make_plan((await inspect(component, wanted, renames)).table)
+    inspection = await inspect(component, wanted, options.get("renames"))
+    return plan_from(
+        inspection.table,
+        wanted,
+        autopilot=component.autopilot,
+        encoding=component.encoding,
+        **options,
+    )
 
 
 def wanted_set(component: Component, wanted: Wanted) -> ParamSet:
@@ -87,34 +85,6 @@ def wanted_set(component: Component, wanted: Wanted) -> ParamSet:
         wanted = ParamSet(wanted, is_extended=component.is_extended)
     check_component(wanted, component.component, is_extended=component.is_extended)
     return wanted
-
-
-def planner_for(
-    component: Component,
-    wanted: ParamSet,
-    include: str | Iterable[str],
-    info: Mapping[str, ParamInfo] | None,
-    *,
-    force: bool,
-    renames: Renames | None,
-) -> Callable[[ParamSet], Plan]:
-    """Return a function that makes a plan from the parameters of a vehicle.
-
-    Raises:
-        UsageError: as from `plan_from`, as far as the vehicle need not be read for it.
-    """
-    include = (include,) if isinstance(include, str) else tuple(include)
-    plan_from({}, wanted, include=include, autopilot=component.autopilot)
-    return lambda table: plan_from(
-        table,
-        wanted,
-        include=include,
-        info=info,
-        autopilot=component.autopilot,
-        encoding=component.encoding,
-        force=force,
-        renames=renames,
-    )
 
 
 async def wait_for_identity(component: Component) -> None:
@@ -194,9 +164,9 @@ async def inspect(
         given_up |= before.intersection(table)
     to_read = [name for name in names if name not in table and name not in absent]
     found, unreported = await _read_names(component, [*given_up, *to_read], given_up)
-    to_set = set_maker(component, f"vehicle {component.system}/{component.component}")
+    known = (param for name, param in (table | found).items() if name not in unreported)
     return Inspection(
-        to_set(param for name, param in (table | found).items() if name not in unreported),
+        component_set(component, known, f"vehicle {component.system}/{component.component}"),
         complete,
         fetched.hash,
         (absent | unreported).difference(table),

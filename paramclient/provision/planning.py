@@ -6,12 +6,12 @@ The parameters that no `apply` writes are in `apply_rules.toml`.
 from __future__ import annotations
 
 import math
-import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from ctypes import c_float
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Final, Protocol
+from typing import Final, Protocol, TypedDict, Unpack
 
 from paramclient.errors import UsageError
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite, version_difference
@@ -38,6 +38,7 @@ __all__ = [
     "ApplyStatus",
     "ParamInfo",
     "Plan",
+    "PlanOptions",
     "Rows",
     "Stage",
     "check_component",
@@ -60,22 +61,35 @@ class ParamInfo(Protocol):
     @property
     def minimum(self) -> float | None:
         """The lowest valid value in the unit of the parameter, or None."""
-        ...
 
     @property
     def maximum(self) -> float | None:
         """The highest valid value in the unit of the parameter, or None."""
-        ...
 
     @property
     def is_read_only(self) -> bool:
         """Whether only the vehicle writes the parameter."""
-        ...
 
     @property
     def reboot_required(self) -> bool:
         """Whether a change takes effect after a reboot."""
-        ...
+
+
+class PlanOptions(TypedDict, total=False):
+    """Options of `plan` and `plan_from`, and of `apply`.
+
+    Attributes:
+        include: categories (`CATEGORIES`) and globs of names to set although the list leaves them out.
+        info: metadata by name.
+        force: allow NaN and infinity for every autopilot.
+        renames: names that firmware versions have changed. A wanted parameter that the vehicle does not have
+            is planned under its other name, if the vehicle has that one.
+    """
+
+    include: str | Iterable[str]
+    info: Mapping[str, ParamInfo] | None
+    force: bool
+    renames: Renames | None
 
 
 class ApplyStatus(StrEnum):
@@ -282,12 +296,9 @@ def plan_from(
     current: ParamSet | Mapping[str, Param],
     wanted: ParamSet,
     *,
-    include: str | Iterable[str] = (),
-    info: Mapping[str, ParamInfo] | None = None,
     autopilot: str | None = None,
     encoding: Encoding | None = None,
-    force: bool = False,
-    renames: Renames | None = None,
+    **options: Unpack[PlanOptions],
 ) -> Plan:
     """Return what must be written to a vehicle with these parameters so that it has the wanted values.
 
@@ -303,13 +314,9 @@ def plan_from(
     Args:
         current: the vehicle's parameters: a table, such as `component.params`, or a snapshot.
         wanted: the wanted parameters.
-        include: categories (`CATEGORIES`) and globs of names to set although the list leaves them out.
-        info: metadata by name.
         autopilot: "px4" or "ardupilot"; None if `current` names it, or to use the lists of both.
         encoding: the encoding of values; None for that of the autopilot.
-        force: allow NaN and infinity for every autopilot.
-        renames: names that firmware versions have changed. A wanted parameter that is not in `current` is
-            planned under its other name, if `current` has that one.
+        options: as in `PlanOptions`.
 
     Raises:
         UsageError: an element of `include` is neither a category nor a glob; `current` and `wanted` are of
@@ -325,34 +332,7 @@ def plan_from(
     _check_autopilot(wanted, autopilot)
     if encoding is None:
         encoding = Encoding.C_CAST if autopilot == "ardupilot" else Encoding.BYTEWISE
-    vehicle_type = None if identity is None else identity.vehicle_type
-    choice, renames = Choice(include), renames or Renames()
-    planner = _Planner(current, wanted, autopilot or "", choice, info or {}, encoding, vehicle_type, renames)
-    rows = planner.settle_missing({name: planner.row(each, force=force) for name, each in wanted.items()})
-    awaiting_reboot = planner.awaiting_reboot(rows)
-    may_be_hidden = planner.belongs_to(awaiting_reboot)
-    named = {row.target.name for row in rows.values()}
-    return Plan(
-        rows,
-        planner.stages(rows),
-        problems={
-            name: row.why
-            for name, row in rows.items()
-            if row.status is ApplyStatus.INVALID
-            or (row.status is ApplyStatus.SKIPPED and row.category == MISSING and not may_be_hidden(name))
-        },
-        extra=tuple(name for name in current if name not in named),
-        unchecked=tuple(
-            name
-            for name, row in rows.items()
-            if row.status is ApplyStatus.SET
-            and row.target.name not in planner.info
-            and not isinstance(row.target.settable, str | bytes)
-            and not choice.has((name, row.target.name), OUT_OF_RANGE)
-        ),
-        firmware=() if wanted.identity is None or identity is None else (wanted.identity, identity),
-        awaiting_reboot=awaiting_reboot,
-    )
+    return _Planner(current, wanted, autopilot or "", encoding, identity, **options).plan()
 
 
 def overlay(base: ParamSet, over: ParamSet) -> ParamSet:
@@ -411,27 +391,59 @@ class _Planner:
     current: ParamSet | Mapping[str, Param]
     wanted: ParamSet
     autopilot: str
-    choice: Choice
-    info: Mapping[str, ParamInfo]
     encoding: Encoding
-    vehicle_type: int | None
-    renames: Renames
+    identity: Identity | None
+    include: str | Iterable[str] = ()
+    info: Mapping[str, ParamInfo] | None = None
+    force: bool = False
+    renames: Renames | None = None
 
     def __post_init__(self) -> None:
+        self.described = self.info or {}
+        self.choice = Choice(self.include)
+        self.names = self.renames or Renames()
         self.rules = rules_for(self.autopilot, is_extended=self.wanted.is_extended)
-        self.renamed = self.renames.renamed(self.wanted, self.current)
+        self.renamed = self.names.renamed(self.wanted, self.current)
         targets = (self.renamed.get(name, param) for name, param in self.wanted.items())
         self.targets = {param.name: param for param in targets}
 
-    def row(self, wanted: WrittenParam, *, force: bool) -> ApplyRow:
+    def plan(self) -> Plan:
+        """Return the plan."""
+        rows = self.settle_missing({name: self.row(each) for name, each in self.wanted.items()})
+        awaiting_reboot = self.awaiting_reboot(rows)
+        may_be_hidden = self.belongs_to(awaiting_reboot)
+        file, own = self.wanted.identity, self.identity
+        return Plan(
+            rows,
+            self.stages(rows),
+            problems={
+                name: row.why
+                for name, row in rows.items()
+                if row.status is ApplyStatus.INVALID
+                or (row.status is ApplyStatus.SKIPPED and row.category == MISSING and not may_be_hidden(name))
+            },
+            extra=tuple(name for name in self.current if name not in self.targets),
+            unchecked=tuple(name for name, row in rows.items() if self.is_unchecked(row)),
+            firmware=() if file is None or own is None else (file, own),
+            awaiting_reboot=awaiting_reboot,
+        )
+
+    def is_unchecked(self, row: ApplyRow) -> bool:
+        """Return whether the range of a value to write was to be checked, and is not known."""
+        name, value = row.target.name, row.target.settable
+        is_to_check = row.status is ApplyStatus.SET and not isinstance(value, str | bytes)
+        return is_to_check and name not in self.described and not self.choice.has([name], OUT_OF_RANGE)
+
+    def row(self, wanted: WrittenParam) -> ApplyRow:
         """Return the row of one parameter; `settle_missing` completes rows of missing parameters."""
         renamed = self.renamed.get(wanted.name)
         target = wanted if renamed is None else renamed
         current: Param | WrittenParam | None = self.current.get(target.name)
         before = None if current is None else current.settable
         kind = target.type_number if current is None or current.type_number is None else current.type_number
-        info = self.info.get(target.name)
-        needs_reboot = self.rules.needs_reboot(target.name, self.vehicle_type)
+        info = self.described.get(target.name)
+        vehicle_type = None if self.identity is None else self.identity.vehicle_type
+        needs_reboot = self.rules.needs_reboot(target.name, vehicle_type)
         needs_reboot = needs_reboot or (info is not None and info.reboot_required)
         names = dict.fromkeys((target.name, wanted.name))  # the list may know only one of two names
 
@@ -450,7 +462,7 @@ class _Planner:
             return verdict(ApplyStatus.UNCHANGED)
         if info is not None and info.is_read_only and not self.choice.has(names, READ_ONLY):
             return verdict(ApplyStatus.SKIPPED, READ_ONLY, "left out: it can only be read")
-        wrong = self._find_fault(target, before, kind, force=force)
+        wrong = self._find_fault(target, before, kind)
         if wrong is None or (wrong[0] == OUT_OF_RANGE and self.choice.has(names, OUT_OF_RANGE)):
             return verdict(ApplyStatus.SET)
         category, reason = wrong
@@ -488,7 +500,7 @@ class _Planner:
     def belongs_to(self, switches: Iterable[str]) -> Callable[[str], bool]:
         """Return a function that decides whether a wanted name, or its other name, is of a switch's group."""
         groups = tuple(switch.rpartition("_")[0] + "_" for switch in switches)
-        return lambda name: any(each.startswith(groups) for each in (name, *self.renames.other_names(name)))
+        return lambda name: any(each.startswith(groups) for each in (name, *self.names.other_names(name)))
 
     def awaiting_reboot(self, rows: Mapping[str, ApplyRow]) -> tuple[str, ...]:
         """Return switches whose missing group may appear after a reboot."""
@@ -517,8 +529,8 @@ class _Planner:
             nearest: tuple[str, ...] = ()
             if len(names) <= SUGGESTIONS_MAX:
                 nearest = nearest_names(name, unnamed | {spelled.get(name.upper(), name)})
-            may_appear = any(map(may_be_revealed, (name, *self.renames.other_names(name))))
-            reason = "; ".join(filter(None, ("not on this vehicle", self.renames.missing_note(name))))
+            may_appear = any(map(may_be_revealed, (name, *self.names.other_names(name))))
+            reason = "; ".join(filter(None, ("not on this vehicle", self.names.missing_note(name))))
             status = ApplyStatus.LATER if may_appear else ApplyStatus.SKIPPED
             settled[name] = replace(rows[name], status=status, reason=reason, nearest=nearest)
         return settled
@@ -549,10 +561,10 @@ class _Planner:
         return lambda name: name.startswith(prefixes)
 
     def _find_fault(
-        self, target: WrittenParam, before: WireValue, kind: ParamType | int | None, *, force: bool
+        self, target: WrittenParam, before: WireValue, kind: ParamType | int | None
     ) -> tuple[str, str] | None:
         """Return why a value is invalid, as category and sentence, or None."""
-        value, info = target.settable, self.info.get(target.name)
+        value, info = target.settable, self.described.get(target.name)
         if self.rules.has("system_id", target.name) and (
             isinstance(value, bytes | str) or not 1 <= value <= 255
         ):
@@ -569,7 +581,7 @@ class _Planner:
         if isinstance(value, bytes | str):
             return None
         if not math.isfinite(value):
-            return None if force else self._fault_of_non_finite(value)
+            return None if self.force else self._fault_of_non_finite(value)
         sent = _float32(value) if kind == ParamType.REAL32 else value
         if info is not None and info.minimum is not None and sent < _float32(info.minimum):
             return OUT_OF_RANGE, f"{format_value(value)} is below its minimum, {info.minimum:g}"
@@ -605,11 +617,7 @@ def _is_same(wanted: WireValue, current: WireValue, kind: ParamType | int | None
 
 def _float32(value: float) -> float:
     """Return the nearest float32; infinity for values beyond its range."""
-    try:
-        number: float = struct.unpack("<f", struct.pack("<f", value))[0]
-    except OverflowError:
-        return math.copysign(math.inf, value)
-    return number
+    return c_float(value).value
 
 
 _INTENDED_CATEGORIES: Final = frozenset(CATEGORIES) - {OUT_OF_RANGE}

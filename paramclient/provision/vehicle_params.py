@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from paramclient.errors import NotInCache, UsageError, VehicleError
@@ -16,22 +15,18 @@ from paramclient.model.values import Param
 from paramclient.model.wording import first_of
 
 if TYPE_CHECKING:
-    from paramclient.cache import CachedComponent, ParamCache
+    from paramclient.cache import CachedComponent
     from paramclient.client.component import Component
-    from paramclient.protocol.fetch import FetchResult, Progress
+    from paramclient.protocol.fetch import FetchResult
 
 __all__ = [
     "NAMES_SHOWN_MAX",
     "NO_DEFAULTS",
-    "FetchedSet",
-    "set_maker",
-    "load_cached_set",
+    "cached_set",
     "collect_defaults",
+    "component_set",
+    "fetched_set",
     "select_non_defaults",
-    "incomplete_error",
-    "cached_param_set",
-    "collect_set",
-    "fetch_set",
 ]
 
 NAMES_SHOWN_MAX: Final = 20
@@ -44,32 +39,10 @@ NO_DEFAULTS: Final = (
 """The message for a request that needs the firmware's defaults when no parameter has one."""
 
 
-@dataclass(frozen=True, slots=True)
-class FetchedSet:
-    """The parameters of a fetched table that were received or confirmed in this session.
-
-    Attributes:
-        set: the parameters as a set.
-        params: the same parameters as `Param` objects of the table.
-        missing: the names (or `index 12`) of parameters that were not received.
-    """
-
-    set: ParamSet
-    params: Sequence[Param]
-    missing: Sequence[str]
-
-
-def set_maker(component: Component, source: str) -> Callable[[Iterable[Param]], ParamSet]:
-    """Return a function that turns parameters of a component into a set.
-
-    The set has the identity and the time of this call. The function may be called in a worker thread.
-
-    Args:
-        component: the component.
-        source: the origin of the set, in words.
-    """
-    return partial(
-        ParamSet.of,
+def component_set(component: Component, params: Iterable[Param], source: str) -> ParamSet:
+    """Return parameters of a component as a set of this moment; `source` is their origin in words."""
+    return ParamSet.of(
+        params,
         component=component.component,
         system=component.system,
         identity=component.identity,
@@ -79,101 +52,61 @@ def set_maker(component: Component, source: str) -> Callable[[Iterable[Param]], 
     )
 
 
-async def collect_set(
-    component: Component,
-    result: FetchResult,
-    *,
-    source: str,
-) -> FetchedSet:
-    """Return the parameters of a fetched table as a set, without values that are only cached.
+def fetched_set(component: Component, result: FetchResult, *, source: str, partial: bool = False) -> ParamSet:
+    """Return a fetched table as a set, without values that are only cached.
 
     Args:
         component: the component.
         result: the result of its fetch.
-        source: the origin of the set, in words; a doubt of the encoding is added.
-
-    Raises:
-        LinkError: the link failed.
-    """
-    if doubt := component.session.encoding_doubt:
-        source = f"{source} ({doubt})"
-    cached = set(result.cached)
-    known = [param for name, param in result.params.items() if name not in cached]
-    indices = {name: result.params[name].index for name in cached}
-    stale = {index: name for name, index in indices.items() if index is not None}
-    missing = [stale.get(index, f"index {index}") for index in sorted({*result.missing, *stale})]
-    return FetchedSet(set_maker(component, source)(known), known, missing)
-
-
-async def fetch_set(
-    component: Component,
-    *,
-    source: str,
-    timeout: float | None = None,
-    progress: Callable[[Progress], None] | None = None,
-) -> FetchedSet:
-    """Fetch all parameters of a component and return them as a set.
-
-    Args:
-        component, source: as in `collect_set`.
-        timeout, progress: as in `Component.fetch_all`.
+        source: the origin of the set, in words; a doubt of the encoding, and with `partial` the missing
+            parameters, are added.
+        partial: whether some parameters may be missing.
 
     Raises:
         VehicleError: some parameters were not received; the message names them.
-        ParamClientError: as from `Component.fetch_all`.
     """
-    result = await component.fetch_all(timeout=timeout, progress=progress)
-    found = await collect_set(component, result, source=source)
-    if found.missing:
-        raise incomplete_error(component, found.missing)
-    return found
+    if doubt := component.session.encoding_doubt:
+        source = f"{source} ({doubt})"
+    cached = {result.params[name].index: name for name in result.cached}
+    indices = sorted({*result.missing, *(index for index in cached if index is not None)})
+    missing = [cached.get(index, f"index {index}") for index in indices]
+    if missing and not partial:
+        vehicle = f"{component.system}/{component.component} {component.autopilot}"
+        was = f"{first_of(missing, NAMES_SHOWN_MAX)} {'was' if len(missing) == 1 else 'were'} not received"
+        raise VehicleError(
+            f"{vehicle} on {component.identity.link} is incomplete: {was}",
+            system=component.system,
+            component=component.component,
+        )
+    left_out = [*missing, *map(repr, sorted(component.session.table.left_out))]
+    if left_out:
+        source = f"{source}, without {first_of(left_out, NAMES_SHOWN_MAX)}"
+    known = result.params.keys() - set(result.cached)
+    return component_set(component, (each for name, each in result.params.items() if name in known), source)
 
 
-def incomplete_error(component: Component, missing: Sequence[str]) -> VehicleError:
-    """Return the error for a component some of whose parameters were not received."""
-    vehicle = f"{component.system}/{component.component} {component.autopilot}"
-    names = first_of(missing, NAMES_SHOWN_MAX)
-    was = "was" if len(missing) == 1 else "were"
-    return VehicleError(
-        f"{vehicle} on {component.identity.link} is incomplete: {names} {was} not received",
-        system=component.system,
-        component=component.component,
-    )
+def cached_set(table: CachedComponent, *, extended: bool = False, partial: bool = False) -> ParamSet:
+    """Return a component's cached parameters as a set.
 
-
-def cached_param_set(table: CachedComponent, *, extended: bool = False) -> ParamSet:
-    """Return a component's cached parameters as a set."""
+    Raises:
+        NotInCache: the cache has not all of them, and `partial` is false.
+    """
+    source = f"cache {table.key}"
+    if not table.complete:
+        of = "" if table.count is None else f" of {table.count}"
+        are = f"{table.size}{of} parameters are in the cache"
+        source = f"{source}: {are}"
+        if not partial:
+            raise NotInCache(f"{table.system}/{table.component} is incomplete: {are}")
     return ParamSet.of(
         table.params.values(),
         component=table.component,
         system=table.system,
         identity=table.identity,
         at=table.updated_at if table.synced_at is None else table.synced_at,
-        source=f"cache {table.key}",
+        source=source,
         is_extended=extended,
     )
-
-
-def load_cached_set(cache: ParamCache, key: str, component: int, *, extended: bool = False) -> ParamSet:
-    """Return the complete cached table of a component as a set.
-
-    Args:
-        cache: the cache.
-        key: `Identity.key` of the vehicle.
-        component: component id.
-        extended: its extended parameters.
-
-    Raises:
-        CacheError: the cache has no table of this component, or an incomplete one.
-    """
-    table = cache.load(key, component, extended=extended)
-    if table is None:
-        raise NotInCache(f"the cache has no table of component {component} of {key}")
-    if not table.complete:
-        vehicle = f"{table.system}/{component} ({key})"
-        of = "" if table.count is None else f" of {table.count}"
-        raise NotInCache(f"the cache has {table.size}{of} parameters of {vehicle}, not all; fetch them first")
-    return cached_param_set(table, extended=extended)
 
 
 def select_non_defaults(whole: ParamSet, described: Mapping[str, int | float]) -> ParamSet:

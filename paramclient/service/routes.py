@@ -40,8 +40,8 @@ from paramclient.model.paramset import ParamSet
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision import ApplyProgress, ApplyResult, apply, restore
 from paramclient.provision import plan as plan_of
-from paramclient.provision.restore_point import load_state_before_apply
-from paramclient.provision.vehicle_params import fetch_set, select_non_defaults, set_maker
+from paramclient.provision.restore_point import load_restore_point
+from paramclient.provision.vehicle_params import component_set, fetched_set, select_non_defaults
 from paramclient.service import bodies, documents
 from paramclient.service.access import author_of, require_write
 from paramclient.service.documents import METRICS_MEDIA_TYPE, ParamsJson, metrics_text
@@ -240,7 +240,8 @@ async def file(
     if at is not None:
         found = await hub.state_at(target, at)
     else:
-        found = (await fetch_set(target.component, source=f"link {target.link.name}")).set
+        fetched = await target.component.fetch_all()
+        found = fetched_set(target.component, fetched, source=f"link {target.link.name}")
         described = {} if target.metadata is None else target.metadata.defaults_of(found)
     if changed:
         found = select_non_defaults(found, described)
@@ -302,7 +303,7 @@ async def restore_(
 ) -> ApplyJson:
     """Restore an earlier state, with the vehicle's own identity and calibration."""
     if body.at is None:
-        state = await hub.read_cache(load_state_before_apply, target)
+        state = (await hub.read_cache(load_restore_point, target)).state
     else:
         state = await hub.state_at(target, body.at)
     options = body.model_dump(exclude={"at"}) | _context(request, hub, target)
@@ -362,7 +363,7 @@ async def create_snapshot(
     known = list(component.params.values())
     if not known:
         raise UsageError("no parameter of the vehicle is known")
-    table = set_maker(component, f"link {target.link.name}")(known)
+    table = component_set(component, known, f"link {target.link.name}")
     is_whole, crc = len(known) >= (component.count or math.inf), component.hash
 
     def store(cache: ParamCache, _: str, number: int, **which: bool) -> SnapshotSummary:

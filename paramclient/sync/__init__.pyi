@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Self, TypeAlias
+from typing import Self, TypeAlias, Unpack
 
 from paramclient.cache import ParamCache
 from paramclient.client.client import COMPONENT_TIMEOUT
@@ -17,7 +17,6 @@ from paramclient.metadata.store import MetadataStore
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet
-from paramclient.model.renames import Renames
 from paramclient.model.values import Encoding, Param, Settable
 from paramclient.protocol import ftp
 from paramclient.protocol.addresses import Address
@@ -25,9 +24,9 @@ from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.watch import SyncState
-from paramclient.provision.execution import ApplyProgress, ApplyResult
+from paramclient.provision.execution import ApplyOptions, ApplyResult, RestoreOptions
 from paramclient.provision.fleet import FleetResult, Outcome
-from paramclient.provision.planning import ParamInfo, Plan
+from paramclient.provision.planning import Plan, PlanOptions
 from paramclient.sim import Endpoint
 from paramclient.wire.signing import SigningKey, SigningReport
 
@@ -280,52 +279,13 @@ class ParamClient:
     def signing_report(self) -> SigningReport | None:
         """Return the signing statistics of the link: signed frames, and refused frames with the reasons."""
 
-def plan(
-    component: Component,
-    wanted: Wanted,
-    *,
-    include: str | Iterable[str] = (),
-    info: Mapping[str, ParamInfo] | None = None,
-    force: bool = False,
-    renames: Renames | None = None,
-) -> Plan:
+def plan(component: Component, wanted: Wanted, **options: Unpack[PlanOptions]) -> Plan:
     """Return what `apply` would write to a vehicle, and in which order. Only reads."""
 
-def apply(
-    component: Component,
-    wanted: Wanted,
-    *,
-    include: str | Iterable[str] = (),
-    info: Mapping[str, ParamInfo] | None = None,
-    reboot: bool = False,
-    allow_armed: bool = False,
-    partial: bool = False,
-    force: bool = False,
-    renames: Renames | None = None,
-    durable: bool = False,
-    backup: str | os.PathLike[str] | None = None,
-    timeout: float | None = None,
-    author: str | None = None,
-    progress: Callable[[ApplyProgress], None] | None = None,
-    before_writing: Callable[[], object] | None = None,
-) -> ApplyResult:
+def apply(component: Component, wanted: Wanted, **options: Unpack[ApplyOptions]) -> ApplyResult:
     """Write the wanted values to a vehicle, and verify each of them by reading it back at the end."""
 
-def restore(
-    component: Component,
-    state: ParamSet,
-    *,
-    include: str | Iterable[str] = (),
-    info: Mapping[str, ParamInfo] | None = None,
-    reboot: bool = False,
-    allow_armed: bool = False,
-    force: bool = False,
-    backup: str | os.PathLike[str] | None = None,
-    timeout: float | None = None,
-    author: str | None = None,
-    progress: Callable[[ApplyProgress], None] | None = None,
-    before_writing: Callable[[], object] | None = None,
-) -> ApplyResult:
+def restore(component: Component, state: Wanted, **options: Unpack[RestoreOptions]) -> ApplyResult:
     """Restore an earlier state of a vehicle: `apply`, with its own identity and calibration included."""
 
 def for_each(components: Iterable[Component], call: Callable[[Component], Outcome]) -> FleetResult[Outcome]:
