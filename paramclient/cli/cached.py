@@ -9,7 +9,7 @@ from typing import Final
 from paramclient.cache import CachedComponent, CachedSummary, HistoryEntry, ParamCache, SnapshotSummary
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson
-from paramclient.cli.options import CacheOptions, Limit
+from paramclient.cli.options import CacheOptions, Positive
 from paramclient.cli.output import local_time, print_json, print_line, say, show
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
 from paramclient.cli.sources import component_of, tables_in
@@ -157,7 +157,7 @@ def history(
     /,
     *names: str,
     since: str | None = None,
-    limit: Limit = None,
+    limit: Positive = None,
     snapshots: bool = False,
     extended: bool = False,
     options: CacheOptions = _DEFAULTS,

@@ -26,7 +26,7 @@ __all__ = [
     "CacheOptions",
     "Id",
     "KeyOptions",
-    "Limit",
+    "Positive",
     "LinkOptions",
     "Seconds",
     "Settle",
@@ -65,8 +65,8 @@ Seconds: TypeAlias = Annotated[float | None, Parameter(validator=_check_seconds)
 """A timeout in seconds."""
 Settle: TypeAlias = Annotated[float, Parameter(validator=Number(gte=0, lte=SETTLE_MAX))]
 """Seconds to watch a value after a write."""
-Limit: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1))]
-"""The largest number of rows."""
+Positive: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1))]
+"""A whole number from 1 up, or none."""
 Verbose: TypeAlias = Annotated[bool, Parameter(name=("--verbose", "-v"))]
 """Whether each step is logged on stderr."""
 

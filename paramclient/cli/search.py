@@ -17,7 +17,7 @@ from paramclient.cli.metadata import (
     known_of_table,
     print_descriptions,
 )
-from paramclient.cli.options import CacheOptions, Limit
+from paramclient.cli.options import CacheOptions, Positive
 from paramclient.cli.output import local_time, print_json, print_line, print_table, report, say
 from paramclient.cli.param_names import unmatched_text
 from paramclient.cli.sources import tables_in
@@ -42,7 +42,7 @@ def search(
     /,
     *words: str,
     vehicle: str | None = None,
-    limit: Limit = None,
+    limit: Positive = None,
     metadata: MetadataChoice = None,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:

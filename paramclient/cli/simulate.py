@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 from anyio.abc import TaskStatus
 from cyclopts import Parameter
 
-from paramclient.cli.options import IN_ID_RANGE, Id
+from paramclient.cli.options import IN_ID_RANGE, Id, Positive
 from paramclient.cli.output import print_line
 from paramclient.client.signing import read_key, timestamp_now
 from paramclient.errors import UsageError
@@ -75,7 +75,7 @@ class VehicleFaults:
     boot_time: float = 0.0
     """Seconds after each start in which the vehicle reports that it boots, and does not send its list."""
 
-    reboot_at: int | None = None
+    reboot_at: Positive = None
     """Number of listed values after which the vehicle reboots, once. Default: never."""
 
     reboot_down: float = 1.0

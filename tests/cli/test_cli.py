@@ -782,7 +782,7 @@ def test_an_ambiguous_name_chooses_no_vehicle(command: Command, warm: Path) -> N
         (["sim", "px4", "--loss", "2", "--link", "tcp:127.0.0.1:1"], "loss"),
         (["sim", "px4", "--dead", "NOPE", "--link", "tcp:127.0.0.1:1"], "NOPE"),
         (["sim", "px4", "--list-stops-at", "-1", "--link", "tcp:127.0.0.1:1"], "list_stops_at"),
-        (["sim", "px4", "--reboot-at", "0", "--link", "tcp:127.0.0.1:1"], "values from 1 up"),
+        (["sim", "px4", "--reboot-at", "0", "--link", "tcp:127.0.0.1:1"], "--reboot-at"),
         (["sim", "px4", "--other-list-every", "0", "--link", "tcp:127.0.0.1:1"], "list_every"),
         (["history"], "VEHICLE"),
     ],
