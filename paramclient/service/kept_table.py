@@ -125,14 +125,20 @@ def listed(session: Session) -> list[ReportedValue]:
 
 
 def known_param(session: Session, name: str | None) -> Param | None:
-    """Return a parameter whose value is known to be the vehicle's.
-
-    Until the encoding is certain, the bytes that the vehicle has sent cannot be told from a value.
-    """
+    """Return a parameter whose value is known to be the vehicle's."""
     param = None if name is None else session.table.params.get(name)
-    is_known = param is not None and param.trust is not Trust.CACHED
-    is_certain = session.dialect.has_ack or session.identification.is_encoding_certain
-    return param if is_known and is_certain else None
+    is_known = param is not None and param.trust is not Trust.CACHED and is_decoded(session)
+    return param if is_known else None
+
+
+def is_decoded(session: Session) -> bool:
+    """Whether values are those that the vehicle has sent: in another encoding, the bytes are not theirs.
+
+    A heartbeat that says so may be late, and the values themselves show it before.
+    """
+    return session.dialect.has_ack or (
+        session.identification.is_encoding_certain and not session.encoding_doubt
+    )
 
 
 class _Announcer(Stream[Change]):
@@ -189,7 +195,10 @@ class KeptTable:
     def is_kept(self) -> bool:
         """Whether the gateway answers for the component; otherwise requests pass to it."""
         node, now = self.component.node, anyio.current_time()
+        is_doubtful = node.identification.is_encoding_certain and not is_decoded(self.session)
         is_usable = not (self.session.table.left_out or node.has_rival(now))
+        if is_doubtful and not self.is_loading:
+            return False
         return is_usable and node.identification.has_parameters and now >= self._unserved_until
 
     @property
@@ -404,6 +413,8 @@ class KeptTable:
             ParamClientError: as from `Component.set`.
         """
         session, is_extended = self.session, self.session.dialect.has_ack
+        while not is_decoded(session):  # noqa: ASYNC110 - no event for doubt
+            await anyio.sleep(PROGRESS_INTERVAL)
         askers, params = self._sets[name, raw, number], session.table.params
         if name not in params or params[name].trust is Trust.CACHED:
             await read(session, name)

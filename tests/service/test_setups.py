@@ -198,28 +198,6 @@ async def test_an_armed_vehicle_is_set_up_only_if_that_is_allowed(cache: str) ->
         assert (await browser.post(f"{V}/apply", json={**body, "allow_armed": True})).json()["complete"]
 
 
-@pytest.mark.parametrize(
-    ("call", "body"),
-    [
-        ("apply", {}),
-        ("apply", {"values": {"PARAM_04": 1}, "at": 1}),
-        ("apply", {"values": {}}),
-        ("plan", {"file": {"name": "x"}}),
-        ("plan", {"values": {"A_NAME_THAT_IS_LONG": 1}}),
-        ("restore", {"at": True}),
-        ("restore", {"at": 0}),
-        ("restore", {"at": "2026-11-20T14:00"}),
-        ("snapshots", {"reason": ""}),
-        ("fetch", {"refresh": "maybe", "x": 1}),
-    ],
-)
-@in_simulated_time
-async def test_a_request_that_means_nothing_is_refused(call: str, body: dict[str, Any]) -> None:
-    async with service(generic()) as (_, browser):
-        await synced(browser)
-        problem(await browser.post(f"{V}/{call}", json=body), 422, "invalid-request")
-
-
 @in_simulated_time
 async def test_a_client_that_leaves_ends_its_apply_and_frees_the_vehicle(cache: str) -> None:
     tap = Tap(generic())

@@ -158,27 +158,6 @@ async def test_numbers_may_be_text_as_for_what_json_lacks() -> None:
         problem(await browser.put(f"{V}/params/WHOLE", json={"value": "much"}), 422, "usage-error")
 
 
-@pytest.mark.parametrize(
-    "body",
-    [
-        {},
-        {"value": 1, "settel_s": 1},
-        {"value": True},
-        {"value": None},
-        {"value": [1]},
-        {"value": {"bits": "0"}},
-        {"value": 1, "timeout_s": -1},
-        {"value": "x" * 1000},
-    ],
-)
-@in_simulated_time
-async def test_an_invalid_body_is_refused_with_its_faults(body: dict[str, Any]) -> None:
-    async with service(generic()) as (_, browser):
-        await synced(browser)
-        reported = problem(await browser.put(f"{V}/params/PARAM_04", json=body), 422, "invalid-request")
-        assert reported["faults"]
-
-
 @in_simulated_time
 async def test_fetches_at_one_time_share_a_download_and_tell_their_progress() -> None:
     tap = Tap(small_px4())
