@@ -11,13 +11,12 @@ from typing import Annotated, Any, Final
 import anyio
 from cyclopts import Parameter
 
-from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.json_apply import ApplyJson, ApplyRowJson, PlanJson
 from paramclient.cli.json_output import VehicleJson
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import Coloured, Status, report, say
+from paramclient.cli.output import Coloured, Status, can_ask, confirm, report, say
 from paramclient.cli.session import CommandSession, Done, Sessions, sessions
 from paramclient.cli.sources import (
     check_new,
@@ -405,7 +404,7 @@ async def run_jobs(found: Sessions, loaded: Sequence[Done[ApplyJob]], *, dry_run
     failed = [each for each in loaded if each.error is not None]
     jobs = {each.session: each.result for each in loaded if each.result is not None}
     ready = Sessions(jobs)
-    if dry_run or (not yes and can_confirm(found[0].options)):
+    if dry_run or (not yes and not found[0].options.json and can_ask()):
         made = await ready.work(lambda session: jobs[session].planned()) if ready else []
         plans = [each.result for each in made if each.result is not None]
         if dry_run or any(each.has_work for each in plans):

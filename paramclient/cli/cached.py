@@ -8,7 +8,7 @@ from typing import Final
 
 from paramclient.cache import CachedComponent, CachedSummary, HistoryEntry, ParamCache, SnapshotSummary
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson
+from paramclient.cli.json_output import HistoryLineJson, SnapshotJson
 from paramclient.cli.options import CacheOptions, Positive
 from paramclient.cli.output import local_time, print_json, print_line, say, show
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text

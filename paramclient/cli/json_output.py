@@ -1,6 +1,6 @@
 """JSON of parameters, sets, fetches and writes, as the command prints it and the service sends it.
 
-A class of this module, of `json_cache` and of `json_apply` is the shape of one object. Its `of(…)` builds it
+A class of this module and of `json_apply` is the shape of one object. Its `of(…)` builds it
 from an object of the library, and `as_json` serialises it.
 """
 
@@ -20,6 +20,7 @@ from paramclient.model.notation import (
     hash_text,
     rounded,
     time_or_none,
+    time_text,
     value_json,
     value_written,
 )
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler, TypeAdapter
     from pydantic_core import CoreSchema
 
+    from paramclient.cache import HistoryEntry, SnapshotSummary
     from paramclient.client.component import Component
     from paramclient.metadata import Metadata, ParamInfo
     from paramclient.model.paramset import ParamSet, WrittenParam
@@ -38,11 +40,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FetchJson",
+    "HistoryLineJson",
     "InfoJson",
     "Json",
     "OriginJson",
     "ParamJson",
     "SetJson",
+    "SnapshotJson",
     "VehicleJson",
     "WriteJson",
     "WrittenJson",
@@ -409,6 +413,49 @@ class WriteJson(Json):
             text=None if info is None or actual is None else info.text(actual) or None,
             reboot_required=(info is not None and info.reboot_required) or None,
         )
+
+
+# The cache
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HistoryLineJson(Json):
+    """One change of a value."""
+
+    time: str
+    component: int
+    name: str
+    old: Scalar
+    new: Scalar | None
+    by: str
+
+    @classmethod
+    def of(cls, entry: HistoryEntry) -> HistoryLineJson:
+        """Return a change."""
+        return cls.take(
+            entry,
+            time=time_text(entry.at),
+            old=value_json(entry.old.settable, entry.old.type_number),
+            new=None if entry.new is None else value_json(entry.new.settable, entry.new.type_number),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SnapshotJson(Json):
+    """A snapshot of a table, without its parameters."""
+
+    id: int
+    time: str
+    component: int
+    size: int
+    complete: bool
+    hash: str | None
+    reason: str
+
+    @classmethod
+    def of(cls, summary: SnapshotSummary) -> SnapshotJson:
+        """Return a snapshot."""
+        return cls.take(summary, time=time_text(summary.at), hash=hash_text(summary.hash))
 
 
 def _number(number: int | float | None) -> Scalar | None:

@@ -19,6 +19,9 @@ from datetime import datetime
 from itertools import accumulate
 from typing import ClassVar, Final, Self, TextIO
 
+import anyio
+import anyio.to_thread
+
 from paramclient.cli.json_output import as_json
 from paramclient.model.values import Param
 from paramclient.protocol.fetch import Progress
@@ -29,6 +32,8 @@ __all__ = [
     "LiveView",
     "Status",
     "by_index",
+    "can_ask",
+    "confirm",
     "in_local_time",
     "local_time",
     "milliseconds",
@@ -293,6 +298,29 @@ def _styled(text: str, style: str) -> str:
     if "NO_COLOR" in os.environ:
         codes = [each for each in codes if len(each) == 1]
     return f"\x1b[{';'.join(codes)}m{text}\x1b[0m" if codes and text else text
+
+
+# Questions
+
+
+def can_ask() -> bool:
+    """Return whether a user can read a question and answer it: stdin and stderr are a terminal."""
+    return sys.stdin.isatty() and sys.stderr.isatty()
+
+
+async def confirm(question: str) -> bool:
+    """Ask a question on stderr; return whether the answer is y or yes. The link is served meanwhile.
+
+    Cancellation, as by Ctrl-C, ends the question.
+    """
+    sys.stderr.write(printable(f"{question} [y/N] "))
+    sys.stderr.flush()
+    if sys.platform == "win32":  # a console cannot be waited for
+        answer = await anyio.to_thread.run_sync(sys.stdin.readline, abandon_on_cancel=True)
+    else:
+        await anyio.wait_readable(sys.stdin)  # a terminal becomes readable with a whole line
+        answer = sys.stdin.readline()
+    return answer.strip().lower() in ("y", "yes")
 
 
 # The status of a command

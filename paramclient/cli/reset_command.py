@@ -8,13 +8,12 @@ from typing import Annotated, Final
 
 from cyclopts import Parameter
 
-from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.default_sources import say_sources
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_output import VehicleJson, as_json
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session, request_from_vehicle
 from paramclient.cli.options import LinkOptions, Settle
-from paramclient.cli.output import Coloured, by_index, report, say
+from paramclient.cli.output import Coloured, by_index, can_ask, confirm, report, say
 from paramclient.cli.param_names import check_given
 from paramclient.cli.read_commands import get_chosen, report_all
 from paramclient.cli.session import CommandSession, Done, sessions
@@ -86,7 +85,7 @@ async def reset(
             return max(errors)
         code = max(job.code for job in jobs.values())
         writes = any(job.writes for job in jobs.values())
-        asks = writes and not yes and can_confirm(options)
+        asks = writes and not yes and not options.json and can_ask()
         if dry_run or asks:
             planned = [Done(each, _Planned(job)) for each, job in jobs.items()]
             found.show(planned, ["name", "now", "default", "status"], "now default")

@@ -8,8 +8,7 @@ from typing import Final
 from paramclient.cache import CachedComponent, HistoryEntry, ParamCache
 from paramclient.cli.cached import load_tables
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.json_cache import HistoryLineJson
-from paramclient.cli.json_output import InfoJson, ParamJson
+from paramclient.cli.json_output import HistoryLineJson, InfoJson, ParamJson
 from paramclient.cli.metadata import (
     MetadataChoice,
     from_file,

@@ -9,10 +9,9 @@ from typing import Annotated, Final
 
 from cyclopts import Parameter
 
-from paramclient.cli.confirmation import can_ask, confirm
 from paramclient.cli.metadata import MetadataChoice, from_file, info_of, known_of_session
 from paramclient.cli.options import LinkOptions, Settle
-from paramclient.cli.output import report
+from paramclient.cli.output import can_ask, confirm, report
 from paramclient.cli.param_names import learn_spelling, spelling
 from paramclient.cli.read_commands import get_chosen
 from paramclient.cli.session import CommandSession, check_link_argument, sessions, wait_for_firmware

@@ -21,11 +21,12 @@ from pydantic import AwareDatetime
 
 from paramclient.cache import ParamCache, SnapshotSummary
 from paramclient.cli.json_apply import ApplyJson, PlanJson
-from paramclient.cli.json_cache import HistoryLineJson, SnapshotJson
 from paramclient.cli.json_output import (
     FetchJson,
+    HistoryLineJson,
     ParamJson,
     SetJson,
+    SnapshotJson,
     VehicleJson,
     WriteJson,
     WrittenJson,
