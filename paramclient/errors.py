@@ -167,7 +167,7 @@ class UsageError(ParamClientError, ValueError):
 
 
 class InvalidParameters(UsageError):
-    """Some values for a set-up are invalid. Nothing was sent.
+    """Some values are invalid, or some names are not on the vehicle. Nothing was sent.
 
     Attributes:
         problems: by parameter name, the problem with its value, as a sentence.
@@ -175,7 +175,7 @@ class InvalidParameters(UsageError):
 
     def __init__(self, problems: Mapping[str, str]) -> None:
         lines = [f"{name}: {problem}" for name, problem in problems.items()]
-        super().__init__("nothing was sent, because of invalid values:\n" + "\n".join(lines))
+        super().__init__("nothing was sent, because of these parameters:\n" + "\n".join(lines))
         self.problems = problems
 
 

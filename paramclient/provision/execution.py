@@ -513,7 +513,8 @@ class _Run:
         own = component.identity
         for known in component.client.components.values():
             is_ours = own.has_own_uid and known.identity.uid == own.uid  # under an earlier id
-            if known.system == system and known.state != "lost" and not is_ours:
+            is_there = known.system == system != component.system and known.state != "lost"
+            if is_there and not is_ours:
                 reason = f"another vehicle on this link has system id {system}"
                 self._settle(row, ApplyStatus.SKIPPED, reason, WRONG)
                 return

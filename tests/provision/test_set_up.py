@@ -609,6 +609,45 @@ async def test_copter_keeps_its_system_id_until_it_reboots() -> None:
     assert (started.reboots, started.system, vehicle.system) == (1, 7, 7)
 
 
+@EVERY_KIND
+@in_simulated_time
+async def test_a_system_id_that_waits_for_a_reboot_can_be_set_back(make: Callable[..., Any]) -> None:
+    vehicle = make()
+    name = "SYSID_THISMAV" if make is ardupilot else "MAV_SYS_ID"
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        for system in (7, 1):
+            result = await apply(component, {name: system}, include="identity")
+            assert statuses(result) == {name: "accepted"}
+    assert (vehicle.system, vehicle.param(name).value) == (1, 1)
+
+
+@in_simulated_time
+async def test_a_refused_system_id_is_reported_with_its_reason() -> None:
+    vehicle = ardupilot(read_only=["SYSID_THISMAV"], param_error=True)
+    async with a_client(vehicle) as client:
+        result = await apply(await client.component(), {"SYSID_THISMAV": 7}, include="identity")
+    assert statuses(result) == {"SYSID_THISMAV": "refused"}
+    assert "read only" in result.rows["SYSID_THISMAV"].reason
+
+
+@in_simulated_time
+async def test_plain_values_are_applied_and_the_actual_value_is_what_the_vehicle_sent_last() -> None:
+    vehicle = ardupilot(ClampingVehicle)
+
+    def change(progress: ApplyProgress) -> None:
+        if progress.row is not None and progress.row.name == "TUNE_02":
+            vehicle.set_param("TUNE_02", 3.0)
+
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        result = await apply(component, {"TUNE_01": 99.0, "TUNE_02": 4.5}, progress=change)
+        assert {name: row.actual for name, row in result.rows.items()} == {
+            name: component.params[name].value for name in result.rows
+        }
+        assert (await plan(component, ParamSet({"TUNE_01": 10}))).complete
+
+
 @in_simulated_time
 async def test_a_system_id_of_another_vehicle_is_not_set() -> None:
     vehicles = [ardupilot(), ardupilot(system=7)]
