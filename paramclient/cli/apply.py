@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import anyio
 from cyclopts import Parameter
@@ -15,7 +15,7 @@ from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.json_apply import ApplyJson, ApplyRowJson, PlanJson
 from paramclient.cli.json_output import VehicleJson
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
-from paramclient.cli.options import LinkOptions
+from paramclient.cli.options import ApplyFlags
 from paramclient.cli.output import Coloured, Status, can_ask, confirm, report, say
 from paramclient.cli.session import CommandSession, Done, Sessions, sessions
 from paramclient.cli.sources import (
@@ -36,6 +36,7 @@ from paramclient.model.wording import counted, first_of
 from paramclient.protocol.fetch import Progress
 from paramclient.provision import (
     CATEGORIES,
+    ApplyOptions,
     ApplyProgress,
     ApplyResult,
     ApplyRow,
@@ -47,7 +48,7 @@ from paramclient.provision import (
 from paramclient.provision import apply as apply_to_vehicle
 from paramclient.provision.planning import Rows
 
-__all__ = ["ApplyJob", "apply", "backups_of", "run_jobs"]
+__all__ = ["ApplyJob", "apply", "run_jobs"]
 
 APPLY_NAMES_MAX: Final = 10
 """Parameters that a line names, so that it stays short; it gives the number of further ones."""
@@ -72,7 +73,7 @@ _STYLES: Final = {
 """Styles of each status."""
 _WORDS: Final = {ApplyStatus.SET: "to set", ApplyStatus.LATER: "that may be revealed"}
 """Words for planned actions in the summary, where they differ from the status."""
-_OPTIONS: Final = LinkOptions()
+_OPTIONS: Final = ApplyFlags()
 
 
 async def apply(
@@ -80,21 +81,12 @@ async def apply(
     file: str,
     /,
     *,
-    include: tuple[str, ...] = (),
     partial: bool = False,
-    reboot: bool = False,
-    allow_armed: bool = False,
-    force: bool = False,
     durable: bool = False,
-    backup: str | None = None,
     over: Annotated[str | None, Parameter(name="--overlay")] = None,
-    dry_run: bool = False,
     renames: str | None = None,
     metadata: MetadataChoice = None,
-    full: bool = False,
-    extended: bool = False,
-    yes: bool = False,
-    options: LinkOptions = _OPTIONS,
+    options: ApplyFlags = _OPTIONS,
 ) -> int:
     """Write the values of a parameter file to a vehicle, in dependency order, and verify each of them.
 
@@ -104,38 +96,30 @@ async def apply(
     file. Exit code 1: some values differ. After an interruption, run the same command again to continue. If
     several vehicles are heard, --vehicle must choose one, or all.
 
+    Left out by default are the categories identity, hardware, calibration, measured, counter, action,
+    read-only and out-of-range.
+
     Args:
         url: The link, such as udpin:0.0.0.0:14550, or sim:ardupilot for a simulated vehicle.
         file: A parameter file; or a vehicle in the cache, as cache:VEHICLE.
-        include: Include a category that is left out by default (identity, hardware, calibration, measured,
-            counter, action, read-only, out-of-range), or a name or pattern such as "COMPASS_OFS*". May be
-            given several times.
         partial: Skip invalid values and names that the vehicle does not have, and write the remaining values.
-        reboot: Reboot the vehicle if values take effect only after a reboot.
-        allow_armed: Continue if the vehicle is armed.
-        force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
         durable: End only when the values and their history are on the disk and survive a power loss.
-        backup: A new file for the state before the first write; its extension determines the file format.
-            {uid} and {system} in the name are replaced by the vehicle's ids.
         over: A file whose parameters replace and extend those of FILE, with {uid} or {system} in its name
             for the vehicle's ids.
-        dry_run: Print the values that would be sent, and send none of them.
         renames: A JSON file of names that firmware versions have changed. A parameter that the vehicle does
             not have is looked up under its other name.
         metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for the
             ranges of values, and for parameters that take effect only after a reboot.
-        full: Also print parameters that are unchanged or left out.
-        extended: Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them.
-        yes: Do not ask for confirmation.
     """
     check_pattern("the file of --overlay", over, options)
-    check_pattern("the file of --backup", backup, options)
+    check_pattern("the file of --backup", options.backup, options)
     given, rules = from_file(metadata), read_rules(renames)
     opened = open_file(file, partial=partial) if is_file(file) else None
-    params = await resolve(file, options, writes=True, extended=extended) if opened is None else None
-    extended = extended or (opened is not None and opened.is_extended)
+    params = None
+    if opened is None:
+        params = await resolve(file, options, writes=True, extended=options.extended)
+    extended = options.extended or (opened is not None and opened.is_extended)
     async with sessions(url, options, writes=True, extended=extended) as found:
-        backups = await backups_of(backup, found)
 
         async def job(session: CommandSession) -> ApplyJob:
             base = params
@@ -144,40 +128,13 @@ async def apply(
             assert base is not None
             wanted = base if over is None else await _with_overlay(base, over, session)
             info = given or await known_of_session(session, metadata)
-
-            def write(**running: Any) -> Awaitable[ApplyResult]:
-                return apply_to_vehicle(
-                    session.component,
-                    wanted,
-                    include=include,
-                    info=info,
-                    force=force,
-                    renames=rules,
-                    partial=partial,
-                    reboot=reboot,
-                    allow_armed=allow_armed,
-                    durable=durable,
-                    backup=backups.get(session),
-                    **running,
-                )
-
-            def make_plan() -> Awaitable[Plan]:
-                return plan(session.component, wanted, include=include, info=info, force=force, renames=rules)
-
-            return ApplyJob(
-                session,
-                make_plan,
-                write,
-                full=full,
-                partial=partial,
-                reboot=reboot,
-                allow_armed=allow_armed,
-            )
+            more: ApplyOptions = {"info": info, "renames": rules, "partial": partial, "durable": durable}
+            return ApplyJob(session, wanted, options, more)
 
         jobs = [Done(each, result=await job(each)) for each in found]
-        if not dry_run and options.no_cache and backup is None and not url.startswith("sim:"):
+        if not options.dry_run and options.no_cache and options.backup is None and not url.startswith("sim:"):
             say("the state before is not stored: --no-cache is given, and --backup is not")
-        code = await run_jobs(found, jobs, dry_run=dry_run, yes=yes)
+        code = await run_jobs(found, jobs)
         return max(code, ExitCode.INCOMPLETE) if opened is not None and opened.left_out else code
 
 
@@ -191,21 +148,6 @@ async def _with_overlay(base: ParamSet, pattern: str, session: CommandSession) -
 # Shared with restore
 
 
-async def backups_of(pattern: str | None, found: Sessions) -> Mapping[CommandSession, Path]:
-    """Return the backup file of each vehicle; none without a pattern.
-
-    Raises:
-        UsageError: the pattern gives several vehicles one file.
-        FileError: one of the files exists.
-    """
-    if pattern is None:
-        return {}
-    names = {each: await fill_pattern(pattern, each) for each in found}
-    if len(set(names.values())) < len(names):
-        raise UsageError(f"--backup {pattern} names one file for several vehicles")
-    return {each: check_new(name) for each, name in names.items()}
-
-
 @dataclass(kw_only=True)
 class _Planned:
     """The plan for one vehicle, as it is printed."""
@@ -214,7 +156,7 @@ class _Planned:
     plan: Plan
 
     def as_json(self) -> PlanJson:
-        return PlanJson.of(self.plan, **self.job.session.ids, full=self.job.full)
+        return PlanJson.of(self.plan, **self.job.session.ids, full=self.job.flags.full)
 
     def rows(self) -> Iterator[Sequence[object]]:
         has_started = False
@@ -223,13 +165,13 @@ class _Planned:
             for row in stage.rows:
                 purpose = stage.purpose + (", takes effect after a reboot" if row.needs_reboot else "")
                 yield number, *_cells(row, row.reason or purpose)
-            if self.job.reboot and stage.reboot_first:
+            if self.job.flags.reboot and stage.reboot_first:
                 has_started = True
                 yield number, *restart
-        if self.job.reboot and not has_started and (self.plan.reboot_for or self.plan.awaiting_reboot):
+        if self.job.flags.reboot and not has_started and (self.plan.reboot_for or self.plan.awaiting_reboot):
             yield None, *restart
         for row in self.plan.rows.values():
-            if row.status is not ApplyStatus.SET and (self.job.full or row.is_shown):
+            if row.status is not ApplyStatus.SET and (self.job.flags.full or row.is_shown):
                 yield None, *_cells(row, row.why)
 
     def say_summary(self) -> None:
@@ -238,7 +180,7 @@ class _Planned:
             say(f"{session.label}: {made.firmware_note}")
         say(f"{session.receiver}: {_counted(made)}; nothing was sent")
         self.job.say_notes(made, made)
-        if made.reboot_for and not self.job.reboot:
+        if made.reboot_for and not self.job.flags.reboot:
             names = first_of(made.reboot_for, APPLY_NAMES_MAX)
             say(f"{session.label}: would take effect after a reboot: {names}")
 
@@ -246,7 +188,7 @@ class _Planned:
     def has_work(self) -> bool:
         """Whether something is written."""
         is_refused = bool(self.plan.problems) and not self.job.partial
-        waits = self.job.reboot and bool(self.plan.awaiting_reboot)
+        waits = self.job.flags.reboot and bool(self.plan.awaiting_reboot)
         return not is_refused and (bool(self.plan.to_write) or waits)
 
     def check(self) -> int:
@@ -256,7 +198,7 @@ class _Planned:
             code = ExitCode.USAGE
         elif any(not row.is_as_wanted for row in self.plan.of(ApplyStatus.SKIPPED, ApplyStatus.INVALID)):
             code = ExitCode.INCOMPLETE
-        if session.component.is_armed and not self.job.allow_armed:
+        if session.component.is_armed and not self.job.flags.allow_armed:
             report(f"{session.label} is armed; nothing would be set now without --allow-armed")
             code = max(code, ExitCode.INCOMPLETE)
         return code
@@ -268,11 +210,11 @@ class ApplyJob:
 
     Attributes:
         session: the vehicle.
-        plan: returns the plan.
-        write: writes; takes `timeout`, `progress` and `before_writing` of `apply`.
-        full: whether unchanged and left-out parameters are printed.
-        partial, reboot, allow_armed: as in `apply`.
-        verb: the action for the status line.
+        wanted: the wanted parameters, or the state to restore.
+        flags: the options of the subcommand.
+        more: further options of `apply`.
+        call: `apply` or `restore`.
+        own: categories that `call` includes by itself.
         again: the command that continues after an error, if it is not the given command.
         done: a sentence on a complete result; "" for none.
         arrived: the outcomes so far.
@@ -280,17 +222,20 @@ class ApplyJob:
     """
 
     session: CommandSession
-    plan: Callable[[], Awaitable[Plan]]
-    write: Callable[..., Awaitable[ApplyResult]]
-    full: bool = False
-    partial: bool = False
-    reboot: bool = False
-    allow_armed: bool = False
-    verb: str = "setting"
+    wanted: ParamSet
+    flags: ApplyFlags
+    more: ApplyOptions
+    call: Callable[..., Awaitable[ApplyResult]] = apply_to_vehicle
+    own: tuple[str, ...] = ()
     again: str = ""
     done: str = ""
     arrived: dict[str, ApplyRow] = field(default_factory=dict)
     result: ApplyResult | None = None
+
+    @property
+    def partial(self) -> bool:
+        """Whether invalid values are skipped."""
+        return self.call is not apply_to_vehicle or self.more.get("partial", False)
 
     async def planned(self) -> _Planned:
         """Return the plan, if it is known before the deadline of the command.
@@ -300,12 +245,20 @@ class ApplyJob:
         """
         left = self.session.deadline.left()
         with anyio.move_on_after(left):
-            return _Planned(job=self, plan=await self.plan())
+            made = await plan(
+                self.session.component,
+                self.wanted,
+                include=(*self.own, *self.flags.include),
+                info=self.more.get("info"),
+                force=self.flags.force,
+                renames=self.more.get("renames"),
+            )
+            return _Planned(job=self, plan=made)
         raise NoReply(f"the parameters of {self.session.label}", attempts=0, waited=left or 0.0)
 
-    async def run(self) -> ApplyJob:
-        """Write, and return the job with its result."""
-        label, session = self.session.label, self.session
+    async def run(self, backup: Path | None) -> ApplyJob:
+        """Write, and return the job with its result; `backup` is the file for the state before."""
+        session, flags = self.session, self.flags
         began: float | None = None
 
         def update(state: ApplyProgress) -> None:
@@ -320,10 +273,20 @@ class ApplyJob:
             await session.check_only()
             session.announce_write()
 
-        title = f"{self.verb} {label}"
+        title = f"{'setting' if self.call is apply_to_vehicle else 'restoring'} {session.label}"
         with Status(f"{title}: waiting for the first response", title) as status:
-            self.result = await self.write(
-                timeout=session.deadline.left(), progress=update, before_writing=announce
+            self.result = await self.call(
+                session.component,
+                self.wanted,
+                include=flags.include,
+                force=flags.force,
+                reboot=flags.reboot,
+                allow_armed=flags.allow_armed,
+                backup=backup,
+                timeout=session.deadline.left(),
+                progress=update,
+                before_writing=announce,
+                **self.more,
             )
         return self
 
@@ -332,13 +295,13 @@ class ApplyJob:
         if self.result is None:
             rows = ApplyRowJson.of_all(self._so_far)
             return {**self.session.ids, "complete": False, "params": rows, "error": "interrupted"}
-        return ApplyJson.of(self.result, VehicleJson.of(self.session.component), full=self.full)
+        return ApplyJson.of(self.result, VehicleJson.of(self.session.component), full=self.flags.full)
 
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the cells of `APPLIED_COLUMNS`."""
         rows: Iterable[ApplyRow] = self._so_far
         if self.result is not None:
-            rows = self.result.rows.values() if self.full else self.result.shown_rows
+            rows = self.result.rows.values() if self.flags.full else self.result.shown_rows
         for row in rows:
             name, before, wanted, *more = _cells(row, row.why)
             yield name, before, wanted, _text(row.actual, row), *more
@@ -389,37 +352,43 @@ class ApplyJob:
         return f"to continue: `{self.again}`" if self.again else "run it again to continue"
 
 
-async def run_jobs(found: Sessions, loaded: Sequence[Done[ApplyJob]], *, dry_run: bool, yes: bool) -> int:
+async def run_jobs(found: Sessions, loaded: Sequence[Done[ApplyJob]]) -> int:
     """Print the plans, or write and print the results, also those so far after an interruption.
 
     Args:
         found: the vehicles.
         loaded: the job of each vehicle, or the error why there is none.
-        dry_run: print the plans only.
-        yes: do not ask the user.
 
     Returns:
         The exit code.
+
+    Raises:
+        UsageError: --backup gives several vehicles one file.
+        FileError: a file of --backup exists.
     """
     failed = [each for each in loaded if each.error is not None]
     jobs = {each.session: each.result for each in loaded if each.result is not None}
-    ready = Sessions(jobs)
-    if dry_run or (not yes and not found[0].options.json and can_ask()):
+    ready, flags = Sessions(jobs), next((job.flags for job in jobs.values()), ApplyFlags())
+    backups = {each: await fill_pattern(flags.backup, each) for each in jobs} if flags.backup else {}
+    if len(set(backups.values())) < len(backups):
+        raise UsageError(f"--backup {flags.backup} names one file for several vehicles")
+    files = {each: check_new(name) for each, name in backups.items()}
+    if flags.dry_run or (not flags.yes and not flags.json and can_ask()):
         made = await ready.work(lambda session: jobs[session].planned()) if ready else []
         plans = [each.result for each in made if each.result is not None]
-        if dry_run or any(each.has_work for each in plans):
+        if flags.dry_run or any(each.has_work for each in plans):
             made += [Done(each.session, error=each.error) for each in failed]
             code = found.show(made, PLAN_COLUMNS, APPLY_NUMBERS)
-            if not found[0].options.json:
+            if not flags.json:
                 for each in plans:
                     each.say_summary()
-        if dry_run:
+        if flags.dry_run:
             return max([code, *(each.check() for each in plans)])
         if any(each.has_work for each in plans) and not await confirm("go on?"):
             return ExitCode.INCOMPLETE
     await found.report_unheard()
     try:
-        done = await ready.work(lambda session: jobs[session].run()) if ready else []
+        done = await ready.work(lambda session: jobs[session].run(files.get(session))) if ready else []
     except anyio.get_cancelled_exc_class():
         found.show(
             [Done(session, result=job) for session, job in jobs.items()], APPLIED_COLUMNS, APPLY_NUMBERS

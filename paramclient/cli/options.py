@@ -22,6 +22,7 @@ from paramclient.wire.signing import SigningKey, SigningPolicy
 
 __all__ = [
     "CONNECTION",
+    "ApplyFlags",
     "IN_ID_RANGE",
     "CacheOptions",
     "Id",
@@ -211,3 +212,36 @@ def _typed_passphrase() -> SigningKey:
         return SigningKey.from_passphrase(getpass.getpass("Signing passphrase: "))
     except EOFError:
         raise UsageError("no passphrase was given") from None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ApplyFlags(LinkOptions):
+    """Options of apply and restore."""
+
+    include: tuple[str, ...] = ()
+    """Include a left-out category, such as calibration, or a name or pattern (STAT_*); repeatable."""
+
+    reboot: bool = False
+    """Reboot the vehicle if values take effect only after a reboot."""
+
+    allow_armed: bool = False
+    """Continue if the vehicle is armed."""
+
+    force: bool = False
+    """Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot."""
+
+    backup: str | None = None
+    """A new file for the state before the first write; {uid} and {system} become the ids of the vehicle."""
+
+    dry_run: bool = False
+    """Print the values that would be sent, and send none of them."""
+
+    full: bool = False
+    """Also print parameters that are unchanged or left out."""
+
+    extended: bool = False
+    """Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them."""
+
+    yes: bool = False
+    """Do not ask for confirmation."""

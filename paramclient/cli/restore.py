@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import shlex
 import time
-from collections.abc import Awaitable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import anyio.to_thread
 
 from paramclient.cache import ParamCache
-from paramclient.cli.apply import ApplyJob, backups_of, run_jobs
+from paramclient.cli.apply import ApplyJob, run_jobs
 from paramclient.cli.file_output import described
 from paramclient.cli.metadata import known_of_session
-from paramclient.cli.options import LinkOptions
+from paramclient.cli.options import ApplyFlags, LinkOptions
 from paramclient.cli.output import local_time, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
 from paramclient.cli.sources import (
@@ -30,7 +30,6 @@ from paramclient.errors import AlreadyRestored, CacheError, FileError, NotInCach
 from paramclient.files import ParamFile
 from paramclient.model.paramset import ParamSet, RestorePoint
 from paramclient.model.wording import age_in_words, first_of
-from paramclient.provision import ApplyResult, plan
 from paramclient.provision import restore as restore_state
 from paramclient.provision.apply_restore import restore_categories
 from paramclient.provision.inspection import wait_for_identity
@@ -41,25 +40,10 @@ __all__ = ["restore"]
 CHANGES_SHOWN_MAX: Final = 10
 """Parameters that a line names, so that it stays short; it gives the number of further ones."""
 
-_OPTIONS: Final = LinkOptions()
+_OPTIONS: Final = ApplyFlags()
 
 
-async def restore(
-    url: str,
-    when: str | None = None,
-    /,
-    *,
-    include: tuple[str, ...] = (),
-    reboot: bool = False,
-    allow_armed: bool = False,
-    force: bool = False,
-    backup: str | None = None,
-    dry_run: bool = False,
-    full: bool = False,
-    extended: bool = False,
-    yes: bool = False,
-    options: LinkOptions = _OPTIONS,
-) -> int:
+async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags = _OPTIONS) -> int:
     """Restore an earlier state of a vehicle, with its own identity and calibration.
 
     Parameters that the state does not have are not changed. Identity and calibration are written if the state
@@ -75,57 +59,27 @@ async def restore(
         when: A time, such as '2h ago' or '2026-11-20 14:00'; the number of a snapshot, from `history VEHICLE
             --snapshots`; or a backup file. Default: the state before the last apply, unless a restore ran
             since then. With --vehicle all, a time, or a backup file with {uid} or {system} in its name.
-        include: Include a category that is left out by default, or a name or pattern, as with apply.
-        reboot: Reboot the vehicle if values take effect only after a reboot.
-        allow_armed: Continue if the vehicle is armed.
-        force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
-        backup: A new file for the current state of the vehicle. {uid} and {system} in the name are replaced
-            by the vehicle's ids.
-        dry_run: Print the values that would be sent, and send none of them.
-        full: Also print parameters that are unchanged or left out.
-        extended: Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them.
-        yes: Do not ask for confirmation.
     """
-    check_pattern("the file of --backup", backup, options)
+    check_pattern("the file of --backup", options.backup, options)
     loader = _Loader.of(url, when, options)
-    extended = extended or (loader.file is not None and loader.file.is_extended)
+    extended = options.extended or (loader.file is not None and loader.file.is_extended)
     async with sessions(url, options, writes=True, extended=extended) as found:
-        backups = await backups_of(backup, found)
 
         async def job(session: CommandSession) -> ApplyJob:
             state = await loader.load(session)
             state.say(session.prefix)
-            component, params = session.component, state.params
-            own = await restore_categories(component, params)
-            info = await known_of_session(session, None)
-
-            def write(**running: Any) -> Awaitable[ApplyResult]:
-                return restore_state(
-                    component,
-                    params,
-                    include=include,
-                    info=info,
-                    force=force,
-                    reboot=reboot,
-                    allow_armed=allow_armed,
-                    backup=backups.get(session),
-                    **running,
-                )
-
             return ApplyJob(
                 session,
-                lambda: plan(component, params, include=(*own, *include), info=info, force=force),
-                write,
-                full=full,
-                partial=True,
-                reboot=reboot,
-                allow_armed=allow_armed,
-                verb="restoring",
+                state.params,
+                options,
+                {"info": await known_of_session(session, None)},
+                restore_state,
+                await restore_categories(session.component, state.params),
                 again=_command(url, state.name, session) if state.name else "",
                 done=f"restored the state {state.point}" if state.point else "",
             )
 
-        return await run_jobs(found, await found.work(job), dry_run=dry_run, yes=yes)
+        return await run_jobs(found, await found.work(job))
 
 
 @dataclass(frozen=True, slots=True)
