@@ -7,6 +7,7 @@ answer, and their tables are downloaded.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from paramclient.errors import NoReply, VehicleError
 from paramclient.protocol.checksum import ChecksumUnavailable, TableDiffers, prove
@@ -15,7 +16,10 @@ from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK
 
-__all__ = ["Answer", "ask", "may_confirm", "request_digest"]
+__all__ = ["Answer", "ask", "may_confirm", "settle"]
+
+CHANGED_MEANWHILE: Final = "The parameters changed during the download: the table may be a mixture."
+UNPROVEN: Final = "The vehicle's hash could not be computed from the table; it was equal before and after."
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,27 +46,57 @@ def may_confirm(session: Session) -> bool:
     return session.table.hash is not None or _may_prove(session)
 
 
-async def ask(session: Session) -> Answer:
+async def ask(session: Session, *, refresh: bool = False) -> Answer:
     """Ask whether the table is current. Confirmed values are verified then.
+
+    With `refresh`, it is none, whatever the vehicle says: only its hash is requested.
 
     Raises:
         LinkError: the link is closed for good.
     """
-    if _may_prove(session):
+    if _may_prove(session) and not refresh:
         try:
             await prove(session)
         except ChecksumUnavailable as error:
             is_other = isinstance(error, TableDiffers)
             return Answer(reason=error.reason, is_silent=error.is_silent, is_other=is_other)
         return Answer(is_current=True)
-    digest = await request_digest(session)
-    if not session.table.agrees_with(digest):
+    digest = await _request(session)
+    if refresh or not session.table.agrees_with(digest):
         return Answer(digest=digest)
     session.table.verify()
     return Answer(is_current=True, digest=digest)
 
 
-async def request_digest(session: Session) -> Digest | None:
+async def settle(session: Session, before: Digest | None, listed: Digest | None) -> tuple[bool, str]:
+    """Compare a table that was just downloaded with PX4's hash. Return whether it was the same meanwhile, as
+    far as known, and a note or "".
+
+    Args:
+        session: the component's.
+        before: the hash before the download, or None.
+        listed: the hash in the downloaded list, or None.
+
+    Raises:
+        LinkError: the link is closed for good.
+    """
+    table = session.table
+    if listed is not None and listed.count == table.count and table.confirm(listed.hash):
+        return True, ""
+    after = await _request(session)
+    if after is None:
+        return True, ""
+    if after.count == table.count:
+        if table.confirm(after.hash):
+            return True, ""
+        before = listed or before
+        if before is not None and before.hash == after.hash:
+            return True, UNPROVEN
+    table.unconfirm()
+    return False, CHANGED_MEANWHILE
+
+
+async def _request(session: Session) -> Digest | None:
     """Return PX4's hash now; None for another vehicle.
 
     Raises:

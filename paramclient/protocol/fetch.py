@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -15,7 +16,7 @@ from paramclient.model.values import Param
 from paramclient.model.wording import first_of
 from paramclient.protocol.checksum import is_moving
 from paramclient.protocol.dialect import Digest
-from paramclient.protocol.digest import Answer, ask, request_digest
+from paramclient.protocol.digest import Answer, ask, settle
 from paramclient.protocol.file_download import FileUnavailable, download_file
 from paramclient.protocol.ftp import SILENT_LOST
 from paramclient.protocol.list_download import ListResult, download_list
@@ -29,9 +30,8 @@ FetchSource: TypeAlias = Literal["cache", "ftp", "stream"]
 
 IDENTITY_TIME: Final = 1.5
 """Seconds that a download waits to hear whether there is a file; PX4 and ArduPilot do not need it."""
-REPAIRS_MAX: Final = 2
-"""Downloads after the first one, while the table changes during them."""
-CHANGED_MEANWHILE: Final = "The parameters changed during the download: the table may be a mixture."
+DOWNLOADS_MAX: Final = 3
+"""Downloads, while the table changes during them."""
 NOT_REFRESHED: Final = "The values outside the hash were not read again, because the policy is hash-only."
 LEFT_OUT: Final = "Skipped {}: no parameter file can contain this name."
 NOT_READ: Final = "Values outside the vehicle's hash could not be read: {}."
@@ -41,7 +41,6 @@ SHOWN_MAX: Final = 5
 UNCONFIRMED: Final = "The cached table was not confirmed: {}."
 LOST: Final = "The component was lost."
 REPLACED: Final = "Another vehicle has taken the address, and its parameters were fetched: {}."
-UNPROVEN: Final = "The vehicle's hash could not be computed from the table; it was equal before and after."
 
 
 class Policy(StrEnum):
@@ -196,12 +195,9 @@ class _Fetch:
         """Fetch, and return the result."""
         if self.policy is Policy.CACHE_ONLY:
             return self._unconfirmed()
-        can_confirm = self.table.is_complete or self.policy is Policy.HASH_ONLY
         answer = Answer()
-        if can_confirm and refresh:
-            answer = Answer(digest=await request_digest(self.session))
-        elif can_confirm:
-            answer = await ask(self.session)
+        if self.table.is_complete or self.policy is Policy.HASH_ONLY:
+            answer = await ask(self.session, refresh=refresh)
         if answer.is_current:
             self._name_changes()
             if self.policy is Policy.AUTO:
@@ -213,30 +209,20 @@ class _Fetch:
             self.notes.append(UNCONFIRMED.format(answer.reason))
         if self.policy is Policy.HASH_ONLY:
             return self._unconfirmed()
-        self._check_heard()
         self._is_silent = answer.is_silent
+        source: FetchSource = "stream"
         digest = answer.digest
-        source = await self._download()
-        for _ in range(REPAIRS_MAX):
+        for _ in range(DOWNLOADS_MAX):
+            if self.session.channel.is_silent(self._began):
+                break
+            source = await self._download()
             is_whole = self.table.is_complete and not self.listed.missing
-            if not self._is_replaced() and (not is_whole or await self._settle(digest)):
+            if not self._is_replaced() and (not is_whole or await self._is_settled(digest)):
                 break
             digest = None
-            source = await self._download()
-        if self.session.channel.is_silent(self._began):
-            if not self.table.params:
-                self._check_heard()
-            self.notes.append(LOST)
         if answer.is_other:
             self._name_changes()
         return self._result(source)
-
-    def _check_heard(self) -> None:
-        """Raise NoReply if the component is lost."""
-        channel = self.session.channel
-        if channel.is_silent(self._began):
-            waited = anyio.current_time() - self._began
-            raise NoReply(f"the parameters of {channel}", attempts=0, waited=waited)
 
     def _is_replaced(self) -> bool:
         """Return whether another vehicle has taken the address since the last call, and tell so."""
@@ -279,29 +265,16 @@ class _Fetch:
             self.table.complete()
         return "stream"
 
-    async def _settle(self, before: Digest | None) -> bool:
-        """Compare the table with the digest after the download; return whether the fetch is done."""
-        listed = self.listed.digest
-        if listed is not None and listed.count == self.table.count and self.table.confirm(listed.hash):
-            return True
-        before = listed or before
-        after = await request_digest(self.session)
-        if after is None:
-            return True
-        if after.count == self.table.count:
-            if self.table.confirm(after.hash):
-                return True
-            if before is not None and before.hash == after.hash:
-                self.notes.append(UNPROVEN)
-                return True
-        self.table.unconfirm()
-        self.notes.append(CHANGED_MEANWHILE)
-        return False
+    async def _is_settled(self, before: Digest | None) -> bool:
+        is_settled, note = await settle(self.session, before, self.listed.digest)
+        self.notes += [note] if note else []
+        return is_settled
 
     async def _read_unverified(self) -> None:
         """Read the values that the digest does not cover."""
-        await read_many(self.session, self.table.unverified(), lambda name, result: None)
-        if left := self.table.unverified(self._began):
+        names = self.table.unverified()
+        await read_many(self.session, names, lambda name, result: None)
+        if left := [name for name in names if self.table.moments[name] < self._began]:
             self.notes.append(NOT_READ.format(first_of(left, SHOWN_MAX)))
 
     def _unconfirmed(self) -> FetchResult:
@@ -310,6 +283,12 @@ class _Fetch:
         return replace(self._result("cache"), hash=None)
 
     def _result(self, source: FetchSource) -> FetchResult:
+        channel, moments = self.session.channel, self.table.moments.values()
+        if self.policy is Policy.AUTO and channel.is_silent(self._began):
+            if source != "cache" and max(moments, default=-math.inf) < self._began:
+                waited = anyio.current_time() - self._began
+                raise NoReply(f"the parameters of {channel}", attempts=0, waited=waited)
+            self.notes.append(LOST)
         self.notes += [LEFT_OUT.format(repr(name)) for name in sorted(self.table.left_out)]
         if doubt := self.session.encoding_doubt:
             self.notes.append(doubt)

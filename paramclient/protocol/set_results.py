@@ -41,7 +41,7 @@ class SetResult:
         requested: the requested value.
         param: the parameter as it is now.
         attempts: sets that were sent.
-        note: a further sentence: PX4 does not save a change as small as this one.
+        note: a further sentence, or empty.
     """
 
     name: str

@@ -63,6 +63,7 @@ BATCH_SIZE: Final = 20
 LATE_ANSWER_TIME: Final = 0.3
 """Seconds after a write in which an ArduPilot may answer an earlier read: it takes the value when it queues
 the answer, and sends it up to 100 ms later."""
+UNWATCHED: Final = "It was not seen whether the vehicle changes the value later: it answers no more."
 DENIED: Final = "Param write denied ("
 """The beginning of ArduPilot's STATUSTEXT for a read-only parameter."""
 
@@ -76,7 +77,7 @@ async def write(
     force: bool = False,
     author: str = "us",
     turn: AbstractAsyncContextManager[object] | None = None,
-    sending: Callable[[], None] = lambda: None,
+    report: Callable[[SetResult | None], None] = lambda result: None,
     vehicles: int | None = None,
 ) -> SetResult:
     """Set one parameter, and prove its value by what the component reports.
@@ -95,7 +96,7 @@ async def write(
         force: also send NaN and infinity to a vehicle that cannot store them.
         author: of the change, for the history.
         turn: entered while requests are sent, but not while the value is watched.
-        sending: called before each set is sent.
+        report: called with None before each set is sent, and with the result before the value is watched.
         vehicles: `Identification.vehicles` of the vehicle to which it is sent; None for the present one.
 
     Raises:
@@ -118,7 +119,7 @@ async def write(
             async with turn or nullcontext():
                 before = await _read_writable(session, name)
                 try:
-                    result = await _Write(session, vehicles, before, value, sending).run()
+                    result = await _Write(session, vehicles, before, value, report).run()
                 except (NoReply, LinkError, anyio.get_cancelled_exc_class()):
                     session.foreign_set(name, author, anyio.current_time())  # it may be acknowledged yet
                     raise
@@ -127,12 +128,8 @@ async def write(
                 session.replaced[name].append(late)
                 session.spawn(_ignore_late_answers, session, late)
             if settle > 0:
-                with session.channel.gate.until_closed():
-                    await anyio.sleep(settle)
-                now = await read_param(session, name)
-                await session.confirm(vehicles)
-                if not now.same_value(result.param):
-                    result = replace(result, status="adjusted", param=now)
+                report(result)
+                result = await _settled(session, vehicles, result, settle)
             return result
         finally:
             session.acknowledging.discard(name)
@@ -179,8 +176,9 @@ async def write_many(
     async def write_one(place: int) -> None:
         name, value = pairs[place]
 
-        def sending() -> None:
-            outcomes[place] = replace(outcomes[place], status=SetStatus.UNKNOWN)
+        def report(result: SetResult | None) -> None:
+            status = SetStatus.UNKNOWN if result is None else SetStatus(result.status)
+            outcomes[place] = SetOutcome(name, value, status, result)
 
         try:
             result = await write(
@@ -191,7 +189,7 @@ async def write_many(
                 force=force,
                 author=author,
                 turn=turn(),
-                sending=sending,
+                report=report,
                 vehicles=vehicles,
             )
         except (NoReply, LinkError, AnotherVehicle) as error:
@@ -200,7 +198,7 @@ async def write_many(
         except ParamClientError as error:
             outcomes[place] = replace(outcomes[place], status=SetStatus.REFUSED, error=error)
         else:
-            outcomes[place] = SetOutcome(name, value, SetStatus(result.status), result)
+            report(result)
         done(outcomes[place])
 
     async def write_in_order(places: Sequence[int]) -> None:
@@ -250,7 +248,7 @@ class _Write:
         vehicles: int,
         before: Param,
         value: WireValue,
-        sending: Callable[[], None],
+        report: Callable[[SetResult | None], None],
     ) -> None:
         self.session = session
         self.channel = session.channel
@@ -260,7 +258,7 @@ class _Write:
         self.attempts = 0
         self._began = anyio.current_time()
         self._confirm = partial(session.confirm, vehicles)
-        self._sending = sending
+        self._report = report
         self._raw = b""
         self._has_other_value = False
         self._has_new_type = False
@@ -287,7 +285,7 @@ class _Write:
                     if self.attempts >= sets_max:
                         return await self._last_answer(inbox)
                 elif adjusted is not None and (adjusted.same_value(answer) or self.attempts >= SETS_MAX):
-                    return self._result(answer)
+                    return self._result(await self._wanted_behind(inbox) or answer)
                 else:
                     adjusted = answer
 
@@ -343,10 +341,16 @@ class _Write:
             raise self._not_applied(answer)
         return self._result(answer)
 
+    async def _wanted_behind(self, inbox: Inbox) -> Param | None:
+        """Return the wanted value if it comes behind answers to earlier reads, as long as these may take."""
+        slowest = self.channel.timing.slowest
+        answer = await self.channel.wait_for(inbox, self._accept, self._began, 0, slowest)
+        return answer if isinstance(answer, Param) and self._is_wanted(answer) else None
+
     def _request(self, attempt: int) -> Message:
         """Return the set, and count it as sent."""
         self.attempts += 1
-        self._sending()
+        self._report(None)
         self.session.acknowledging.add(self.name)
         dialect, number = self.session.dialect, self.before.type_number
         return dialect.request_set(self.channel.target, self.name, self._raw, number)
@@ -434,6 +438,21 @@ class _Write:
         words, sent = (format_value(each, actual.type_number) for each in (kept, self.value))
         what = f"{self.channel} keeps {self.name} at {words}; {sent} was sent {self.attempts} times"
         return ValueNotApplied(what, *target, name=self.name, requested=self.value, actual=kept)
+
+
+async def _settled(session: Session, vehicles: int, result: SetResult, seconds: float) -> SetResult:
+    """Read a value once more after some seconds. A vehicle that is lost meanwhile has acknowledged it."""
+    channel = session.channel
+    with channel.gate.until_closed(), channel.waiting_until(anyio.current_time() + seconds):
+        await anyio.sleep_forever()
+    if channel.is_lost:
+        return replace(result, note=UNWATCHED)
+    try:
+        now = await read_param(session, result.name)
+        await session.confirm(vehicles)
+    except NoReply:
+        return replace(result, note=UNWATCHED)
+    return result if now.same_value(result.param) else replace(result, status="adjusted", param=now)
 
 
 async def _read_writable(session: Session, name: str) -> Param:

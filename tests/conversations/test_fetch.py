@@ -150,6 +150,25 @@ def test_a_lost_vehicle_ends_a_fetch_within_7_s_with_what_came(kind: str, backen
 
 
 @BACKENDS
+def test_a_vehicle_that_is_lost_after_its_hash_is_told_as_lost(backend: str) -> None:
+    async def main() -> None:
+        endpoint = Silence(Air.symmetric([PX4Vehicle()], delay=0.3), at=1e9)
+        async with converse(endpoint) as conversation:
+            session = (await conversation.node()).plain
+            await fetch_all(session)
+            session.table.doubt()  # as at the next start
+            endpoint.at = anyio.current_time() + 0.65
+            result = await fetch_all(session)
+            assert anyio.current_time() - endpoint.at < 7.0
+            assert "The component was lost." in result.notes
+            assert session.table.volatile
+            (left,) = [note for note in result.notes if "outside the vehicle's hash" in note]
+            assert f"and {len(session.table.volatile) - 5} more" in left
+
+    run(main, backend=backend)
+
+
+@BACKENDS
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
 def test_a_vehicle_that_takes_the_address_during_a_fetch_is_fetched_whole(kind: str, backend: str) -> None:
     async def main() -> None:

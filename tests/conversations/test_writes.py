@@ -432,6 +432,21 @@ async def test_an_acknowledgement_to_another_station_changes_no_type() -> None:
         assert vehicle.param("RTL_ALT").value == 1600
 
 
+@virtual_on_both
+@pytest.mark.parametrize("timeout", [None, 2.0], ids=["lost", "at the timeout"])
+async def test_values_are_accepted_though_they_could_not_be_watched(timeout: float | None) -> None:
+    endpoint = Silence(Air.symmetric([PX4Vehicle()], delay=0.05), at=1e9)
+    async with converse(endpoint) as conversation:
+        session = (await conversation.node()).plain
+        if timeout is None:
+            endpoint.at = anyio.current_time() + 1.0
+        pairs = [("MC_ROLL_P", 5.5), ("MC_PITCH_P", 5.5)]
+        result = await write_many(session, pairs, settle=30.0, timeout=timeout)
+        assert timeout is not None or anyio.current_time() - endpoint.at < 7.0
+        assert [each.status for each in result.outcomes] == [SetStatus.ACCEPTED] * 2
+        assert [each.reported for each in result.outcomes] == [5.5, 5.5]
+
+
 # another vehicle
 
 
