@@ -361,10 +361,11 @@ def json_fields(params: ParamSet, param: WrittenParam) -> dict[str, object]:
     if isinstance(value, str) and value.startswith(HEX):  # as text, it would read as bytes
         value = value.encode()
     is_exact = params.is_extended and isinstance(value, str | bytes)
+    kind = None if number is None else type_name(number)
     return _without_none(
         {
             "value": value_written(value, param),
-            "type": number and (f"TYPE_{number}" if param.type is ParamType.UNKNOWN else type_name(number)),
+            "type": f"TYPE_{number}" if param.type is ParamType.UNKNOWN else kind,
             "bits": None if is_exact else bits_written(param),
             "default": None if param.default is None else value_written(param.default, param),
             "comment": _encodable(param.comment) or None,
