@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Final
+from typing import Annotated, ClassVar, Final
 
 from cyclopts import Parameter
 
@@ -96,16 +96,7 @@ async def reset(
             return code
         if asks and not await confirm("go on?"):
             return ExitCode.INCOMPLETE
-        written = await write_all(
-            found,
-            jobs,
-            ["name", "before", "default", "now", "status"],
-            "before default now",
-            verb="resetting",
-            settle=settle,
-            force=False,
-            durable=durable,
-        )
+        written = await write_all(found, jobs, settle=settle, force=False, durable=durable)
     for job in jobs.values():
         if not options.json:
             say_sources(job.session.label, job.sources)
@@ -124,6 +115,10 @@ class _ResetJob(WriteJob):
         errors: the unknown names.
         is_incomplete: whether parameters of a pattern were not received.
     """
+
+    columns: ClassVar[Sequence[str]] = ("name", "before", "default", "now", "status")
+    right: ClassVar[str] = "before default now"
+    verb: ClassVar[str] = "resetting"
 
     before: Mapping[str, Param] = field(default_factory=dict)
     unchanged: Sequence[str] = ()

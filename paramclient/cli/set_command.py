@@ -15,7 +15,7 @@ from paramclient.cli.output import can_ask, confirm, report
 from paramclient.cli.param_names import learn_spelling, spelling
 from paramclient.cli.read_commands import get_chosen
 from paramclient.cli.session import CommandSession, check_link_argument, sessions, wait_for_firmware
-from paramclient.cli.writes import OUTCOME_COLUMNS, WriteJob, write_all
+from paramclient.cli.writes import WriteJob, write_all
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.metadata.info import number_of
@@ -67,16 +67,7 @@ async def set_(
     async with sessions(url, options, writes=True, extended=extended) as found:
         jobs = {each: await _prepare(each, wanted, described, metadata) for each in found}
         await _check_values([*jobs.values()], force=force)
-        return await write_all(
-            found,
-            jobs,
-            OUTCOME_COLUMNS,
-            "requested actual",
-            verb="setting",
-            settle=settle,
-            force=force,
-            durable=durable,
-        )
+        return await write_all(found, jobs, settle=settle, force=force, durable=durable)
 
 
 async def _prepare(

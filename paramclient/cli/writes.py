@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, TypeVar
+from typing import ClassVar, Final, TypeVar
 
 import anyio
 
@@ -23,10 +23,8 @@ from paramclient.model.wording import counted, first_of
 from paramclient.protocol.fetch import Progress
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 
-__all__ = ["OUTCOME_COLUMNS", "WriteJob", "write_all"]
+__all__ = ["WriteJob", "write_all"]
 
-OUTCOME_COLUMNS: Final = ("name", "requested", "actual", "status")
-"""Columns of a table of outcomes."""
 NOT_ON_VEHICLE: Final = "not on this vehicle"
 """The status, in a table, of a name that the vehicle does not have: it has refused nothing."""
 INVALID: Final = "invalid"
@@ -47,18 +45,17 @@ _STYLES: Final = {
 class WriteJob:
     """The values for one vehicle in the order of the writes, its metadata, and the outcomes so far."""
 
+    columns: ClassVar[Sequence[str]] = ("name", "requested", "actual", "status")
+    right: ClassVar[str] = "requested actual"
+    verb: ClassVar[str] = "setting"
+
     session: CommandSession
     writes: Sequence[tuple[str, WireValue]]
     described: Metadata | None
     arrived: list[SetOutcome] = field(default_factory=list)
 
-    async def write(self, verb: str, *, settle: float, force: bool, durable: bool) -> None:
-        """Write the values; afterwards each has an outcome, also if nothing could be written.
-
-        Args:
-            verb: the action for the status line, `setting`.
-            settle, force, durable: as in `Component.set_many`.
-        """
+    async def write(self, *, settle: float, force: bool, durable: bool) -> None:
+        """Write the values as `Component.set_many` does; afterwards each has an outcome in any case."""
         session, began, total = self.session, anyio.current_time(), len(self.writes)
         is_announced = False
 
@@ -72,7 +69,7 @@ class WriteJob:
             status.update(Progress.after(done, total, anyio.current_time() - began))
 
         label = session.label
-        with Status(f"waiting for {label} to acknowledge PARAM_SET", f"{verb} {label}") as status:
+        with Status(f"waiting for {label} to acknowledge PARAM_SET", f"{self.verb} {label}") as status:
             try:
                 done = await session.component.set_many(
                     self.writes,
@@ -123,7 +120,7 @@ class WriteJob:
         return {"vehicle": as_json(VehicleJson.of(self.session.component)), "results": as_json(results)}
 
     def rows(self) -> Iterator[Sequence[object]]:
-        """Yield the cells of `OUTCOME_COLUMNS`; the reported value with its meaning, if that is known."""
+        """Yield the rows; the reported value with its meaning, if that is known."""
         for each in self.outcomes:
             kind = self._type_of(each)
             number = kind if isinstance(each.requested, bytes) else ParamType.REAL64
@@ -170,10 +167,7 @@ Job = TypeVar("Job", bound=WriteJob)
 async def write_all(
     found: Sessions,
     jobs: Mapping[CommandSession, Job],
-    columns: Sequence[str],
-    right: str,
     *,
-    verb: str,
     settle: float,
     force: bool,
     durable: bool,
@@ -186,18 +180,18 @@ async def write_all(
     Raises:
         AmbiguousVehicle, NoReply, LinkError: as from `CommandSession.check_only`; nothing was written.
     """
-    for each in found:
-        if jobs[each].writes:
+    first, writes = jobs[found[0]], any(job.writes for job in jobs.values())
+    if writes:
+        for each in found:
             await each.check_only()
-    await found.report_unheard()
+        await found.report_unheard()
     began = anyio.current_time()
     done = [Done(session, job) for session, job in jobs.items()]
     try:
-        await found.work(
-            lambda session: jobs[session].write(verb, settle=settle, force=force, durable=durable)
-        )
+        if writes:
+            await found.work(lambda each: jobs[each].write(settle=settle, force=force, durable=durable))
     except anyio.get_cancelled_exc_class():
-        found.show(done, columns, right, errors=False)
+        found.show(done, first.columns, first.right, errors=False)
         unknown = sum(each.status is SetStatus.UNKNOWN for job in jobs.values() for each in job.outcomes)
         say(
             f"interrupted: the outcome of {counted(unknown, 'value')} is not known, and the vehicle may "
@@ -205,7 +199,7 @@ async def write_all(
         )
         raise
     elapsed = anyio.current_time() - began
-    found.show(done, columns, right, errors=False)
+    found.show(done, first.columns, first.right, errors=False)
     for job in jobs.values():
         if not found[0].options.json:
             client = job.session.client
