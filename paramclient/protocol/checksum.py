@@ -34,8 +34,8 @@ __all__ = ["CHECKED_READ_SIZE", "ChecksumUnavailable", "TableDiffers", "is_movin
 
 CHECKED_READ_SIZE: Final = 64
 """Bytes that ArduPilot reads at a time for a checksum: the padding of the file depends on it (measured)."""
-AT_ONCE: Final = 5
-"""Requests sent at once: ArduPilot's queue has 5 places, and drops the surplus silently (measured)."""
+AT_ONCE: Final = 4
+"""Requests sent at once: of five, a Plane and a Rover lose the next one within 10 ms (measured)."""
 INTERVAL: Final = 0.006
 """Seconds between further requests: ArduPilot loses some of those sent every 4 ms (measured)."""
 REQUEST_SIZE: Final = 54
@@ -47,19 +47,26 @@ FILE_RATE: Final = 48_500
 FLOAT32_EXACT: Final = 2**24
 """The largest integer up to which float32 holds all."""
 BOOT_COUNT: Final = "STAT_BOOTCNT"
-SECONDS: Final = re.compile(r"STAT_RUNTIME|STAT_FLTTIME")
+RUN_TIME: Final = "STAT_RUNTIME"
+"""Name of the value that has moved at almost every connection."""
+SECONDS: Final = re.compile(f"{RUN_TIME}|STAT_FLTTIME")
 """Names of values that count seconds."""
-MOVING: Final = re.compile(f"{SECONDS.pattern}|{BOOT_COUNT}")
-"""Names that have another value at almost every connection."""
+RARE: Final = re.compile(f"{BOOT_COUNT}|STAT_FLTTIME")
+"""Names of values that move with each start, and with each flight."""
+PRESSURE: Final = re.compile(r"BARO\d_GND_PRESS")
+"""Names of values that a disarmed Plane or Rover measures all the time (measured)."""
+PRESSURE_DRIFT: Final = 0.001
+"""Share by which these change in between."""
 SECONDS_SLACK: Final = 60.0
 """By how much these may grow more than time passes: they are stored every 30 s."""
 MEASURED: Final = re.compile(
-    r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|ARSPD\d?_OFFSET|COMPASS_DEC|BARO\d_GND_PRESS"
+    r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|ARSPD\d?_OFFSET|COMPASS_DEC|" + PRESSURE.pattern
 )
 """Names that each start of the vehicle measures again (measured)."""
 TOO_MANY: Final = "it differs, and a download is quicker than a search for the changes"
+RESTLESS: Final = "the parameters change all the time"
 OTHER: Final = "the vehicle has other parameters than the cached table"
-PROOFS_MAX: Final = 2
+PROOFS_MAX: Final = 3
 """Proofs: the vehicle may change a value in the middle of one."""
 PARTS_MIN: Final = 3
 PARTS_MAX: Final = 12
@@ -104,10 +111,10 @@ async def prove(session: Session) -> None:
         raise ChecksumUnavailable(BUSY)
     async with session.channel.ftp:
         try:
+            unexplained: set[int] = set()
             for _ in range(PROOFS_MAX):
                 proof = _Proof(session, _rows(session.table))
-                await proof.run()
-                if proof.take_over():
+                if await proof.run(unexplained) and proof.take_over():
                     return
         except FileTransferError as error:
             if error.code == FileErrorCode.UNKNOWN_COMMAND:
@@ -117,12 +124,12 @@ async def prove(session: Session) -> None:
             session.ftp_unanswered += error.attempts
             is_silent = session.serves_checksum is None
             raise ChecksumUnavailable("MAVFTP did not answer", is_silent=is_silent) from None
-    raise ChecksumUnavailable("the parameters change all the time")
+    raise TableDiffers(RESTLESS)
 
 
 def is_moving(name: str) -> bool:
     """Return whether ArduPilot changes this value itself, at each start or all the time."""
-    return bool(MOVING.fullmatch(name) or MEASURED.fullmatch(name))
+    return name == BOOT_COUNT or bool(SECONDS.fullmatch(name) or MEASURED.fullmatch(name))
 
 
 class _Proof:
@@ -140,44 +147,57 @@ class _Proof:
         self._round_trip = math.inf  # of the quickest requests
         self._byte_time = 0.0  # seconds for each byte of requests that waited for each other
 
-    async def run(self) -> None:
-        """Compare, and read what differs, until nothing does.
+    async def run(self, unexplained: set[int]) -> bool:
+        """Compare, and read what differs, until nothing does; return False if values may just have moved.
+
+        Args:
+            unexplained: checksums of the whole file with a difference that nothing has explained.
 
         Raises:
             TableDiffers: the tables are too different.
         """
         rows, volatile = self._rows, self._session.table.volatile
         whole = range(len(rows))
-        moving = {at for at, row in enumerate(rows) if MOVING.fullmatch(row.name) or may_be_rounded(row)}
         measured = {at for at, row in enumerate(rows) if MEASURED.fullmatch(row.name) and row.bits}
-        learnt = {at for at, row in enumerate(rows) if row.name in volatile} - moving - measured
+        moving = {at for at, row in enumerate(rows) if row.name == RUN_TIME or _is_learnt(row, volatile)}
+        rare = {at for at, row in enumerate(rows) if RARE.fullmatch(row.name) or may_be_rounded(row)}
         suspects: set[int] = set()
-        await self._request({len(whole), *(self._ends_of(moving, whole) if self._is_slow else ())})
+        early = moving | rare if self._is_slow else moving if len(moving) > 1 else set()
+        await self._request({len(whole)} | self._ends_of(early, whole))
+        if self._found[len(whole)] in unexplained:
+            raise TableDiffers(OTHER)
         while places := self._places():
             if any(len(place) == 1 and rows[place.start].name == BOOT_COUNT for place in places):
                 suspects |= measured
             guesses: dict[int, int] = {}
             numbers: set[int] = set()
             for place, difference in places.items():
-                if ends := self._ends_of(moving, place):
+                if ends := self._ends_of(moving, place) or self._ends_of(rare, place):
                     numbers |= ends
+                elif place.stop == len(whole) != len(place) and self._is_first(place.stop):
+                    numbers.add(place.stop)
                 elif suspected := suspects.intersection(place):
                     guesses.update((at, rows[at].bits) for at in suspected)
                 elif guess := self._guess(place, difference):
                     guesses |= guess
-                elif suspected := learnt.intersection(place):
-                    guesses.update((at, rows[at].bits) for at in suspected)
                 elif len(place) > 1:
                     numbers |= self._parts(place)
-                else:
+                elif len(places) == len(self._found):
                     raise TableDiffers(OTHER)
+                else:
+                    unexplained.add(self._found[len(whole)])
+                    return False
             self._weigh(len(guesses), len(numbers))
             if numbers:
                 await self._request(numbers)
             else:
                 await self._read(guesses)
                 suspects -= guesses.keys()
-                learnt -= guesses.keys()
+        return True
+
+    def _is_first(self, number: int) -> bool:
+        """Whether this checksum is the oldest one: values may have moved since."""
+        return next(iter(self._found)) == number
 
     @property
     def _is_slow(self) -> bool:
@@ -188,9 +208,8 @@ class _Proof:
 
     def _ends_of(self, indices: Collection[int], place: range) -> set[int]:
         """Return the numbers of rows whose checksums show these values, as far as they are in a range and not
-        known; with all rows, as the values may just have moved."""
-        ends = {end for at in indices if at in place for end in (at, at + 1)} - {0, *self._found}
-        return ends and {*ends, len(self._rows)}
+        known."""
+        return {end for at in indices if at in place for end in (at, at + 1)} - {0, *self._found}
 
     def _parts(self, place: range) -> set[int]:
         parts = min(max(PARTS_MIN, int(self._round_trip / PART_TIME)), PARTS_MAX)
@@ -252,10 +271,12 @@ class _Proof:
 
         async def request(number: int) -> None:
             query = "" if number == len(self._rows) else f"?count={number}"
-            self._found[number] = await checksum(session.channel, PARAM_FILE + query, attempts=attempts)
+            answer = await checksum(session.channel, PARAM_FILE + query, attempts=attempts)
+            self._found.pop(number, None)
+            self._found[number] = answer  # the last one
 
         async with task_group() as tasks:
-            for place, number in enumerate(numbers):
+            for place, number in enumerate(sorted(numbers, reverse=True)):
                 if place >= AT_ONCE:
                     await anyio.sleep(INTERVAL)
                 tasks.start_soon(request, number)
@@ -268,7 +289,7 @@ class _Proof:
     async def _read(self, guesses: dict[int, int]) -> None:
         """Read values by their indices, and take over those that are others; `guesses` has their exact bits.
 
-        A value that has counted the seconds since it was known needs no read: nothing else explains it.
+        A value that has just moved as it always does needs no read: hardly anything else explains it.
 
         Raises:
             TableDiffers: the vehicle has another parameter at such an index.
@@ -277,11 +298,9 @@ class _Proof:
 
         async def read_one(at: int, guess: int) -> None:
             row = self._rows[at]
-            if SECONDS.fullmatch(row.name) and row.type is ParamType.INT32:
-                passed = now - table.moments[row.name] + SECONDS_SLACK
-                if 0 < int(from_bits(guess, row.type)) - int(from_bits(row.bits, row.type)) <= passed:
-                    self._take(at, guess, now)
-                    return
+            if _has_just_moved(row, guess, now - table.moments[row.name]):
+                self._take(at, guess, now)
+                return
             try:
                 found = await read(self._session, at)
             except (NoReply, VehicleError):
@@ -324,6 +343,20 @@ class _Proof:
             table.volatile = frozenset(self._rows[at].name for at in self._changed)
         table.prove(self._found[len(self._rows)])
         return True
+
+
+def _is_learnt(row: PackedParam, volatile: Collection[str]) -> bool:
+    is_measured = MEASURED.fullmatch(row.name) and not PRESSURE.fullmatch(row.name)
+    return row.name in volatile and not is_measured
+
+
+def _has_just_moved(row: PackedParam, bits: int, passed: float) -> bool:
+    """Return whether a value has grown by the seconds that have passed, or is the same day's pressure."""
+    old, new = float(from_bits(row.bits, row.type)), float(from_bits(bits, row.type))
+    if SECONDS.fullmatch(row.name) and row.type is ParamType.INT32:
+        return 0 < new - old <= passed + SECONDS_SLACK
+    is_pressure = PRESSURE.fullmatch(row.name) and row.type is ParamType.REAL32
+    return bool(is_pressure) and 0 < abs(new - old) <= PRESSURE_DRIFT * old
 
 
 def _bits_to_write(bits: int, kind: ParamType) -> float:
