@@ -59,14 +59,12 @@ PRESSURE_DRIFT: Final = 0.001
 """Share by which these change in between."""
 SECONDS_SLACK: Final = 60.0
 """By how much these may grow more than time passes: they are stored every 30 s."""
-MEASURED: Final = re.compile(
-    r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|ARSPD\d?_OFFSET|COMPASS_DEC|" + PRESSURE.pattern
-)
+MEASURED_ONCE: Final = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|ARSPD\d?_OFFSET|COMPASS_DEC")
+MEASURED: Final = re.compile(f"{MEASURED_ONCE.pattern}|{PRESSURE.pattern}")
 """Names that each start of the vehicle measures again (measured)."""
 TOO_MANY: Final = "it differs, and a download is quicker than a search for the changes"
-RESTLESS: Final = "the parameters change all the time"
-OTHER: Final = "the vehicle has other parameters than the cached table"
-PROOFS_MAX: Final = 3
+OTHER: Final = "the vehicle has other parameters than the cached table, or changes them all the time"
+PROOFS_MAX: Final = 2
 """Proofs: the vehicle may change a value in the middle of one."""
 PARTS_MIN: Final = 3
 PARTS_MAX: Final = 12
@@ -111,10 +109,9 @@ async def prove(session: Session) -> None:
         raise ChecksumUnavailable(BUSY)
     async with session.channel.ftp:
         try:
-            unexplained: set[int] = set()
             for _ in range(PROOFS_MAX):
                 proof = _Proof(session, _rows(session.table))
-                if await proof.run(unexplained) and proof.take_over():
+                if await proof.run() and proof.take_over():
                     return
         except FileTransferError as error:
             if error.code == FileErrorCode.UNKNOWN_COMMAND:
@@ -124,7 +121,7 @@ async def prove(session: Session) -> None:
             session.ftp_unanswered += error.attempts
             is_silent = session.serves_checksum is None
             raise ChecksumUnavailable("MAVFTP did not answer", is_silent=is_silent) from None
-    raise TableDiffers(RESTLESS)
+    raise TableDiffers(OTHER)
 
 
 def is_moving(name: str) -> bool:
@@ -147,35 +144,29 @@ class _Proof:
         self._round_trip = math.inf  # of the quickest requests
         self._byte_time = 0.0  # seconds for each byte of requests that waited for each other
 
-    async def run(self, unexplained: set[int]) -> bool:
+    async def run(self) -> bool:
         """Compare, and read what differs, until nothing does; return False if values may just have moved.
-
-        Args:
-            unexplained: checksums of the whole file with a difference that nothing has explained.
 
         Raises:
             TableDiffers: the tables are too different.
         """
         rows, volatile = self._rows, self._session.table.volatile
         whole = range(len(rows))
-        measured = {at for at, row in enumerate(rows) if MEASURED.fullmatch(row.name) and row.bits}
-        moving = {at for at, row in enumerate(rows) if row.name == RUN_TIME or _is_learnt(row, volatile)}
+        moving = {at for at, row in enumerate(rows) if row.name == RUN_TIME or row.name in volatile}
         rare = {at for at, row in enumerate(rows) if RARE.fullmatch(row.name) or may_be_rounded(row)}
         suspects: set[int] = set()
         early = moving | rare if self._is_slow else moving if len(moving) > 1 else set()
         await self._request({len(whole)} | self._ends_of(early, whole))
-        if self._found[len(whole)] in unexplained:
-            raise TableDiffers(OTHER)
         while places := self._places():
             if any(len(place) == 1 and rows[place.start].name == BOOT_COUNT for place in places):
-                suspects |= measured
+                suspects = {at for at in whole if MEASURED.fullmatch(rows[at].name) and rows[at].bits}
             guesses: dict[int, int] = {}
             numbers: set[int] = set()
             for place, difference in places.items():
                 if ends := self._ends_of(moving, place) or self._ends_of(rare, place):
                     numbers |= ends
-                elif place.stop == len(whole) != len(place) and self._is_first(place.stop):
-                    numbers.add(place.stop)
+                elif place.stop == next(iter(self._found)) == len(whole) > len(place):
+                    numbers.add(len(whole))  # it was the first one, and values may have moved since
                 elif suspected := suspects.intersection(place):
                     guesses.update((at, rows[at].bits) for at in suspected)
                 elif guess := self._guess(place, difference):
@@ -185,7 +176,6 @@ class _Proof:
                 elif len(places) == len(self._found):
                     raise TableDiffers(OTHER)
                 else:
-                    unexplained.add(self._found[len(whole)])
                     return False
             self._weigh(len(guesses), len(numbers))
             if numbers:
@@ -194,10 +184,6 @@ class _Proof:
                 await self._read(guesses)
                 suspects -= guesses.keys()
         return True
-
-    def _is_first(self, number: int) -> bool:
-        """Whether this checksum is the oldest one: values may have moved since."""
-        return next(iter(self._found)) == number
 
     @property
     def _is_slow(self) -> bool:
@@ -340,14 +326,10 @@ class _Proof:
         if _rows(table) != self._rows:
             return False
         if self._changed:
-            table.volatile = frozenset(self._rows[at].name for at in self._changed)
+            names = {self._rows[at].name for at in self._changed}
+            table.volatile = frozenset(name for name in names if not MEASURED_ONCE.fullmatch(name))
         table.prove(self._found[len(self._rows)])
         return True
-
-
-def _is_learnt(row: PackedParam, volatile: Collection[str]) -> bool:
-    is_measured = MEASURED.fullmatch(row.name) and not PRESSURE.fullmatch(row.name)
-    return row.name in volatile and not is_measured
 
 
 def _has_just_moved(row: PackedParam, bits: int, passed: float) -> bool:
@@ -374,14 +356,10 @@ def _rows(table: Table) -> list[PackedParam]:
         raise ChecksumUnavailable(
             "the list of parameters has a gap, a name twice, or one that no file can contain"
         )
-    return [_row(table, name) for name in names]
-
-
-def _row(table: Table, name: str) -> PackedParam:
-    param = table.params[name]
-    if param.is_raw or param.type_number not in PACKABLE:
-        raise ChecksumUnavailable(f"the exact value of {name} is not known")
-    return PackedParam(name, ParamType(param.type_number), param.bits)
+    params = [table.params[name] for name in names]
+    if inexact := [each.name for each in params if each.is_raw or each.type_number not in PACKABLE]:
+        raise ChecksumUnavailable(f"the exact value of {inexact[0]} is not known")
+    return [PackedParam(each.name, ParamType(each.type_number), each.bits) for each in params]
 
 
 def may_be_rounded(row: PackedParam) -> bool:
