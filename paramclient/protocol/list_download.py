@@ -256,7 +256,7 @@ class _Download:
                 attempts = error.attempts
         await self._take_received()
         self._reading.discard(index)
-        if index not in self._received:
+        if not self._has(index):
             self._tried[index] = attempts
 
     def _missing(self) -> list[int]:
@@ -265,7 +265,14 @@ class _Download:
         count = self._count or 0
         first = int(count in self._received and 0 not in self._received)
         indices = range(first, first + count + self.table.is_growing)
-        return [index for index in indices if index not in self._received]
+        return [index for index in indices if not self._has(index)]
+
+    def _has(self, index: int) -> bool:
+        """Return whether an index was received, and is not forgotten with the encoding of its value.
+
+        The table has no indices where the count is beyond them.
+        """
+        return index in self._received and (index in self.table.names or self._count == PARAMETERS_MAX)
 
     def _gaps(self) -> list[int]:
         """Return the indices that are missing, below the end of the list so far."""

@@ -88,6 +88,27 @@ async def test_gaps_of_a_file_are_read_when_all_its_bursts_are_over(seed: int) -
         check_right(vehicle, session.table.params)
 
 
+@virtual
+async def test_values_that_are_forgotten_with_their_encoding_are_read_again() -> None:
+    """The first heartbeat of an ArduPilot is late: it waits behind a list, and arrives in the middle."""
+    float_120 = struct.pack("<f", 120)
+    values = [ParamValue(f"P_{index}", float_120, ParamType.INT16, 20, index) for index in range(20)]
+
+    def answer(message: Message) -> list[Message]:
+        if isinstance(message, ParamRequestList):
+            return [*values[:9], Heartbeat(2, 3), *values[9:]]
+        return [values[message.param_index]] if isinstance(message, ParamRequestRead) else []
+
+    vehicle = Puppet(answer, heartbeat=None)
+    async with converse(vehicle) as conversation:
+        vehicle.say(values[0])
+        session = (await conversation.node()).plain
+        await session.identification.encoding_certain()  # as of one that never sends a heartbeat
+        result = await fetch_all(session)
+        assert (result.missing, len(session.table.params)) == ((), 20)
+        assert {param.value for param in session.table.params.values()} == {120}
+
+
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "ardupilot by list"])
 @pytest.mark.parametrize("faults", KINDS)
 @virtual
