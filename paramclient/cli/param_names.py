@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Final
 
 import anyio.to_thread
@@ -18,9 +17,9 @@ from paramclient.model.names import NameChoice, did_you_mean, is_group_switch, i
 from paramclient.model.values import check_name
 
 __all__ = [
-    "ChosenNames",
     "cached_names",
     "check_given",
+    "choose_names",
     "learn_spelling",
     "may_appear",
     "spelling",
@@ -35,32 +34,26 @@ _CAPITALS: Final = ("px4", "ardupilot")
 """Autopilots whose parameters all have names in capitals."""
 
 
-@dataclass(frozen=True, slots=True)
-class ChosenNames:
-    """The parameters of a vehicle that names and patterns choose.
+def choose_names(component: Component, given: Iterable[str]) -> tuple[list[str], dict[str, ParamClientError]]:
+    """Choose among the known parameters of a component by names and patterns.
 
-    Attributes:
-        names: the names, in the vehicle's spelling; those that the vehicle may not have are among them.
-        errors: errors by pattern for the patterns without a match.
+    Returns:
+        The names in the vehicle's spelling, among them those that the vehicle may not have; and errors by
+        pattern for the patterns without a match.
     """
-
-    names: list[str]
-    errors: dict[str, ParamClientError]
-
-    @classmethod
-    def of(cls, component: Component, given: Iterable[str]) -> ChosenNames:
-        """Choose among the known parameters of a component."""
-        names: dict[str, None] = {}
-        errors: dict[str, ParamClientError] = {}
-        for text in given:
-            if not is_pattern(text):
-                names[spelling(text, component)] = None
-                continue
-            chosen, _ = NameChoice([text]).divide(component.params)
-            names |= dict.fromkeys(sorted(chosen))
-            if not chosen:
-                errors[text] = _no_match(text, component)
-        return cls(list(names), errors)
+    names: dict[str, None] = {}
+    errors: dict[str, ParamClientError] = {}
+    for text in given:
+        if not is_pattern(text):
+            names[spelling(text, component)] = None
+            continue
+        chosen, _ = NameChoice([text]).divide(component.params)
+        names |= dict.fromkeys(sorted(chosen))
+        if not chosen:
+            system, number = component.address
+            what = f"{system}/{number} has no parameter that matches {text}"
+            errors[text] = UnknownParameter(what, system, number, name=text)
+    return list(names), errors
 
 
 async def learn_spelling(component: Component, given: Iterable[str]) -> None:
@@ -178,8 +171,3 @@ def spelling(name: str, component: Component) -> str:
     if known:
         return known[0] if len(known) == 1 else name
     return upper if component.autopilot in _CAPITALS else name
-
-
-def _no_match(pattern: str, component: Component) -> UnknownParameter:
-    text = f"{component.system}/{component.component} has no parameter that matches {pattern}"
-    return UnknownParameter(text, component.system, component.component, name=pattern)

@@ -20,7 +20,7 @@ from paramclient.cli.metadata import (
 )
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Status, by_index, milliseconds, report, say
-from paramclient.cli.param_names import ChosenNames, check_given, learn_spelling, suggest
+from paramclient.cli.param_names import check_given, choose_names, learn_spelling, suggest
 from paramclient.cli.param_table import RIGHT, ParamTable
 from paramclient.cli.session import CommandSession, sessions
 from paramclient.errors import ParamClientError, UsageError
@@ -244,11 +244,11 @@ async def get_chosen(
     if not is_fetched and (is_fetched := any(map(is_pattern, name_patterns))):
         await session.fetch()
     await learn_spelling(component, name_patterns)
-    chosen = ChosenNames.of(component, name_patterns)
+    names, unmatched = choose_names(component, name_patterns)
     known = component.params if is_fetched else {}
-    found = {name: known[name] for name in chosen.names if name in known}
+    found = {name: known[name] for name in names if name in known}
     found = {name: param for name, param in found.items() if param.trust is not Trust.CACHED}
-    requested = [name for name in chosen.names if name not in found]
+    requested = [name for name in names if name not in found]
     errors: dict[str, ParamClientError] = {}
 
     async def read(name: str) -> None:
@@ -263,8 +263,8 @@ async def get_chosen(
                 tasks.start_soon(read, name)
     in_order = {name: errors[name] for name in requested if name in errors}
     return (
-        [found[name] for name in chosen.names if name in found],
-        await suggest(session, in_order | chosen.errors),
+        [found[name] for name in names if name in found],
+        await suggest(session, in_order | unmatched),
     )
 
 

@@ -12,7 +12,7 @@ import anyio
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import local_time, print_json, print_line, say
-from paramclient.cli.param_names import ChosenNames, check_given, may_appear
+from paramclient.cli.param_names import check_given, choose_names, may_appear
 from paramclient.cli.read_commands import get_chosen, report_all
 from paramclient.cli.session import CommandSession, Sessions, sessions
 from paramclient.client.events import Discovered, Events, Found, Lost, Rebooted, Resynced
@@ -87,7 +87,7 @@ async def _begin(session: CommandSession, given: Sequence[str]) -> int:
     if not given:
         return ExitCode.DONE
     _, errors = await get_chosen(session, [text for text in given if not is_pattern(text)])
-    errors |= ChosenNames.of(session.component, patterns).errors
+    errors |= choose_names(session.component, patterns)[1]
     hidden = [name for name in errors if may_appear(name, session.component)]
     if hidden:
         say(f"{session.prefix}not there at present: {', '.join(hidden)}")
