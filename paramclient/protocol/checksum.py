@@ -55,6 +55,8 @@ RARE: Final = re.compile(f"{BOOT_COUNT}|STAT_FLTTIME")
 """Names of values that move with each start, and with each flight."""
 PRESSURE: Final = re.compile(r"BARO\d_GND_PRESS")
 """Names of values that a disarmed Plane or Rover measures all the time (measured)."""
+PLANES_AND_ROVERS: Final = frozenset({1, 10, 11})
+"""MAV_TYPE of these, boats included."""
 PRESSURE_DRIFT: Final = 0.001
 """Share by which these change in between."""
 SECONDS_SLACK: Final = 60.0
@@ -152,7 +154,14 @@ class _Proof:
         """
         rows, volatile = self._rows, self._session.table.volatile
         whole = range(len(rows))
-        moving = {at for at, row in enumerate(rows) if row.name == RUN_TIME or row.name in volatile}
+        measures_pressure = self._session.identification.vehicle_type in PLANES_AND_ROVERS
+        moving = {
+            at
+            for at, row in enumerate(rows)
+            if row.name == RUN_TIME
+            or row.name in volatile
+            or (measures_pressure and row.bits and PRESSURE.fullmatch(row.name))
+        }
         rare = {at for at, row in enumerate(rows) if RARE.fullmatch(row.name) or may_be_rounded(row)}
         suspects: set[int] = set()
         early = moving | rare if self._is_slow else moving if len(moving) > 1 else set()
@@ -167,7 +176,7 @@ class _Proof:
                     numbers |= ends
                 elif place.stop == next(iter(self._found)) == len(whole) > len(place):
                     numbers.add(len(whole))  # it was the first one, and values may have moved since
-                elif suspected := suspects.intersection(place):
+                elif len(place) > 1 and (suspected := suspects.intersection(place)):
                     guesses.update((at, rows[at].bits) for at in suspected)
                 elif guess := self._guess(place, difference):
                     guesses |= guess

@@ -90,11 +90,11 @@ async def test_seconds_that_were_counted_need_no_read(delay: float, seconds: flo
 
 
 @virtual
-async def test_pressure_that_a_rover_measures_all_the_time_is_learnt_and_then_needs_no_read() -> None:
+async def test_pressure_that_a_rover_measures_all_the_time_needs_no_read() -> None:
     vehicle = ArduPilotVehicle(kind="rover", live_period=0.0)
     async with converse(Air.symmetric([vehicle], delay=0.004)) as conversation:
         node = await with_cached_table(conversation, vehicle.params)
-        for step, reads in ((0.5, 2), (1.25, 2), (-3.5, 2), (4000.0, 4)):
+        for step, reads in ((0.5, 0), (1.25, 0), (-3.5, 0), (4000.0, 2)):
             vehicle.load(
                 {n: float(vehicle.param(n).value) + step for n in ("BARO1_GND_PRESS", "BARO2_GND_PRESS")}
             )
