@@ -9,6 +9,7 @@ import asyncio
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from paramclient import (
@@ -19,7 +20,7 @@ from paramclient import (
     UsageError,
     read_file,
 )
-from paramclient.provision import apply, for_each, overlay, plan, restore
+from paramclient.provision import apply, for_each, plan, restore
 
 FILE = Path(__file__).parent / "parameters/ardupilot/copter.param"
 
@@ -34,8 +35,7 @@ async def main(link: str, file: Path) -> bool:
     shared = read_file(file).choose()
 
     def wanted(vehicle: Component) -> ParamSet:
-        own = OWN.get(vehicle.system, {})
-        return overlay(shared, ParamSet(own))
+        return replace(shared, params=ParamSet({**shared.params, **OWN.get(vehicle.system, {})}))
 
     def backup(vehicle: Component) -> Path:
         return Path(tempfile.gettempdir()) / f"before-{vehicle.system}-{started}.json"

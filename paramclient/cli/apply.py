@@ -42,11 +42,10 @@ from paramclient.provision import (
     ApplyRow,
     ApplyStatus,
     Plan,
-    overlay,
     plan,
 )
 from paramclient.provision import apply as apply_to_vehicle
-from paramclient.provision.planning import Rows
+from paramclient.provision.planning import Rows, check_component
 
 __all__ = ["ApplyJob", "apply", "run_jobs"]
 
@@ -142,7 +141,10 @@ async def _with_overlay(base: ParamSet, pattern: str, session: CommandSession) -
     path = await fill_pattern(pattern, session)
     if not is_file(path):
         raise FileError(f"no such file, which --overlay names for {session.label}", source=path)
-    return overlay(base, choose(open_file(path), session.choice.component, session.component.system))
+    own = choose(open_file(path), session.choice.component, session.component.system)
+    check_component(own, base.component, is_extended=base.is_extended)
+    params = {**base.params, **own.params}
+    return replace(base, params=params, identity=own.identity or base.identity)
 
 
 # Shared with restore

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from paramclient.provision.apply_restore import apply, restore
 from paramclient.provision.apply_rules import CATEGORIES
-from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult, RestoreOptions
+from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult
 from paramclient.provision.fleet import FleetResult, for_each
 from paramclient.provision.inspection import plan
 from paramclient.provision.planning import (
@@ -29,7 +29,6 @@ from paramclient.provision.planning import (
     Plan,
     PlanOptions,
     Stage,
-    overlay,
     plan_from,
 )
 
@@ -45,12 +44,10 @@ __all__ = [
     "ParamInfo",
     "Plan",
     "PlanOptions",
-    "RestoreOptions",
     "Stage",
     "WRONG",
     "apply",
     "for_each",
-    "overlay",
     "plan",
     "plan_from",
     "restore",

@@ -8,7 +8,7 @@ from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.model.paramset import ParamSet
 from paramclient.provision.apply_rules import OUT_OF_RANGE
-from paramclient.provision.execution import ApplyOptions, ApplyResult, RestoreOptions, run
+from paramclient.provision.execution import ApplyOptions, ApplyResult, run
 from paramclient.provision.inspection import Wanted, wait_for_identity, wanted_set
 
 __all__ = ["BEFORE_APPLY", "BEFORE_RESTORE", "apply", "restore", "restore_categories"]
@@ -58,7 +58,7 @@ async def apply(component: Component, wanted: Wanted, **options: Unpack[ApplyOpt
     return await run(component, wanted_set(component, wanted), BEFORE_APPLY, **options)
 
 
-async def restore(component: Component, state: Wanted, **options: Unpack[RestoreOptions]) -> ApplyResult:
+async def restore(component: Component, state: Wanted, **options: Unpack[ApplyOptions]) -> ApplyResult:
     """Restore an earlier state of a vehicle: `apply`, with its own identity and calibration included.
 
     Parameters that the vehicle measures at each start, counts, or does not let clients write are not changed:
@@ -69,18 +69,17 @@ async def restore(component: Component, state: Wanted, **options: Unpack[Restore
         component: the vehicle.
         state: the earlier state, such as a snapshot or a backup file. Identity and calibration are left out
             unless the state names this vehicle as its own.
-        options: as in `RestoreOptions`.
+        options: as in `ApplyOptions`.
 
     Raises:
         UsageError: the state is that of another vehicle.
         ParamClientError: as from `apply`.
     """
-    state, include = wanted_set(component, state), options.pop("include", ())
+    state, include = wanted_set(component, state), options.get("include", ())
     given = (include,) if isinstance(include, str) else tuple(include)
-    included = (*await restore_categories(component, state), *given)
-    return await run(
-        component, state, BEFORE_RESTORE, skips_read_only=True, partial=True, include=included, **options
-    )
+    options["include"] = (*await restore_categories(component, state), *given)
+    options.setdefault("partial", True)
+    return await run(component, state, BEFORE_RESTORE, skips_read_only=True, **options)
 
 
 async def restore_categories(component: Component, state: ParamSet) -> tuple[str, ...]:

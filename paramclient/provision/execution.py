@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Final, TypedDict
+from typing import Any, Final, cast
 
 import anyio
 
@@ -27,7 +27,6 @@ from paramclient.errors import (
 )
 from paramclient.files import write_file
 from paramclient.model.paramset import ParamSet
-from paramclient.model.renames import Renames
 from paramclient.model.values import Param
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
@@ -43,14 +42,14 @@ from paramclient.provision.planning import (
     WRONG,
     ApplyRow,
     ApplyStatus,
-    ParamInfo,
     Plan,
+    PlanOptions,
     Rows,
     Stage,
     plan_from,
 )
 
-__all__ = ["ApplyOptions", "ApplyProgress", "ApplyResult", "RestoreOptions", "run"]
+__all__ = ["ApplyOptions", "ApplyProgress", "ApplyResult", "run"]
 
 WRITE_ATTEMPTS_MAX: Final = 2
 """Times that a value is written if the vehicle acknowledges it and later holds another value: a write of
@@ -127,13 +126,18 @@ class ApplyResult(Rows):
         )
 
 
-class RestoreOptions(TypedDict, total=False):
-    """Options of `restore`, and of `apply`.
+class ApplyOptions(PlanOptions, total=False):
+    """Options of `apply` and `restore`, besides those of `PlanOptions`.
+
+    After each stage that reveals parameters, names of `renames` are looked up again.
 
     Attributes:
-        include, info, force: as in `PlanOptions`.
+        partial: skip invalid values and names that the vehicle does not have, and write the remaining values;
+            `restore` does so by default.
         reboot: reboot the vehicle if values take effect after a reboot.
         allow_armed: continue if the vehicle is armed.
+        durable: return only when the values and their history are on the disk and survive a power loss; if
+            that fails, `error` of the result is a CacheError.
         backup: a file for the state before the first write; its name determines the file format, see
             `paramclient.files`.
         timeout: seconds, after which the result reports the progress of the run.
@@ -144,32 +148,15 @@ class RestoreOptions(TypedDict, total=False):
             end the call.
     """
 
-    include: str | Iterable[str]
-    info: Mapping[str, ParamInfo] | None
-    force: bool
+    partial: bool
     reboot: bool
     allow_armed: bool
+    durable: bool
     backup: str | os.PathLike[str] | None
     timeout: float | None
     author: str | None
     progress: Callable[[ApplyProgress], None] | None
     before_writing: Callable[[], object] | None
-
-
-class ApplyOptions(RestoreOptions, total=False):
-    """Options of `apply`: those of `restore`, and more.
-
-    Attributes:
-        partial: skip invalid values and names that the vehicle does not have, and write the remaining values.
-        renames: as in `PlanOptions`. After each stage that reveals parameters, the other names are looked up
-            again.
-        durable: return only when the values and their history are on the disk and survive a power loss; if
-            that fails, `error` of the result is a CacheError.
-    """
-
-    partial: bool
-    renames: Renames | None
-    durable: bool
 
 
 async def run(
@@ -191,7 +178,8 @@ async def run(
     """
     began = anyio.current_time()
     error: ParamClientError | None = None
-    one = _Run(component, wanted, reason, skips_read_only, **options)
+    planned = {name: options.pop(name) for name in PlanOptions.__annotations__ if name in options}
+    one = _Run(component, wanted, reason, skips_read_only, cast(PlanOptions, planned), **options)
     with anyio.move_on_after(timeout) as scope:
         await one.begin()
         try:
@@ -224,10 +212,7 @@ class _Run:
     wanted: ParamSet
     reason: str
     skips_read_only: bool
-    include: str | Iterable[str] = ()
-    info: Mapping[str, ParamInfo] | None = None
-    force: bool = False
-    renames: Renames | None = None
+    planned: PlanOptions
     partial: bool = False
     reboot: bool = False
     allow_armed: bool = False
@@ -395,7 +380,9 @@ class _Run:
 
     async def _inspect(self) -> None:
         absent = frozenset[str]() if self._before is None else self._inspection.absent
-        await self._read(inspect(self.component, self.wanted, self.renames, absent), verifies=True)
+        await self._read(
+            inspect(self.component, self.wanted, self.planned.get("renames"), absent), verifies=True
+        )
 
     async def _verify(self) -> None:
         """Read the wanted parameters: by name if that is faster than the whole table, else the table.
@@ -411,7 +398,7 @@ class _Run:
     async def _read_revealed(self, done: Stage) -> None:
         """Read by name the parameters that a stage may have revealed. This verifies no write."""
         later = [row.name for row in self._plan.of(ApplyStatus.LATER)]
-        names = with_other_names(later, (), self.renames)
+        names = with_other_names(later, (), self.planned.get("renames"))
         if self.component.autopilot == "ardupilot":  # a switch reveals the names with its own prefix
             groups = tuple(row.target.name.rpartition("_")[0] for row in done.rows)
             names = tuple(name for name in names if name.startswith(groups))
@@ -433,10 +420,7 @@ class _Run:
             self.wanted,
             autopilot=self.component.autopilot,
             encoding=self.component.encoding,
-            include=self.include,
-            info=self.info,
-            force=self.force,
-            renames=self.renames,
+            **self.planned,
         )
 
     def _check_same_vehicle(self) -> None:
@@ -472,7 +456,7 @@ class _Run:
         try:
             done = await self.component.set_many(
                 [(name, row.target.settable) for name, row in by_name.items()],
-                force=self.force,
+                force=self.planned.get("force", False),
                 author=self.author,
                 progress=lambda outcome: self._take(by_name[outcome.name], outcome),
             )

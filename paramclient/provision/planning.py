@@ -42,7 +42,6 @@ __all__ = [
     "Rows",
     "Stage",
     "check_component",
-    "overlay",
     "plan_from",
 ]
 
@@ -333,27 +332,6 @@ def plan_from(
     if encoding is None:
         encoding = Encoding.C_CAST if autopilot == "ardupilot" else Encoding.BYTEWISE
     return _Planner(current, wanted, autopilot or "", encoding, identity, **options).plan()
-
-
-def overlay(base: ParamSet, over: ParamSet) -> ParamSet:
-    """Return the parameters of `base`, replaced and extended by those of `over`.
-
-    For a file that all vehicles share, and a small file for each vehicle. The identity and address of `over`
-    have precedence over those of `base`.
-
-    Raises:
-        UsageError: the two are of different components.
-    """
-    check_component(over, base.component, is_extended=base.is_extended)
-    return ParamSet(
-        {**base.params, **over.params},
-        component=base.component if over.component is None else over.component,
-        system=base.system if over.system is None else over.system,
-        identity=over.identity or base.identity,
-        at=base.at if over.at is None else over.at,
-        source=" + ".join(filter(None, (base.source, over.source))),
-        is_extended=base.is_extended,
-    )
 
 
 def check_component(wanted: ParamSet, component: int | None, *, is_extended: bool) -> None:

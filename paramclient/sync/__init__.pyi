@@ -24,7 +24,7 @@ from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.watch import SyncState
-from paramclient.provision.execution import ApplyOptions, ApplyResult, RestoreOptions
+from paramclient.provision.execution import ApplyOptions, ApplyResult
 from paramclient.provision.fleet import FleetResult, Outcome
 from paramclient.provision.planning import Plan, PlanOptions
 from paramclient.sim import Endpoint
@@ -285,7 +285,7 @@ def plan(component: Component, wanted: Wanted, **options: Unpack[PlanOptions]) -
 def apply(component: Component, wanted: Wanted, **options: Unpack[ApplyOptions]) -> ApplyResult:
     """Write the wanted values to a vehicle, and verify each of them by reading it back at the end."""
 
-def restore(component: Component, state: Wanted, **options: Unpack[RestoreOptions]) -> ApplyResult:
+def restore(component: Component, state: Wanted, **options: Unpack[ApplyOptions]) -> ApplyResult:
     """Restore an earlier state of a vehicle: `apply`, with its own identity and calibration included."""
 
 def for_each(components: Iterable[Component], call: Callable[[Component], Outcome]) -> FleetResult[Outcome]:

@@ -11,7 +11,7 @@ from paramclient.errors import UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Encoding, Param, ParamType, WireValue, bits_of, from_bits
-from paramclient.provision import CATEGORIES, MISSING, WRONG, ApplyStatus, Plan, overlay, plan_from
+from paramclient.provision import CATEGORIES, MISSING, WRONG, ApplyStatus, Plan, plan_from
 from paramclient.provision.apply_rules import OUT_OF_RANGE, READ_ONLY
 from paramclient.sim.param_table import SimParam, ardupilot_table, px4_table
 
@@ -368,8 +368,6 @@ def test_a_file_of_another_component_is_refused() -> None:
         UsageError, match=r"parameters of cam.params are those of component 100, not of component 1"
     ):
         plan_from(autopilot, camera)
-    with pytest.raises(UsageError, match="component 100"):
-        overlay(camera, autopilot)
 
 
 def test_a_file_of_another_autopilot_is_refused() -> None:
@@ -382,12 +380,3 @@ def test_a_file_of_another_autopilot_is_refused() -> None:
         assert plan_from(held(A=1), wanted, autopilot=other).to_write
         assert plan_from(held(A=1), wanted, autopilot="generic").to_write
         assert plan_from(held(A=1), wanted).to_write
-
-
-def test_overlay_replaces_and_extends_the_base() -> None:
-    base = ParamSet({name: WrittenParam(name, 1) for name in "ABC"}, component=1, source="base")
-    over = ParamSet({"B": WrittenParam("B", 2), "D": WrittenParam("D", 3)}, system=7, source="over")
-    both = overlay(base, over)
-    assert {name: param.value for name, param in both.items()} == {"A": 1, "B": 2, "C": 1, "D": 3}
-    assert (both.component, both.system, both.source) == (1, 7, "base + over")
-    assert list(both) == ["A", "B", "C", "D"]

@@ -33,7 +33,6 @@ from paramclient.provision import (
     ApplyStatus,
     apply,
     for_each,
-    overlay,
     plan,
     restore,
 )
@@ -471,7 +470,7 @@ async def test_several_vehicles_are_set_and_restored_concurrently() -> None:
     async with a_client(Air(vehicles)) as client:
         await client.fetch_all()
         components = [client.components[vehicle.system, 1] for vehicle in vehicles]
-        wanted = {system: overlay(written(another()), written(more)) for system, more in own.items()}
+        wanted = {system: another() | more for system, more in own.items()}
         applied = await for_each(components, lambda each: apply(each, wanted[each.system]))
         assert list(applied.results) == [(1, 1), (2, 1)]
         assert isinstance(applied.errors[3, 1], InvalidParameters)
