@@ -47,6 +47,7 @@ LINK_FIRST = "the first argument is the link, such as udpin:0.0.0.0:14550 or sim
         ),
         (["fetch", "sim:px4", "-system", 3], "Unknown option: -system. Did you mean --system?\n"),
         (["fetch", "sim:px4", "-q"], "Unknown option: -q."),
+        (["fect", "sim:px4"], 'Unknown command "fect". Did you mean "fetch"?'),
         (["get", "a\0b", "MC_YAW_P"], "link name 'a\\x00b'"),
         (["get", "14550", "MC_YAW_P"], "link name '14550': the kind of link is missing"),
     ],
@@ -56,6 +57,35 @@ def test_a_mistaken_argument_is_named(command: Command, words: list[object], tex
     outcome = command(*words)
     assert (outcome.code, outcome.out) == (2, "")
     assert outcome.err.startswith(f"paramclient: {text}")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["fetch", "LINK", "--only", "MC_ROLL_PP"],
+        ["get", "LINK", "MC_ROLL_PP"],
+        ["set", "LINK", "MC_ROLL_PP", 5],
+        ["reset", "LINK", "MC_ROLL_PP"],
+        ["watch", "LINK", "MC_ROLL_PP"],
+        ["show", "1", "MC_ROLL_PP"],
+        ["info", "MC_ROLL_PP"],
+        ["history", "1", "MC_ROLL_PP"],
+        ["save", "LINK", "new.param", "--only", "MC_ROLL_PP"],
+        ["diff", "LINK", "1", "--only", "MC_ROLL_PP"],
+        ["apply", "LINK", "quad.param"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_an_unknown_name_has_one_exit_code_and_a_suggestion(
+    command: Command, put: Put, words: list[object]
+) -> None:
+    Path("quad.param").write_text("MC_ROLL_PP,5\n", encoding="utf-8")
+    url = put(PX4Vehicle(table={"MC_ROLL_P": 4.0, "MC_YAW_P": 2.0}))
+    assert command("fetch", url).code == 0
+    done = command(*(url if word == "LINK" else word for word in words))
+    assert done.code == 2
+    assert "did you mean MC_ROLL_P?" in done.err
+    assert "writing to" not in done.err
 
 
 def test_a_missing_argument_is_answered_with_the_usage(command: Command) -> None:
