@@ -48,8 +48,6 @@ EARLY = 0.1
 DURABLE = 0.3
 """Share of durable sets in every second round."""
 NAMES = [f"PARAM_{number:02}" for number in range(30)]
-LOST_SHOWN_MAX = 20
-"""Lost sets that are printed."""
 FRESH_EVERY = 25
 """Rounds after which a new cache is used, because the history has a maximum length."""
 
@@ -75,8 +73,7 @@ def main() -> int:
     logging.disable()  # the loss of the database is intended
     dice = random.Random(options.seed)
     values = iter(range(1, 1 << 24))  # a float32 holds these exactly
-    lost: list[str] = []
-    sets = 0
+    lost = sets = 0
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         running = stack.enter_context(server()) if "database" in kinds else None
@@ -88,13 +85,14 @@ def main() -> int:
             killed = running if kind == "database" else None
             acknowledged, killed_at = play(place, mine, dice, killed)
             sets += len(acknowledged)
-            lost += [
-                f"{kind} {number}: {each}" for each in missing(place, acknowledged, killed_at, options.slack)
-            ]
+            found = missing(place, acknowledged, killed_at, options.slack)
+            for each in found:
+                print(f"{kind} {number}, killed at {killed_at:.2f}: {each}", flush=True)
+            lost += len(found)
             if not (number + 1) % 50:
-                print(f"{number + 1}: {len(lost)} lost", flush=True)
-    print(f"{options.kills} kills, {sets:,} sets, {len(lost)} lost", *lost[:LOST_SHOWN_MAX], sep="\n")
-    return int(bool(lost))
+                print(f"{number + 1}: {lost} lost", flush=True)
+    print(f"{options.kills} kills, {sets:,} sets, {lost} lost")
+    return int(lost > 0)
 
 
 def play(

@@ -19,11 +19,6 @@ LARGEST_FILE: Final = 16 * 1024 * 1024
 """Largest parameter file, in bytes. 65,535 parameters, the most that an index can count, with names, bits,
 defaults and comments take less in the longest format."""
 
-if sys.platform == "win32":
-    _OPEN_FLAGS: Final = os.O_BINARY | os.O_NOINHERIT  # text mode would convert line ends
-else:
-    _OPEN_FLAGS: Final = os.O_NONBLOCK | os.O_CLOEXEC
-
 
 def read_bytes(source: str) -> bytes:
     """Return the content of a file, at most one byte more than `LARGEST_FILE`.
@@ -32,18 +27,13 @@ def read_bytes(source: str) -> bytes:
         FileError: the file cannot be read, or is not a regular file.
     """
     with _named_errors(source, "read"):
-        # With O_NONBLOCK, opening a pipe without a writer does not block.
-        descriptor = os.open(source, os.O_RDONLY | _OPEN_FLAGS)
-        try:
-            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                raise FileError("cannot be read: not a regular file", source=source)
-            with os.fdopen(descriptor, "rb", closefd=False) as file:
-                return file.read(LARGEST_FILE + 1)
-        finally:
-            os.close(descriptor)
+        if not stat.S_ISREG(Path(source).stat().st_mode):  # opening a pipe would wait for its other end
+            raise FileError("cannot be read: not a regular file", source=source)
+        with Path(source).open("rb") as file:
+            return file.read(LARGEST_FILE + 1)
 
 
-def replace_file(source: str, data: bytes, new_mode: int = 0o666) -> None:
+def replace_file(source: str, data: bytes, new_mode: int | None = None) -> None:
     """Replace a file atomically by one with this content; on failure, leave the old file unchanged.
 
     The mode is kept. If the path is a symbolic link, the link stays and its target is replaced.
@@ -51,27 +41,26 @@ def replace_file(source: str, data: bytes, new_mode: int = 0o666) -> None:
     Args:
         source: the file.
         data: the content.
-        new_mode: the mode of a file that did not exist, which the user's umask restricts.
+        new_mode: the mode of a file that did not exist; None for that of the user's umask.
 
     Raises:
         FileError: writing failed.
     """
     with _named_errors(source, "written"):
         target = Path(os.path.realpath(source))
-        mode = None
+        mode = new_mode
         with suppress(FileNotFoundError):
             mode = target.stat().st_mode
-        if mode is not None and not stat.S_ISREG(mode):
-            raise FileError("cannot be written: not a regular file", source=source)
+            if not stat.S_ISREG(mode):
+                raise FileError("cannot be written: not a regular file", source=source)
         temporary = target.with_name(f".{target.name[:200]}.{secrets.token_hex(8)}.tmp")
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _OPEN_FLAGS, new_mode)
         try:
-            with os.fdopen(descriptor, "wb") as file:
+            with temporary.open("xb") as file:
                 if mode is not None and sys.platform != "win32":
-                    os.fchmod(descriptor, stat.S_IMODE(mode))
+                    os.fchmod(file.fileno(), stat.S_IMODE(mode))
                 file.write(data)
                 file.flush()
-                os.fsync(descriptor)
+                os.fsync(file.fileno())
             temporary.replace(target)
         except BaseException:
             with suppress(OSError):

@@ -34,7 +34,7 @@ from paramclient.files.reading import (
     value_text,
 )
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, WireValue, check_name, is_portable_name
+from paramclient.model.values import ParamType, WireValue, check_portable_name, is_portable_name
 
 __all__ = [
     "is_pair",
@@ -125,12 +125,16 @@ class _Pairs:
         value = self._number(line, words, source)
         if value is None:
             return
+        try:
+            check_portable_name(words[0])
+        except UsageError as error:
+            self._reading.bad_line(
+                line, f"{self._expected} with a parameter's name ({error})", source, is_name=True
+            )
+            return
         number = None if chain else line.number
         place = f"{source}:{line.number}" if chain else f"line {line.number}"
-        if (problem := _name_problem(words[0])) is not None:
-            self._reading.bad_line(line, f"{self._expected} with {problem}", source, is_name=True)
-        else:
-            self._reading.add(WrittenParam(words[0], value, comment=comment, line=number), place)
+        self._reading.add(WrittenParam(words[0], value, comment=comment, line=number), place)
 
     def _number(self, line: TextLine, words: list[str], source: str) -> int | float | None:
         """Return the value of a line; None, with a fault, if it has none."""
@@ -218,8 +222,10 @@ def read_qgc(reading: Reading, file_format: FileFormat) -> ParamFile:
         except UsageError as error:
             reading.bad_line(line, str(error))
             return
-        if (problem := _name_problem(name)) is not None:
-            reading.bad_line(line, f"{problem} in the third column", is_name=True)
+        try:
+            check_portable_name(name)
+        except UsageError as error:
+            reading.bad_line(line, f"a parameter's name in the third column ({error})", is_name=True)
         else:
             reading.add(param, f"line {line.number}", system, component)
 
@@ -331,17 +337,6 @@ def _read_commented_lines(text: str, reading: Reading, take: Callable[[TextLine,
             header += waiting
             waiting = []
     return tuple(header), tuple(waiting)
-
-
-def _name_problem(name: str) -> str | None:
-    """Return what was expected in place of a name that no vehicle can have; None for a valid one."""
-    if is_portable_name(name):
-        return None
-    try:
-        check_name(name)
-    except UsageError as error:
-        return f"a parameter's name ({error})"
-    return "a parameter's name"
 
 
 def _writable_name(param: WrittenParam) -> str:
