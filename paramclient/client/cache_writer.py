@@ -35,8 +35,8 @@ PENDING_MAX: Final = 4_096
 CLOCK_STEP: Final = 1.0
 """Seconds by which the computer's clock must differ to count as set, or as suspended."""
 CLOSE_RETRY_INTERVAL: Final = 0.3
-"""Seconds until `close` tries once more to write: a database may have been restarted, and the cache fails at
-once for 0.25 s after a failed connection."""
+"""Seconds between two attempts of `close` to write to a cache that was written before: a database may be
+restarting, and calls fail at once for a time after a failed connection."""
 CLOSE_WAIT_MAX: Final = 6.0
 """Seconds for which `close` waits for the cache: longer than another process may lock a file."""
 
@@ -93,6 +93,7 @@ class CacheWriter:
         self._records: dict[Session, _Record] = {}
         self._writing = anyio.Lock()
         self._is_closing = False
+        self._has_written = False  # so the cache is one that can be written
         self._is_synced = True  # what was written is safe from power loss
         self._something_to_write = anyio.Event()
         self._known: set[tuple[int | str, int]] = set()  # systems and keys of vehicles, with components
@@ -122,13 +123,17 @@ class CacheWriter:
                 is_known = node.identification.is_settled
                 if is_known or any(each.table.is_complete for each in node.sessions):
                     await self.load(node, vehicle_of(nodes, node))
-            for delay in (CLOSE_RETRY_INTERVAL, 0.0):
+            wait = CLOSE_WAIT_MAX if self._has_written else CLOSE_RETRY_INTERVAL
+            deadline = anyio.current_time() + wait
+            while True:
                 with suppress(CacheError):
                     await self.write_all()
                     await self.write_all()  # after a replaced file
                     is_written = True
                     break
-                await anyio.sleep(delay)
+                if anyio.current_time() >= deadline:
+                    break
+                await anyio.sleep(CLOSE_RETRY_INTERVAL)
         if not is_written and not was_warned:
             self._warn_of_lost()
         if self._owned:
@@ -275,7 +280,7 @@ class CacheWriter:
             is_saved = self._is_synced = False
             try:
                 await self._call(partial(cache.save, updates, durable=durable))
-                is_saved = True
+                is_saved = self._has_written = True
             finally:
                 for record, count, was_whole in before:
                     if is_saved:

@@ -50,9 +50,9 @@ def full(path: Path) -> Iterator[None]:
         yield
 
 
-def fails_once(save: Callable[..., None]) -> Callable[..., None]:
-    """A write that succeeds only the second time."""
-    failures = iter([CacheError("the database is starting")])
+def fails_at_first(save: Callable[..., None]) -> Callable[..., None]:
+    """A write that succeeds only the tenth time."""
+    failures = iter([CacheError("the database is starting")] * 9)
 
     def write(*args: object, **kwargs: object) -> None:
         if (error := next(failures, None)) is not None:
@@ -158,15 +158,15 @@ async def test_a_client_that_ends_says_what_is_lost(
 
 
 @in_simulated_time
-async def test_a_client_that_ends_tries_once_more(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A database that was just restarted refuses the first connection."""
+async def test_a_client_that_ends_waits_for_the_cache(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A database that is restarting refuses connections for a time."""
     with ParamCache(path) as cache:
         async with ParamClient(small_px4(), cache=cache) as client:
             component = await client.only_component()
             await component.fetch_all()
             await anyio.sleep(2.0)
             await component.set(NAME, 5.0)
-            monkeypatch.setattr(cache, "save", fails_once(cache.save))
+            monkeypatch.setattr(cache, "save", fails_at_first(cache.save))
         assert cache.component().params[NAME].value == 5.0
 
 
