@@ -9,8 +9,8 @@ file      a program with a ParamClient, and a cache in a file
 database  the PostgreSQL of a station, with all of its processes; the station continues, and ends normally
 
 Then the cache is opened. It must not be damaged, and table and history must have every set that was
-acknowledged as durable, and every other set that was acknowledged more than 0.25 s plus the slack before the
-kill: by then a change should be on the disk. The slack covers a batch in progress at that time, the commit,
+acknowledged as durable, all sets before it, and every other set that was acknowledged more than 0.25 s plus
+the slack before the kill: by then a change should be on the disk. The slack covers a batch in progress at that time, the commit,
 and two waits for a core on a busy machine. With a killed database, no acknowledged set may be missing,
 because its station continues.
 
@@ -169,11 +169,12 @@ def missing(
             lines |= {(line.name, int(line.new.value)) for line in changes if line.new is not None}
         found: list[str | Acknowledged] = list(cache.notes)
     last = {each.name: each.value for each in acknowledged}
+    flushed_at = max((each.at for each in acknowledged if each.durable), default=0.0)
     for each in acknowledged:
         is_there = (each.name, each.value) in lines and (
             each.value < last[each.name] or values.get(each.name, 0) >= each.value
         )
-        if not is_there and (each.durable or killed_at - each.at > FLUSH_INTERVAL + slack):
+        if not is_there and (each.at <= flushed_at or killed_at - each.at > FLUSH_INTERVAL + slack):
             found.append(each)
     return found
 
