@@ -403,7 +403,7 @@ class Hub:
         """Publish the state of a component if it has changed."""
         vehicle = target.state
         state = {**vehicle, **dict.fromkeys(CHANGING_MEMBERS)}
-        if state != target.published:
+        if target.is_listed and state != target.published:
             target.published = state
             self.feed.publish("vehicle", **target.address, vehicle=vehicle)
 
