@@ -10,9 +10,9 @@ database  the PostgreSQL of a station, with all of its processes; the station co
 
 Then the cache is opened. It must not be damaged, and table and history must have every set that was
 acknowledged as durable, all sets before it, and every other set that was acknowledged more than 0.25 s plus
-the slack before the kill: by then a change should be on the disk. The slack covers a batch in progress at that time, the commit,
-and two waits for a core on a busy machine. With a killed database, no acknowledged set may be missing,
-because its station continues.
+the slack before the kill: by then a change should be on the disk. The slack covers a batch in progress at
+that time, the commit, and two waits for a core on a busy machine. With a killed database, no acknowledged
+set may be missing, because its station continues.
 
 Exit code 1: a set was lost.
 """

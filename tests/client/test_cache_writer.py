@@ -108,7 +108,7 @@ async def test_an_unchanged_vehicle_is_not_downloaded_again(
     path: Path, make: Callable[[], PX4Vehicle]
 ) -> None:
     vehicle = make()
-    volatile = {entry.name for entry in vehicle.entries if entry.row.volatile and entry.name in vehicle.params}
+    volatile = {each.name for each in vehicle.entries if each.row.volatile and each.name in vehicle.params}
     first = await session(vehicle, path)
     assert first.source == "stream"
     tap = Tap(vehicle)
