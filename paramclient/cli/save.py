@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -38,7 +38,6 @@ from paramclient.cli.sources import (
 from paramclient.errors import NotInCache, UsageError, VehicleError
 from paramclient.files import FileFormat, writable, write_file
 from paramclient.files.formats import AUTOPILOT, address, format_of_name
-from paramclient.metadata import Metadata
 from paramclient.model.defaults import default_of
 from paramclient.model.names import NameChoice
 from paramclient.model.paramset import ParamSet
@@ -104,81 +103,52 @@ async def save(
     is_offline = is_file(where) or names_vehicle(where)
     if is_offline and refresh:
         raise UsageError(f"--refresh needs a link; {where!r} is a file or a vehicle in the cache")
-    selection = _Selection(changed, STORED_DEFAULTS_HINT if is_offline else DEFAULTS_HINT)
     given = from_file(metadata, offline=is_offline)
-    if is_offline:
-        _add_offline(selection, where, given, options, incomplete=incomplete, extended=extended)
-    else:
-        check_link(where)
-        fetch = partial(_fetch, refresh=refresh, incomplete=incomplete)
-        await _add_link(selection, where, metadata, given, options, fetch, extended=extended)
-    for fault in selection.faults:
-        report(fault)
-    sets = _chosen(selection.sets, only) if only else selection.sets
-    sets = [_writable(each, written) for each in sets]
-    files = _by_file(str(file), sets) if is_pattern_name(str(file)) else {file: sets}
-    if sets:
-        for path, each in files.items():
-            await anyio.to_thread.run_sync(partial(write_file, path, each, file_format=written))
-        _show(files, written, as_json=options.json)
-    else:
-        report(f"nothing was written to {file}")
-    return ExitCode.INCOMPLETE if selection.faults or not sets else ExitCode.DONE
+    sets: list[ParamSet] = []
+    faults: list[str] = []
 
-
-class _Selection:
-    """The sets to write, or their parameters that differ from the defaults, and sentences on failures.
-
-    Args:
-        is_changed: whether only parameters that differ from the firmware's defaults are written.
-        hint: what to do if no defaults are known.
-    """
-
-    def __init__(self, is_changed: bool, hint: str) -> None:
-        self.is_changed = is_changed
-        self.sets: list[ParamSet] = []
-        self.faults: list[str] = []
-        self._hint = hint
-
-    def add(self, whole: ParamSet, described: Mapping[str, int | float]) -> None:
-        """Add a set; `described` has defaults of the metadata by name."""
-        if not self.is_changed:
-            self.sets.append(whole)
+    def add(whole: ParamSet, described: Mapping[str, int | float]) -> None:
+        """Add a set to write; `described` has defaults of the metadata by name."""
+        if not changed:
+            sets.append(whole)
             return
         try:
-            differing = select_non_defaults(whole, described)
+            sets.append(differing := select_non_defaults(whole, described))
         except UsageError as error:
-            hint = f"; {self._hint}" if str(error) == NO_DEFAULTS else ""
-            self.faults.append(f"{address(whole)}: {error}{hint}")
+            hint = f"; {STORED_DEFAULTS_HINT if is_offline else DEFAULTS_HINT}"
+            faults.append(f"{address(whole)}: {error}{hint if str(error) == NO_DEFAULTS else ''}")
             return
-        self.sets.append(differing)
         known = [default_of(each, described.get(each.name)) for each in differing.values()]
         say_sources(address(whole), known)
 
-
-async def _add_link(
-    selection: _Selection,
-    url: str,
-    choice: str | None,
-    given: Metadata | None,
-    options: LinkOptions,
-    fetch: Callable[[CommandSession], Awaitable[ParamSet]],
-    *,
-    extended: bool,
-) -> None:
-    """Add the parameters of the vehicles on a link that were received or confirmed in this session."""
-    async with sessions(url, options, extended=extended) as found:
-        for done in await found.work(fetch):
-            if done.result is None:
-                selection.faults.append(f"{done.session.address}: {done.error}")
-                continue
-            described: Mapping[str, int | float] = {}
-            if selection.is_changed:
+    if is_offline:
+        found = _offline_sets(where, options, faults, incomplete=incomplete, extended=extended)
+        described = known_of_sets(found, options) if changed and given is None else [given] * len(found)
+        for each, known_of_set in zip(found, described, strict=True):
+            add(each, defaults_in(known_of_set, each))
+    else:
+        check_link(where)
+        async with sessions(where, options, extended=extended) as opened:
+            fetch = partial(_fetch, refresh=refresh, incomplete=incomplete)
+            for done in await opened.work(fetch):
+                if done.result is None:
+                    faults.append(f"{done.session.address}: {done.error}")
+                    continue
                 table = done.session.component.params
-                params = [table[name] for name in done.result if name in table]
-                described = await find_defaults(done.session, choice, given, params)
-            selection.add(done.result, described)
-        await found.report_others()
+                params = [table[name] for name in done.result if changed and name in table]
+                add(done.result, await find_defaults(done.session, metadata, given, params))
+            await opened.report_others()
+    for fault in faults:
+        report(fault)
+    sets = [_writable(each, written) for each in (_chosen(sets, only) if only else sets)]
+    files = _by_file(str(file), sets) if is_pattern_name(str(file)) else {file: sets}
+    if sets:
+        for path, of_file in files.items():
+            await anyio.to_thread.run_sync(partial(write_file, path, of_file, file_format=written))
+        _show(files, written, as_json=options.json)
+    else:
+        report(f"nothing was written to {file}")
+    return ExitCode.INCOMPLETE if faults or not sets else ExitCode.DONE
 
 
 async def _fetch(session: CommandSession, *, refresh: bool, incomplete: bool) -> ParamSet:
@@ -186,46 +156,37 @@ async def _fetch(session: CommandSession, *, refresh: bool, incomplete: bool) ->
     try:
         return await whole_table(session, refresh=refresh, partial=incomplete)
     except VehicleError as error:
-        raise VehicleError(
-            f"{error}; {INCOMPLETE_HINT}", system=error.system, component=error.component
-        ) from None
+        message = f"{error}; {INCOMPLETE_HINT}"
+        raise VehicleError(message, system=error.system, component=error.component) from None
 
 
-def _add_offline(
-    selection: _Selection,
-    where: str,
-    given: Metadata | None,
-    options: LinkOptions,
-    *,
-    incomplete: bool,
-    extended: bool,
-) -> None:
-    """Add the parameters of a file, of an on-board log, or of a vehicle in the cache."""
+def _offline_sets(
+    where: str, options: LinkOptions, faults: list[str], *, incomplete: bool, extended: bool
+) -> list[ParamSet]:
+    """Return the parameters of a file, of an on-board log, or of a vehicle in the cache.
+
+    Appends a sentence to `faults` for each cached table that is not complete, unless `incomplete` is given.
+    """
     choice = ChosenVehicle.parse(options.vehicle)
     if is_file(where):
         file = open_file(where, partial=incomplete)
-        sets = list(file.sets) if choice.is_all else [choose(file, choice.component, choice.system)]
-    else:
-        if options.place is False:
-            raise UsageError(f"{where!r} is a vehicle in the cache, which --no-cache excludes")
-        tables = tables_of(options.cache, where, choice.component, extended=extended)
-        if not choice.is_all and len(tables) > 1:
-            pilots = [table for table in tables if table.component == AUTOPILOT]
-            if not pilots:
-                known = ", ".join(f"{table.system}/{table.component}" for table in tables)
-                raise UsageError(f"no autopilot is among {known}; name one of them, or use --vehicle all")
-            tables = pilots
-        sets = []
-        for table in tables:
-            try:
-                sets.append(cached_set(table, extended=extended, partial=incomplete))
-            except NotInCache as error:
-                selection.faults.append(f"{error}; {INCOMPLETE_HINT}")
-    metadata = [given] * len(sets)
-    if selection.is_changed and given is None:
-        metadata = known_of_sets(sets, options)
-    for each, known_of_set in zip(sets, metadata, strict=True):
-        selection.add(each, defaults_in(known_of_set, each))
+        return list(file.sets) if choice.is_all else [choose(file, choice.component, choice.system)]
+    if options.place is False:
+        raise UsageError(f"{where!r} is a vehicle in the cache, which --no-cache excludes")
+    tables = tables_of(options.cache, where, choice.component, extended=extended)
+    if not choice.is_all and len(tables) > 1:
+        pilots = [table for table in tables if table.component == AUTOPILOT]
+        if not pilots:
+            known = ", ".join(f"{table.system}/{table.component}" for table in tables)
+            raise UsageError(f"no autopilot is among {known}; name one of them, or use --vehicle all")
+        tables = pilots
+    sets = []
+    for table in tables:
+        try:
+            sets.append(cached_set(table, extended=extended, partial=incomplete))
+        except NotInCache as error:
+            faults.append(f"{error}; {INCOMPLETE_HINT}")
+    return sets
 
 
 def _writable(params: ParamSet, file_format: FileFormat) -> ParamSet:
