@@ -16,6 +16,7 @@ Prints a Markdown table, and below it the date, the machine, its load and the fi
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import math
 import os
@@ -287,6 +288,7 @@ async def time_warm_start(
     async with ParamClient(vehicle.relay.link, cache=vehicle.warm) as client:
         component = await client.component(vehicle.system, timeout=DISCOVERY_TIMEOUT)
         await component.wait_until_identified(DISCOVERY_TIMEOUT)
+        gc.collect()  # what the clients before have left
         before = client.bytes_received + client.bytes_sent
         began = time.monotonic()
         result = await component.fetch_all(timeout=FETCH_TIMEOUT)
