@@ -30,7 +30,7 @@ FetchSource: TypeAlias = Literal["cache", "ftp", "stream"]
 
 IDENTITY_TIME: Final = 1.5
 """Seconds that a download waits to hear whether there is a file; PX4 and ArduPilot do not need it."""
-DOWNLOADS_MAX: Final = 3
+ROUNDS_MAX: Final = 3
 """Downloads, while the table changes during them."""
 NOT_REFRESHED: Final = "The values outside the hash were not read again, because the policy is hash-only."
 LEFT_OUT: Final = "Skipped {}: no parameter file can contain this name."
@@ -212,7 +212,7 @@ class _Fetch:
         self._is_silent = answer.is_silent
         source: FetchSource = "stream"
         digest = answer.digest
-        for _ in range(DOWNLOADS_MAX):
+        for _ in range(ROUNDS_MAX):
             if self.session.channel.is_silent(self._began):
                 break
             source = await self._download()

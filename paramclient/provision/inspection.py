@@ -147,6 +147,9 @@ async def inspect(
     """
     before = {name for name, param in component.params.items() if param.trust is Trust.LIVE}
     fetched = await component.fetch_all()
+    if component.node.channel.is_lost:
+        subject = f"the parameters of {component.system}/{component.component}"
+        raise NoReply(subject, attempts=0, waited=fetched.elapsed)
     if doubt := component.session.encoding_doubt:
         raise UsageError(doubt)
     params = dict(component.params)
