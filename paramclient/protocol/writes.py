@@ -283,9 +283,13 @@ class _Write:
                 elif answer.same_value(self.before):
                     sets_max = min(max(self.channel.timing.attempts_for(SETS_LOST), SETS_MIN), SETS_MAX)
                     if self.attempts >= sets_max:
-                        return await self._last_answer(inbox)
+                        now = anyio.current_time()
+                        answer = await self._wanted_behind(inbox, now) or await self._read(inbox)
+                        if self._is_wanted(answer):
+                            return self._result(answer)
+                        raise self._not_applied(answer)
                 elif adjusted is not None and (adjusted.same_value(answer) or self.attempts >= SETS_MAX):
-                    return self._result(await self._wanted_behind(inbox) or answer)
+                    return self._result(await self._wanted_behind(inbox, self._began) or answer)
                 else:
                     adjusted = answer
 
@@ -321,31 +325,21 @@ class _Write:
         if isinstance(answer, Param) and answer.type_number == self.before.type_number:
             return answer
         if not channel.is_silent(self._began):
-            with suppress(
-                NoReply
-            ):  # only a read shows a changed type, and the value of an extended parameter
+            with suppress(NoReply):  # only a read shows a changed type, or an extended parameter's value
                 return await self._read(inbox)
         raise NoReply(what, attempts=self.attempts, waited=anyio.current_time() - self._began)
 
-    async def _last_answer(self, inbox: Inbox) -> SetResult:
-        """Wait for the wanted value behind the answers to earlier reads, which a slow link has queued."""
-        answer: Param | ParamExtAck | None = None
+    async def _wanted_behind(self, inbox: Inbox, since: float) -> Param | None:
+        """Return the wanted value if it comes behind answers to earlier reads, which a slow link has queued."""
         for _ in range(QUEUE_WAITS):
-            self._has_other_value, now = False, anyio.current_time()
-            answer = await self.channel.wait_for(inbox, self._accept, now, 0, self.channel.timing.slowest)
-            if answer is not None or not self._has_other_value:
+            self._has_other_value = False
+            answer = await self.channel.wait_for(inbox, self._accept, since, 0, self.channel.timing.slowest)
+            if isinstance(answer, Param) and self._is_wanted(answer):
+                return answer
+            if not self._has_other_value:
                 break
-        if not isinstance(answer, Param):
-            answer = await self._read(inbox)
-        if not self._is_wanted(answer):
-            raise self._not_applied(answer)
-        return self._result(answer)
-
-    async def _wanted_behind(self, inbox: Inbox) -> Param | None:
-        """Return the wanted value if it comes behind answers to earlier reads, as long as these may take."""
-        slowest = self.channel.timing.slowest
-        answer = await self.channel.wait_for(inbox, self._accept, self._began, 0, slowest)
-        return answer if isinstance(answer, Param) and self._is_wanted(answer) else None
+            since = anyio.current_time()
+        return None
 
     def _request(self, attempt: int) -> Message:
         """Return the set, and count it as sent."""
