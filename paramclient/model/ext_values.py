@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import struct
-from typing import Final, SupportsFloat, SupportsIndex
+from typing import Final
 
 from paramclient.errors import UsageError
 from paramclient.model.values import (
     HEX,
+    TYPES_BY_NAME,
     Param,
     ParamType,
     Settable,
@@ -15,6 +15,7 @@ from paramclient.model.values import (
     WireValue,
     bits_of,
     byte_length,
+    check_number,
     from_bits,
     type_name,
 )
@@ -32,18 +33,15 @@ __all__ = [
 EXT_VALUE_SIZE: Final = 128
 """Bytes of `param_value` in PARAM_EXT_VALUE, PARAM_EXT_SET and PARAM_EXT_ACK (MAVLink common message set)."""
 
-_LAYOUTS: Final = {
-    number: struct.Struct("<" + code) for number, code in enumerate("BbHhIiQqfd", start=ParamType.UINT8)
-}
+_SIZES: Final = {int(kind): kind.size for kind in TYPES_BY_NAME.values()}
+"""Bytes of a number, by its type."""
 
 
 def own_bytes(data: bytes, number: int) -> bytes:
     """Return the bytes of a message's value that count for its type: all but zeros at the end, as the message
     carries no length, for a type that is no number."""
-    layout = _LAYOUTS.get(number)
-    if layout is None:
-        return data[:EXT_VALUE_SIZE].rstrip(b"\0")
-    return data[: layout.size].ljust(layout.size, b"\0")
+    size = _SIZES.get(number)
+    return data[:EXT_VALUE_SIZE].rstrip(b"\0") if size is None else data[:size].ljust(size, b"\0")
 
 
 def ext_param(
@@ -56,30 +54,19 @@ def ext_param(
 
 def ext_bytes(param: Param) -> bytes:
     """Return the bytes of the value of an extended parameter, without zeros at the end of text and bytes."""
-    layout = _LAYOUTS.get(param.type_number)
-    size = byte_length(param.bits) if layout is None else layout.size
-    return param.bits.to_bytes(size, "little")
+    return param.bits.to_bytes(_SIZES.get(param.type_number, byte_length(param.bits)), "little")
 
 
 def check_ext_value(value: Settable) -> WireValue:
     """Convert a caller's value to an int, a float, a str or bytes; else raise UsageError."""
-    if isinstance(value, bytes | str):
-        data = value if isinstance(value, bytes) else value.encode(errors="surrogatepass")
-        if len(data) > EXT_VALUE_SIZE:
-            raise UsageError(f"the value has {len(data)} bytes; an extended parameter holds {EXT_VALUE_SIZE}")
-        if isinstance(value, str) and ("\0" in value or not _is_encodable(value)):
-            raise UsageError(
-                "text for an extended parameter is UTF-8 without NUL; give bytes for anything else"
-            )
-        return value
-    try:
-        if isinstance(value, SupportsIndex):
-            return value.__index__()
-        if isinstance(value, SupportsFloat):
-            return float(value)
-    except (ArithmeticError, TypeError, ValueError) as error:
-        raise UsageError(f"the value must be a number in the range of a float: {error}") from error
-    raise UsageError(f"an extended parameter is a number, text or bytes, not {type(value).__name__}")
+    if not isinstance(value, bytes | str):
+        return check_number(value, "an extended parameter is a number, text or bytes; a number")
+    data = value if isinstance(value, bytes) else value.encode(errors="surrogatepass")
+    if len(data) > EXT_VALUE_SIZE:
+        raise UsageError(f"the value has {len(data)} bytes; an extended parameter holds {EXT_VALUE_SIZE}")
+    if isinstance(value, str) and ("\0" in value or data != value.encode(errors="replace")):
+        raise UsageError("text for an extended parameter is UTF-8 without NUL; give bytes for anything else")
+    return value
 
 
 def encode_ext_value(value: WireValue, number: int) -> bytes:
@@ -89,17 +76,17 @@ def encode_ext_value(value: WireValue, number: int) -> bytes:
         UsageError: the value does not fit the type: a number only fits a numeric type, text and bytes only
             CUSTOM, and bytes a type that MAVLink does not define.
     """
-    name, layout = type_name(number), _LAYOUTS.get(number)
-    if layout is None:
-        if isinstance(value, str) and number == ParamType.CUSTOM:
-            return own_bytes(value.encode(), number)
-        if isinstance(value, bytes):
-            return own_bytes(value, number)
-        wanted = "text or bytes" if number == ParamType.CUSTOM else "bytes"
-        raise UsageError(f"{value!r} is not {wanted}, and the parameter is {name}")
-    if isinstance(value, str | bytes):
-        raise UsageError(f"{value!r} is not a number, and the parameter is {name}")
-    return bits_of(value, number).to_bytes(layout.size, "little")
+    name, is_custom = type_name(number), number == ParamType.CUSTOM
+    if number in _SIZES:
+        if isinstance(value, str | bytes):
+            raise UsageError(f"{value!r} is not a number, and the parameter is {name}")
+        return bits_of(value, number).to_bytes(_SIZES[number], "little")
+    if isinstance(value, str) and is_custom:
+        value = value.encode()
+    if isinstance(value, bytes):
+        return own_bytes(value, number)
+    wanted = "text or bytes" if is_custom else "bytes"
+    raise UsageError(f"{value!r} is not {wanted}, and the parameter is {name}")
 
 
 def parse_ext_value(name: str, text: str, number: int) -> WireValue:
@@ -110,7 +97,7 @@ def parse_ext_value(name: str, text: str, number: int) -> WireValue:
     """
     try:
         value: WireValue = bytes.fromhex(text.removeprefix(HEX)) if text.startswith(HEX) else text
-        if isinstance(value, str) and ParamType.UINT8 <= number <= ParamType.REAL64:
+        if isinstance(value, str) and number in _SIZES:
             value = float(text) if number >= ParamType.REAL32 else int(text, 0)
     except ValueError:
         raise UsageError(f"{name}: {text!r} is not a value of type {type_name(number)}") from None
@@ -119,11 +106,3 @@ def parse_ext_value(name: str, text: str, number: int) -> WireValue:
     except UsageError as error:
         raise UsageError(f"{name}: {error}") from None
     return value
-
-
-def _is_encodable(text: str) -> bool:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True

@@ -35,6 +35,7 @@ __all__ = [
     "as_reported",
     "bits_of",
     "check_name",
+    "check_number",
     "check_portable_name",
     "check_value",
     "decode_value",
@@ -320,7 +321,7 @@ def check_value(value: Settable) -> WireValue:
     rejected: only the code that read the text knows its notation.
     """
     if isinstance(value, bytes):
-        if len(value) != 4:
+        if len(value) != WIRE_SIZE:
             raise UsageError(f"raw bytes for a parameter are the 4 bytes of the message, not {len(value)}")
         return value
     if isinstance(value, str):
@@ -328,14 +329,23 @@ def check_value(value: Settable) -> WireValue:
             f"a parameter value is a number, not the text {value!r}. The number of a value's name is "
             "ParamInfo.parse(text), with the metadata of the parameter"
         )
+    return check_number(value)
+
+
+def check_number(value: object, wanted: str = "a parameter value is a number") -> int | float:
+    """Convert a number, also of another library, to an int or a float.
+
+    Raises:
+        UsageError: it is no number in the range of a float; the text says what is `wanted`.
+    """
     try:
         if isinstance(value, SupportsIndex):
             return value.__index__()
         if isinstance(value, SupportsFloat):
             return float(value)
     except (ArithmeticError, TypeError, ValueError) as error:
-        raise UsageError(f"a parameter value must be a number in the range of a float: {error}") from error
-    raise UsageError(f"a parameter value is a number, not {type(value).__name__}")
+        raise UsageError(f"{wanted} in the range of a float: {error}") from error
+    raise UsageError(f"{wanted}, not {type(value).__name__}")
 
 
 def decode_value(raw: bytes, number: int, encoding: Encoding) -> tuple[WireValue, int]:
@@ -399,36 +409,28 @@ def encode_value(value: WireValue, number: int, encoding: Encoding) -> bytes:
     """
     if isinstance(value, bytes):
         return value
-    if isinstance(value, str):
-        raise UsageError(f"{value!r} is text, and the parameter is a number")
-    if not 1 <= number <= ParamType.REAL64:
-        raise UsageError(f"{type_name(number)} is not a type that MAVLink defines; give the 4 raw bytes")
-    kind = ParamType(number)
-    if not kind.is_integer:
-        if kind is ParamType.REAL64 and encoding is Encoding.BYTEWISE:
-            raise UsageError("REAL64 takes 8 bytes and PARAM_SET has 4; it cannot be written this way")
-        return _to_float32(value, kind)
-    if isinstance(value, float):
-        if value.is_integer():
-            value = int(value)
-        elif encoding is Encoding.BYTEWISE or not math.isfinite(value):
-            raise UsageError(f"{value!r} is not a whole number, and the parameter is {kind.name}")
-    low, high = kind.bounds
-    if not low <= int(value) <= high:
-        raise UsageError(f"{value} does not fit {kind.name}, which holds {low} to {high}")
     if encoding is Encoding.BYTEWISE:
-        if kind.size > 4:
-            raise UsageError(f"{kind.name} takes 8 bytes and PARAM_SET has 4; it cannot be written this way")
-        return _LAYOUT[kind].pack(value).ljust(4, b"\0")
+        if _LAYOUTS.get(number, _FLOAT32).size > WIRE_SIZE:
+            raise UsageError(
+                f"{type_name(number)} takes 8 bytes and PARAM_SET has 4; it cannot be written this way"
+            )
+        return bits_of(value, number).to_bytes(WIRE_SIZE, "little")
+    value, kind = _number_of(value, number)
     raw = _to_float32(value, kind)
-    sent = _FLOAT32.unpack(raw)[0]
-    if isinstance(value, int) and sent != value:
-        raise UsageError(
-            f"{value} cannot be sent exactly: this vehicle takes integers as float32, "
-            f"and the nearest is {int(sent)}"
-        )
-    if not low <= int(sent) <= high:
-        raise UsageError(f"{value!r} rounds to {sent!r} as float32; {kind.name} holds {low} to {high}")
+    if kind.is_integer:
+        low, high = kind.bounds
+        sent = _FLOAT32.unpack(raw)[0]
+        if not math.isfinite(value):
+            raise UsageError(f"{value!r} is not a whole number, and the parameter is {kind.name}")
+        if not low <= int(value) <= high:
+            raise UsageError(f"{value} does not fit {kind.name}, which holds {low} to {high}")
+        if float(value).is_integer() and sent != value:
+            raise UsageError(
+                f"{value} cannot be sent exactly: this vehicle takes integers as float32, "
+                f"and the nearest is {int(sent)}"
+            )
+        if not low <= int(sent) <= high:
+            raise UsageError(f"{value!r} rounds to {sent!r} as float32; {kind.name} holds {low} to {high}")
     return raw
 
 
@@ -493,26 +495,32 @@ def bits_of(value: WireValue, number: int) -> int:
         if not isinstance(value, str | bytes):
             raise UsageError(f"{value!r} is a number, and the parameter is CUSTOM")
         return int.from_bytes(value.encode() if isinstance(value, str) else value, "little")
-    value = check_value(value)
-    if isinstance(value, str):
-        raise UsageError(f"{value!r} is text, and the parameter is a number")
-    if number in (ParamType.UINT64, ParamType.INT64) and not isinstance(value, bytes):
-        kind = ParamType(number)
-        low, high = kind.bounds
-        if isinstance(value, float):
-            if not value.is_integer():
-                raise UsageError(f"{value!r} is not a whole number, and the parameter is {kind.name}")
-            value = int(value)
-        if not low <= value <= high:
-            raise UsageError(f"{value} does not fit {kind.name}, which holds {low} to {high}")
-        return value & 0xFFFFFFFF_FFFFFFFF
-    if number == ParamType.REAL64 and not isinstance(value, bytes):
+    if isinstance(value, bytes):
+        check_value(value)
+        return int.from_bytes(value[: _LAYOUTS.get(number, _FLOAT32).size], "little")
+    value, kind = _number_of(value, number)
+    if kind is ParamType.REAL32:
+        return int.from_bytes(_to_float32(value, kind), "little")
+    if kind is ParamType.REAL64:
         try:
-            return int.from_bytes(struct.pack("<d", value), "little")
+            return int.from_bytes(_LAYOUT[kind].pack(value), "little")
         except struct.error:
             raise UsageError(f"{value} is beyond the range of REAL64") from None
-    size = ParamType(number).size if 1 <= number <= ParamType.REAL64 else 4
-    return int.from_bytes(encode_value(value, number, Encoding.BYTEWISE)[:size], "little")
+    if isinstance(value, float) and not value.is_integer():
+        raise UsageError(f"{value!r} is not a whole number, and the parameter is {kind.name}")
+    low, high = kind.bounds
+    if not low <= value <= high:
+        raise UsageError(f"{value} does not fit {kind.name}, which holds {low} to {high}")
+    return int(value) & (high - low)  # high - low has as many ones as the type has bits
+
+
+def _number_of(value: WireValue, number: int) -> tuple[int | float, ParamType]:
+    """Return a number and its type; UsageError for a value or a type that is no number."""
+    if isinstance(value, str | bytes):
+        raise UsageError(f"{value!r} is text, and the parameter is a number")
+    if number not in _LAYOUTS:
+        raise UsageError(f"{type_name(number)} is not a type that MAVLink defines; give the 4 raw bytes")
+    return check_number(value), ParamType(number)
 
 
 def same_bits(number: int, a: int, b: int) -> bool:
