@@ -10,7 +10,7 @@ from heapq import heappop, heappush
 from typing import Protocol, TypedDict, Unpack
 
 from paramclient.errors import UsageError
-from paramclient.sim.other_station import OtherStation
+from paramclient.sim.device import OUT_LIMIT
 from paramclient.sim.param_table import check_range
 
 __all__ = ["Air", "Endpoint", "FaultyLink"]
@@ -98,13 +98,8 @@ class FaultyLink:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_range(
-            *(0.0, 1.0),
-            loss=self.loss,
-            duplicate=self.duplicate,
-            reorder=self.reorder,
-            bit_errors=self.bit_errors,
-        )
+        shares = ("loss", "duplicate", "reorder", "bit_errors")
+        check_range(0.0, 1.0, **{name: getattr(self, name) for name in shares})
         check_range(1.0, loss_burst=self.loss_burst)
         check_range(0.0, delay=self.delay, jitter=self.jitter, queue=self.queue or 0)
         if self.rate is not None and not 0.0 < self.rate < math.inf:
@@ -193,8 +188,8 @@ class Air:
         vehicles: any endpoints.
         uplink: from the program to the vehicles; None for a link without faults.
         downlink: from the vehicles to the program; None for a link without faults.
-        others: further ground stations on the channel. Their data goes through both links, to the vehicles
-            and to the program.
+        others: further ground stations on the channel (see `OtherStation`). Their data goes through both
+            links, to the vehicles and to the program.
 
     Attributes:
         vehicles: as given.
@@ -208,7 +203,7 @@ class Air:
         *,
         uplink: FaultyLink | None = None,
         downlink: FaultyLink | None = None,
-        others: Sequence[OtherStation] = (),
+        others: Sequence[Endpoint] = (),
     ) -> None:
         self.uplink = uplink or FaultyLink()
         self.downlink = downlink or FaultyLink()
@@ -224,7 +219,7 @@ class Air:
         cls,
         vehicles: Sequence[Endpoint],
         *,
-        others: Sequence[OtherStation] = (),
+        others: Sequence[Endpoint] = (),
         seed: int = 0,
         **faults: Unpack[Faults],
     ) -> Air:
@@ -274,12 +269,10 @@ class Air:
                     if place < self._others:
                         self.uplink.send(data, now)
                 due[place] = _at(sender)
+        self.uplink.deliver(now)  # without vehicles, nothing has taken it
         arrived = self.downlink.deliver(now)
         self._out += arrived[: OUT_LIMIT - len(self._out)]
 
-
-OUT_LIMIT = 20_000
-"""Frames that an endpoint keeps for `data_to_send`; further ones are dropped to bound the memory."""
 
 _HELD_BACK = 0.03
 """Largest additional delay of a reordered datagram, in seconds."""

@@ -8,14 +8,16 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from operator import itemgetter
-from typing import ClassVar
+from typing import ClassVar, Final
 
 from paramclient.errors import CommandResult
-from paramclient.sim.air import OUT_LIMIT
 from paramclient.sim.param_table import check_range
 from paramclient.wire import frames, messages, signing
 
-__all__ = ["Device"]
+__all__ = ["OUT_LIMIT", "Device"]
+
+OUT_LIMIT: Final = 20_000
+"""Frames that an endpoint keeps for `data_to_send`; further ones are dropped to bound the memory."""
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -49,7 +51,6 @@ class Device:
     signing_key: signing.SigningKey | None = None
     signing_timestamp: int = 0
     usb: bool = False
-    reboot_ack: bool = True
     reboot_down: float = 1.0
 
     def _set_up(self, heartbeat: messages.Heartbeat, version: messages.AutopilotVersion) -> None:
@@ -128,14 +129,10 @@ class Device:
 
     def send(self, message: messages.Message) -> None:
         """Send a message. A subclass may drop some, or send others instead."""
+        system, component, sequence = self.system, self.component, self._sequence
+        version = self.mavlink_version
         self._queue(
-            messages.encode(
-                message,
-                system=self.system,
-                component=self.component,
-                sequence=self._sequence,
-                version=self.mavlink_version,
-            )
+            messages.encode(message, system=system, component=component, sequence=sequence, version=version)
         )
 
     # Time
@@ -283,8 +280,6 @@ class Device:
             result = self._restart_result(int(request.param1))
             if result == CommandResult.ACCEPTED and request.param1 == _REBOOT:
                 self._sooner(self._restart, self._now + self._restart_delay)
-                if not self.reboot_ack:
-                    return
             self._acknowledge(request, sender, result)
         elif wanted == messages.message_id(messages.SystemTime):
             self._acknowledge(request, sender)

@@ -56,7 +56,6 @@ class Vehicle(Device):
             and a set of them is answered. Can be replaced at any time.
         list_stops_at: number of values after which a list stops, once; None for never. The list has then
             ended: a new request starts at the beginning.
-        reboot_ack: whether a reboot command is acknowledged before the reboot.
         reboot_down: seconds for which the vehicle is off during a reboot.
         signing_key: the key that signs sent frames; only frames signed with it, and RADIO_STATUS, are then
             accepted. None: no signing, until SETUP_SIGNING sets a key. A sender's timestamps must rise, and

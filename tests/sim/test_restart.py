@@ -99,18 +99,6 @@ def test_a_vehicle_may_stay_off() -> None:
     assert desk.vehicle.next_deadline() is None
 
 
-@pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle, generic])
-def test_reboot_without_acknowledgement(make: Any) -> None:
-    desk = Desk(make(reboot_ack=False))
-    assert desk.command() == []
-    desk.run(0.9)
-    assert desk.silence(0.45, 0.9)
-    desk.run(5.0)
-    assert desk.messages(messages.Heartbeat)
-    desk.vehicle.armed = True
-    assert len(desk.command()) == 1  # refusals are acknowledged
-
-
 @pytest.mark.parametrize(
     ("make", "answer"),
     [

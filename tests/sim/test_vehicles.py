@@ -766,3 +766,7 @@ class TestAir:
         mute.send(LIST).wait(1.0)
         assert vehicle.requests == {"PARAM_REQUEST_LIST": 1}
         assert mute.log == []
+
+    def test_without_vehicles_data_is_lost(self) -> None:
+        station = Station(Air([])).send(LIST).wait(1.0)
+        assert station.log == []
