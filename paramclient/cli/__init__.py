@@ -1,14 +1,13 @@
 """The command line: parses arguments, calls the client, and prints tables or JSON.
 
 - `app`: all subcommands, the main function, signals and errors.
-- Subcommands: `read_commands` (fetch, get), `set_command`, `reset_command`, `watch`, `show`, `cached` (cache,
-  history), `search` (search, info), `logs` (import), `apply`, `restore`, `save`, `diff`, `metadata`, `link`,
-  `check`, `ports`, `signing`, `serve` (serve, token) and `simulate` (sim).
+- Subcommands: `read_commands` (fetch, get), `set_command` (set, and writes), `reset_command`, `watch`,
+  `show`, `cached` (cache, history), `search` (search, info), `logs` (import), `apply`, `restore`, `save`,
+  `diff`, `metadata`, `link`, `check`, `ports`, `signing`, `serve` (serve, token) and `simulate` (sim).
 - `session`: open links with the vehicles of --vehicle, on which a subcommand works. `options`: options.
 - `sources`: the parameters that an argument names: of a file, a link or the cache. `time_arguments`: times.
 - `param_names`: names and patterns of parameters, and suggestions.
 - `metadata`, `default_sources`: descriptions and defaults that a subcommand uses.
-- `writes`: writes and their outcomes.
 - `output`: tables, lines, the status line. `param_table`: the parameters of a vehicle. `file_output`: files.
 - `json_output`, `json_apply`: JSON.
 - `exit_codes`: exit codes.

@@ -17,7 +17,7 @@ from paramclient.cli.output import Coloured, by_index, can_ask, confirm, report,
 from paramclient.cli.param_names import check_given
 from paramclient.cli.read_commands import get_chosen, report_all
 from paramclient.cli.session import CommandSession, Done, sessions
-from paramclient.cli.writes import WriteJob, write_all
+from paramclient.cli.set_command import WriteJob, write_all
 from paramclient.errors import NoReply, ParamClientError, UsageError, VehicleError
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import Default, DefaultSource, default_of
