@@ -6,12 +6,11 @@ pymavlink and MAVSDK; `HOST:PORT` alone listens too, as in MAVProxy.
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from ipaddress import AddressValueError, IPv4Address, IPv6Address
-from math import isfinite
 from typing import Final, NoReturn
 from urllib.parse import parse_qsl
 
@@ -137,12 +136,8 @@ def _parse(name: str) -> LinkSpec:
             _fail(f"{scheme[1]!r} is not a kind of link" if scheme else "the kind of link is missing")
         return _network(LinkKind.UDPIN, name)
     rest = scheme[2].removeprefix("//")
-    if kind is LinkKind.SERIAL:
-        return _serial(rest)
-    if kind is LinkKind.SIM:
-        return _sim(rest)
-    if kind is LinkKind.REPLAY:
-        return _replay(rest)
+    if kind in _PARSERS:
+        return _PARSERS[kind](rest)
     if kind in _LISTENING and rest.isdecimal():
         rest = f":{rest}"
     return _network(kind, rest)
@@ -214,7 +209,7 @@ def _sim(rest: str) -> LinkSpec:
             _fail(f"{key!r} is not an option of a simulated link; the options are {', '.join(_SIM_OPTIONS)}")
         if key in options:
             _fail(f"option {key} is given twice")
-        options[key] = _SIM_OPTIONS[key](key, value)
+        options[key] = _number(key, value, *_SIM_OPTIONS[key])
     if "metadata" in options and autopilot.lower() != "px4":
         _fail("option metadata is for sim:px4; the other simulated vehicles do not describe their parameters")
     if "queue" in options and "rate" not in options:
@@ -223,58 +218,48 @@ def _sim(rest: str) -> LinkSpec:
 
 
 def _replay(rest: str) -> LinkSpec:
-    path, mark, query = rest.rpartition("?")
-    if not mark or not query.startswith("speed="):
-        path, query = rest, ""
+    path, mark, speed = rest.rpartition("?speed=")
+    if not mark:
+        path = rest
     if not path:
         _fail("the file is missing")
-    options: tuple[tuple[str, int | float], ...] = ()
-    if query:
-        text = query.removeprefix("speed=")
-        options = (("speed", 0.0 if text == "inf" else _real(0, 1e6)("speed", text)),)
-    return LinkSpec(LinkKind.REPLAY, path, options=options)
+    number = 0.0 if speed == "inf" else _number("speed", speed, 0.0, 1e6) if mark else 1.0
+    return LinkSpec(LinkKind.REPLAY, path, options=(("speed", number),) if mark else ())
 
 
 def _fail(problem: str) -> NoReturn:
     raise _BadName(problem)
 
 
-def _real(smallest: float, largest: float) -> Callable[[str, str], float]:
-    def read(key: str, text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            _fail(f"option {key}: {text!r} is not a number")
-        if not (isfinite(value) and smallest <= value <= largest):
-            _fail(f"option {key} must be from {smallest:g} to {largest:g}")
-        return abs(value)  # −0.0 is 0.0
-
-    return read
-
-
-def _whole(smallest: int, largest: int) -> Callable[[str, str], int]:
-    def read(key: str, text: str) -> int:
-        if not re.fullmatch("[0-9]{1,20}", text) or not smallest <= int(text) <= largest:
-            _fail(f"option {key} must be a whole number from {smallest} to {largest}")
-        return int(text)
-
-    return read
+def _number(key: str, text: str, low: float, high: float) -> int | float:
+    """Return the number of an option, a whole one where its limits are."""
+    kind = int if isinstance(low, int) else float
+    try:
+        value = kind(text) if kind is float or (text.isascii() and text.isdigit()) else -math.inf
+    except ValueError:
+        value = -math.inf
+    if not low <= value <= high:
+        word = "whole number" if kind is int else "number"
+        _fail(f"option {key} must be a {word} from {low:g} to {high:g}, not {text!r}")
+    return abs(value)  # −0.0 is 0.0
 
 
-_SIM_OPTIONS: dict[str, Callable[[str, str], int | float]] = {
-    "loss": _real(0, 1),
-    "loss_burst": _real(1, 1e6),
-    "delay": _real(0, 3600),
-    "jitter": _real(0, 3600),
-    "duplicate": _real(0, 1),
-    "reorder": _real(0, 1),
-    "bit_errors": _real(0, 1),
-    "rate": _real(1, 1e9),
-    "queue": _whole(0, 2**31),
-    "seed": _whole(0, 2**63),
-    "system": _whole(1, 255),
-    "param_error": _whole(0, 1),
-    "metadata": _whole(0, 1),
+_PARSERS = {LinkKind.SERIAL: _serial, LinkKind.SIM: _sim, LinkKind.REPLAY: _replay}
+"""The parsers of links that are not those of a network."""
+_SIM_OPTIONS: dict[str, tuple[float, float]] = {
+    "loss": (0.0, 1.0),
+    "loss_burst": (1.0, 1e6),
+    "delay": (0.0, 3600.0),
+    "jitter": (0.0, 3600.0),
+    "duplicate": (0.0, 1.0),
+    "reorder": (0.0, 1.0),
+    "bit_errors": (0.0, 1.0),
+    "rate": (1.0, 1e9),
+    "queue": (0, 2**31),
+    "seed": (0, 2**63),
+    "system": (1, 255),
+    "param_error": (0, 1),
+    "metadata": (0, 1),
 }
-"""Options of `sim:` links: probabilities, datagrams lost in a row, seconds one way, bytes per second, bytes
-in the queue, and numbers. The values are parsers with the option's range."""
+"""Options of `sim:` links, each with its range: probabilities, datagrams lost in a row, seconds one way,
+bytes per second, bytes in the queue, and numbers. Whole limits are those of whole numbers."""

@@ -315,7 +315,7 @@ def test_a_spec_has_the_parts_of_the_name() -> None:
         ("sim:ardupilot?metadata=1", "option metadata is for sim:px4"),
         ("sim:px4?colour=red", "'colour' is not an option"),
         ("sim:px4?loss=0.1&loss=0.2", "given twice"),
-        ("sim:px4?loss=", "not a number"),
+        ("sim:px4?loss=", "a number from 0 to 1, not ''"),
         ("sim:px4?loss=1.1", "from 0 to 1"),
         ("sim:px4?loss=nan", "from 0 to 1"),
         ("sim:px4?delay=-1", "from 0 to 3600"),
