@@ -5,7 +5,7 @@ The tree shows the cause of each error::
     ParamClientError
     ├── UsageError(ValueError)        the caller: an invalid name, value, link name or argument
     │   ├── FileError                 a file of parameters or of metadata that cannot be read or written
-    │   ├── InvalidParameters         invalid values for a set-up
+    │   ├── InvalidParameters         invalid values or unknown names
     │   ├── AlreadyRestored           the state before the last apply was already restored
     │   ├── UnknownVehicle            no vehicle in the cache matches the given name
     │   └── AmbiguousVehicle          several vehicles match, on the link or in the cache

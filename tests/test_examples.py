@@ -45,12 +45,12 @@ PRINTED = {
         r"wrong: +1\.5 is not a whole number",
         r"refused: .*NO_SUCH",
     ],
-    "setup_ardupilot": [
+    "apply_ardupilot": [
         r"1: <ApplyResult 1/1 8 accepted, 1 skipped in ",
         r"1: COMPASS_OFS_X = 5\.0, skipped: left out: ",
-        r"1: set up",
+        r"1: as wanted",
     ],
-    "setup_px4": [
+    "apply_px4": [
         r"  SYS_AUTOSTART 10040 -> 4001, set \(takes effect after a reboot\)",
         r"CAL_ACC0_XOFF 0\.0 -> 0\.0125, skipped: left out: ",
         r"the vehicle reboots",

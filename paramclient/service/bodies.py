@@ -150,7 +150,7 @@ class PlanRequest(Body):
         return self
 
 
-class SetupOptions(Body):
+class RunOptions(Body):
     """Options of an apply or restore; see `paramclient.provision.apply`."""
 
     include: Patterns = ()
@@ -160,14 +160,14 @@ class SetupOptions(Body):
     timeout: Annotated[Seconds, Field(alias="timeout_s")] = None
 
 
-class ApplyRequest(SetupOptions, PlanRequest):
+class ApplyRequest(RunOptions, PlanRequest):
     """Wanted parameters with options."""
 
     partial: bool = False
     durable: Durable = False
 
 
-class RestoreRequest(SetupOptions):
+class RestoreRequest(RunOptions):
     """The state to restore; without `at`, the state before the last apply."""
 
     at: Moment | None = None

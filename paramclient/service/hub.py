@@ -67,7 +67,7 @@ class Target:
     Attributes:
         link: its link.
         component: the component.
-        setup: held by the running apply or restore of plain or extended parameters.
+        applying: held by the running apply or restore of plain or extended parameters.
         metadata: the metadata of its parameters, or None: extended ones have none.
         described: the identity to which `metadata` belongs.
         progress: the progress of a running fetch, or None.
@@ -77,7 +77,7 @@ class Target:
 
     link: ServiceLink
     component: Component
-    setup: anyio.Lock
+    applying: anyio.Lock
     metadata: Metadata | None = None
     described: Identity | None = None
     progress: Progress | None = None
@@ -352,9 +352,9 @@ class Hub:
         component = event.component
         key = component.system, component.component, False
         if key not in link.targets or link.targets[key].component is not component:
-            setup = anyio.Lock()
+            applying = anyio.Lock()
             for each in (component, component.ext):
-                target = Target(link, each, setup)
+                target = Target(link, each, applying)
                 link.targets[component.system, component.component, each.is_extended] = target
                 tasks.start_soon(self._publish_changes, target)
         target = link.targets[key]

@@ -262,19 +262,19 @@ def _file_name(params: ParamSet, file_format: FileFormat) -> str:
     return re.sub(r"[^A-Za-z0-9._-]", "_", "-".join(parts))[:100] + ending
 
 
-# set-ups
+# apply and restore
 
 
-async def _only_setup(target: TargetArgument) -> AsyncIterator[None]:
+async def _only_apply(target: TargetArgument) -> AsyncIterator[None]:
     """Run one apply or restore of a component at a time: two would undo each other's changes."""
     try:
-        target.setup.acquire_nowait()
+        target.applying.acquire_nowait()
     except anyio.WouldBlock:
-        raise ServiceError(409, "busy", "Another request is setting up this vehicle.") from None
+        raise ServiceError(409, "busy", "Another apply or restore of this vehicle is running.") from None
     try:
         yield
     finally:
-        target.setup.release()
+        target.applying.release()
 
 
 @reading.post(f"{VEHICLE}/plan")
@@ -285,7 +285,7 @@ async def plan(hub: HubArgument, target: TargetArgument, body: bodies.PlanReques
     return PlanJson.of(found, system=component.system, component=component.component)
 
 
-@writing.post(f"{VEHICLE}/apply", dependencies=[Depends(_only_setup)])
+@writing.post(f"{VEHICLE}/apply", dependencies=[Depends(_only_apply)])
 async def apply_(
     request: Request, hub: HubArgument, target: TargetArgument, body: bodies.ApplyRequest
 ) -> ApplyJson:
@@ -298,7 +298,7 @@ async def apply_(
     return _applied(target, await apply(target.component, wanted, **options))
 
 
-@writing.post(f"{VEHICLE}/restore", dependencies=[Depends(_only_setup)])
+@writing.post(f"{VEHICLE}/restore", dependencies=[Depends(_only_apply)])
 async def restore_(
     request: Request, hub: HubArgument, target: TargetArgument, body: bodies.RestoreRequest
 ) -> ApplyJson:
@@ -328,12 +328,12 @@ def _applied(target: Target, result: ApplyResult) -> ApplyJson:
 
 def _context(request: Request, hub: Hub, target: Target) -> dict[str, Any]:
     """Return the arguments of `apply` and `restore` that are not in the body."""
-    progress = _publisher(partial(hub.feed.publish, "setup", **target.address))
+    progress = _publisher(partial(hub.feed.publish, "apply", **target.address))
     return {"info": target.metadata, "author": author_of(request), "progress": progress}
 
 
 def _publisher(publish: Callable[..., None]) -> Callable[[ApplyProgress], None]:
-    """Return a function that publishes each phase of a set-up, and its progress at an interval."""
+    """Return a function that publishes each phase of an apply, and its progress at an interval."""
     phase, due_at = "", 0.0
 
     def progress(now: ApplyProgress) -> None:

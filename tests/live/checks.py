@@ -406,7 +406,7 @@ async def show_group(session: Session) -> Measured:
     raise Skip(f"none of these shows a group: {', '.join(tried)}" if tried else "no switch of a group is off")
 
 
-# Set-ups
+# Apply and restore
 
 
 async def apply_hidden(session: Session) -> Measured:

@@ -136,7 +136,7 @@ class Journal:
         """Whether a vehicle of this kind may give the parameter another value without requests.
 
         Counters, calibration and what is measured or written by the vehicle alone do, by the list that the
-        set-up of vehicles uses.
+        list of `apply` has.
         """
         return self._category(name) in _MOVING
 

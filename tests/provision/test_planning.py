@@ -1,4 +1,4 @@
-"""Plans of set-ups: values to write, their order, left-out and invalid parameters, similar names."""
+"""Plans: values to write, their order, left-out and invalid parameters, similar names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Set-ups with files whose names the vehicle's firmware has changed: plans, `apply`, `verify`, versions."""
+"""Files whose names the firmware of the vehicle has changed: plans, `apply`, versions."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ async def test_the_progress_of_an_apply_is_told() -> None:
             values = {"PARAM_04": 9, "PARAM_05": 9}
             applied = await browser.post(f"{V}/apply", json={"values": values})
             assert applied.json()["complete"]
-            event = await stream.next("setup")
+            event = await stream.next("apply")
             assert {"phase", "done", "total", "system", "component"} <= event.keys()
 
 

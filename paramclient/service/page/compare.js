@@ -265,7 +265,7 @@ export async function takeOver() {
   store.whileShown(table_, "table", () => {
     if (!hasBegun) for (const line of lines) line.follow();
   });
-  store.whileShown(table_, "setup", (event) => {
+  store.whileShown(table_, "apply", (event) => {
     if (hasBegun && !isOver && keyOf(event) === keyOf(component) && event.total)
       summary.textContent = `${PHASES[event.phase] ?? "Applying"}: ${event.done} of ${event.total}`;
   });

@@ -274,7 +274,7 @@ class Store {
     const key = keyOf(event);
     if (event.type === "vehicle") this.takeComponent(key, event);
     else if (event.type === "change") this.takeChange(key, event);
-    else if (event.type === "setup") this.emit("setup", event);
+    else if (event.type === "apply") this.emit("apply", event);
   }
 
   takeComponent(key, event) {

@@ -1,6 +1,6 @@
-"""Set up a PX4 vehicle from a parameter file: show the plan, back up, apply, reboot, verify.
+"""Apply a parameter file to a PX4 vehicle: show the plan, back up, apply, reboot, verify.
 
-python examples/setup_px4.py [LINK [FILE]]
+python examples/apply_px4.py [LINK [FILE]]
 
 After an interruption, run it again to continue.
 """

@@ -1,6 +1,6 @@
-"""Set up ArduPilot vehicles from a shared file and own values of each; restore a vehicle on failure.
+"""Apply a shared file to ArduPilot vehicles and own values of each; restore a vehicle on failure.
 
-python examples/setup_ardupilot.py [LINK [FILE]]
+python examples/apply_ardupilot.py [LINK [FILE]]
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ async def main(link: str, file: Path) -> bool:
             vehicles, lambda each: apply(each, wanted(each), reboot=True, backup=backup(each))
         )
         for (system, _), error in applied.errors.items():
-            print(f"{system}: nothing was set: {error}")
+            print(f"{system}: nothing was written: {error}")
         for (system, component), result in applied.results.items():
             print(f"{system}: {result}")
             for row in result.rows.values():
@@ -62,11 +62,11 @@ async def main(link: str, file: Path) -> bool:
             print(
                 f"{system}: restored to its state before"
                 if back.complete
-                else f"{system}: NEITHER SET UP NOR RESTORED: {back}"
+                else f"{system}: NEITHER APPLIED NOR RESTORED: {back}"
             )
         verified = await for_each(vehicles, lambda each: plan(each, wanted(each)))
         for (system, _), planned in verified.results.items():
-            print(f"{system}: {'set up' if planned.complete else 'NOT set up'}")
+            print(f"{system}: {'as wanted' if planned.complete else 'NOT as wanted'}")
         return applied.complete and verified.complete
 
 
