@@ -141,6 +141,7 @@ class Gateway:
         for station in self.stations:
             if is_answer and table is not None and self._serves(station, table, link):
                 station.withhold(seen)
+                table.take_over(station)
             else:
                 station.relay(seen)
 
@@ -168,6 +169,8 @@ class Gateway:
                 return
         if not station.endpoint.is_readonly or _is_harmless(frame, message):
             self._pass(station, seen)
+            if isinstance(message, ListRequest):
+                station.list_passed_at = anyio.current_time()
             if getattr(message, "command", None) == messages.MAV_CMD_PREFLIGHT_STORAGE:
                 for link in self.links:
                     for table in link.tables(_target_of(frame), COMP_ID_ALL, extended=False):

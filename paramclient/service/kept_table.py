@@ -45,6 +45,8 @@ SET_TIMEOUT: Final = 2.9
 """Seconds for a verified write: a station has a result within 3 s."""
 ASKED_AT_ONCE: Final = 4
 """Reads by stations that the vehicle is asked for at once."""
+TAKE_OVER_TIME: Final = 10.0
+"""Seconds in which a list that was passed to a vehicle may still be in progress."""
 PENDING_MAX: Final = 1_000
 """Reads, and sets, that wait for one component, at most; further ones are dropped, as on a full link."""
 UNKNOWN_TIME: Final = 30.0
@@ -252,6 +254,12 @@ class KeptTable:
         else:
             self._waiting.setdefault(station, set())
             self.load()
+
+    def take_over(self, station: GroundStation) -> None:
+        """Answer a list that was passed to the vehicle, and whose values are withheld from now on."""
+        if anyio.current_time() - station.list_passed_at < TAKE_OVER_TIME:
+            station.list_passed_at = -math.inf
+            self.send_list(station)
 
     def _current(self, values: Iterable[ReportedValue]) -> Iterator[Message]:
         """Yield the values of one list, each as it is by then, until the component is lost or restarts."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import suppress
@@ -99,6 +100,7 @@ class GroundStation:
         sources: the system and component ids under which it sends.
         version: of MAVLink, of the answers: 1 only for a station that has sent version 1 and never 2.
         requests: of parameters, by kind.
+        list_passed_at: when its last request for a list was passed to a vehicle.
         relayed, answered, dropped: frames.
         saved: bytes of answers that did not have to come over the vehicle's link.
     """
@@ -111,6 +113,7 @@ class GroundStation:
         self.sources: set[Source] = set()
         self.version = 2
         self.requests: Counter[str] = Counter()
+        self.list_passed_at = -math.inf
         self.relayed = self.answered = self.dropped = self.saved = 0
         self._has_sent_version_2 = False
         self._numbering: dict[Source, Numbering] = {}

@@ -157,6 +157,19 @@ async def test_rule_1_a_list_at_the_first_heartbeat_stays_off_the_radio() -> Non
 
 
 @in_simulated_time
+async def test_rule_1_a_list_that_was_passed_before_the_vehicle_was_heard_is_answered() -> None:
+    """A station may ask before the first heartbeat; the values are then answers to the gateway too."""
+    vehicle = ArduPilotVehicle(ftp=False)
+    async with gateway_over(Air.symmetric([vehicle], delay=0.02, rate=5_760)) as served:
+        station = served.partner()
+        station.send(GCS, LIST)
+        await until(lambda: served.clients[0].components)
+        await served.synced()
+        await anyio.sleep(2.0)
+        assert {each.param_index for each in station.of(ParamValue)} >= set(range(1382))
+
+
+@in_simulated_time
 async def test_rule_1_a_key_is_never_passed_on() -> None:
     vehicle = Tap(small_px4())
     async with gateway_over(vehicle) as served:
