@@ -167,6 +167,18 @@ def test_ctrl_c_ends_a_call_and_the_client_goes_on(call: Callable[[ParamClient],
             client.component(timeout=0.01)
 
 
+def test_ctrl_c_cancels_the_calls_to_several_vehicles() -> None:
+    with ParamClient("sim:px4", cache=False) as client:
+        vehicle, changes = client.only_component(), client.component().changes()
+        timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
+        timer.start()
+        with pytest.raises(KeyboardInterrupt):
+            for_each(
+                [vehicle], lambda each: apply(each, {NAME: 6.5}, before_writing=lambda: changes.next(60.0))
+            )
+        assert vehicle.get(NAME).value == 4.0
+
+
 PROGRAM = """
 import sys, gc
 from paramclient.sync import ParamClient
