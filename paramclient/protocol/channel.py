@@ -176,16 +176,10 @@ class Inbox:
     def __init__(self) -> None:
         self._messages: deque[Message] = deque()
         self._arrived = anyio.Event()
-        self._error: LinkError | None = None
 
     def put(self, message: Message) -> None:
         """Add a message, and wake the conversation."""
         self._messages.append(message)
-        self._arrived.set()
-
-    def fail(self, error: LinkError) -> None:
-        """End the wait of the conversation with an error."""
-        self._error = error
         self._arrived.set()
 
     def __bool__(self) -> bool:
@@ -194,8 +188,6 @@ class Inbox:
     async def next(self) -> Message:
         """Wait for the next message."""
         while not self._messages:
-            if self._error is not None:
-                raise self._error.with_traceback(None)
             self._arrived = anyio.Event()
             await self._arrived.wait()
         return self._messages.popleft()
@@ -364,12 +356,6 @@ class Channel:
                 for inbox in self.inboxes.get(key, ()):
                     inbox.put(message)
 
-    def fail(self, error: LinkError) -> None:
-        """End all conversations that wait, as the link has failed."""
-        for inboxes in list(self.inboxes.values()):
-            for inbox in inboxes:
-                inbox.fail(error)
-
     @contextmanager
     def inbox(self, *keys: Key) -> Iterator[Inbox]:
         """Collect the messages with some keys for one conversation, without a gap between its steps."""
@@ -430,7 +416,7 @@ class Channel:
                 del self._waits[scope]
 
     def lose(self) -> None:
-        """End the waits for messages: the component is lost."""
+        """End the waits for messages: the component is lost, or the link has failed."""
         for scope in self._waits:
             scope.deadline = -math.inf
 
@@ -477,6 +463,7 @@ class Channel:
             if answer is not None:
                 self._measure(attempt, now - sent, now - began)
                 return answer
+            self.gate.check()
             if self.is_hopeless(attempt, began, attempts() if callable(attempts) else attempts):
                 raise NoReply(what, attempts=attempt, waited=now - began)
 

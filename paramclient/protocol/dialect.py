@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -43,91 +43,61 @@ class Digest:
         return cls(int.from_bytes(message.raw, "little"), message.param_count)
 
 
-class Dialect(ABC):
+@dataclass(frozen=True, slots=True)
+class Dialect:
     """One of the two protocols.
 
     Attributes:
-        name: "plain" or "extended".
         value: the message with a value: the first part of its key in a channel.
+        list_request, read_request, set_request: the messages for all values, for one, and with a new one.
         has_ack: whether a set is acknowledged by a message of its own, in place of the value.
+        encode: returns the bytes of a value of this type for the message. It raises UsageError where the
+            value does not fit the type.
+        param: returns the parameter of this name with the value in these bytes, its type and index.
     """
 
-    name: str
     value: type[ReportedValue]
+    list_request: type[messages.ParamRequestList | messages.ParamExtRequestList]
+    read_request: type[messages.ParamRequestRead | messages.ParamExtRequestRead]
+    set_request: type[messages.ParamSet | messages.ParamExtSet]
     has_ack: bool
+    encode: Callable[[WireValue, int, Encoding], bytes]
+    param: Callable[[str, bytes, int, int | None, Encoding], Param]
 
-    @abstractmethod
     def request_list(self, target: tuple[int, int]) -> Message:
         """Return the request for all parameters."""
+        return self.list_request(*target)
 
-    @abstractmethod
     def request_read(self, target: tuple[int, int], which: str | int) -> Message:
         """Return the request for one parameter, by name or index."""
+        name, index = (which, -1) if isinstance(which, str) else ("", which)
+        return self.read_request(*target, name, index)
 
-    @abstractmethod
     def request_set(self, target: tuple[int, int], name: str, raw: bytes, number: int) -> Message:
         """Return the request to set a parameter to these bytes, in this type."""
-
-    @abstractmethod
-    def encode(self, value: WireValue, number: int, encoding: Encoding) -> bytes:
-        """Return the bytes of a value for the message.
-
-        Raises:
-            UsageError: the value does not fit the type.
-        """
-
-    @abstractmethod
-    def param(self, name: str, raw: bytes, number: int, index: int | None, encoding: Encoding) -> Param:
-        """Return the parameter with the value in these bytes."""
+        return self.set_request(*target, name, raw, number)
 
 
-class _Plain(Dialect):
-    name = "plain"
-    value = messages.ParamValue
-    has_ack = False
-
-    def request_list(self, target: tuple[int, int]) -> Message:
-        return messages.ParamRequestList(*target)
-
-    def request_read(self, target: tuple[int, int], which: str | int) -> Message:
-        name, index = (which, -1) if isinstance(which, str) else ("", which)
-        return messages.ParamRequestRead(*target, name, index)
-
-    def request_set(self, target: tuple[int, int], name: str, raw: bytes, number: int) -> Message:
-        return messages.ParamSet(*target, name, raw, number)
-
-    def encode(self, value: WireValue, number: int, encoding: Encoding) -> bytes:
-        return encode_value(value, number, encoding)
-
-    def param(self, name: str, raw: bytes, number: int, index: int | None, encoding: Encoding) -> Param:
-        bits, is_raw = bits_of_wire(raw, number, encoding)
-        value = from_bits(bits, number, is_raw=is_raw)
-        return Param(name, value, known_type(number), index, bits, is_raw=is_raw)
+def _plain_param(name: str, raw: bytes, number: int, index: int | None, encoding: Encoding) -> Param:
+    bits, is_raw = bits_of_wire(raw, number, encoding)
+    value = from_bits(bits, number, is_raw=is_raw)
+    return Param(name, value, known_type(number), index, bits, is_raw=is_raw)
 
 
-class _Extended(Dialect):
-    name = "extended"
-    value = messages.ParamExtValue
-    has_ack = True
-
-    def request_list(self, target: tuple[int, int]) -> Message:
-        return messages.ParamExtRequestList(*target)
-
-    def request_read(self, target: tuple[int, int], which: str | int) -> Message:
-        name, index = (which, -1) if isinstance(which, str) else ("", which)
-        return messages.ParamExtRequestRead(*target, name, index)
-
-    def request_set(self, target: tuple[int, int], name: str, raw: bytes, number: int) -> Message:
-        return messages.ParamExtSet(*target, name, raw, number)
-
-    def encode(self, value: WireValue, number: int, encoding: Encoding) -> bytes:
-        return encode_ext_value(value, number)
-
-    def param(self, name: str, raw: bytes, number: int, index: int | None, encoding: Encoding) -> Param:
-        return ext_param(name, raw, number, index)
-
-
-PLAIN = _Plain()
+PLAIN = Dialect(
+    *(messages.ParamValue, messages.ParamRequestList, messages.ParamRequestRead, messages.ParamSet),
+    has_ack=False,
+    encode=encode_value,
+    param=_plain_param,
+)
 """PARAM_REQUEST_READ, PARAM_REQUEST_LIST, PARAM_SET, and PARAM_VALUE, which is also the acknowledgement."""
-EXTENDED = _Extended()
+EXTENDED = Dialect(
+    messages.ParamExtValue,
+    messages.ParamExtRequestList,
+    messages.ParamExtRequestRead,
+    messages.ParamExtSet,
+    has_ack=True,
+    encode=lambda value, number, encoding: encode_ext_value(value, number),
+    param=lambda name, raw, number, index, encoding: ext_param(name, raw, number, index),
+)
 """PARAM_EXT_REQUEST_READ, …; PARAM_EXT_ACK acknowledges a set."""

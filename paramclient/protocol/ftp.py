@@ -143,7 +143,6 @@ async def read_file(
     channel: Channel,
     path: str,
     *,
-    read_size: int = DATA_SIZE_MAX,
     size_max: int = FILE_SIZE_MAX,
     open_attempts: Callable[[], int] | None = None,
     progress: Callable[[int, int | None], None] | None = None,
@@ -154,7 +153,6 @@ async def read_file(
     Args:
         channel: the component's.
         path: of the file, as the component names it.
-        read_size: bytes of each read, 1 to 239.
         size_max: bytes, at most.
         open_attempts: returns those to open the file, where there is another way without it; None for as many
             as loss explains.
@@ -167,7 +165,7 @@ async def read_file(
         LinkError: the link is closed for good.
     """
     async with channel.ftp, _opened(channel, path, open_attempts) as (session, size):
-        reader = _FileReader(channel, session, path, read_size, size_max)
+        reader = _FileReader(channel, session, path, size_max)
         reader.progress = None if progress is None else (lambda received: progress(received, size))
         reader.begun = begun
         try:
@@ -373,13 +371,12 @@ class _Pieces:
 class _FileReader:
     """The read of one open file: a burst from beginning to end, and single reads of lost blocks."""
 
-    def __init__(self, channel: Channel, session: int, path: str, read_size: int, size_max: int) -> None:
+    def __init__(self, channel: Channel, session: int, path: str, size_max: int) -> None:
         self.progress: Callable[[int], None] | None = None
         self.begun: Callable[[bytes], None] = lambda head: None
         self._channel = channel
         self._session = session
         self._path = path
-        self._read_size = read_size
         self._size_max = size_max
         self._pieces = _Pieces()
         self._has_bursts = True
@@ -422,7 +419,7 @@ class _FileReader:
             await channel.gate.wait()
             sequence = channel.next_ftp_sequence()
             request = Packet(
-                sequence, self._session, Opcode.BURST_READ_FILE, size=self._read_size, offset=offset
+                sequence, self._session, Opcode.BURST_READ_FILE, size=DATA_SIZE_MAX, offset=offset
             )
             channel.send(FileTransfer(0, *channel.target, request.pack()))
             self._bursts += 1
@@ -470,7 +467,7 @@ class _FileReader:
         """Read what is missing, and the end while it is unknown, block by block."""
         pieces, window = self._pieces, anyio.Semaphore(READS_MAX)
         while True:
-            wanted = [at for first, end in pieces.gaps() for at in range(first, end, self._read_size)]
+            wanted = [at for first, end in pieces.gaps() for at in range(first, end, DATA_SIZE_MAX)]
             if pieces.end is None:
                 wanted.append(pieces.reached)
             if not wanted:
@@ -496,7 +493,7 @@ class _FileReader:
                 self._path,
                 session=self._session,
                 offset=offset,
-                size=self._read_size,
+                size=DATA_SIZE_MAX,
                 copies=copies,
             )
         except FileTransferError as error:

@@ -301,6 +301,7 @@ class _Download:
 
     async def _take_for(self, seconds: float) -> None:
         """Take the values that arrive, at most for some seconds without one."""
+        self.channel.gate.check()
         with anyio.move_on_after(seconds) as scope:
             self._take(await self._inbox.next())
         if anyio.current_time() > scope.deadline + LATE_WAKE_UP:

@@ -91,10 +91,11 @@ def decode(data: bytes) -> Pack:
         PackError: the file is invalid: magic, type, flag or name, a name that occurs twice, a truncated file,
             another number of entries than in the header, or more bytes than possible.
     """
-    magic, number, total = _header(data)
-    _check_header(magic, number, total)
-    with_defaults = magic == _MAGIC_WITH_DEFAULTS
-    return Pack(_entries(data, number, with_defaults), total, with_defaults)
+    pack, number = decode_prefix(data)
+    if len(pack.entries) < number:
+        what = f"the file is cut off: {len(pack.entries)} of {number} entries"
+        raise PackError(what, offset=len(data))
+    return pack
 
 
 def decode_prefix(data: bytes) -> tuple[Pack, int]:
@@ -106,10 +107,17 @@ def decode_prefix(data: bytes) -> tuple[Pack, int]:
     Raises:
         PackError: as in `decode`, except for a file that is truncated behind its header.
     """
-    magic, number, total = _header(data)
-    _check_header(magic, number, total)
+    if len(data) > PACK_SIZE_MAX:
+        raise PackError(f"no packed parameter file has {len(data)} bytes", offset=PACK_SIZE_MAX)
+    if len(data) < _HEADER.size:
+        raise PackError("the file is cut off in its header", offset=len(data))
+    magic, number, total = _HEADER.unpack_from(data)
+    if magic not in (_MAGIC, _MAGIC_WITH_DEFAULTS):
+        raise PackError(f"a packed parameter file does not begin with 0x{magic:04x}", offset=0)
+    if total < number:
+        raise PackError(f"{number} entries of a table of {total}", offset=2)
     with_defaults = magic == _MAGIC_WITH_DEFAULTS
-    return Pack(_entries(data, number, with_defaults, may_end=True), total, with_defaults), number
+    return Pack(_entries(data, number, with_defaults), total, with_defaults), number
 
 
 def encode(
@@ -149,26 +157,8 @@ def header(number: int, total: int, *, with_defaults: bool = False) -> bytes:
     return _HEADER.pack(_MAGIC_WITH_DEFAULTS if with_defaults else _MAGIC, number, total)
 
 
-def _header(data: bytes) -> tuple[int, int, int]:
-    if len(data) > PACK_SIZE_MAX:
-        raise PackError(f"no packed parameter file has {len(data)} bytes", offset=PACK_SIZE_MAX)
-    if len(data) < _HEADER.size:
-        raise PackError("the file is cut off in its header", offset=len(data))
-    magic, number, last = _HEADER.unpack_from(data)
-    return magic, number, last
-
-
-def _check_header(magic: int, number: int, total: int) -> None:
-    if magic not in (_MAGIC, _MAGIC_WITH_DEFAULTS):
-        raise PackError(f"a packed parameter file does not begin with 0x{magic:04x}", offset=0)
-    if total < number:
-        raise PackError(f"{number} entries of a table of {total}", offset=2)
-
-
-def _entries(
-    data: bytes, number: int, with_defaults: bool, *, may_end: bool = False
-) -> tuple[PackedParam, ...]:
-    """Decode all entries behind the header: exactly that many; fewer where the file may be truncated."""
+def _entries(data: bytes, number: int, with_defaults: bool) -> tuple[PackedParam, ...]:
+    """Decode the entries behind the header: that many, or the complete ones of a truncated file."""
     found: dict[str, PackedParam] = {}
     name = b""
     at = _HEADER.size
@@ -176,9 +166,7 @@ def _entries(
         match = _padding(data, at)
         at = at if match is None else match.end()
         if at + 2 > len(data):
-            if may_end:
-                break
-            raise PackError(f"the file is cut off: {place} of {number} entries", offset=len(data))
+            break
         kind = _TYPES.get(data[at] & 0x0F)
         flags = data[at] & 0xF0
         if kind is None or flags not in (0, _HAS_DEFAULT) or (flags and not with_defaults):
@@ -187,9 +175,7 @@ def _entries(
         value_at = at + 2 + more
         end = value_at + (2 * kind.size if flags else kind.size)
         if end > len(data):
-            if may_end:
-                break
-            raise PackError(f"the file is cut off in entry {place} of {number}", offset=len(data))
+            break
         if shared > len(name):
             raise PackError(f"entry {place} shares {shared} characters with {name!r}", offset=at)
         name = name[:shared] + data[at + 2 : value_at]

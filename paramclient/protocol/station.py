@@ -245,7 +245,7 @@ class Station:
         """End all conversations: the link is down for too long, or for good."""
         self.gate.fail(error, for_good=for_good)
         for node in self.nodes.values():
-            node.channel.fail(error)
+            node.channel.lose()
 
     def _new_framer(self, *, stream: bool) -> Framer:
         framer = Framer(messages.DECODED_IDS, occasional=BOOT_CLOCK_OFFSETS, stream=stream)

@@ -289,7 +289,8 @@ class _Write:
                             return self._result(answer)
                         raise self._not_applied(answer)
                 elif adjusted is not None and (adjusted.same_value(answer) or self.attempts >= SETS_MAX):
-                    return self._result(await self._wanted_behind(inbox, self._began) or answer)
+                    wanted = await self._wanted_behind(inbox, self._began)
+                    return self._result(wanted or answer)
                 else:
                     adjusted = answer
 
@@ -330,7 +331,7 @@ class _Write:
         raise NoReply(what, attempts=self.attempts, waited=anyio.current_time() - self._began)
 
     async def _wanted_behind(self, inbox: Inbox, since: float) -> Param | None:
-        """Return the wanted value if it comes behind answers to earlier reads, which a slow link has queued."""
+        """Return the wanted value if it comes behind answers to earlier reads, queued by a slow link."""
         for _ in range(QUEUE_WAITS):
             self._has_other_value = False
             answer = await self.channel.wait_for(inbox, self._accept, since, 0, self.channel.timing.slowest)

@@ -181,7 +181,7 @@ async def test_a_component_may_have_both_kinds_or_none() -> None:
         await fetch_all(node.plain)
         await fetch_all(node.extended)
         assert (node.plain.table.params["A"].value, node.extended.table.params["A"].value) == (5, "text")
-        assert {session.dialect.name for session in node.sessions} == {"plain", "extended"}
+        assert {session.dialect.has_ack for session in node.sessions} == {False, True}
         px4 = await conversation.node(1, 1)
         began = anyio.current_time()
         with pytest.raises(NoReply, match="list of 1/1"):

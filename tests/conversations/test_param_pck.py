@@ -107,7 +107,7 @@ class TestTheFormat:
             (packed(entry("A", kind=0x10)), "entry 0 begins with 0x10"),
             (packed(entry("A", b"\1\2", kind=0x11)), "entry 0 begins with 0x11"),
             (packed(entry("A", b"\1\2", kind=0x21), magic=0x671C), "entry 0 begins with 0x21"),
-            (packed(entry("A", b"\1", kind=0x11), magic=0x671C), "cut off in entry 0"),
+            (packed(entry("A", b"\1", kind=0x11), magic=0x671C), "cut off: 0 of 1 entries"),
             (packed(entry("AB", shared=1)), "shares 1 characters"),
             (packed(entry("AB"), entry("ABCD", shared=3)), "shares 3 characters"),
             (packed(entry("ABCDEFGHIJ"), entry("ABCDEFGHIJKLMNOPQ", shared=10)), "has the name"),
