@@ -41,7 +41,7 @@ from paramclient.protocol.session import Session
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.watch import SyncState, Watch
 from paramclient.protocol.writes import write, write_many
-from paramclient.wire.messages import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, PARAMETERS_MAX
+from paramclient.wire.messages import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, PARAMETERS_MAX, SetupSigning
 from paramclient.wire.signing import SigningKey
 
 __all__ = ["SETTLE_MAX", "Component", "ComponentState"]
@@ -54,6 +54,10 @@ REBOOT_TIMEOUT: Final = 60.0
 seconds, and boards that calibrate sensors first a little longer."""
 SETTLE_MAX: Final = 60.0
 """Maximum `settle` in seconds: further writes to the same name wait for it."""
+SETUP_SIGNING_COUNT: Final = 3
+"""SETUP_SIGNING messages that are sent: they have no acknowledgement, and a frame may be lost."""
+SETUP_SIGNING_INTERVAL: Final = 0.1
+"""Seconds after each SETUP_SIGNING message."""
 PASSIVE_TIMEOUT: Final = 20.0
 """Seconds of a fetch where nothing is sent, by default: another station may never request a list."""
 TIMEOUT_NOTE: Final = "The fetch ended at its timeout."
@@ -505,8 +509,13 @@ class Component:
             )
         if self.node.version == 1:
             raise UsageError(f"{self.system}/{self.component} uses MAVLink 1, which has no signing")
-        self.core.station.check_may_send()
-        await self.core.station.set_up_signing(self.node, key, 0 if key is None else timestamp_now())
+        station, node = self.core.station, self.node
+        station.check_may_send()
+        message = SetupSigning(self.system, self.component, key, 0 if key is None else timestamp_now())
+        for _ in range(SETUP_SIGNING_COUNT):
+            station.gate.check()
+            station.transmit(message, node.peer)
+            await anyio.sleep(SETUP_SIGNING_INTERVAL)
 
     async def reboot(self, *, system: int | None = None, timeout: float | None = REBOOT_TIMEOUT) -> Component:
         """Reboot the vehicle, and wait until it is back and identified. Written values are saved before.

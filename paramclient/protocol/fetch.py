@@ -186,7 +186,7 @@ class _Fetch:
         self.notes: list[str] = []
         self.listed = ListResult()
         self._began = anyio.current_time()
-        self._before = session.table.view()
+        self._before = dict(session.table.params)
         self._changed: tuple[str, ...] = ()
         self._is_silent = False  # MAVFTP
         self._vehicles = session.identification.vehicles
@@ -273,7 +273,7 @@ class _Fetch:
     async def _read_unverified(self) -> None:
         """Read the values that the digest does not cover."""
         names = self.table.unverified()
-        await read_many(self.session, names, lambda name, result: None)
+        await read_many(self.session, names)
         if left := [name for name in names if self.table.moments[name] < self._began]:
             self.notes.append(NOT_READ.format(first_of(left, SHOWN_MAX)))
 
@@ -317,7 +317,7 @@ def result_of(
     return FetchResult(
         channel.system,
         channel.component,
-        ParamMap(table.view()),
+        ParamMap(dict(table.params)),
         source,
         table.count or len(table.params) + len(missing),  # none where it cannot be one
         tuple(sorted(missing)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from typing import Final
 
@@ -20,7 +20,7 @@ from paramclient.errors import (
 )
 from paramclient.model.names import did_you_mean, nearest_names
 from paramclient.model.values import Param, Trust
-from paramclient.protocol.channel import ATTEMPTS_MAX, BACKOFF_FROM, PATIENCE_MIN, Inbox
+from paramclient.protocol.channel import ATTEMPTS_MAX, BACKOFF_FROM, PATIENCE_MIN, Inbox, task_group
 from paramclient.protocol.dialect import ReportedValue
 from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.protocol.list_download import download_list
@@ -165,29 +165,18 @@ async def read_param(session: Session, which: str | int) -> Param:
     return session.dialect.param(*fields, session.table.encoding)
 
 
-async def read_many(
-    session: Session, names: Iterable[str], done: Callable[[str, Param | ParamClientError], None]
-) -> None:
-    """Read several parameters, as many at once as the component serves.
-
-    Args:
-        session: the component's.
-        names: of the parameters.
-        done: called with each parameter or its error, as it arrives.
+async def read_many(session: Session, names: Iterable[str]) -> None:
+    """Read several parameters into the table, as many at once as the component serves; some may fail.
 
     Raises:
         LinkError: the link is closed for good.
     """
 
     async def read_one(name: str) -> None:
-        try:
-            param = await read_param(session, name)
-        except ParamClientError as error:
-            done(name, error)
-        else:
-            done(name, param)
+        with suppress(NoReply, VehicleError):
+            await read_param(session, name)
 
-    async with anyio.create_task_group() as tasks:
+    async with task_group() as tasks:
         for name in names:
             tasks.start_soon(read_one, name)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, Generic, TypeVar
 
 import anyio
@@ -59,56 +59,45 @@ class Shared(Generic[T]):
         """
         run = self._run
         if run is None:
-            run = self._run = _Run(work)
-            self._spawn(self._execute, run)
+            run = self._run = _Run()
+            self._spawn(self._execute, run, work)
         run.waiters += 1
         try:
             with self._gate.until_closed():  # a client that is being closed starts no work
                 await run.done.wait()
-                if run.was_cancelled:
+                if not run.results and run.error is None:  # it was cancelled
                     await anyio.sleep_forever()
         finally:
             run.waiters -= 1
             if not run.waiters:
                 run.scope.cancel()
-                if self._run is run:
-                    self._run = None
-        return run.outcome()
+                self._forget(run)
+        if run.error is not None:
+            raise run.error.with_traceback(None)
+        return run.results[0]
 
-    async def _execute(self, run: _Run[T]) -> None:
+    async def _execute(self, run: _Run[T], work: Callable[[], Awaitable[T]]) -> None:
         try:
-            await run.execute()
-        finally:
-            if self._run is run:
-                self._run = None
-
-
-class _Run(Generic[T]):
-    def __init__(self, work: Callable[[], Awaitable[T]]) -> None:
-        self.waiters = 0
-        self.scope = anyio.CancelScope()
-        self.done = anyio.Event()
-        self._work = work
-        self._results: list[T] = []
-        self._error: Exception | None = None
-
-    @property
-    def was_cancelled(self) -> bool:
-        return self.done.is_set() and not self._results and self._error is None
-
-    async def execute(self) -> None:
-        try:
-            with self.scope:
-                self._results.append(await self._work())
+            with run.scope:
+                run.results.append(await work())
         except Exception as error:  # belongs to the callers
-            self._error = error
+            run.error = error
         finally:
-            self.done.set()
+            run.done.set()
+            self._forget(run)
 
-    def outcome(self) -> T:
-        if self._error is not None:
-            raise self._error.with_traceback(None)
-        return self._results[0]
+    def _forget(self, run: _Run[T]) -> None:
+        if self._run is run:
+            self._run = None
+
+
+@dataclass(eq=False, slots=True)
+class _Run(Generic[T]):
+    waiters: int = 0
+    scope: anyio.CancelScope = field(default_factory=anyio.CancelScope)
+    done: anyio.Event = field(default_factory=anyio.Event)
+    results: list[T] = field(default_factory=list)
+    error: Exception | None = None
 
 
 @dataclass(slots=True)

@@ -20,7 +20,7 @@ from paramclient.protocol.session import Spawn
 from paramclient.wire import messages
 from paramclient.wire.frames import BOOT_CLOCK_OFFSETS, Frame, Framer, sign_frame
 from paramclient.wire.messages import Heartbeat, Message, ParamExtSet, ParamSet, decode, encode, message_id
-from paramclient.wire.signing import Signer, SigningKey, Verifier
+from paramclient.wire.signing import Signer, Verifier
 
 __all__ = ["Peer", "Station"]
 
@@ -34,10 +34,6 @@ COMPONENTS_MAX: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each."""
 STREAM_PEERS_MAX: Final = 256
 """Peers of a stream with an unfinished frame."""
-SETUP_SIGNING_COUNT: Final = 3
-"""SETUP_SIGNING messages that are sent: they have no acknowledgement, and a frame may be lost."""
-SETUP_SIGNING_INTERVAL: Final = 0.1
-"""Seconds after each SETUP_SIGNING message."""
 _MAVLINK2_REQUESTS: Final = (messages.ParamExtRequestRead, messages.ParamExtRequestList, ParamExtSet)
 """Requests that exist in MAVLink 2 only: a component that has sent MAVLink 1 so far may understand them."""
 
@@ -202,18 +198,6 @@ class Station:
         if self._signer is not None:
             data = sign_frame(data, self._signer)
         self._send(data, peer)
-
-    async def set_up_signing(self, node: Node, key: SigningKey | None, timestamp: int) -> None:
-        """Give a vehicle its signing key, in clear, or with None disable signing. There is no
-        acknowledgement.
-
-        Raises:
-            LinkError: the link failed.
-        """
-        for _ in range(SETUP_SIGNING_COUNT):
-            self.gate.check()
-            self.transmit(messages.SetupSigning(node.system, node.component, key, timestamp), node.peer, 2)
-            await anyio.sleep(SETUP_SIGNING_INTERVAL)
 
     async def send_heartbeats(self) -> None:
         """Send our heartbeat once a second."""

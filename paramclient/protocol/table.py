@@ -439,7 +439,3 @@ class Table:
             self.unconfirm()
         elif name not in self.volatile:
             self._hash_is_stale = True
-
-    def view(self) -> Mapping[str, Param]:
-        """Return the parameters as they are now."""
-        return dict(self.params)

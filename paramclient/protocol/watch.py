@@ -124,7 +124,7 @@ class Watch:
             self._is_fetched = False
         elif self._is_fetched:
             if not self._is_doubted:
-                self._before = self._session.table.view()
+                self._before = dict(self._session.table.params)
             self._is_doubted = self._is_due = True
             self._signal.set()
 
@@ -173,7 +173,7 @@ class Watch:
         """Ask whether the table is current, and fetch it where the vehicle does not say so."""
         session, table = self._session, self._session.table
         was_doubted = self._is_doubted
-        before = self._before if was_doubted else table.view()
+        before = self._before if was_doubted else dict(table.params)
         answer = await ask(session)
         if answer.reason and not answer.is_other and not was_doubted:
             return  # another station's file is open, for example

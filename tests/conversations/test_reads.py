@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from collections import Counter
 from collections.abc import Iterable
 
 import anyio
@@ -102,9 +101,9 @@ async def test_on_a_clean_link_few_reads_are_repeated_to_ardupilot(delay: float)
         await read(node.plain, 0)
         conversation.sent.clear()
         names = [param.name for param in vehicle.listed[10:1210:10]]
-        began, answers = anyio.current_time(), Counter[str]()
-        await read_many(node.plain, names, lambda name, result: answers.update([type(result).__name__]))
-        assert answers == {"Param": 120}
+        began = anyio.current_time()
+        await read_many(node.plain, names)
+        assert node.plain.table.params.keys() >= set(names)
         assert len(conversation.sent_of(ParamRequestRead)) <= 140  # the first ones wait in the queue
         assert anyio.current_time() - began < 120 / 49 + 12 * (0.1 + 2 * delay)  # 5 in each 100 ms
 
@@ -255,4 +254,4 @@ async def test_a_cancelled_read_leaves_nothing_behind() -> None:
         conversation.sent.clear()
         await anyio.sleep(5.0)
         assert not conversation.sent_of(ParamRequestRead)
-        await read_many(node.plain, ["MC_ROLL_P"] * 200, lambda name, result: None)
+        await read_many(node.plain, ["MC_ROLL_P"] * 200)

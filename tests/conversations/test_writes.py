@@ -532,7 +532,7 @@ async def test_another_vehicle_behind_a_value_ends_a_write_and_no_read() -> None
     calls: list[tuple[str, Callable[[Session], Awaitable[object]]]] = [
         ("AnotherVehicle", lambda session: write(session, "A", 1.0)),
         ("Param", lambda session: read_param(session, "A")),
-        ("NoneType", lambda session: read_many(session, ["A", "B"], lambda name, result: None)),
+        ("NoneType", lambda session: read_many(session, ["A", "B"])),
     ]
     async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
         session = (await conversation.node()).plain
