@@ -61,12 +61,17 @@ Put: TypeAlias = Callable[[Endpoint | SimLink | PeersLink], str]
 """Takes a simulated vehicle or a link; returns its URL."""
 
 
+WITHOUT_CACHE = frozenset({"check", "link", "ports", "signing"})
+"""Subcommands without the option --cache."""
+
+
 def in_process(capsys: pytest.CaptureFixture[str], *cache: str) -> Command:
-    """Return a function that runs a command in this process, with the arguments `cache` unless --no-cache."""
+    """Return a function that runs a command in this process, with the arguments `cache` where they fit."""
 
     def call(*arguments: object) -> Outcome:
         words = [*map(str, arguments)]
-        code = run([*words, *(() if "--no-cache" in words else cache)])
+        takes_cache = WITHOUT_CACHE.isdisjoint(words[:1]) and {"--cache", "--no-cache"}.isdisjoint(words)
+        code = run([*words, *(cache if takes_cache else ())])
         printed = capsys.readouterr()
         return Outcome(code, printed.out, printed.err)
 

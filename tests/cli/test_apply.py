@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import pty
 import re
 import signal
-import sys
 import time
 from collections.abc import Callable
 from datetime import datetime
@@ -19,9 +16,9 @@ import pytest
 
 from paramclient import Encoding, ParamCache, ParamType, read_file
 from paramclient.model.values import WireValue
-from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle
 from paramclient.wire import frames, messages
-from tests.commands import Command, Put, behind, in_process, leaping
+from tests.commands import Command, Put
 from tests.conversations.partial import Partial
 
 TABLE: dict[str, WireValue | tuple[ParamType, WireValue]] = {
@@ -39,29 +36,6 @@ WPNAV_SPEED,750.5
 WPNAV_ACCEL,100
 COMPASS_OFS_X,12.5
 """
-
-
-@pytest.fixture
-def cache(tmp_path: Path) -> Path:
-    return tmp_path / "cache.sqlite3"
-
-
-@pytest.fixture
-def in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run commands on simulated time."""
-    leaping(monkeypatch)
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], cache: Path, in_no_time: None) -> Command:
-    """Run the command line in this process, with a new cache."""
-    return in_process(capsys, "--cache", str(cache))
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect every URL to simulated vehicles; return a URL."""
-    return behind(monkeypatch, "udpin:0.0.0.0:14550")
 
 
 @pytest.fixture
@@ -93,7 +67,7 @@ def restarted(vehicle: ArduPilotVehicle) -> ArduPilotVehicle:
 
 
 def test_apply_sets_and_verifies_values_that_differ(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+    command: Command, put: Put, file: Callable[..., Path]
 ) -> None:
     vehicle = copter()
     outcome = command("apply", put(vehicle), file())
@@ -122,7 +96,7 @@ def test_apply_sets_and_verifies_values_that_differ(
 
 
 def test_a_name_that_no_vehicle_can_have_is_invalid_too(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+    command: Command, put: Put, file: Callable[..., Path]
 ) -> None:
     vehicle = copter()
     wrong = file("RTL_ALT,2500\nSIM_GPS1_BYTELOSS,0\n")
@@ -141,7 +115,7 @@ def test_a_name_that_no_vehicle_can_have_is_invalid_too(
     ],
 )
 def test_invalid_values_and_mistyped_names_are_reported_before_anything_is_sent(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], line: str, fault: str
+    command: Command, put: Put, file: Callable[..., Path], line: str, fault: str
 ) -> None:
     vehicle = copter()
     wrong = file(f"RTL_ALT,2500\n{line}\n")
@@ -157,9 +131,7 @@ def test_invalid_values_and_mistyped_names_are_reported_before_anything_is_sent(
     assert vehicle.values["RTL_ALT"] == 2500
 
 
-def test_armed_vehicles_are_refused(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
-) -> None:
+def test_armed_vehicles_are_refused(command: Command, put: Put, file: Callable[..., Path]) -> None:
     vehicle = copter(armed=True)
     outcome = command("apply", put(vehicle), file())
     assert (outcome.code, outcome.out) == (1, "")
@@ -174,7 +146,7 @@ def test_armed_vehicles_are_refused(
 
 
 def test_the_vehicle_reboots_only_with_the_option(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+    command: Command, put: Put, file: Callable[..., Path]
 ) -> None:
     wanted = file("EK2_ENABLE,1\nEK2_GPS_TYPE,3\n")
     vehicle = copter()
@@ -194,32 +166,28 @@ def test_the_vehicle_reboots_only_with_the_option(
 @pytest.mark.parametrize(("answer", "sets"), [("y", 2), ("yes", 2), ("n", 0), ("", 0)])
 def test_a_user_at_a_terminal_must_confirm(
     command: Command,
-    put: Callable[[Endpoint], str],
+    put: Put,
     file: Callable[..., Path],
-    monkeypatch: pytest.MonkeyPatch,
+    at_terminal: Callable[[str], None],
     answer: str,
     sets: int,
 ) -> None:
     vehicle = copter()
-    hand, terminal = pty.openpty()
-    os.write(hand, f"{answer}\n".encode())
-    with os.fdopen(hand, "wb"), os.fdopen(terminal, encoding="utf-8") as stdin:
-        monkeypatch.setattr(sys, "stdin", stdin)
-        monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-        outcome = command("apply", put(vehicle), file())
-        assert outcome.code == (0 if sets else 1)
-        assert "go on? [y/N]" in outcome.err
-        assert ["1", "RTL_ALT", "1500", "2500", "set", "all other parameters"] in outcome.rows
-        assert vehicle.requests["PARAM_SET"] == sets
-        _, _, after = outcome.err.partition("go on? [y/N]")
-        assert outcome.err.count("writing to 1/1") == after.count("writing to 1/1") == (1 if sets else 0)
-        assert "go on?" not in command("apply", put(copter()), file(), "--json").err
-        assert "go on?" not in command("apply", put(vehicle), file(), "--yes").err
-        assert "go on?" not in command("apply", put(vehicle), file()).err, "there is nothing to ask about"
+    at_terminal(answer)
+    outcome = command("apply", put(vehicle), file())
+    assert outcome.code == (0 if sets else 1)
+    assert "go on? [y/N]" in outcome.err
+    assert ["1", "RTL_ALT", "1500", "2500", "set", "all other parameters"] in outcome.rows
+    assert vehicle.requests["PARAM_SET"] == sets
+    _, _, after = outcome.err.partition("go on? [y/N]")
+    assert outcome.err.count("writing to 1/1") == after.count("writing to 1/1") == (1 if sets else 0)
+    assert "go on?" not in command("apply", put(copter()), file(), "--json").err
+    assert "go on?" not in command("apply", put(vehicle), file(), "--yes").err
+    assert "go on?" not in command("apply", put(vehicle), file()).err, "there is nothing to ask about"
 
 
 def test_dry_run_prints_the_stages_in_order(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
+    command: Command, put: Put, file: Callable[..., Path], tmp_path: Path
 ) -> None:
     vehicle = copter()
     wanted = file(FILE + "EK2_ENABLE,1\nEK2_NO_SUCH,1\n")
@@ -251,7 +219,7 @@ def test_dry_run_prints_the_stages_in_order(
 
 
 def test_the_backup_file_has_the_state_before(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
+    command: Command, put: Put, file: Callable[..., Path], tmp_path: Path
 ) -> None:
     vehicle = copter()
     backup = tmp_path / "{system}-{uid}.json"
@@ -291,9 +259,7 @@ def test_a_backup_restores_the_calibration_of_the_very_same_vehicle(
         assert vehicle.values["COMPASS_OFS_X"] == 5.0
 
 
-def test_restore_reverts_the_last_apply(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
-) -> None:
+def test_restore_reverts_the_last_apply(command: Command, put: Put, file: Callable[..., Path]) -> None:
     vehicle = copter()
     command("apply", put(vehicle), file(), "--include", "calibration")
     assert vehicle.values["COMPASS_OFS_X"] == 12.5
@@ -372,9 +338,7 @@ def test_restore_does_not_undo_an_apply_twice(command: Command, put: Put, file: 
         (["4"], " has no earlier state of uid:"),
     ],
 )
-def test_restore_needs_a_stored_state(
-    command: Command, put: Callable[[Endpoint], str], when: list[str], text: str
-) -> None:
+def test_restore_needs_a_stored_state(command: Command, put: Put, when: list[str], text: str) -> None:
     outcome = command("restore", put(copter()), *when)
     assert outcome.code == 5
     assert text in outcome.err
@@ -382,9 +346,6 @@ def test_restore_needs_a_stored_state(
         "; name the time of the state to restore, such as '2h ago', or a backup file\n"
     )
     assert command("restore", put(copter()), *when, "--no-cache").code == 2
-
-
-# verify
 
 
 # several vehicles
@@ -397,7 +358,7 @@ def fleet(**options: Any) -> tuple[Air, list[ArduPilotVehicle]]:
 
 
 def test_all_vehicles_are_set_concurrently(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
+    command: Command, put: Put, file: Callable[..., Path], tmp_path: Path
 ) -> None:
     air, vehicles = fleet()
     for system in (1, 2, 3):
@@ -420,7 +381,7 @@ def test_all_vehicles_are_set_concurrently(
 
 
 def test_a_failed_vehicle_does_not_stop_the_others(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+    command: Command, put: Put, file: Callable[..., Path]
 ) -> None:
     air, vehicles = fleet()
     vehicles[1].armed = True
@@ -434,7 +395,7 @@ def test_a_failed_vehicle_does_not_stop_the_others(
 
 
 def test_file_names_for_all_vehicles_need_a_placeholder(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
+    command: Command, put: Put, file: Callable[..., Path], tmp_path: Path
 ) -> None:
     air, vehicles = fleet()
     for option in ("--overlay", "--backup"):
@@ -451,7 +412,7 @@ def test_file_names_for_all_vehicles_need_a_placeholder(
 
 
 def test_a_file_of_several_systems_has_a_set_for_each(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+    command: Command, put: Put, file: Callable[..., Path]
 ) -> None:
     air, vehicles = fleet()
     text = "".join(f"{system}\t1\tRTL_ALT\t{system}000\t6\n" for system in (1, 2, 3))
@@ -512,19 +473,15 @@ def test_a_restore_of_all_vehicles_must_be_confirmed(
     command: Command,
     put: Put,
     file: Callable[..., Path],
-    monkeypatch: pytest.MonkeyPatch,
+    at_terminal: Callable[[str], None],
     answer: str,
     sets: int,
 ) -> None:
     air, vehicles = fleet()
     command("apply", put(air), file(), "--vehicle", "all")
     before = sum(vehicle.requests["PARAM_SET"] for vehicle in vehicles)
-    hand, terminal = pty.openpty()
-    os.write(hand, f"{answer}\n".encode())
-    with os.fdopen(hand, "wb"), os.fdopen(terminal, encoding="utf-8") as stdin:
-        monkeypatch.setattr(sys, "stdin", stdin)
-        monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-        done = command("restore", put(air), "--vehicle", "all")
+    at_terminal(answer)
+    done = command("restore", put(air), "--vehicle", "all")
     assert done.code == (0 if sets else 1)
     reported, _, _ = done.err.partition("go on? [y/N]")
     assert reported.count("the state is that before the last apply, ") == 3
@@ -546,7 +503,7 @@ class Interrupting(GenericVehicle):
 
 @pytest.mark.parametrize("as_json", [False, True])
 def test_ctrl_c_prints_the_outcomes_so_far(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], as_json: bool
+    command: Command, put: Put, file: Callable[..., Path], as_json: bool
 ) -> None:
     names = [f"P{number:02}" for number in range(40)]
     vehicle = Interrupting(dict.fromkeys(names, 1))
@@ -618,9 +575,7 @@ def test_a_restore_that_fails_prints_the_command_that_continues(
 # Metadata
 
 
-def test_metadata_gives_ranges_and_reboots(
-    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
-) -> None:
+def test_metadata_gives_ranges_and_reboots(command: Command, put: Put, file: Callable[..., Path]) -> None:
     vehicle = copter()
     described = [
         {"name": "RTL_ALT", "type": "Int32", "min": 30, "max": 2000},

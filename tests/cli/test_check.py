@@ -4,23 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
-
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
-from tests.commands import Command, Put, behind, in_process, leaping
+from tests.commands import Command, Put
 from tests.shell import Tap
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run the command line in this process, on simulated time."""
-    leaping(monkeypatch)
-    return in_process(capsys)
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    return behind(monkeypatch, "udpin:0.0.0.0:14550")
 
 
 def texts(document: dict[str, Any]) -> str:

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -31,10 +31,11 @@ from paramclient.errors import ClientClosed, ParamClientError, ParamErrorCode
 from paramclient.links import Peer, SimLink
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.wire import frames, messages
-from tests.commands import Command, Outcome, Put, behind, in_process, leaping, strict
+from tests.commands import Command, Outcome, Put, in_process, leaping, strict
 from tests.conversations.virtual import Tap
 
 ROOT = Path(__file__).parents[2]
+URL = "sim:custom"
 TIMEOUT = 60.0  # seconds after which a test fails; a passing test never waits that long
 ESCAPE = "\x1b"
 
@@ -59,12 +60,6 @@ def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
 def live_command(capsys: pytest.CaptureFixture[str]) -> Command:
     """Run the command line in this process in real time, for sockets to another process."""
     return in_process(capsys)
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect every URL to a simulated vehicle or a link; return a URL."""
-    return behind(monkeypatch, "sim:custom")
 
 
 @pytest.fixture(scope="session")
@@ -188,7 +183,7 @@ def test_fetch_prints_a_table_and_a_summary(command: Command, warm: Path) -> Non
     )
 
 
-def test_missing_parameters_are_named(command: Command, put: Callable[[Endpoint], str]) -> None:
+def test_missing_parameters_are_named(command: Command, put: Put) -> None:
     url = put(GenericVehicle({"A": 1, "B": 2, "C": 3}, dead=["B"]))
     fetched = command("fetch", url, "--json", "--no-cache", "--timeout", 5)
     assert fetched.code == 1
@@ -211,9 +206,7 @@ class ListOnlyValues(PX4Vehicle):
             super().respond(message, sender)
 
 
-def test_a_value_that_is_only_cached_is_missing(
-    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
-) -> None:
+def test_a_value_that_is_only_cached_is_missing(command: Command, put: Put, tmp_path: Path) -> None:
     cache = tmp_path / "cache.sqlite3"
     url = put(ListOnlyValues())
     known = command("fetch", url, "--json", "--cache", cache).json
@@ -226,7 +219,7 @@ def test_a_value_that_is_only_cached_is_missing(
 
 
 def test_what_came_of_a_refresh_until_the_vehicle_was_lost_is_printed(
-    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+    command: Command, put: Put, tmp_path: Path
 ) -> None:
     cache = tmp_path / "cache.sqlite3"
     known = command("fetch", put(PX4Vehicle()), "--json", "--cache", cache).json
@@ -353,7 +346,7 @@ class SilentOnParams(GenericVehicle):
 )
 def test_a_failed_set_prints_its_reason(
     command: Command,
-    put: Callable[[Endpoint], str],
+    put: Put,
     vehicle: Endpoint,
     name: str,
     value: int,
@@ -390,9 +383,7 @@ def test_a_failed_set_prints_its_reason(
         ("F", "INF", float("inf")),
     ],
 )
-def test_numbers_are_parsed_exactly(
-    command: Command, put: Callable[[Endpoint], str], name: str, text: str, held: float
-) -> None:
+def test_numbers_are_parsed_exactly(command: Command, put: Put, name: str, text: str, held: float) -> None:
     table = [SimParam("I", ParamType.INT32, 1), SimParam("U", ParamType.UINT32, 1), SimParam("F", 9, 1.0)]
     vehicle = GenericVehicle(table)
     done = command("set", put(vehicle), name, text, "--json", "--no-cache")
@@ -404,9 +395,7 @@ def test_numbers_are_parsed_exactly(
 
 
 @pytest.mark.parametrize("policy", ["cache-only", "hash-only"])
-def test_fetch_obeys_the_policy(
-    command: Command, put: Callable[[Endpoint], str], tmp_path: Path, policy: str
-) -> None:
+def test_fetch_obeys_the_policy(command: Command, put: Put, tmp_path: Path, policy: str) -> None:
     cache = tmp_path / "cache.sqlite3"
     rows = [SimParam("A", ParamType.INT32, 1), SimParam("CAL_ACC0_XOFF", ParamType.INT32, 2, volatile=True)]
     vehicle = PX4Vehicle(table=rows)
@@ -558,9 +547,7 @@ def vehicle_lost_and_found() -> PX4Vehicle:
 
 
 @pytest.mark.parametrize("as_json", [True, False])
-def test_watch_prints_events_of_the_vehicle(
-    command: Command, put: Callable[[Endpoint], str], as_json: bool
-) -> None:
+def test_watch_prints_events_of_the_vehicle(command: Command, put: Put, as_json: bool) -> None:
     url = put(vehicle_lost_and_found())
     printed = command("watch", url, "--no-cache", "--timeout", 20, *(["--json"] if as_json else []))
     assert (printed.code, printed.err) == (0, "watching 2 parameters of 1/1 px4\n")
@@ -589,9 +576,7 @@ def test_watch_prints_events_of_the_vehicle(
 
 
 @pytest.mark.parametrize("is_json", [True, False])
-def test_a_link_that_fails_during_watch_is_reported_once(
-    command: Command, put: Callable[[Endpoint | SimLink], str], is_json: bool
-) -> None:
+def test_a_link_that_fails_during_watch_is_reported_once(command: Command, put: Put, is_json: bool) -> None:
     class Failing(SimLink):
         received = 0
 
@@ -622,7 +607,7 @@ class Modem(PX4Vehicle):
         return sent
 
 
-def test_link_prints_a_table_of_components(command: Command, put: Callable[[Endpoint], str]) -> None:
+def test_link_prints_a_table_of_components(command: Command, put: Put) -> None:
     received = command("link", put(Modem(telemetry=20)), "--seconds", 2)
     assert (received.code, received.err) == (0, "")
     lines = received.out.splitlines()
@@ -647,7 +632,7 @@ def test_link_prints_a_table_of_components(command: Command, put: Callable[[Endp
     assert len(lines) == 10
 
 
-def test_a_silent_link_is_exit_code_3(live_command: Command, put: Callable[..., str]) -> None:
+def test_a_silent_link_is_exit_code_3(live_command: Command, put: Put) -> None:
     silent = live_command("link", "udpin:127.0.0.1:0", "--seconds", 0.3, "--json")
     assert (silent.code, silent.out) == (3, "")
     assert re.fullmatch(
@@ -804,7 +789,7 @@ def test_a_missing_vehicle_is_exit_code_3(live_command: Command) -> None:
     )
 
 
-def test_a_failed_link_is_exit_code_4(live_command: Command, put: Callable[..., str]) -> None:
+def test_a_failed_link_is_exit_code_4(live_command: Command, put: Put) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
@@ -831,7 +816,7 @@ def test_a_failed_link_is_exit_code_4(live_command: Command, put: Callable[..., 
 
 
 def test_a_failed_cache_is_exit_code_5_and_only_a_warning_for_fetch(
-    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+    command: Command, put: Put, tmp_path: Path
 ) -> None:
     for arguments in (["show"], ["show", "--json"], ["cache", "list"], ["history", "1"]):
         outcome = command(*arguments, "--cache", tmp_path)
@@ -1048,9 +1033,7 @@ class Hostile:
         return data
 
 
-def test_text_from_the_wire_is_escaped(
-    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
-) -> None:
+def test_text_from_the_wire_is_escaped(command: Command, put: Put, tmp_path: Path) -> None:
     cache = tmp_path / "cache.sqlite3"
     url = put(Hostile())
     for outcome in (fetched := command("fetch", url, "--cache", cache), command("show", "--cache", cache)):

@@ -6,30 +6,15 @@ import json
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from paramclient.files import read_file
 from paramclient.model.values import ParamType
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.wire import messages
-from tests.commands import Command, Put, behind, in_process, leaping
+from tests.commands import Command, Put
 from tests.shell import Tap
 
 TABLE = {"COM_FLTMODE1": 0, "EKF2_GPS_CTRL": 7, "MC_PITCH_P": 6.5, "MC_ROLL_P": 4.0}
 """The defaults in the metadata of the simulated PX4."""
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run the command line in this process, on simulated time, with a new cache."""
-    leaping(monkeypatch)
-    return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect every URL to a simulated vehicle."""
-    return behind(monkeypatch, "udpin:0.0.0.0:14550")
 
 
 def quad(*, metadata: bool = True, **options: Any) -> PX4Vehicle:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,7 +21,6 @@ from paramclient.sim import GenericVehicle, Vehicle
 from tests.caches import NOW, PX4, update
 from tests.commands import Command, in_process
 
-ROOT = Path(__file__).parents[2]
 TIMEOUT = 60.0  # seconds after which a test fails; a passing test never waits that long
 
 INT32, REAL32 = ParamType.INT32, ParamType.REAL32
@@ -33,11 +31,6 @@ SECOND = replace(PX4, system=2, uid="bb00000000000002")
 THIRD = replace(PX4, system=3, uid="cc00000000000003")
 
 Content = dict[str, tuple[WireValue, int] | tuple[WireValue, int, WireValue]]
-
-
-@pytest.fixture
-def cache(tmp_path: Path) -> Path:
-    return tmp_path / "cache.sqlite3"
 
 
 @pytest.fixture
@@ -331,12 +324,3 @@ def test_a_failed_link_ends_the_comparison(command: Command) -> None:
     outcome = command("diff", "udpin:127.0.0.1:0", "tcp:127.0.0.1:1", "--timeout", TIMEOUT)
     assert (outcome.code, outcome.out) == (4, "")
     assert time.monotonic() - began < TIMEOUT  # the silent link was not waited for
-
-
-# Terminals and pipes
-
-PLAIN = {
-    name: value
-    for name, value in os.environ.items()
-    if name not in {"FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "COLUMNS", "PYTHONUNBUFFERED"}
-}

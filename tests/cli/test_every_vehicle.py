@@ -11,22 +11,10 @@ from paramclient import read_file
 from paramclient.cli import set_command
 from paramclient.metadata import Metadata, ParamInfo
 from paramclient.sim import Air, ArduPilotVehicle, Camera, PX4Vehicle
-from tests.commands import Command, Put, behind, in_process, leaping
+from tests.commands import Command, Put
 from tests.shell import Tap
 
 SHARED: dict[str, int | float] = {"GAIN": 4.0, "MODE": 2}
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
-    """Run the command line in this process, on simulated time, with a new cache."""
-    leaping(monkeypatch)
-    return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    return behind(monkeypatch, "udpin:0.0.0.0:14550")
 
 
 @pytest.fixture

@@ -4,27 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from paramclient.sim import Air, Camera, PX4Vehicle
 from paramclient.wire import messages
-from tests.commands import Command, Put, behind, in_process, leaping
+from tests.commands import Command, Put
 
 URL = "udpin:0.0.0.0:14550"
 CAMERA = ("--vehicle", "1/100", "--extended")
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run the command line in this process, on simulated time, with a new cache."""
-    leaping(monkeypatch)
-    return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect every link to simulated vehicles."""
-    return behind(monkeypatch, URL)
 
 
 EXT_FILE = """{"paramclient": 1, "sets": [{"extended": true, "params": {

@@ -19,7 +19,7 @@ from paramclient.cli import ports as ports_command
 from paramclient.links import SerialPort
 from paramclient.model.values import ParamType
 from paramclient.sim import Air, ArduPilotVehicle, Camera, Endpoint, GenericVehicle, PX4Vehicle, SimParam
-from tests.commands import Command, Put, behind, in_process, leaping, strict
+from tests.commands import Command, Put, strict
 
 DATA: Final = Path(__file__).parents[1] / "data"
 RECORDS: Final = "PARAMCLIENT_RECORD_JSON" in os.environ
@@ -245,20 +245,6 @@ CASES: Final = {
     "ports": Case(None, ("ports --json",)),
 }
 
-WITHOUT_CACHE: Final = ("check", "link", "ports")
-"""Subcommands without the option --cache."""
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    leaping(monkeypatch)
-    return in_process(capsys)
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    return behind(monkeypatch, "udpin:0.0.0.0:14550")
-
 
 def outputs(case: Case, command: Command, put: Put, folder: Path) -> list[Any]:
     """Run the commands of a case; return their names, exit codes and masked JSON lines."""
@@ -269,9 +255,7 @@ def outputs(case: Case, command: Command, put: Put, folder: Path) -> list[Any]:
         words = line.split()
         for place, text in places.items():
             words = [word.replace(place, text) for word in words]
-        has_none = words[0] in WITHOUT_CACHE or "--no-cache" in words
-        cache = () if has_none else ("--cache", folder / "cache.sqlite3")
-        done = command(*words, *cache)
+        done = command(*words)
         if "--json" not in words:
             assert done.code == 0, done.err
             continue

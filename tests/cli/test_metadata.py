@@ -10,10 +10,12 @@ import pytest
 from paramclient.metadata import MetadataStore
 from paramclient.model.values import ParamType
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
-from tests.commands import Command, Put, behind, in_process, leaping
+from tests.commands import Command, Put, in_process, leaping
 
 DATA = Path(__file__).parents[1] / "data"
 XML = DATA / "apm.pdef.xml"
+
+URL = "sim:custom"
 
 
 @pytest.fixture
@@ -21,12 +23,6 @@ def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
     """Run the command line in this process, on simulated time."""
     leaping(monkeypatch)
     return in_process(capsys)
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect every URL to a simulated vehicle; return a URL."""
-    return behind(monkeypatch, "sim:custom")
 
 
 def quad(*, metadata: bool = True, ftp: bool = False) -> PX4Vehicle:

@@ -7,21 +7,15 @@ from pathlib import Path
 import pytest
 
 from paramclient.sim import Air, PX4Vehicle
-from tests.commands import Command, Put, behind, in_process, leaping
+from tests.commands import Command, Put
 from tests.shell import Late
 
 
 @pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
-    """Run the command line in this process and in a new folder, on simulated time, with a new cache."""
-    leaping(monkeypatch)
+def command(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
+    """Run the command line in a new folder."""
     monkeypatch.chdir(tmp_path)
-    return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    return behind(monkeypatch, "udpin:0.0.0.0:14550")
+    return command
 
 
 LINK_FIRST = "the first argument is the link, such as udpin:0.0.0.0:14550 or sim:px4\n"

@@ -9,21 +9,15 @@ import pytest
 
 from paramclient.sim import Air, GenericVehicle, PX4Vehicle
 from paramclient.sim.other_station import OtherStation
-from tests.commands import Command, Put, behind, in_process, leaping
+from tests.commands import Command, Put
+
+URL = "sim:custom"
 
 
 @pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run the command line in this process, on simulated time and without a cache."""
-    leaping(monkeypatch)
-    run = in_process(capsys)
-    return lambda *words: run(*words, "--no-cache")
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect every URL to a simulated vehicle."""
-    return behind(monkeypatch, "sim:custom")
+def command(command: Command) -> Command:
+    """Run the command line without a cache."""
+    return lambda *words: command(*words, "--no-cache")
 
 
 class Deaf(PX4Vehicle):

@@ -14,7 +14,7 @@ import pytest
 from paramclient.cli.output import local_time, print_line, print_table, say
 from paramclient.cli.time_arguments import parse_time
 from paramclient.sim import PX4Vehicle
-from tests.commands import Command, Put, behind, in_process, leaping
+from tests.commands import Command, Put
 
 COLUMNS = ["name", "value", "type", "index", "trust"]
 ROWS = [
@@ -88,15 +88,10 @@ def in_zone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("in_zone")
-def test_times_are_local_with_their_zone_and_can_be_parsed_back(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_times_are_local_with_their_zone_and_can_be_parsed_back(command: Command, put: Put) -> None:
     at = 1_795_000_000.125
     assert local_time(at) == "2026-11-18T16:36:40.125+05:30"
     assert parse_time(local_time(at), at + 1) == at
-    leaping(monkeypatch)
-    command: Command = in_process(capsys, "--cache", str(tmp_path / "cache"))
-    put: Put = behind(monkeypatch, "sim:px4")
     vehicle = PX4Vehicle(table={"A": 1, "B": 2})
     assert command("fetch", put(vehicle)).code == 0
     assert command("set", put(vehicle), "A", 3).code == 0
@@ -114,12 +109,7 @@ def test_times_are_local_with_their_zone_and_can_be_parsed_back(
 
 
 @pytest.mark.usefixtures("in_zone")
-def test_messages_of_the_cache_have_local_times(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    leaping(monkeypatch)
-    command: Command = in_process(capsys, "--cache", str(tmp_path / "cache"))
-    put: Put = behind(monkeypatch, "sim:px4")
+def test_messages_of_the_cache_have_local_times(command: Command, put: Put) -> None:
     assert command("fetch", put(PX4Vehicle(table={"A": 1}))).code == 0
     failed = command("restore", put(PX4Vehicle(table={"A": 1})), "2026-01-02 03:00", "--dry-run")
     assert failed.code == 5
@@ -158,12 +148,12 @@ def test_help_whose_reader_closes_it_is_no_error(words: list[str]) -> None:
     ],
 )
 def test_import_says_what_a_file_is_that_is_no_log(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, content: bytes | None, kind: str
+    command: Command, tmp_path: Path, content: bytes | None, kind: str
 ) -> None:
     file = tmp_path / "flight.tlog"
     if content is not None:
         file.write_bytes(content)
-    outcome = in_process(capsys)("import", file, "--cache", tmp_path / "cache")
+    outcome = command("import", file)
     assert (outcome.code, outcome.out) == (2, "")
     assert kind in outcome.err
     assert outcome.err.count("\n") == 1

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
-from tests.commands import Command, Put, behind, in_process, leaping
+from tests.commands import Command, Put
 
+URL = "sim:px4"
 TABLE: dict[str, Any] = {
     "MC_ROLL_P": 4.0,
     "MC_PITCH_P": 4.5,
@@ -17,24 +18,6 @@ TABLE: dict[str, Any] = {
     "SYS_AUTOSTART": 4001,
 }
 GROUP = {"GRP_ONE": 1.0, "GRP_TWO": 2.0}
-
-
-@pytest.fixture
-def cache(tmp_path: Path) -> Path:
-    return tmp_path / "cache.sqlite3"
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], cache: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run the command line in this process, on simulated time, with a new cache."""
-    leaping(monkeypatch)
-    return in_process(capsys, "--cache", str(cache))
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect every URL to a simulated vehicle."""
-    return behind(monkeypatch, "sim:px4")
 
 
 def px4(**options: Any) -> PX4Vehicle:

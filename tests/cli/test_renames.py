@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +9,8 @@ import pytest
 
 from paramclient import ParamType
 from paramclient.model.values import WireValue
-from paramclient.sim import ArduPilotVehicle, Endpoint
-from tests.commands import Command, Put, behind, in_process, leaping
+from paramclient.sim import ArduPilotVehicle
+from tests.commands import Command, Put
 
 TABLE: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "WP_SPD": 10.0,
@@ -30,18 +29,11 @@ NOT_HERE = "renamed to GONE_TOO in names.json, which this vehicle does not have 
 
 
 @pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run the command line in this process, on simulated time, in a folder with `names.json`."""
-    leaping(monkeypatch)
+def command(command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Run the command line in a folder with `names.json`."""
     monkeypatch.chdir(tmp_path)
     Path("names.json").write_text(RULES)
-    return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect every URL to simulated vehicles; return a URL."""
-    return behind(monkeypatch, "udpin:0.0.0.0:14550")
+    return command
 
 
 def copter(**options: Any) -> ArduPilotVehicle:
@@ -53,7 +45,7 @@ def file(text: str = FILE, name: str = "quad.param") -> str:
     return name
 
 
-def test_apply_writes_under_the_name_of_the_vehicle(command: Command, put: Callable[[Endpoint], str]) -> None:
+def test_apply_writes_under_the_name_of_the_vehicle(command: Command, put: Put) -> None:
     vehicle = copter()
     outcome = command("apply", put(vehicle), file(), "--renames", "names.json", "--full")
     assert outcome.code == 0
@@ -64,7 +56,7 @@ def test_apply_writes_under_the_name_of_the_vehicle(command: Command, put: Calla
     assert vehicle.values["WP_SPD"] == 7.5
 
 
-def test_a_dry_run_shows_the_steps_under_both_names(command: Command, put: Callable[[Endpoint], str]) -> None:
+def test_a_dry_run_shows_the_steps_under_both_names(command: Command, put: Put) -> None:
     vehicle = copter()
     outcome = command("apply", put(vehicle), file(), "--renames", "names.json", "--dry-run")
     reason = "WP_SPD on this vehicle; all other parameters"
@@ -76,7 +68,7 @@ def test_a_dry_run_shows_the_steps_under_both_names(command: Command, put: Calla
     assert vehicle.requests["PARAM_SET"] == 0
 
 
-def test_a_missing_parameter_names_its_other_name(command: Command, put: Callable[[Endpoint], str]) -> None:
+def test_a_missing_parameter_names_its_other_name(command: Command, put: Put) -> None:
     vehicle, wanted = copter(), file("GONE,1\n")
     outcome = command("apply", put(vehicle), wanted, "--renames", "names.json", "--partial")
     assert outcome.code == 1
@@ -84,9 +76,7 @@ def test_a_missing_parameter_names_its_other_name(command: Command, put: Callabl
 
 
 @pytest.mark.parametrize("subcommand", ["apply", "diff"])
-def test_a_bad_file_of_names_is_an_error_with_its_line(
-    command: Command, put: Callable[[Endpoint], str], subcommand: str
-) -> None:
+def test_a_bad_file_of_names_is_an_error_with_its_line(command: Command, put: Put, subcommand: str) -> None:
     bad = file('[{"old": "A", "new": "B"},\n{"old": "C", "new": "D", "factor": 0}]\n', "bad.json")
     outcome = command(subcommand, put(copter()), file(), "--renames", bad)
     assert outcome.code == 2

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import pty
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +11,10 @@ import pytest
 from paramclient import ParamType
 from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
 from paramclient.wire import frames, messages
-from tests.commands import Command, Put, behind, in_process, leaping
+from tests.commands import Command, Put
 from tests.shell import Tap
 
+URL = "sim:custom"
 TABLE = [
     SimParam("MC_ENABLE", ParamType.INT8, 1, default=0),
     SimParam("MC_ROLL_P", ParamType.REAL32, 7.0, default=0.1),
@@ -25,19 +24,6 @@ TABLE = [
 ]
 RECEIVER = "1/1 ArduPilot quadrotor, firmware 4.6.0-dev"
 CHANGED = {"MC_ENABLE": 0, "MC_ROLL_P": pytest.approx(0.1), "COUNT": 12}
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run the command line in this process, on simulated time, with a new cache."""
-    leaping(monkeypatch)
-    return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect every URL to a simulated vehicle."""
-    return behind(monkeypatch, "sim:custom")
 
 
 def copter(**others: Any) -> ArduPilotVehicle:
@@ -197,23 +183,19 @@ def test_names_all_and_changed_exclude_each_other(command: Command, put: Put, wo
 
 @pytest.mark.parametrize(("answer", "is_written"), [("y", True), ("n", False), ("", False)])
 def test_the_user_of_a_terminal_confirms(
-    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch, answer: str, is_written: bool
+    command: Command, put: Put, at_terminal: Callable[[str], None], answer: str, is_written: bool
 ) -> None:
     tap = Tap(copter())
-    hand, terminal = pty.openpty()
-    os.write(hand, f"{answer}\n".encode())
-    with os.fdopen(hand, "wb"), os.fdopen(terminal, encoding="utf-8") as stdin:
-        monkeypatch.setattr(sys, "stdin", stdin)
-        monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-        done = command("reset", put(tap), "COUNT")
-        assert done.code == (0 if is_written else 1)
-        assert "go on? [y/N]" in done.err
-        assert ["COUNT", "300", "12", "default of vehicle"] in done.rows
-        assert written(tap) == ["COUNT"] * is_written
-        again = Tap(copter())
-        for words in (["COUNT", "--yes"], ["COUNT", "--json"], ["MC_PITCH_P"]):
-            done = command("reset", put(again), *words)
-            assert (done.code, "go on?" in done.err) == (0, False)
+    at_terminal(answer)
+    done = command("reset", put(tap), "COUNT")
+    assert done.code == (0 if is_written else 1)
+    assert "go on? [y/N]" in done.err
+    assert ["COUNT", "300", "12", "default of vehicle"] in done.rows
+    assert written(tap) == ["COUNT"] * is_written
+    again = Tap(copter())
+    for words in (["COUNT", "--yes"], ["COUNT", "--json"], ["MC_PITCH_P"]):
+        done = command("reset", put(again), *words)
+        assert (done.code, "go on?" in done.err) == (0, False)
 
 
 def test_a_vehicle_that_falls_silent_has_an_outcome_for_each_value(command: Command, put: Put) -> None:

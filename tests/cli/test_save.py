@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from paramclient import ParamCache, ParamSet, ParamType, WrittenParam, read_file, write_file
-from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam
-from tests.commands import Command, Put, behind, in_process, leaping
+from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
+from tests.commands import Command, Put, in_process, leaping
 from tests.conversations.partial import TABLE, Partial
 
+URL = "sim:px4"
 ODD = [
     SimParam("BIG", ParamType.INT32, 16777217),
     SimParam("TENTH", ParamType.REAL32, 0.1),
@@ -27,15 +27,7 @@ def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
     return in_process(capsys)
 
 
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect every URL to a simulated vehicle; return a URL."""
-    return behind(monkeypatch, "sim:px4")
-
-
-def test_save_writes_the_parameters_of_the_vehicle(
-    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
-) -> None:
+def test_save_writes_the_parameters_of_the_vehicle(command: Command, put: Put, tmp_path: Path) -> None:
     path = tmp_path / "quad.json"
     saved = command("save", put(GenericVehicle(ODD)), path, "--no-cache")
     assert (saved.code, saved.out) == (0, "")
@@ -103,9 +95,7 @@ def test_save_writes_parameters_that_differ_from_the_defaults(command: Command, 
         path.unlink()
 
 
-def test_nothing_is_written_if_no_parameter_differs(
-    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
-) -> None:
+def test_nothing_is_written_if_no_parameter_differs(command: Command, put: Put, tmp_path: Path) -> None:
     vehicle = ArduPilotVehicle(table=[SimParam("A", ParamType.INT8, 1, default=1)])
     saved = command("save", put(vehicle), tmp_path / "quad.param", "--changed", "--no-cache")
     assert saved.code == 1
@@ -115,7 +105,7 @@ def test_nothing_is_written_if_no_parameter_differs(
 
 @pytest.mark.parametrize("ending", ["params", "parm", "param", "json"])
 def test_what_was_received_is_written_with_incomplete_and_the_file_names_the_others(
-    command: Command, put: Callable[[Endpoint], str], tmp_path: Path, ending: str
+    command: Command, put: Put, tmp_path: Path, ending: str
 ) -> None:
     table = {**TABLE, "RC MAP": (1.0, ParamType.REAL32)}
     vehicle, path = Partial(table, count=lambda index: len(table) + 1), tmp_path / f"quad.{ending}"
@@ -130,7 +120,7 @@ def test_what_was_received_is_written_with_incomplete_and_the_file_names_the_oth
 
 @pytest.mark.parametrize("ending", ["params", "param", "json"])
 def test_values_that_are_no_numbers_are_left_out_of_a_file_that_cannot_hold_them(
-    command: Command, put: Callable[[Endpoint], str], tmp_path: Path, ending: str
+    command: Command, put: Put, tmp_path: Path, ending: str
 ) -> None:
     raw = {"WIDE": (b"\1\0\0\0", ParamType.INT64), "ODD": (b"\2\0\0\0", ParamType.UNKNOWN)}
     path = tmp_path / f"quad.{ending}"
@@ -148,7 +138,7 @@ def test_values_that_are_no_numbers_are_left_out_of_a_file_that_cannot_hold_them
 
 @pytest.mark.parametrize("ending", ["params", "json"])
 def test_a_vehicle_with_component_0_is_written_and_read(
-    command: Command, put: Callable[[Endpoint], str], tmp_path: Path, ending: str
+    command: Command, put: Put, tmp_path: Path, ending: str
 ) -> None:
     path = tmp_path / f"quad.{ending}"
     for words in ((), ("--vehicle", "1/0")):
@@ -166,9 +156,7 @@ def test_a_name_that_the_format_cannot_hold_is_left_out(command: Command, tmp_pa
     assert list(read_file(path).choose()) == ["A"]
 
 
-def test_an_incomplete_table_is_not_written(
-    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
-) -> None:
+def test_an_incomplete_table_is_not_written(command: Command, put: Put, tmp_path: Path) -> None:
     """A file without some parameters would look like that of a vehicle that does not have them."""
     cache, path = tmp_path / "cache.sqlite3", tmp_path / "quad.param"
     vehicle = GenericVehicle([SimParam(f"P{at}", ParamType.INT32, at) for at in range(20)], dead=[5])
@@ -184,9 +172,7 @@ def test_an_incomplete_table_is_not_written(
     assert len(read_file(path).choose()) == 19
 
 
-def test_a_value_that_is_only_cached_is_not_written(
-    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
-) -> None:
+def test_a_value_that_is_only_cached_is_not_written(command: Command, put: Put, tmp_path: Path) -> None:
     """No hash covers a volatile value: unless the vehicle sends it, it is unknown."""
     cache, path = tmp_path / "cache.sqlite3", tmp_path / "quad.param"
     rows = [SimParam("A", ParamType.INT32, 1), SimParam("CAL_ACC0_XOFF", ParamType.INT32, 2, volatile=True)]

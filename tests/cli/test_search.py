@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle
-from tests.commands import Command, Put, behind, in_process, leaping
+from tests.commands import Command, Put
+
+URL = "sim:px4"
 
 
 @pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
-    """Run the command line in this process, on simulated time, with the cached tables of two vehicles."""
-    leaping(monkeypatch)
-    run = in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
-    put: Put = behind(monkeypatch, "sim:px4")
+def tables(command: Command, put: Put) -> None:
+    """Cache the tables of two vehicles."""
     px4 = PX4Vehicle(metadata=True)
-    assert run("fetch", put(px4)).code == 0
-    assert run("set", put(px4), "MC_ROLL_P", 6.5, "MC_ROLL_P", 7.5).code == 0
-    assert run("get", put(px4), "MC_ROLL_P", "--metadata", "vehicle").code == 0
-    assert run("fetch", put(ArduPilotVehicle(system=2))).code == 0
-    return run
+    assert command("fetch", put(px4)).code == 0
+    assert command("set", put(px4), "MC_ROLL_P", 6.5, "MC_ROLL_P", 7.5).code == 0
+    assert command("get", put(px4), "MC_ROLL_P", "--metadata", "vehicle").code == 0
+    assert command("fetch", put(ArduPilotVehicle(system=2))).code == 0
 
 
+@pytest.mark.usefixtures("tables")
 def test_search_finds_names_descriptions_and_value_names(command: Command) -> None:
     found = command("search", "ROLL", "gain", "--json")
     assert found.code == 0
@@ -41,6 +38,7 @@ def test_search_finds_names_descriptions_and_value_names(command: Command) -> No
     assert command("search", "rtl_alt", "--vehicle", 1).code == 1
 
 
+@pytest.mark.usefixtures("tables")
 def test_search_limits_and_reports_nothing(command: Command) -> None:
     some = command("search", "mc_", "--limit", 2)
     assert len(some.rows) == 3
@@ -59,36 +57,30 @@ def test_search_limits_and_reports_nothing(command: Command) -> None:
 
 
 def test_search_prints_a_value_that_all_vehicles_have_and_the_number_of_different_ones(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    command: Command, put: Put
 ) -> None:
-    leaping(monkeypatch)
-    run = in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
-    put = behind(monkeypatch, "sim:px4")
     for system in (1, 2, 3):
         table = {"GAIN_P": 4.0, "GAIN_I": system / 2, "GAIN_D": min(system, 2)}
-        assert run("fetch", put(PX4Vehicle(system=system, table=table))).code == 0
-    assert run("search", "gain").rows[1:] == [
+        assert command("fetch", put(PX4Vehicle(system=system, table=table))).code == 0
+    assert command("search", "gain").rows[1:] == [
         ["GAIN_D", "2 values", "1/1, 2/1, 3/1"],
         ["GAIN_I", "3 values", "1/1, 2/1, 3/1"],
         ["GAIN_P", "4.0", "1/1, 2/1, 3/1"],
     ]
 
 
-def test_a_camera_needs_no_metadata(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    leaping(monkeypatch)
-    run = in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
-    assert run("fetch", "sim:camera", "--vehicle", "1/100", "--extended").code == 0
-    assert run("get", "sim:px4?metadata=1", "MC_ROLL_P", "--metadata", "vehicle").code == 0
-    found = run("search", "roll")
+def test_a_camera_needs_no_metadata(command: Command) -> None:
+    assert command("fetch", "sim:camera", "--vehicle", "1/100", "--extended").code == 0
+    assert command("get", "sim:px4?metadata=1", "MC_ROLL_P", "--metadata", "vehicle").code == 0
+    found = command("search", "roll")
     assert (found.code, found.err) == (0, "")
-    assert run("fetch", "sim:ardupilot").code == 0
-    assert run("search", "roll").err.startswith(
+    assert command("fetch", "sim:ardupilot").code == 0
+    assert command("search", "roll").err.startswith(
         "of 1/1, only names were searched: no metadata is stored for the firmware of ardupilot. "
     )
 
 
+@pytest.mark.usefixtures("tables")
 def test_info_prints_description_values_and_changes(command: Command) -> None:
     known = command("info", "mc_roll_p")
     assert known.code == 0
@@ -109,6 +101,7 @@ def test_info_prints_description_values_and_changes(command: Command) -> None:
     assert [each["new"] for each in vehicle["changes"]] == [6.5, 7.5]
 
 
+@pytest.mark.usefixtures("tables")
 def test_info_of_an_unknown_name_suggests_others(command: Command) -> None:
     wrong = command("info", "MC_ROLLP")
     assert (wrong.code, wrong.out) == (2, "")

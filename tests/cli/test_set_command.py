@@ -11,25 +11,18 @@ import pytest
 from paramclient import ParamType
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from paramclient.wire import frames, messages
-from tests.commands import Command, Outcome, Put, behind, in_process, leaping
+from tests.commands import Command, Outcome, Put
 
+URL = "sim:custom"
 NAMES = [f"P_{number:02}" for number in range(60)]
 PAIRS = [word for name in NAMES for word in (name, "7")]
 TABLE: dict[str, Any] = dict.fromkeys(NAMES, 1)
 
 
 @pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run the command line in this process, on simulated time and without a cache."""
-    leaping(monkeypatch)
-    run = in_process(capsys)
-    return lambda *words: run(*words, "--no-cache")
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect every URL to a simulated vehicle."""
-    return behind(monkeypatch, "sim:custom")
+def command(command: Command) -> Command:
+    """Run the command line without a cache."""
+    return lambda *words: command(*words, "--no-cache")
 
 
 class Ending(GenericVehicle):

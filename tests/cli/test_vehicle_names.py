@@ -13,7 +13,7 @@ from paramclient.cache.lookup import find_vehicle, is_vehicle_name
 from paramclient.model.identity import Identity
 from paramclient.sim import PX4Vehicle
 from tests.caches import NOW, PX4, stored, update
-from tests.commands import Command, Put, behind, in_process, leaping
+from tests.commands import Command, Put
 
 FOUR = "4a00000000000011"
 """The hardware id of system 3: it begins with the number of another system."""
@@ -154,19 +154,7 @@ def cache(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.fixture
-def command(cache: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run the command line in this process, on simulated time, with this cache."""
-    leaping(monkeypatch)
-    return in_process(capsys, "--cache", str(cache))
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    return behind(monkeypatch, "udpin:127.0.0.1:1")
-
-
-LINK = "udpin:127.0.0.1:1"
+URL = "udpin:127.0.0.1:1"
 COMMANDS = [
     ["show", "NAME"],
     ["show", "NAME", "--json"],
@@ -177,9 +165,9 @@ COMMANDS = [
     ["save", "NAME", "FILE", "--vehicle", "all"],
     ["diff", "3", "NAME"],
     ["diff", "3", "3", "--base", "NAME"],
-    ["diff", LINK, "NAME"],
-    ["apply", LINK, "NAME", "--yes"],
-    ["apply", LINK, "NAME", "--vehicle", "all", "--yes"],
+    ["diff", URL, "NAME"],
+    ["apply", URL, "NAME", "--yes"],
+    ["apply", URL, "NAME", "--vehicle", "all", "--yes"],
 ]
 """With NAME for the vehicle, and FILE for a file that is not there."""
 

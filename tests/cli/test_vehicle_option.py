@@ -10,23 +10,11 @@ from typing import Any
 import pytest
 
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
-from tests.commands import Command, Put, behind, in_process, leaping, strict
+from tests.commands import Command, Put, strict
 
+URL = "sim:custom"
 TABLE: dict[str, Any] = {"A": 1.0, "B": 2.0}
 UID = "0a" * 18
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run the command line in this process, on simulated time, with a new cache."""
-    leaping(monkeypatch)
-    return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect every URL to a simulated vehicle."""
-    return behind(monkeypatch, "sim:custom")
 
 
 def px4(system: int = 1, **options: Any) -> PX4Vehicle:
@@ -88,13 +76,8 @@ def test_subcommands_for_one_vehicle_refuse_all(command: Command, put: Put, tmp_
     vehicle = px4()
     url = put(vehicle)
     for words in (["check", url], ["set", url, "A", "1", "--extended"]):
-        done = in_words(command, *words, "--vehicle", "all")
-        assert (done, vehicle.requests["PARAM_SET"]) == (2, 0)
-
-
-def in_words(command: Command, *words: str) -> int:
-    """Return the exit code of a command; check takes no cache."""
-    return command(*words, *(["--no-cache"] if words[0] != "check" else [])).code
+        done = command(*words, "--vehicle", "all")
+        assert (done.code, vehicle.requests["PARAM_SET"]) == (2, 0)
 
 
 def test_kinds_and_addresses_in_the_cache(command: Command, put: Put) -> None:

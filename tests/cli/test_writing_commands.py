@@ -20,7 +20,7 @@ from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, Vehicle
 from paramclient.wire import messages
 from tests.caches import NOW, update
-from tests.commands import Command, Put, behind, in_process, leaping
+from tests.commands import Command, Put, behind
 from tests.shell import Late, PeersLink, Tap
 
 URL = "udpin:0.0.0.0:14550"
@@ -33,19 +33,6 @@ LISTED = (
 )
 QUESTIONS = (messages.Heartbeat, messages.CommandLong)
 """What identifies vehicles."""
-
-
-@pytest.fixture
-def cache(tmp_path: Path) -> Path:
-    return tmp_path / "cache.sqlite3"
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], cache: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run the command line in this process, on simulated time, with a new cache."""
-    leaping(monkeypatch)
-    cached, plain = in_process(capsys, "--cache", str(cache)), in_process(capsys)
-    return lambda *words: (plain if words[0] == "signing" else cached)(*words)
 
 
 @pytest.fixture
