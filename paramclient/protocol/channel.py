@@ -10,12 +10,13 @@ import math
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
-from typing import Final, Protocol, TypeAlias, TypeVar
+from typing import Final, TypeAlias, TypeVar
 
 import anyio
 import anyio.abc
 
 from paramclient.errors import LinkError, NoReply
+from paramclient.protocol.presence import Presence
 from paramclient.wire import messages
 from paramclient.wire.messages import Message
 
@@ -160,16 +161,6 @@ class Gate:
             self.check()
 
 
-class Liveness(Protocol):
-    """What a channel asks about its component; see `paramclient.protocol.presence`."""
-
-    received_at: float
-
-    @property
-    def timeout(self) -> float:
-        """Seconds of silence after which the component is lost; infinity without heartbeats."""
-
-
 class Inbox:
     """The messages with some keys, from the moment of its creation until the end of its `with` block."""
 
@@ -311,7 +302,7 @@ class Channel:
         component: int,
         transmit: Callable[[Message], None],
         gate: Gate,
-        presence: Liveness,
+        presence: Presence,
     ) -> None:
         self.system = system
         self.component = component
@@ -407,6 +398,9 @@ class Channel:
             deadline: on the clock of the event loop.
             attempt: when a request was sent, how often before, and the seconds to wait at least: a shorter
                 round trip that is measured meanwhile shortens the wait.
+
+        Raises:
+            LinkError: the link has failed.
         """
         with anyio.CancelScope(deadline=deadline) as scope:
             self._waits[scope] = attempt
@@ -414,11 +408,13 @@ class Channel:
                 yield scope
             finally:
                 del self._waits[scope]
+        if scope.cancelled_caught:
+            self.gate.check()
 
     def lose(self) -> None:
         """End the waits for messages: the component is lost, or the link has failed."""
         for scope in self._waits:
-            scope.deadline = -math.inf
+            scope.cancel()
 
     async def exchange(
         self,
@@ -463,7 +459,6 @@ class Channel:
             if answer is not None:
                 self._measure(attempt, now - sent, now - began)
                 return answer
-            self.gate.check()
             if self.is_hopeless(attempt, began, attempts() if callable(attempts) else attempts):
                 raise NoReply(what, attempts=attempt, waited=now - began)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TypeVar
 
 import anyio
@@ -93,36 +94,30 @@ async def reboot(node: Node, *, returns: bool = True) -> None:
     if (presence.base_mode or 0) & messages.MAV_MODE_FLAG_SAFETY_ARMED:
         raise VehicleArmed(f"{channel} is armed: it was not rebooted", *channel.target)
     generation = node.generation
+
+    def has_rebooted() -> bool:
+        return node.generation != generation
+
     with channel.gate.until_closed():
         await anyio.sleep_until(node.plain.written_at + SAVING_TIME)
     command = messages.CommandLong(*channel.target, messages.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1.0)
     try:
         await send_command(channel, command)
     except NoReply:
-        if node.generation == generation and not presence.is_lost:
+        if not has_rebooted() and not presence.is_lost:
             raise
     with channel.gate.until_closed():
-        await _wait_until_off(node, generation)
+        await _until(lambda: has_rebooted() or anyio.current_time() - presence.received_at >= REBOOT_SILENCE)
         if not returns:
             return
-        await _wait_until_back(node, generation)
-    if node.generation == generation:
+        silent_since = presence.received_at
+        await _until(lambda: has_rebooted() or presence.received_at != silent_since)
+        await _until(lambda: not (presence.is_booting or presence.is_lost))
+    if not has_rebooted():
         node.rebooted(anyio.current_time())
     await node.identified()
 
 
-async def _wait_until_off(node: Node, generation: int) -> None:
-    """Wait until the vehicle is silent, or has shown that it has rebooted already."""
-    while node.generation == generation:
-        if anyio.current_time() - node.presence.received_at >= REBOOT_SILENCE:
-            return
-        await anyio.sleep(PRESENCE_INTERVAL)
-
-
-async def _wait_until_back(node: Node, generation: int) -> None:
-    """Wait until the vehicle is heard again, and does not boot any more."""
-    silent_since = node.presence.received_at
-    while node.generation == generation and node.presence.received_at == silent_since:  # noqa: ASYNC110 - a state
-        await anyio.sleep(PRESENCE_INTERVAL)
-    while node.presence.is_booting or node.presence.is_lost:  # noqa: ASYNC110 - a state, without an event
+async def _until(condition: Callable[[], bool]) -> None:
+    while not condition():  # noqa: ASYNC110 - states, without an event
         await anyio.sleep(PRESENCE_INTERVAL)

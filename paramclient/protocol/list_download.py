@@ -160,7 +160,7 @@ class _Download:
             while not self._is_over():
                 await self._take_for(GAPS_INTERVAL)
             fruitless = 0
-            while (missing := self._missing()) and not self._is_silent():
+            while (missing := self._missing()) and not self.channel.is_silent(self._began):
                 seconds_left = len(self.table.names) / self._rate() + PASS_OVERHEAD
                 is_slower = len(missing) / READS_PER_SECOND_ARDUPILOT > seconds_left
                 has_begun = len(self._received) > self.channel.window_size  # others may answer earlier reads
@@ -171,14 +171,14 @@ class _Download:
                 ):
                     await self._read_gaps()
                     is_short = self._missing() and self._count != 1  # a count of one may be right
-                    if is_short and not self._has_answer and not self._is_silent():
+                    if is_short and not self._has_answer and not self.channel.is_silent(self._began):
                         await self._next_pass()  # some firmware serves no reads
                     break
                 self.result.lost += len(missing)
                 await self._next_pass()
                 fruitless = fruitless + 1 if self._missing() == missing else 0
         self.result.missing = missing = self._missing()
-        if self.table.is_growing and not self._is_silent():
+        if self.table.is_growing and not self.channel.is_silent(self._began):
             missing.pop()  # it has no more
 
     async def _next_pass(self) -> None:
@@ -200,7 +200,7 @@ class _Download:
         component has none of the others.
         """
         async with task_group() as tasks:
-            while not self._is_read() and not self._is_silent():
+            while not self._is_read() and not self.channel.is_silent(self._began):
                 self.channel.is_streaming = not self._is_over()
                 for index in self._gaps():
                     if len(self._reading) >= self.channel.window_size:
@@ -289,11 +289,7 @@ class _Download:
         if count is not None and self._reached >= count - TAIL:
             pause = PAUSE_TAIL
         pause = max(pause, PAUSE_INTERVALS / self._rate() if self._listed else self.channel.timing.timeout(0))
-        return anyio.current_time() - self._listed_at > pause or self._is_silent()
-
-    def _is_silent(self) -> bool:
-        """Return whether the component is silent for so long that it counts as lost."""
-        return self.channel.is_silent(self._began)
+        return anyio.current_time() - self._listed_at > pause or self.channel.is_silent(self._began)
 
     def _rate(self) -> float:
         """Return the values per second of this list so far, or of an earlier pass."""

@@ -12,14 +12,7 @@ from paramclient.model.values import Encoding
 from paramclient.protocol.addresses import Address, Peer, PeerAddress
 from paramclient.protocol.channel import WINDOW_PX4, Channel, Gate
 from paramclient.protocol.dialect import EXTENDED, PLAIN, Digest
-from paramclient.protocol.events import (
-    ComponentEvent,
-    Found,
-    Identified,
-    Lost,
-    Rebooted,
-    Replaced,
-)
+from paramclient.protocol.events import ComponentEvent, Found, Identified, Lost, Rebooted, Replaced
 from paramclient.protocol.identity import HEARTBEAT_WAIT, Identification
 from paramclient.protocol.presence import SYSTEM_TIME, Presence
 from paramclient.protocol.session import Session, Shared, Spawn

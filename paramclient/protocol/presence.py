@@ -57,12 +57,10 @@ class Presence:
     @property
     def timeout(self) -> float:
         """Seconds of silence after which the component is lost; infinity before the first heartbeat."""
-        if self.is_over:
+        if self.is_over or not (self.has_beaten or self._is_high_latency):
             return math.inf
         if self._is_high_latency:
             return LOST_AFTER_HIGH_LATENCY
-        if self.beat_at == -math.inf:
-            return math.inf
         if self._interval == math.inf:
             return LOST_AFTER
         return min(max(LOST_AFTER, LOST_INTERVALS * self._interval), LOST_AFTER_MAX)

@@ -28,14 +28,7 @@ from paramclient.errors import (
 )
 from paramclient.model.identity import autopilot_name, reason_against_non_finite
 from paramclient.model.names import is_group_switch
-from paramclient.model.values import (
-    Param,
-    ParamType,
-    Trust,
-    WireValue,
-    format_value,
-    type_name,
-)
+from paramclient.model.values import Param, ParamType, Trust, WireValue, format_value, type_name
 from paramclient.protocol.channel import Inbox, task_group
 from paramclient.protocol.reads import queue_time, read, read_param, refusal
 from paramclient.protocol.session import ReplacedValue, Session

@@ -41,6 +41,7 @@ from paramclient.wire.messages import (
     HighLatency2,
     Message,
     ParamValue,
+    SetupSigning,
     StatusText,
     SystemTime,
     encode,
@@ -573,7 +574,7 @@ async def test_setup_signing_is_obeyed_and_another_key_is_not_understood() -> No
     vehicle = PX4Vehicle()
     async with converse(vehicle) as conversation:
         node = await conversation.node()
-        await conversation.station.set_up_signing(node, KEY, NOW)
+        conversation.station.transmit(SetupSigning(1, 1, KEY, NOW), node.peer)
         await anyio.sleep(0.5)
         assert vehicle.signing_key == KEY
         with pytest.raises(NoReply):
