@@ -216,16 +216,6 @@ class Tap:
         return [] if self.is_mute else data
 
 
-class Clock:
-    """A time in seconds that tests set."""
-
-    def __init__(self, now: float = 0.0) -> None:
-        self.now = now
-
-    def __call__(self) -> float:
-        return self.now
-
-
 class Late:
     """A vehicle that is switched on later than the link is opened, or was present before and falls silent.
 

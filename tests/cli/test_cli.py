@@ -152,19 +152,6 @@ def test_a_simulated_camera_is_fetched_and_written_over_udp(live_command: Comman
         assert [each["value"] for each in params.values()] == ["Rear", 2**62 + 1]
 
 
-ODD = [
-    SimParam("NAN", ParamType.REAL32, float("nan")),
-    SimParam("UP", ParamType.REAL32, float("inf")),
-    SimParam("DOWN", ParamType.REAL32, float("-inf")),
-    SimParam("TENTH", ParamType.REAL32, 0.1),
-    SimParam("SNAN", ParamType.INT32, -5000000),
-    SimParam("LONG", ParamType.UINT64, 0x1_0000_0002),
-    SimParam("DOUBLE", ParamType.REAL64, 0.5),
-    SimParam("ODD", 77, b"\x01\x02\x03\x04"),
-    SimParam("SMALL", ParamType.INT8, -1),
-]
-
-
 def test_fetch_prints_a_table_and_a_summary(command: Command, warm: Path) -> None:
     fetched = command("fetch", "sim:px4", "--cache", warm)
     assert fetched.code == 0
@@ -729,16 +716,6 @@ def test_show_lists_several_vehicles_and_prints_one(command: Command, warm: Path
         assert (component["system"], component["synced_at"]) == (2, None)
         assert list(component["params"]) == ["RTL_ALT"]
     assert [row[0] for row in command("show", "2", "--cache", warm).words] == ["name", "RTL_ALT"]
-
-
-def test_an_ambiguous_name_chooses_no_vehicle(command: Command, warm: Path) -> None:
-    assert command("get", "sim:ardupilot", "RTL_ALT", "--cache", warm).code == 0
-    for arguments in (["show", "1"], ["history", "1"], ["cache", "remove", "1"]):
-        outcome = command(*arguments, "--cache", warm)
-        assert (outcome.code, outcome.out) == (2, "")
-        assert "vehicle 1 fits 2 vehicles" in outcome.err
-        assert all(f"\n  {each}\n" in outcome.err for each in ParamCache(warm).vehicles())
-    assert len(ParamCache(warm).vehicles()) == 2
 
 
 # Exit codes and signals

@@ -142,18 +142,6 @@ def test_partial_leaves_out_only_parameters_of_the_right_side(command: Command) 
     assert "C_LEFT" in names
 
 
-def test_partial_compares_a_few_values_with_a_whole_vehicle(
-    command: Command, cache: Path, tmp_path: Path
-) -> None:
-    keep(cache, BEFORE)
-    file = tmp_path / "few.param"
-    file.write_text("B_FLOAT,0.1\nC_LEFT,5\n")
-    assert command("diff", file, 1).code == 1
-    assert command("diff", file, 1, "--partial").code == 0
-    file.write_text("B_FLAOT,0.1\n")
-    assert command("diff", file, 1, "--partial").code == 1
-
-
 @pytest.mark.usefixtures("two")
 def test_only_compares_the_named_parameters(command: Command) -> None:
     assert command("diff", 1, 2, "--only", "A_*", "--only", "E_BOTH").code == 0
@@ -228,14 +216,6 @@ def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]
         return name
 
     return place
-
-
-def test_a_file_is_compared_with_a_vehicle(
-    command: Command, write: Callable[..., str], vehicles: dict[str, Vehicle]
-) -> None:
-    vehicles["tcp:one:1"] = GenericVehicle({"A": 1, "B": 0.1})
-    outcome = command("diff", write("quad.parm", "A 1", "B 0.1"), "tcp:one:1", "--json")
-    assert (outcome.code, outcome.json["counts"]["same"]) == (0, 2)
 
 
 @pytest.mark.usefixtures("two")

@@ -1,9 +1,8 @@
-"""The subcommands history and fleet diff, and the parsing of times."""
+"""The subcommand history, and the parsing of times."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
@@ -13,8 +12,7 @@ from paramclient.cache import BY_US, ParamCache, TableState
 from paramclient.cli.time_arguments import parse_time, parse_when
 from paramclient.errors import UsageError
 from paramclient.model.notation import time_text
-from paramclient.model.values import ParamType, bits_of
-from tests.caches import NOW, PX4, stored, update, whole_table
+from tests.caches import NOW, PX4, stored, update
 from tests.commands import Command, in_process
 
 DONE = TableState(complete=True)
@@ -184,24 +182,3 @@ def test_invalid_arguments_of_history_are_errors(
     failed = command("history", *arguments)
     assert (failed.code, failed.out) == (code, "")
     assert text in failed.err
-
-
-# fleet diff
-
-
-def three(path: Path) -> None:
-    """Three vehicles: the second has changed A, the third lacks it."""
-    with ParamCache(path) as cache:
-        for number in (1, 2, 3):
-            identity = replace(PX4, system=number, uid=f"{number:04x}")
-            cache.save(
-                update(
-                    *([stored("A", 1)] if number < 3 else []),
-                    stored("F", bits_of(0.1, 9), ParamType.REAL32),
-                    identity=identity,
-                    table=DONE,
-                )
-            )
-        second = replace(PX4, system=2, uid="0002")
-        cache.save(update(stored("A", 5, at=NOW + 60, by=BY_US), identity=second, at=NOW + 60))
-        cache.save(whole_table(1, second, component=154))

@@ -64,26 +64,30 @@ def test_many_pairs_are_in_flight_at_a_time(command: Command, put: Put, kind: An
 
 
 def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put) -> None:
-    vehicle = ArduPilotVehicle(
-        table={"A": 1.0, "COUNT": 3, "FIXED": 2.0}, read_only=["FIXED"], live=(), ftp=False, param_error=True
-    )
-    words = ["A", 5, "NO_SUCH", 1, "COUNT", 7.6, "FIXED", 9, "A", 6]
+    small = (ParamType.INT8, 0)
+    table: dict[str, Any] = {"A": 1.0, "COUNT": 3, "FIXED": 2.0, "SMALL": small}
+    vehicle = ArduPilotVehicle(table=table, read_only=["FIXED"], live=(), ftp=False, param_error=True)
+    words = ["A", 5, "NO_SUCH=1", "COUNT", 7.6, "SMALL=300", "FIXED", 9, "A", 6]
     done = command("set", put(vehicle), *words, "--force")
     assert done.code == 2
     assert [[row[0], row[-1]] for row in done.rows[1:]] == [
         ["A", "accepted"],
         ["NO_SUCH", "not on this vehicle"],
         ["COUNT", "adjusted"],
+        ["SMALL", "invalid"],
         ["FIXED", "refused"],
         ["A", "accepted"],
     ]
     doubt, announced, line, *_ = done.err.splitlines()
     assert doubt == "paramclient: COUNT: 7.6 is not a whole number, and COUNT is an integer"
     assert announced == "writing to 1/1 ArduPilot quadrotor, firmware 4.6.0-dev on sim:custom"
-    assert line.startswith("3 of 5 set, 1 not on this vehicle, 1 refused on 1/1 ArduPilot ")
+    assert line.startswith("3 of 6 set, 1 not on this vehicle, 1 invalid, 1 refused on 1/1 ArduPilot ")
     assert "paramclient: 1/1 has no NO_SUCH\n" in done.err
     assert "paramclient: 1/1 refused FIXED: " in done.err
     assert vehicle.values["A"] == 6
+    as_json = command("set", put(vehicle), *words, "--force", "--json")
+    failed = dict.fromkeys(["NO_SUCH", "SMALL", "FIXED"], "refused")
+    assert statuses(as_json) == failed | {"A": "accepted", "COUNT": "adjusted"}
 
 
 def test_a_vehicle_that_ends_in_the_middle_loses_no_outcome(command: Command, put: Put) -> None:
@@ -117,25 +121,3 @@ def test_ctrl_c_prints_the_outcomes_so_far(command: Command, put: Put, as_json: 
     assert all(vehicle.values[name] == 7 for name in accepted)
     assert {found[name] for name in NAMES if name not in accepted} == {"unknown"}
     assert command("set", put(GenericVehicle(TABLE)), *PAIRS).code == 0
-
-
-def test_a_name_that_the_vehicle_lacks_and_an_invalid_value_are_not_called_refused(
-    command: Command, put: Put
-) -> None:
-    table: dict[str, float | tuple[ParamType, int]] = {
-        "RTL_ALT": (ParamType.INT16, 1500),
-        "RTL_TYPE": (ParamType.INT8, 0),
-        "LOCKED": 1.0,
-    }
-    vehicle = ArduPilotVehicle(table=table, read_only=["LOCKED"], param_error=True, live=())
-    words = ["set", put(vehicle), "RTL_ALT=3000", "MISSPELT=1", "RTL_TYPE=300", "LOCKED=2"]
-    done = command(*words, "--force")
-    assert (done.code, vehicle.values["RTL_ALT"]) == (2, 3000)
-    assert done.rows[1:] == [
-        ["RTL_ALT", "3000", "3000", "accepted"],
-        ["MISSPELT", "1", "not on this vehicle"],
-        ["RTL_TYPE", "300", "invalid"],
-        ["LOCKED", "2", "refused"],
-    ]
-    assert "1 of 4 set, 1 not on this vehicle, 1 invalid, 1 refused on " in done.err
-    assert list(statuses(command(*words, "--force", "--json")).values()) == ["accepted", *["refused"] * 3]

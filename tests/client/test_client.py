@@ -115,15 +115,7 @@ async def test_a_time_limit_around_the_client_ends_it() -> None:
 
 
 @in_simulated_time
-async def test_a_client_is_opened_once() -> None:
-    client = a_client(generic())
-    async with client:
-        with pytest.raises(UsageError, match="opened only once"):
-            await client.__aenter__()
-        await client.component()
-    with pytest.raises(UsageError, match="opened only once"):
-        await client.__aenter__()
-
+async def test_of_two_openings_at_once_one_is_refused() -> None:
     twice = a_client(generic())
     second = asyncio.create_task(outcome(twice.__aenter__()))
     async with twice:
@@ -350,21 +342,6 @@ async def test_a_write_learns_the_type_first() -> None:
 
 def reads_of_hash(tap: Tap) -> list[messages.ParamRequestRead]:
     return [each for each in tap.messages(messages.ParamRequestRead) if each.param_id == messages.HASH_CHECK]
-
-
-@in_simulated_time
-async def test_a_write_that_the_vehicle_adjusts() -> None:
-    async with a_client(ArduPilotVehicle()) as client:
-        component = await client.component()
-        result = await component.set("RTL_ALT", 1234.7)
-        assert (result.status, result.adjusted, result.requested, result.actual) == (
-            "adjusted",
-            True,
-            1234.7,
-            1234,
-        )
-        assert str(result) == "RTL_ALT = 1234 (adjusted from 1234.7)"
-        assert (await component.set("rtl_alt", 1000)).param.name == "RTL_ALT"
 
 
 class Retyping(GenericVehicle):
@@ -863,21 +840,6 @@ async def known_component(client: ParamClient) -> Component:
     component = await client.component()
     await until(lambda: not client.core.station.is_waiting)
     return component
-
-
-@in_simulated_time
-async def test_nothing_rests_while_an_answer_is_awaited() -> None:
-    vehicle = Chatter(generic(), 1 / 2000)
-    async with a_client(vehicle) as client:
-        component = await known_component(client)
-        vehicle.is_deaf = True
-        call = asyncio.create_task(component.get("PARAM_01"))
-        await settled()
-        vehicle.portions.clear()
-        await asyncio.sleep(0.1)
-        assert not call.done()
-        assert len(vehicle.portions) >= 190
-        call.cancel()
 
 
 @in_simulated_time

@@ -225,18 +225,6 @@ async def test_a_link_that_stays_disconnected_ends_it() -> None:
 
 
 @in_simulated_time
-async def test_the_client_s_end_ends_it() -> None:
-    async with a_client(with_files()) as client:
-        files = await files_of(client)
-        reading = asyncio.ensure_future(outcome(files.read("/APM/LOGS/1.BIN")))
-        await anyio.sleep(0.3)
-    assert isinstance(await reading, ClientClosed)
-    with pytest.raises(ClientClosed):
-        await files.checksum("/x")
-    assert not tasks_beside()
-
-
-@in_simulated_time
 async def test_a_neighbour_of_a_large_integer_can_be_set() -> None:
     big = (1 << 24) + 1
     vehicle = ArduPilotVehicle(table=[SimParam("BIG", ParamType.INT32, big)], live_period=0)

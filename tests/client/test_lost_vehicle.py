@@ -8,7 +8,7 @@ from pathlib import Path
 import anyio
 import pytest
 
-from paramclient import Component, ParamCache, ParamClient, SetStatus, SyncState
+from paramclient import Component, NoReply, ParamCache, ParamClient, SetOutcome, SetStatus, SyncState
 from paramclient.cli.json_apply import ApplyJson
 from paramclient.cli.json_output import FetchJson, VehicleJson, WriteJson, as_json
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -140,15 +140,19 @@ async def test_set_many(kind: str, delay: float, tmp_path: Path) -> None:
         component = await client.component()
         await component.fetch_all()
         accepted: dict[str, float] = {}
+        seen: list[SetOutcome] = []
 
         async def call() -> None:
-            result = await component.set_many(world.wanted)
+            result = await component.set_many(world.wanted, progress=seen.append)
+            assert isinstance(result.error, NoReply)
+            assert sorted(each.name for each in seen) == sorted(world.wanted)
             assert {each.status for each in result.outcomes} == {
                 *(SetStatus.ACCEPTED, SetStatus.UNKNOWN, SetStatus.NOT_TRIED)
             }
             for each in result.outcomes:
                 shown = as_json(WriteJson.of(each, ParamType.REAL32, None))
                 assert shown["status"] == each.status.value
+                assert each.is_set is (each.error is None)
                 if each.status is SetStatus.ACCEPTED:
                     accepted[each.name] = shown["actual"]
 

@@ -17,12 +17,12 @@ import anyio.abc
 import anyio.lowlevel
 import pytest
 
-from paramclient import ClientClosed, LinkError, ParamCache, ParamClient, UsageError
+from paramclient import ClientClosed, ParamCache, ParamClient, UsageError
 from paramclient.client import core
 from paramclient.links import Peer, SimLink
 from paramclient.sim import Endpoint
 from tests.cable import TIMEOUT
-from tests.shell import Tap, a_client, bits, generic, small_px4
+from tests.shell import a_client, generic, small_px4
 
 pytestmark = pytest.mark.anyio
 
@@ -104,21 +104,6 @@ class FaultyLink(SimLink):
         raise ZeroDivisionError("a mistake")
 
 
-async def test_a_client_is_used_between_open_and_aclose(tmp_path: Path) -> None:
-    vehicle = small_px4(burst=50, period=0.001)
-    client = ParamClient(vehicle, cache=tmp_path / "cache")
-    with anyio.fail_after(TIMEOUT):
-        assert await client.open() is client
-        component = await client.component()
-        assert (await component.fetch_all()).complete
-        assert (await component.set("PARAM_01", 77)).status == "accepted"
-        await client.aclose()
-        with pytest.raises(ClientClosed):
-            await component.get("PARAM_01")
-    with ParamCache(tmp_path / "cache") as cache:
-        assert bits(cache.component(system=1).params) == bits(vehicle.params)
-
-
 async def test_opened_used_and_closed_in_different_tasks() -> None:
     client = a_client(generic())
     async with beside() as tasks:
@@ -173,37 +158,6 @@ async def test_async_with_closes_what_it_opens() -> None:
                 await client.open()
             assert (await (await client.component()).get("PARAM_01")).value == 1
         assert " closed, " in repr(client)
-        await client.aclose()
-
-
-async def test_closing_ends_the_calls_of_other_tasks() -> None:
-    tap = Tap(generic())
-    client = a_client(tap)
-    endings: list[type[BaseException]] = []
-
-    async def wait() -> None:
-        try:
-            await component.get("PARAM_01")
-        except LinkError as error:
-            endings.append(type(error))
-
-    async with beside():
-        await client.open()
-        component = await client.component()
-        tap.is_deaf = True
-        async with anyio.create_task_group() as tasks:
-            for _ in range(2):
-                tasks.start_soon(wait)
-            await anyio.lowlevel.checkpoint()
-            await client.aclose()
-    assert endings == [ClientClosed] * 2
-
-
-async def test_a_link_that_cannot_be_opened() -> None:
-    client = a_client("tcp:127.0.0.1:1")
-    async with beside():
-        with pytest.raises(LinkError, match="refused"):
-            await client.open()
         await client.aclose()
 
 

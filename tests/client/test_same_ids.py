@@ -35,21 +35,6 @@ async def test_another_live_peer_is_one_warning_and_forbids_writes(caplog: pytes
 
 
 @in_simulated_time
-async def test_the_other_peer_has_the_ids_after_the_silence_of_the_first() -> None:
-    first, second = Tap(generic()), generic(table={"OTHER": 1})
-    peers: dict[Peer, Endpoint] = {"one": first}
-    link = PeersLink(peers)
-    async with a_client(link) as client:
-        component = await client.component()
-        await component.fetch_all()
-        first.is_mute = True
-        link.endpoints["two"] = second
-        await anyio.sleep(10.0)
-        assert component.peer == "two"
-        assert (await component.set("OTHER", 2)).actual == 2
-
-
-@in_simulated_time
 async def test_the_new_connection_of_a_vehicle_has_its_ids_at_once() -> None:
     """As of a vehicle that connects to us again after its TCP connection broke."""
     first = Tap(generic())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from unittest import mock
 
@@ -12,7 +12,6 @@ import pytest
 
 from paramclient import (
     CacheError,
-    LinkError,
     NoReply,
     NotDurable,
     Param,
@@ -23,7 +22,7 @@ from paramclient import (
     UsageError,
 )
 from paramclient.client.cache_writer import CacheWriter
-from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire import messages
 from tests.shell import VALUES, Tap, a_client, generic, in_simulated_time, residue, small_px4
 
@@ -33,21 +32,6 @@ NEW: dict[str, int | float] = {name: value + 0.5 for name, value in MANY.items()
 
 def values_of(params: Mapping[str, Param], names: Mapping[str, object]) -> dict[str, object]:
     return {name: params[name].value for name in names}
-
-
-@pytest.mark.parametrize("kind", [PX4Vehicle, ArduPilotVehicle])
-@in_simulated_time
-async def test_all_values_are_set_on_a_link_that_loses_packets(kind: Callable[..., Vehicle]) -> None:
-    vehicle = kind(table=MANY)
-    async with a_client(Air.symmetric([vehicle], delay=0.05, loss=0.05)) as client:
-        component = await client.component()
-        await component.fetch_all()
-        result = await component.set_many(NEW)
-        assert result.is_complete
-        assert [each.name for each in result.outcomes] == list(NEW)
-        assert result.elapsed < 3.0
-        assert values_of(vehicle.params, NEW) == values_of(component.params, NEW) == NEW
-        assert not residue(component)
 
 
 @in_simulated_time
@@ -102,41 +86,6 @@ async def test_values_of_one_name_are_set_in_order() -> None:
         assert component.params["PARAM_01"].value == 4
         sent = [each.raw[0] for each in tap.messages(messages.ParamSet) if each.param_id == "PARAM_01"]
         assert sent == [5, 6, 4]
-
-
-@in_simulated_time
-async def test_a_lost_vehicle_ends_the_call_and_nothing_is_lost() -> None:
-    tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
-    seen: list[SetOutcome] = []
-
-    def take(outcome: SetOutcome) -> None:
-        seen.append(outcome)
-
-    async with a_client(tap) as client:
-        component = await client.component()
-        await component.fetch_all()
-
-        async def fall_silent() -> None:
-            while len(tap.messages(messages.ParamSet)) < 50:  # noqa: ASYNC110 - no event reports it
-                await asyncio.sleep(0.01)
-            tap.is_deaf = tap.is_mute = True
-
-        silencing = asyncio.create_task(fall_silent())
-        result = await component.set_many(NEW, progress=take)
-        await silencing
-        assert isinstance(result.error, NoReply)
-        counts = result.counts
-        assert counts[SetStatus.ACCEPTED] >= 10
-        assert counts[SetStatus.UNKNOWN] >= 10
-        assert counts[SetStatus.NOT_TRIED] >= 100
-        assert sum(counts.values()) == len(seen) == 200
-        for each in result.outcomes:
-            assert each.is_set is (each.error is None)
-        assert all(isinstance(each.error, NoReply) for each in result.of(SetStatus.UNKNOWN))
-        assert not residue(component)
-        again = await component.set_many(NEW)
-        assert isinstance(again.error, NoReply)
-        assert SetStatus.ACCEPTED not in again.counts
 
 
 @in_simulated_time
@@ -255,11 +204,3 @@ async def test_two_calls_at_once_both_end() -> None:
             tasks.start_soon(set_all, dict(reversed(MANY.items())))
         assert all(result.is_complete for result in results)
         assert values_of(vehicle.params, NEW) == values_of(component.params, NEW)
-
-
-@in_simulated_time
-async def test_a_closed_client_writes_nothing() -> None:
-    async with a_client(generic()) as client:
-        component = await client.component()
-    with pytest.raises(LinkError):
-        await component.set_many({"PARAM_01": 5})

@@ -151,20 +151,6 @@ async def test_by_default_a_hash_is_watched_and_a_list_is_not() -> None:
 
 
 @in_simulated_time
-async def test_an_interval_that_is_given_goes_for_lists_too() -> None:
-    vehicle = ArduPilotVehicle(ftp=False, table=VALUES)
-    tap = Tap(vehicle)
-    async with a_client(tap, watch_interval=20) as client:
-        component = await client.component()
-        await component.fetch_all()
-        changes, events = component.changes(), client.events()
-        await change_silently(tap, vehicle, PARAM_01=1001)
-        with anyio.fail_after(21.0):
-            assert (await anext(changes)).name == "PARAM_01"
-            assert await anext(events) == Resynced(component, ("PARAM_01",), None)
-
-
-@in_simulated_time
 @pytest.mark.parametrize("source", ["file", "list"])
 async def test_parameters_that_appear_are_added_and_can_be_set(path: Path, source: str) -> None:
     group = {f"GRIP_{number}": number for number in range(5)}
@@ -205,18 +191,6 @@ async def test_parameters_that_appear_are_added_and_can_be_set(path: Path, sourc
         name: param.index for name, param in vehicle.params.items()
     }
     assert vehicle.requests["PARAM_REQUEST_LIST"] == {"file": 0, "list": 3}[source]
-
-
-@in_simulated_time
-async def test_an_interval_of_zero_ends_the_watch() -> None:
-    tap = Tap(small_px4())
-    async with a_client(tap, watch_interval=0) as client:
-        component = await client.component()
-        await component.fetch_all()
-        tap.received.clear()
-        await asyncio.sleep(200.0)
-        assert requested(tap) == 0
-        assert state(component) is SyncState.SYNCED
 
 
 @pytest.mark.parametrize("wrong", [-1, 0.5, float("nan")])

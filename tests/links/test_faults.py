@@ -1,4 +1,4 @@
-"""External faults of links: network outages, changed addresses, ports used by other programs."""
+"""External faults of links: network outages, changed addresses, event loops of other systems."""
 
 from __future__ import annotations
 
@@ -192,9 +192,6 @@ async def test_udpout_resolves_a_silent_name_again(
         await link.send(HEARTBEAT, None)
         assert after.recv(100) == HEARTBEAT
         await link.close()
-
-
-# Ports used by other programs
 
 
 # Selectors without a file descriptor, as on Windows

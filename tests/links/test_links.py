@@ -30,11 +30,10 @@ from paramclient.links import (
     create_link,
     link,
     parse_link,
-    serve_endpoint,
     tcp,
     udp,
 )
-from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
+from paramclient.sim import Air, PX4Vehicle
 from paramclient.wire import frames, messages
 from tests.cable import Cable
 
@@ -853,12 +852,6 @@ def request_hash(system: int = 1) -> bytes:
     return messages.encode(request, system=255, component=190, sequence=0)
 
 
-def request_by_index(index: int, system: int = 1) -> bytes:
-    return messages.encode(
-        messages.ParamRequestRead(system, 1, "", index), system=255, component=190, sequence=0
-    )
-
-
 async def answer(link: Link, request: bytes) -> tuple[frames.Frame, messages.ParamValue]:
     """Send a request, and wait for the first PARAM_VALUE."""
     framer = frames.Framer(stream=link.is_stream)
@@ -873,29 +866,6 @@ async def answer(link: Link, request: bytes) -> tuple[frames.Frame, messages.Par
 
 
 @pytest.mark.asyncio
-@pytest.mark.parametrize("vehicle", ["px4", "ardupilot"])
-async def test_a_simulated_vehicle_responds_in_the_process(vehicle: str) -> None:
-    async with opened(f"sim:{vehicle}?system=7") as link:
-        sender, value = await answer(link, request_by_index(5, system=7))
-        assert (sender.system, value.param_index) == (7, 5)
-        assert isinstance(link.endpoint, PX4Vehicle if vehicle == "px4" else ArduPilotVehicle)
-
-
-@pytest.mark.asyncio
-async def test_a_simulated_vehicle_sends_its_complete_list() -> None:
-    names: set[str] = set()
-    framer = frames.Framer({22}, stream=False)
-    async with opened("sim:px4") as link:
-        request = messages.ParamRequestList(1, 1)
-        await link.send(messages.encode(request, system=255, component=190, sequence=0), None)
-        with anyio.fail_after(TIMEOUT):
-            while len(names) < 904:
-                for _, data in await link.receive():
-                    names.update(messages.text_of(found.payload[8:24]) for found in framer.receive(data))
-    assert messages.HASH_CHECK in names
-
-
-@pytest.mark.asyncio
 async def test_a_sim_link_has_the_faults_of_its_name() -> None:
     async with opened("sim:px4?delay=0.03&seed=4&param_error=1") as link:
         assert isinstance(link.endpoint, Air)
@@ -906,31 +876,3 @@ async def test_a_sim_link_has_the_faults_of_its_name() -> None:
         for _ in range(5):
             await link.send(request_hash(), None)
         assert link.endpoint.uplink.lost == 5
-
-
-@pytest.mark.asyncio
-@pytest.mark.parametrize(
-    ("vehicle_link", "station_link"),
-    [("udpout", "udpin"), ("udpin", "udpout"), ("tcp", "tcpin"), ("tcpin", "tcp")],
-)
-async def test_a_simulated_vehicle_on_a_real_link(vehicle_link: str, station_link: str) -> None:
-    async with anyio.create_task_group() as tasks:
-        vehicle = PX4Vehicle(stream=vehicle_link.startswith("tcp"))
-        if vehicle_link.endswith("in"):
-            served: Any = await tasks.start(
-                serve_endpoint, vehicle, create_link(f"{vehicle_link}:127.0.0.1:0")
-            )
-            address = served.address
-            async with opened(f"{station_link}:127.0.0.1:{address[1]}") as link:
-                _, value = await answer(link, request_hash())
-        else:
-            async with opened(f"{station_link}:127.0.0.1:0") as link:
-                far = create_link(f"{vehicle_link}:127.0.0.1:{link.address[1]}")
-                served = await tasks.start(serve_endpoint, vehicle, far)
-                assert any(data for _, data in await collect(link, 1))  # its heartbeat
-                _, value = await answer(link, request_hash())
-                tasks.cancel_scope.cancel()
-        assert value.param_id == messages.HASH_CHECK
-        assert int.from_bytes(value.raw, "little") == vehicle.announced_hash()
-        tasks.cancel_scope.cancel()
-    assert served.address is None

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from paramclient import ParamCache, ParamClient
 from paramclient.errors import (
     AnotherVehicle,
-    CacheError,
     InvalidParameters,
     LinkError,
     NoReply,
@@ -286,17 +285,6 @@ async def test_the_state_is_stored_before_anything_is_sent(tmp_path: Path) -> No
         name: param.value for name, param in ardupilot().params.items()
     }
     assert dict(first.before) == dict(state)
-
-
-@in_simulated_time
-async def test_nothing_is_sent_if_the_state_cannot_be_stored(tmp_path: Path) -> None:
-    tap = Tap(ardupilot())
-    broken = mock.Mock(side_effect=CacheError("disk full"))
-    with mock.patch.object(ParamCache, "store_snapshot", broken):
-        async with ParamClient(tap, cache=tmp_path / "cache.sqlite3") as client:
-            with pytest.raises(CacheError, match="disk full"):
-                await apply(await client.component(), written(another()))
-    assert tap.messages(messages.ParamSet) == []
 
 
 @pytest.mark.parametrize("bring", [apply, restore])

@@ -33,12 +33,6 @@ NO_INDEX = messages.NO_INDEX
 
 
 class TestTables:
-    def test_recorded_tables(self) -> None:
-        assert len(px4_table()) == 903
-        assert len(ardupilot_table()) == 1382
-        assert px4_table() is px4_table()
-        assert PX4Vehicle().announced_hash() == 0xCF579589
-
     def test_a_table_from_a_mapping(self) -> None:
         vehicle = GenericVehicle(SMALL)
         assert vehicle.param("A_FLOAT") == Param("A_FLOAT", 1.5, ParamType.REAL32, 0, 0x3FC00000)
@@ -267,25 +261,6 @@ def hash_set(value: int = 0) -> messages.ParamSet:
 
 
 class TestPX4:
-    def test_the_list_starts_with_the_hash(self) -> None:
-        vehicle = PX4Vehicle()
-        values = Station(vehicle).ask(LIST, seconds=2.0)
-        raw = (0xCF579589).to_bytes(4, "little")
-        assert values[0] == messages.ParamValue("_HASH_CHECK", raw, ParamType.UINT32, 903, NO_INDEX)
-        assert indices(values[1:]) == list(range(903))
-
-    def test_20_messages_every_20_ms(self) -> None:
-        station = Station(PX4Vehicle()).send(LIST).wait(2.0)
-        times = station.times()
-        assert [len(list(group)) for _, group in itertools.groupby(times)] == [20] * 45 + [4]
-        assert times[-1] - times[0] == pytest.approx(0.9)
-
-    def test_a_repeated_request_restarts_the_list_without_the_hash(self) -> None:
-        station = Station(PX4Vehicle())
-        assert len(station.ask(LIST, seconds=0.29)) == 15 * 20
-        values = station.ask(LIST, seconds=2.0)
-        assert indices(values) == list(range(903))
-
     @pytest.mark.parametrize("value", [0, 0xCF579589])
     def test_a_set_of_the_hash_stops_the_list_after_what_is_queued(self, value: int) -> None:
         station = Station(PX4Vehicle())
@@ -348,15 +323,6 @@ class TestPX4:
             ("NO_SUCH", -1, 1),
             ("SYS_AUTOSTART", -1, 7),
         ]
-
-    def test_a_set_is_acknowledged_and_pushed_once(self) -> None:
-        vehicle = PX4Vehicle()
-        station = Station(vehicle).wait(0.3).send(write("MPC_XY_VEL_MAX", 11.5, ParamType.REAL32)).wait(2.0)
-        assert [time - 0.3 for time in station.times()] == pytest.approx([0.0, 0.010])
-        first, second = station.values()
-        assert first == second
-        assert first.param_index == vehicle.param("MPC_XY_VEL_MAX").index
-        assert vehicle.values["MPC_XY_VEL_MAX"] == 11.5
 
     @pytest.mark.parametrize(
         ("name", "value", "changed"),
@@ -430,27 +396,8 @@ class TestPX4:
         assert len(values) == 920
         assert names(values[1:]) == sorted(names(values[1:]))
 
-    def test_identity_before_its_acknowledgement(self) -> None:
-        station = Station(PX4Vehicle())
-        station.log.clear()
-        station.send(messages.CommandLong(1, 1, 520))
-        (_, _, version), (_, _, ack) = station.log
-        assert isinstance(version, messages.AutopilotVersion)
-        assert (version.capabilities, version.uid) == (59647, 5283920058631409231)
-        assert isinstance(ack, messages.CommandAck)
-
 
 class TestArduPilot:
-    def test_the_list(self) -> None:
-        station = Station(ArduPilotVehicle()).wait(0.05).send(LIST).wait(2.0)
-        texts = [message.text for _, _, message in station.log if isinstance(message, messages.StatusText)]
-        assert len(texts) == 3
-        times = station.times()
-        assert times[0] == pytest.approx(0.1)
-        assert times[-1] - 0.05 == pytest.approx(0.9, rel=0.1)
-        assert max(len(list(group)) for _, group in itertools.groupby(times)) == 10
-        assert indices(station.values()) == list(range(1382))
-
     @pytest.mark.parametrize("name", ["EK3_IMU_MASK", "INS_GYRO_FILTER"])
     def test_a_set_to_the_default_is_answered_with_another_type(self, name: str) -> None:
         """Until the parameter has had another value; measured on a real vehicle."""
@@ -636,15 +583,6 @@ class TestArduPilot:
             *("BARO1_GND_PRESS", "BARO2_GND_PRESS", "INS_GYR2OFFS_X", "INS_GYR2OFFS_Y", "INS_GYR2OFFS_Z"),
             *("INS_GYR2_CALTEMP", "INS_GYROFFS_X", "INS_GYROFFS_Y", "INS_GYROFFS_Z", "STAT_BOOTCNT"),
         ]
-
-    def test_identity_after_its_acknowledgement(self) -> None:
-        station = Station(ArduPilotVehicle())
-        station.log.clear()
-        station.send(messages.CommandLong(1, 1, 520))
-        (_, _, ack), (_, _, version) = station.log
-        assert isinstance(ack, messages.CommandAck)
-        assert isinstance(version, messages.AutopilotVersion)
-        assert (version.capabilities, version.uid2) == (64495, b"3d1219c7c4c5404aa\0")
 
 
 def pass_through(link: FaultyLink, count: int = 5000, gap: float = 0.001) -> list[tuple[float, int]]:

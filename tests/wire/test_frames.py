@@ -409,9 +409,6 @@ PV_V1 = pack(MESSAGES[7][1], version=1)
 PV_SIGNED = pack_signed(MESSAGES[7][1])
 HEARTBEAT = pack(MESSAGES[0][1], sequence=1)
 STATUS = pack(dialect.MAVLink_statustext_message(6, b"\xfd\xfe" * 20))
-UNKNOWN = bare_frame(410, b"of a later dialect")
-
-
 # Any mix of frames and noise
 
 
