@@ -3,26 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from paramclient.metadata import MetadataStore
 from paramclient.model.values import ParamType
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
-from tests.commands import Command, Put, in_process, leaping
+from tests.commands import Command, Put
 
 DATA = Path(__file__).parents[1] / "data"
 XML = DATA / "apm.pdef.xml"
 
 URL = "sim:custom"
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run the command line in this process, on simulated time."""
-    leaping(monkeypatch)
-    return in_process(capsys)
 
 
 def quad(*, metadata: bool = True, ftp: bool = False) -> PX4Vehicle:
@@ -48,7 +40,7 @@ def copter(system: int = 1) -> ArduPilotVehicle:
 # set
 
 
-def test_set_accepts_value_names_of_the_vehicle(command: Command, put: Any) -> None:
+def test_set_accepts_value_names_of_the_vehicle(command: Command, put: Put) -> None:
     vehicle = quad()
     done = command(
         "set", put(vehicle), "COM_FLTMODE1=return", "EKF2_GPS_CTRL=Position|Heading", "--json", "--no-cache"
@@ -89,7 +81,7 @@ def test_set_accepts_value_names_of_the_vehicle(command: Command, put: Any) -> N
         (["FLTMODE1=5", "TST_LOG"], "set takes pairs of NAME and VALUE, or NAME=VALUE"),
     ],
 )
-def test_nothing_is_sent_with_a_wrong_name(command: Command, put: Any, words: list[str], said: str) -> None:
+def test_nothing_is_sent_with_a_wrong_name(command: Command, put: Put, words: list[str], said: str) -> None:
     vehicle = copter()
     done = command("set", put(vehicle), *words, "--metadata", XML, "--no-cache")
     assert (done.code, done.out) == (2, "")
@@ -98,7 +90,7 @@ def test_nothing_is_sent_with_a_wrong_name(command: Command, put: Any, words: li
     assert not vehicle.requests
 
 
-def test_value_names_need_metadata(command: Command, put: Any) -> None:
+def test_value_names_need_metadata(command: Command, put: Put) -> None:
     vehicle = copter()
     done = command("set", put(vehicle), "TST_LOG", 3, "FLTMODE1=Loiter", "--no-cache")
     assert (done.code, done.out) == (2, "")
@@ -107,7 +99,7 @@ def test_value_names_need_metadata(command: Command, put: Any) -> None:
     assert not vehicle.requests["PARAM_SET"]
 
 
-def test_a_value_outside_of_the_range_is_sent_with_force(command: Command, put: Any) -> None:
+def test_a_value_outside_of_the_range_is_sent_with_force(command: Command, put: Put) -> None:
     """The range of the metadata is advice; the vehicle decides."""
     vehicle = quad()
     words = ("set", put(vehicle), "MC_ROLL_P=40", "--metadata", "vehicle", "--no-cache")
@@ -122,7 +114,7 @@ def test_a_value_outside_of_the_range_is_sent_with_force(command: Command, put: 
 # get
 
 
-def test_get_prints_meaning_and_units(command: Command, put: Any) -> None:
+def test_get_prints_meaning_and_units(command: Command, put: Put) -> None:
     done = command(
         *("get", put(quad()), "EKF2_GPS_CTRL", "MC_ROLL_P", "COM_FLTMODE1"),
         *("--metadata", "vehicle", "--no-cache"),
@@ -136,35 +128,33 @@ def test_get_prints_meaning_and_units(command: Command, put: Any) -> None:
     ]
 
 
-def test_downloaded_metadata_is_stored(command: Command, put: Any, tmp_path: Path) -> None:
+def test_downloaded_metadata_is_stored(command: Command, put: Put) -> None:
     """The stored metadata is used for its firmware without a request, also without a link."""
-    cache = ("--cache", tmp_path / "cache.sqlite3")
-    plain = command("get", put(quad()), "MC_ROLL_P", "--json", *cache)
+    plain = command("get", put(quad()), "MC_ROLL_P", "--json")
     assert "units" not in plain.out
-    assert "1/s" in command("get", put(quad()), "MC_ROLL_P", "--metadata", "vehicle", *cache).out
+    assert "1/s" in command("get", put(quad()), "MC_ROLL_P", "--metadata", "vehicle").out
     vehicle = quad()
-    assert "1/s" in command("get", put(vehicle), "MC_ROLL_P", *cache).out
+    assert "1/s" in command("get", put(vehicle), "MC_ROLL_P").out
     assert not vehicle.requests["FILE_TRANSFER_PROTOCOL"]
-    assert "units" not in command("get", put(copter(system=2)), "TST_LOG", *cache).out
+    assert "units" not in command("get", put(copter(system=2)), "TST_LOG").out
     newer = quad(ftp=True)
-    assert "units" not in command("get", put(newer), "MC_ROLL_P", "--json", *cache).out
-    done = command("set", put(quad()), "MC_ROLL_P", 13, *cache)
+    assert "units" not in command("get", put(newer), "MC_ROLL_P", "--json").out
+    done = command("set", put(quad()), "MC_ROLL_P", 13)
     assert "above the maximum of 12" in done.err
-    done = command("show", "1", "MC_ROLL_P", *cache)
+    done = command("show", "1", "MC_ROLL_P")
     assert "Gain from the error of the roll angle" in done.out
 
 
-def test_the_vehicle_must_confirm_stored_value_names(command: Command, put: Any, tmp_path: Path) -> None:
+def test_the_vehicle_must_confirm_stored_value_names(command: Command, put: Put, cache: Path) -> None:
     """The vehicle confirms it by its checksum: a firmware may have been built from other sources."""
-    cache = ("--cache", tmp_path / "cache.sqlite3")
-    assert command("get", put(quad()), "MC_ROLL_P", "--metadata", "vehicle", *cache).code == 0
-    assert MetadataStore.beside(tmp_path / "cache.sqlite3").has_notes
+    assert command("get", put(quad()), "MC_ROLL_P", "--metadata", "vehicle").code == 0
+    assert MetadataStore.beside(cache).has_notes
     silent = quad(metadata=False)
-    done = command("set", put(silent), "COM_FLTMODE1=Return", *cache)
+    done = command("set", put(silent), "COM_FLTMODE1=Return")
     assert done.code == 2
     assert not silent.requests["PARAM_SET"]
     vehicle = quad()
-    assert command("set", put(vehicle), "COM_FLTMODE1=Return", *cache).code == 0
+    assert command("set", put(vehicle), "COM_FLTMODE1=Return").code == 0
     assert not vehicle.requests["FILE_TRANSFER_PROTOCOL"]
 
 
@@ -192,10 +182,9 @@ def test_diff_prints_meaning_and_units(command: Command, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("words", [["get", "sim:px4", "A"], ["set", "sim:px4", "A=1"], ["show"]])
 def test_an_invalid_metadata_file_is_exit_code_2(command: Command, tmp_path: Path, words: list[str]) -> None:
-    cache = ("--cache", tmp_path / "cache.sqlite3")
     (tmp_path / "a.xml").write_text("<html/>")
     for file, said in (("none.xml", "cannot be read"), ("a.xml", "begins with <html>")):
-        done = command(*words, "--metadata", tmp_path / file, *cache)
+        done = command(*words, "--metadata", tmp_path / file)
         assert (done.code, done.out) == (2, "")
         assert said in done.err
         assert done.err.count("\n") == 1
@@ -204,16 +193,9 @@ def test_an_invalid_metadata_file_is_exit_code_2(command: Command, tmp_path: Pat
 # show
 
 
-@pytest.fixture
-def shown(command: Command, put: Any, tmp_path: Path) -> tuple[object, ...]:
-    """Return the options with which `show` finds the table of a vehicle."""
-    cache = ("--cache", tmp_path / "cache.sqlite3")
-    assert command("fetch", put(copter()), *cache).code == 0
-    return cache
-
-
-def test_show_prints_the_metadata_of_a_parameter(command: Command, shown: tuple[object, ...]) -> None:
-    done = command("show", "1", "FLTMODE1", "TST_ALT", "--metadata", XML, *shown)
+def test_show_prints_the_metadata_of_a_parameter(command: Command, put: Put) -> None:
+    assert command("fetch", put(copter())).code == 0
+    done = command("show", "1", "FLTMODE1", "TST_ALT", "--metadata", XML)
     assert done.code == 0
     lines = done.out.splitlines()
     assert lines[0].split()[-2:] == ["meaning", "units"]
@@ -235,9 +217,9 @@ def test_show_prints_the_metadata_of_a_parameter(command: Command, shown: tuple[
     ]
 
 
-def test_a_vehicle_without_metadata_beside_one_with_it(command: Command, put: Put, tmp_path: Path) -> None:
-    url, cache = put(Air([quad(), copter(2)])), ["--cache", tmp_path / "cache.sqlite3"]
-    assert command("get", url, "MC_ROLL_P", "--vehicle", 1, "--metadata", "vehicle", *cache).code == 0
-    done = command("get", url, "MC_ROLL_P", "TST_ALT", "--vehicle", "all", *cache)
+def test_a_vehicle_without_metadata_beside_one_with_it(command: Command, put: Put) -> None:
+    url = put(Air([quad(), copter(2)]))
+    assert command("get", url, "MC_ROLL_P", "--vehicle", 1, "--metadata", "vehicle").code == 0
+    done = command("get", url, "MC_ROLL_P", "TST_ALT", "--vehicle", "all")
     assert done.rows[0][-2:] == ["meaning", "units"]
     assert [row[:3] for row in done.rows[1:]] == [["1/1", "MC_ROLL_P", "6.5"], ["2/1", "TST_ALT", "100.0"]]

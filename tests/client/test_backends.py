@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -41,6 +40,7 @@ from paramclient.provision import apply, plan, restore
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, Vehicle
 from paramclient.wire import messages
 from tests.cable import TIMEOUT, Cable
+from tests.client.conftest import beside
 from tests.shell import FlakyLink, Tap, a_client, bits, generic, residue, small_px4
 
 pytestmark = pytest.mark.anyio
@@ -49,25 +49,11 @@ QUICK: dict[str, Any] = {"burst": 50, "period": 0.001}
 """A list that takes no time to speak of."""
 
 
-@pytest.fixture(params=["asyncio", "trio"])
-def anyio_backend(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
 @pytest.fixture(autouse=True)
 def nothing_remains() -> Iterator[None]:
     """No thread of ours outlives its client."""
     yield
     assert [thread.name for thread in threading.enumerate() if "paramclient" in thread.name] == []
-
-
-@asynccontextmanager
-async def beside() -> AsyncIterator[anyio.abc.TaskGroup]:
-    """Tasks beside the test, which end with it."""
-    with anyio.fail_after(TIMEOUT):
-        async with anyio.create_task_group() as tasks:
-            yield tasks
-            tasks.cancel_scope.cancel()
 
 
 async def serve(

@@ -7,8 +7,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +20,12 @@ from paramclient import ClientClosed, ParamCache, ParamClient, UsageError
 from paramclient.client import core
 from paramclient.links import Peer, SimLink
 from paramclient.sim import Endpoint
-from tests.cable import TIMEOUT
+from tests.client.conftest import beside
 from tests.shell import a_client, generic, small_px4
 
 pytestmark = pytest.mark.anyio
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(params=["asyncio", "trio"])
-def anyio_backend(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
 
 
 @pytest.fixture(autouse=True)
@@ -40,15 +34,6 @@ def nothing_remains() -> Iterator[None]:
     yield
     assert not core.running
     assert [thread.name for thread in threading.enumerate() if "paramclient" in thread.name] == []
-
-
-@asynccontextmanager
-async def beside() -> AsyncIterator[anyio.abc.TaskGroup]:
-    """Tasks beside the test, which end with it."""
-    with anyio.fail_after(TIMEOUT):
-        async with anyio.create_task_group() as tasks:
-            yield tasks
-            tasks.cancel_scope.cancel()
 
 
 async def in_a_task(tasks: anyio.abc.TaskGroup, call: Callable[[], Any]) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,6 @@ from paramclient.files import FileFormat, dumps, loads
 from paramclient.model.values import WireValue, bits_of, from_bits
 
 DATA = Path(__file__).parents[1] / "data"
-TABLES = Path(__file__).parents[2] / "paramclient/sim/tables"
 TYPED = [FileFormat.QGC, FileFormat.JSON]
 PAIRS = [FileFormat.PARM, FileFormat.MISSION_PLANNER]
 
@@ -250,25 +248,6 @@ def test_an_incomplete_packed_file_has_a_note() -> None:
     assert file.notes == ("The file contains 1 of the vehicle's 3 parameters.",)
     assert "contains no parameters" in str(failed(param_pck.encode([])))
     assert "invalid packed parameter file: the file is cut off" in str(failed(param_pck.encode([entry])[:-1]))
-
-
-@pytest.mark.parametrize("table", ["px4.csv", "ardupilot.csv"])
-def test_tables_of_real_vehicles_round_trip(table: str) -> None:
-    with (TABLES / table).open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
-    params = params_of(
-        *(
-            WrittenParam(row["name"], float(row["value"]), ParamType[row["type"]])
-            for row in rows
-            if row["type"] in ParamType.__members__
-        )
-    )
-    assert len(params) > 900
-    for form in (FileFormat.QGC, FileFormat.MISSION_PLANNER):
-        assert all(
-            param.bits_as(params[name].type or 0) == params[name].bits_as(params[name].type or 0)
-            for name, param in back(params, form).items()
-        )
 
 
 # Lines that resemble a parameter

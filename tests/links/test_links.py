@@ -1,4 +1,4 @@
-"""Links: names, sockets on loopback, simulated vehicles in the process and on real links."""
+"""Links: names, sockets on loopback, simulated vehicles in the process."""
 
 from __future__ import annotations
 
