@@ -9,7 +9,7 @@ import pytest
 
 from paramclient import ParamCache, ParamSet, ParamType, WrittenParam, read_file, write_file
 from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
-from tests.commands import Command, Put, in_process, leaping
+from tests.commands import Command, Put
 from tests.conversations.partial import TABLE, Partial
 
 URL = "sim:px4"
@@ -18,13 +18,6 @@ ODD = [
     SimParam("TENTH", ParamType.REAL32, 0.1),
     SimParam("NAN", ParamType.REAL32, float("nan")),
 ]
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run the command line in this process, on simulated time."""
-    leaping(monkeypatch)
-    return in_process(capsys)
 
 
 def test_save_writes_the_parameters_of_the_vehicle(command: Command, put: Put, tmp_path: Path) -> None:
@@ -43,15 +36,14 @@ def test_save_writes_the_parameters_of_the_vehicle(command: Command, put: Put, t
     assert json.loads(path.read_text())["sets"][0]["source"] == "link sim:px4"
 
 
-def test_save_needs_no_link_for_a_vehicle_in_the_cache(command: Command, tmp_path: Path) -> None:
-    cache = tmp_path / "cache.sqlite3"
-    assert command("fetch", "sim:px4", "--cache", cache).code == 0
+def test_save_needs_no_link_for_a_vehicle_in_the_cache(command: Command, cache: Path, tmp_path: Path) -> None:
+    assert command("fetch", "sim:px4").code == 0
     (vehicle,) = ParamCache(cache).vehicles()
     uid = vehicle.identity.uid
     assert uid is not None
     for where in ("1", f"uid:{uid[:6]}", vehicle.key):
         path = tmp_path / "quad.json"
-        saved = command("save", where, path, "--cache", cache)
+        saved = command("save", where, path)
         assert (saved.code, saved.err) == (0, f"903 parameters of 1/1 written to {path} (json)\n")
         params = read_file(path).choose()
         assert params.identity == vehicle.identity
@@ -80,16 +72,15 @@ def test_useless_options_are_refused(
 
 
 def test_a_vehicle_that_is_not_in_the_cache_is_an_error(command: Command, tmp_path: Path) -> None:
-    saved = command("save", "7", tmp_path / "quad.param", "--cache", tmp_path / "cache.sqlite3")
+    saved = command("save", "7", tmp_path / "quad.param")
     assert (saved.code, saved.out) == (2, "")
     assert not (tmp_path / "quad.param").exists()
 
 
 def test_save_writes_parameters_that_differ_from_the_defaults(command: Command, tmp_path: Path) -> None:
-    cache = tmp_path / "cache.sqlite3"
     for where in ("sim:ardupilot", "1"):
         path = tmp_path / "quad.param"
-        saved = command("save", where, path, "--changed", "--cache", cache)
+        saved = command("save", where, path, "--changed")
         assert (saved.code, saved.err) == (0, f"41 parameters of 1/1 written to {path} (mission-planner)\n")
         assert read_file(path).choose()["RELAY1_FUNCTION"].value == 1
         path.unlink()
@@ -158,28 +149,28 @@ def test_a_name_that_the_format_cannot_hold_is_left_out(command: Command, tmp_pa
 
 def test_an_incomplete_table_is_not_written(command: Command, put: Put, tmp_path: Path) -> None:
     """A file without some parameters would look like that of a vehicle that does not have them."""
-    cache, path = tmp_path / "cache.sqlite3", tmp_path / "quad.param"
+    path = tmp_path / "quad.param"
     vehicle = GenericVehicle([SimParam(f"P{at}", ParamType.INT32, at) for at in range(20)], dead=[5])
-    saved = command("save", put(vehicle), path, "--cache", cache)
+    saved = command("save", put(vehicle), path)
     assert (saved.code, saved.out) == (1, "")
     assert "1/1 generic on sim:px4 is incomplete: index 5 " in saved.err
     assert not path.exists()
-    cached = command("save", "1", path, "--cache", cache)
+    cached = command("save", "1", path)
     assert (cached.code, cached.out) == (1, "")
     assert "1/1 is incomplete: 19 of 20 parameters are in the cache" in cached.err
     assert not path.exists()
-    assert command("save", "1", path, "--cache", cache, "--incomplete").code == 0
+    assert command("save", "1", path, "--incomplete").code == 0
     assert len(read_file(path).choose()) == 19
 
 
 def test_a_value_that_is_only_cached_is_not_written(command: Command, put: Put, tmp_path: Path) -> None:
     """No hash covers a volatile value: unless the vehicle sends it, it is unknown."""
-    cache, path = tmp_path / "cache.sqlite3", tmp_path / "quad.param"
+    path = tmp_path / "quad.param"
     rows = [SimParam("A", ParamType.INT32, 1), SimParam("CAL_ACC0_XOFF", ParamType.INT32, 2, volatile=True)]
-    assert command("save", put(PX4Vehicle(table=rows)), path, "--cache", cache).code == 0
+    assert command("save", put(PX4Vehicle(table=rows)), path).code == 0
     path.unlink()
     silent = PX4Vehicle(table=rows, dead=["CAL_ACC0_XOFF"])
-    saved = command("save", put(silent), path, "--cache", cache)
+    saved = command("save", put(silent), path)
     assert (saved.code, saved.out) == (1, "")
     assert "1/1 px4 on sim:px4 is incomplete: CAL_ACC0_XOFF " in saved.err
     assert not path.exists()
