@@ -240,7 +240,7 @@ def cancel_on_disconnect(app: ASGIApp) -> ASGIApp:
     return cancellable
 
 
-def author_of(request: Request) -> str:
+async def author_of(request: Request) -> str:
     """Return the author of the changes of a request: the name of the token, and that in X-Author, if any."""
     name: str = request.state.holder.name
     page = request.headers.get("x-author", "")

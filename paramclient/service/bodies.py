@@ -1,24 +1,17 @@
-"""Models of request bodies, and the values and parameter sets in them."""
+"""Models of request bodies."""
 
 from __future__ import annotations
 
 from base64 import b64decode
-from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
+from typing import Annotated, ClassVar, Final, Self
 
-from pydantic import AwareDatetime, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AwareDatetime, BaseModel, BeforeValidator, Field, model_validator
 from pydantic import StrictFloat as Real
 from pydantic import StrictInt as Whole
 
-from paramclient.errors import UsageError
+from paramclient.client.component import Component
 from paramclient.files import FileFormat, ParamFile, loads
-from paramclient.metadata.info import number_of
-from paramclient.model.ext_values import parse_ext_value
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import WireValue, check_name
-from paramclient.service.problems import ServiceError
-
-if TYPE_CHECKING:
-    from paramclient.service.hub import Target
 
 FILE_BYTES_MAX: Final = 2 * 2**20
 """Maximum size of a parameter file in bytes; a table of 10,000 parameters takes 1 MB."""
@@ -26,10 +19,20 @@ VALUES_MAX: Final = 10_000
 """Maximum number of values of a request: more than a vehicle has."""
 
 
-class Body(BaseModel):
-    """A request body. An unknown member is refused, so that a misspelt one is not ignored."""
+class Body(BaseModel, frozen=True, extra="forbid"):
+    """A request body. An unknown member is refused, so that a misspelt one is not ignored.
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    Attributes:
+        one_of: members of which exactly one is needed.
+    """
+
+    one_of: ClassVar[tuple[str, ...]] = ()
+
+    @model_validator(mode="after")
+    def _has_one(self) -> Self:
+        if self.one_of and sum(getattr(self, each) is not None for each in self.one_of) != 1:
+            raise ValueError(f"exactly one of {', '.join(self.one_of)} is needed")
+        return self
 
 
 def _parse_number(given: object) -> object:
@@ -46,8 +49,6 @@ def _check_text(given: object) -> object:
     return given
 
 
-GivenValue: TypeAlias = int | float | str
-"""A value as a request gives it."""
 Name = Annotated[str, Field(min_length=1, max_length=16)]
 Value = Annotated[
     Whole | Annotated[Real, Field(allow_inf_nan=False)] | Annotated[str, Field(max_length=400)],
@@ -104,17 +105,12 @@ class FetchRequest(Body):
 class UploadedFile(Body):
     """A parameter file, as text or in base64. Its name can indicate its format; `component` selects a set."""
 
+    one_of = ("text", "base64")
     name: Annotated[str, Field(max_length=255)] = ""
     text: Annotated[str, Field(max_length=FILE_BYTES_MAX)] | None = None
     base64: Annotated[bytes, BeforeValidator(_decode), Field(max_length=FILE_BYTES_MAX)] | None = None
     format: FileFormat | None = None
     component: Annotated[int, Field(ge=1, le=255)] | None = None
-
-    @model_validator(mode="after")
-    def _is_one(self) -> UploadedFile:
-        if (self.text is None) == (self.base64 is None):
-            raise ValueError("a file needs either `text` or `base64`")
-        return self
 
     def read(self, *, partial: bool = False) -> ParamFile:
         """Parse the file; see `files.loads`. Blocks for up to seconds.
@@ -125,9 +121,9 @@ class UploadedFile(Body):
         data = (self.text or "").encode("utf-8", "surrogatepass") if self.base64 is None else self.base64
         return loads(data, source=self.name, file_format=self.format, partial=partial)
 
-    def read_set(self, target: Target) -> ParamSet:
+    def read_set(self, component: Component) -> ParamSet:
         """Parse the file, and return its set for a component; see `read`."""
-        file, component = self.read(), target.component
+        file = self.read()
         is_of_several = len({each.system for each in file.sets}) > 1
         chosen = component.component if self.component is None else self.component
         return file.choose(chosen, system=component.system if is_of_several else None)
@@ -136,18 +132,13 @@ class UploadedFile(Body):
 class PlanRequest(Body):
     """Wanted parameters: exactly one of `values`, `file` and `at`, limited to `only`."""
 
+    one_of = ("values", "file", "at")
     values: Values | None = None
     file: UploadedFile | None = None
     at: Moment | None = None
     only: Patterns | None = None
     include: Patterns = ()
     force: Force = False
-
-    @model_validator(mode="after")
-    def _is_one(self) -> PlanRequest:
-        if sum(each is not None for each in (self.values, self.file, self.at)) != 1:
-            raise ValueError("exactly one of `values`, `file` and `at` is needed")
-        return self
 
 
 class RunOptions(Body):
@@ -177,49 +168,3 @@ class SnapshotRequest(Body):
     """Reason of a snapshot."""
 
     reason: Annotated[str, Field(min_length=1, max_length=200)]
-
-
-async def read_values(values: dict[str, GivenValue], target: Target) -> dict[str, WireValue]:
-    """Return the values of a request. Text for a number is the number: JavaScript rounds 64-bit integers.
-
-    Raises:
-        UsageError: no value has this name.
-        ParamClientError: the component did not send the type of an extended parameter.
-    """
-    found: dict[str, WireValue] = {}
-    component = target.component
-    for name, given in values.items():
-        info = target.info(name)
-        if not isinstance(given, str):
-            found[name] = given
-        elif component.is_extended:
-            known = component.params.get(name) or await component.get(name)
-            found[name] = parse_ext_value(name, given, known.type_number)
-        elif (value := number_of(given) if info is None else info.parse(given)) is not None:
-            found[name] = value
-        else:
-            raise UsageError(f"{name}: {given!r} is not a number, and no metadata names its values")
-    return found
-
-
-async def values_in_range(
-    values: dict[str, GivenValue], target: Target, *, force: bool
-) -> dict[str, WireValue]:
-    """Return the values of a request, see `read_values`; with `force`, they may be out of range.
-
-    Raises:
-        ServiceError: 422, values are outside the range in the metadata.
-    """
-    found = await read_values(values, target)
-    infos = {name: info for name in found if not force and (info := target.info(name)) is not None}
-    faults = {name: fault for name, info in infos.items() if (fault := info.problem(found[name]))}
-    if faults:
-        detail = f"{'; '.join(list(faults.values())[:5])}. Nothing was written; `force` writes it anyway."
-        raise ServiceError(422, "out-of-range", detail, names=list(faults))
-    return found
-
-
-async def values_set(values: dict[str, GivenValue], target: Target) -> ParamSet:
-    """Return values as a set; see `read_values`."""
-    read = await read_values(values, target)
-    return ParamSet({check_name(name): read[name] for name in read}, is_extended=target.component.is_extended)

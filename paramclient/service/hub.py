@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
@@ -17,7 +17,7 @@ import anyio.abc
 import anyio.to_thread
 
 from paramclient.cache import ParamCache
-from paramclient.cli.json_output import ParamJson, VehicleJson, as_json
+from paramclient.cli.json_output import ParamJson, VehicleJson, WriteJson, as_json
 from paramclient.client.cache_writer import choose_cache
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
@@ -25,13 +25,16 @@ from paramclient.client.events import Discovered, Event, Found, Rebooted, Resync
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo, metadata_of
+from paramclient.metadata.info import number_of
+from paramclient.model.ext_values import parse_ext_value
 from paramclient.model.identity import Identity
-from paramclient.model.notation import hash_text, rounded
+from paramclient.model.notation import Scalar, hash_text, rounded
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param
-from paramclient.protocol.events import Change
+from paramclient.model.values import Param, ParamType, WireValue
+from paramclient.protocol.channel import task_group
 from paramclient.protocol.fetch import FetchResult, Progress
 from paramclient.protocol.identity import expects_extended
+from paramclient.protocol.set_results import SetOutcome
 from paramclient.protocol.watch import SyncState
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.service.event_feed import EventFeed
@@ -65,6 +68,7 @@ class Target:
     """The plain or the extended parameters of one component on a link.
 
     Attributes:
+        hub: the hub.
         link: its link.
         component: the component.
         applying: held by the running apply or restore of plain or extended parameters.
@@ -75,6 +79,7 @@ class Target:
         published: the last published state.
     """
 
+    hub: Hub
     link: ServiceLink
     component: Component
     applying: anyio.Lock
@@ -97,10 +102,6 @@ class Target:
         component = self.component
         is_usual = expects_extended(component.identity.vehicle_type, component.component)
         return not component.is_extended or is_usual or bool(component.params)
-
-    def info(self, name: str) -> ParamInfo | None:
-        """Return the metadata of a parameter, or None."""
-        return None if self.metadata is None else self.metadata.find(name)
 
     @property
     def state(self) -> dict[str, Any]:
@@ -129,14 +130,145 @@ class Target:
             "has_metadata": self.metadata is not None,
         }
 
-    def change(self, found: Change) -> dict[str, Any]:
-        """Return the members of an event about a changed, added or removed parameter."""
+    def publish(self, kind: str, /, **members: Any) -> None:
+        """Publish an event about the component."""
+        self.hub.feed.publish(kind, **self.address, **members)
 
-        def shown(each: Param | None) -> dict[str, Any] | None:
-            return None if each is None else as_json(ParamJson.of_table(each, self.info(each.name)))
+    def check(self) -> None:
+        """Publish the state if it has changed."""
+        vehicle = self.state
+        state = {**vehicle, **dict.fromkeys(CHANGING_MEMBERS)}
+        if self.is_listed and state != self.published:
+            self.published = state
+            self.publish("vehicle", vehicle=vehicle)
 
-        old, new = shown(found.old), shown(found.new)
-        return {"name": found.name, "old": old, "new": new, "by": found.by, "kind": found.kind}
+    async def publish_changes(self) -> None:
+        """Publish the changes of parameters until the client is closed.
+
+        First values are not published: a fetch has thousands, and its end is published.
+        """
+        with suppress(ParamClientError):
+            async for found in self.component.changes():
+                if found.kind != "first":
+                    old, new = (as_json(each and self.shown(each)) for each in (found.old, found.new))
+                    self.publish("change", name=found.name, old=old, new=new, by=found.by, kind=found.kind)
+
+    # fetches and metadata
+
+    async def fetch(self, **options: Any) -> FetchResult:
+        """Fetch the parameters; see `Component.fetch_all`. The progress is published."""
+        try:
+            result = await self.component.fetch_all(**options, progress=partial(setattr, self, "progress"))
+        finally:
+            self.progress = None
+            self.fetches += 1
+            self.check()
+        store, identity = self.hub.metadata_store, self.component.identity
+        if store is not None and self.described != identity and not self.component.is_extended:
+            number = self.component.component
+            self.metadata = await anyio.to_thread.run_sync(store.known, identity, number)
+            self.described = identity
+        return result
+
+    async def fetch_complete(self) -> None:
+        """Fetch the table of a component that was heard, again if that ends without all of it."""
+        for delay in (0.0, *REFETCH_DELAYS):
+            await anyio.sleep(delay)
+            if delay and self.component.sync_state in (SyncState.SYNCED, SyncState.LOST):
+                return
+            with suppress(ParamClientError):
+                await self.fetch()
+
+    async def load_metadata(self, *, timeout: float | None = None) -> None:
+        """Load the metadata from the vehicle; see `metadata_of`.
+
+        Raises:
+            ServiceError: 404, the vehicle provides none.
+        """
+        identity, store = self.component.identity, self.hub.metadata_store
+        found = await metadata_of(self.component, store=store or False, timeout=timeout)
+        if found is None:
+            detail = "The vehicle provides no metadata. Add a file of its firmware: paramclient metadata add."
+            raise ServiceError(404, "no-metadata", detail)
+        self.metadata, self.described = found, identity
+        self.check()
+
+    # values
+
+    def info(self, name: str) -> ParamInfo | None:
+        """Return the metadata of a parameter, or None."""
+        return None if self.metadata is None else self.metadata.find(name)
+
+    def defaults_of(self, names: Iterable[str]) -> dict[str, int | float]:
+        """Return the defaults in the metadata, by name."""
+        return {} if self.metadata is None else self.metadata.defaults_of(names)
+
+    def shown(self, param: Param, *, whole: bool = False) -> ParamJson:
+        """Return a parameter of the table as JSON; with `whole`, with all its metadata."""
+        return ParamJson.of_table(param, self.info(param.name), whole=whole)
+
+    def outcome(self, found: SetOutcome) -> WriteJson:
+        """Return the outcome of a write as JSON."""
+        known = self.component.params.get(found.name)
+        kind = ParamType.REAL64 if known is None else known.type_number
+        return WriteJson.of(found, kind, self.info(found.name))
+
+    async def values(self, given: Mapping[str, Scalar], *, force: bool = True) -> dict[str, WireValue]:
+        """Return the values of a request; with `force`, they may be outside the range in the metadata.
+
+        Text for a number is the number: JavaScript rounds 64-bit integers.
+
+        Raises:
+            UsageError: no value has this name.
+            ServiceError: 422, values are out of range.
+            ParamClientError: the component did not send the type of an extended parameter.
+        """
+        found: dict[str, WireValue] = {}
+        faults: dict[str, str] = {}
+        component = self.component
+        for name, each in given.items():
+            info = self.info(name)
+            value: WireValue | None = each
+            if isinstance(each, str) and component.is_extended:
+                known = component.params.get(name) or await component.get(name)
+                value = parse_ext_value(name, each, known.type_number)
+            elif isinstance(each, str):
+                value = number_of(each) if info is None else info.parse(each)
+            if value is None:
+                raise UsageError(f"{name}: {each!r} is not a number, and no metadata names its values")
+            found[name] = value
+            if info is not None and not force and (fault := info.problem(value)):
+                faults[name] = fault
+        if faults:
+            detail = f"{'; '.join(list(faults.values())[:5])}. Nothing was written; `force` writes it anyway."
+            raise ServiceError(422, "out-of-range", detail, names=list(faults))
+        return found
+
+    # the cache
+
+    async def cached(
+        self, call: Callable[Concatenate[ParamCache, str, int, ...], Result], *more: Any
+    ) -> Result:
+        """Call a function of the cache, in a thread, with the place of these parameters in it.
+
+        Raises:
+            ServiceError: the service has no cache, or ends.
+            ParamClientError: the cache cannot be read, or does not have what is requested.
+        """
+        component, cache = self.component, self.hub.cache
+        if cache is None:
+            detail = "The service runs without a cache and has no earlier states."
+            raise ServiceError(409, "no-cache", detail)
+        if not self.hub.is_open:
+            raise ServiceError(503, "closing", "The service is shutting down.")
+        await wait_for_identity(component)
+        place = component.identity.key, component.component
+        work = partial(call, cache, *place, *more, extended=component.is_extended)
+        return await anyio.to_thread.run_sync(work, limiter=self.hub.cache_thread)
+
+    async def state_at(self, at: int | datetime) -> ParamSet:
+        """Return the parameters of a snapshot, or at a time; see `cached`."""
+        return await self.cached(ParamCache.state_at, at if isinstance(at, int) else at.timestamp())
 
 
 @dataclass(eq=False)
@@ -174,8 +306,10 @@ class Hub:
 
     Attributes:
         cache: the cache, or None.
+        cache_thread: limits the work on the cache to one thread.
         feed: the event feed.
         gateway: the ground stations.
+        is_open: whether the hub is open.
         links: the links, by name.
         metadata_store: the metadata files beside the cache; None without a cache.
         started: `time.monotonic()` of the start.
@@ -203,8 +337,8 @@ class Hub:
         self.metadata_store = None if self.cache is None else MetadataStore.beside(self.cache.path)
         self.started = time.monotonic()
         self.links: dict[str, ServiceLink] = {}
-        self._tasks: anyio.abc.TaskGroup | None = None
-        self._cache_thread = anyio.CapacityLimiter(1)
+        self.is_open = False
+        self.cache_thread = anyio.CapacityLimiter(1)
         for link in links:
             name = create_link(link).name
             if name in self.links:
@@ -227,14 +361,14 @@ class Hub:
             self._tasks.start_soon(self._run_link, link)
         self._tasks.start_soon(self.gateway.run)
         self._tasks.start_soon(self._check_regularly)
+        self.is_open = True
         return self
 
     async def __aexit__(self, *error: Any) -> None:
-        tasks, self._tasks = self._tasks, None
-        assert tasks is not None, "the hub is open"
+        self.is_open = False
         self.feed.end()
-        tasks.cancel_scope.cancel()
-        await tasks.__aexit__(None, None, None)
+        self._tasks.cancel_scope.cancel()
+        await self._tasks.__aexit__(None, None, None)
         if self.cache is not None and self._owns_cache:
             with anyio.CancelScope(shield=True):
                 await anyio.to_thread.run_sync(self.cache.close)
@@ -265,64 +399,6 @@ class Hub:
             raise ServiceError(409, "ambiguous", detail, links=names)
         return found[0]
 
-    async def fetch(self, target: Target, **options: Any) -> FetchResult:
-        """Fetch the parameters of a component; see `Component.fetch_all`. The progress is published."""
-
-        def note(progress: Progress) -> None:
-            target.progress = progress
-
-        try:
-            result = await target.component.fetch_all(**options, progress=note)
-        finally:
-            target.progress = None
-            target.fetches += 1
-            self._check(target)
-        await self._load_known_metadata(target)
-        return result
-
-    async def load_metadata(self, target: Target, *, timeout: float | None = None) -> None:
-        """Load the metadata of a component from the vehicle; see `metadata_of`.
-
-        Raises:
-            ServiceError: 404, the vehicle provides none.
-        """
-        identity = target.component.identity
-        found = await metadata_of(target.component, store=self.metadata_store or False, timeout=timeout)
-        if found is None:
-            detail = "The vehicle provides no metadata. Add a file of its firmware: paramclient metadata add."
-            raise ServiceError(404, "no-metadata", detail)
-        target.metadata, target.described = found, identity
-        self._check(target)
-
-    async def read_cache(
-        self,
-        call: Callable[Concatenate[ParamCache, str, int, ...], Result],
-        target: Target,
-        *more: Any,
-    ) -> Result:
-        """Call a function of the cache, in a thread, with the place of these parameters in it.
-
-        Raises:
-            ServiceError: the service has no cache, or ends.
-            ParamClientError: the cache cannot be read, or does not have what is requested.
-        """
-        cache = self.cache
-        if cache is None:
-            detail = "The service runs without a cache and has no earlier states."
-            raise ServiceError(409, "no-cache", detail)
-        if self._tasks is None:
-            raise ServiceError(503, "closing", "The service is shutting down.")
-        component = target.component
-        await wait_for_identity(component)
-        place = component.identity.key, component.component
-        work = partial(call, cache, *place, *more, extended=component.is_extended)
-        return await anyio.to_thread.run_sync(work, limiter=self._cache_thread)
-
-    async def state_at(self, target: Target, at: int | datetime) -> ParamSet:
-        """Return the parameters of a snapshot, or at a time; see `read_cache`."""
-        when = at if isinstance(at, int) else at.timestamp()
-        return await self.read_cache(ParamCache.state_at, target, when)
-
     async def _run_link(self, link: ServiceLink) -> None:
         """Keep a link open until cancelled. At the end of a log, its components stay."""
         attempts = 0
@@ -330,19 +406,19 @@ class Hub:
             try:
                 client = link.make()
                 events = client.events()
-                async with client, anyio.create_task_group() as tasks:
+                async with client, task_group() as tasks:
                     link.client, attempts = client, 0
                     self._set_state(link, "open")
                     async for event in events:
                         self._take(link, event, tasks)
                     self._set_state(link, "ended")
                     await anyio.sleep_forever()
-            except* (LinkError, UsageError) as group:  # UsageError: a missing library
-                self._set_state(link, "failed", str(_first(group)))
+            except (LinkError, UsageError) as error:  # UsageError: a missing library
+                self._set_state(link, "failed", str(error))
             finally:
                 link.client = None
                 for target in link.targets.values():
-                    self.feed.publish("vehicle", **target.address, vehicle=None)
+                    target.publish("vehicle", vehicle=None)
                 link.targets.clear()
             await anyio.sleep(REOPEN_DELAYS[min(attempts, len(REOPEN_DELAYS) - 1)])
             attempts += 1
@@ -354,58 +430,22 @@ class Hub:
         if key not in link.targets or link.targets[key].component is not component:
             applying = anyio.Lock()
             for each in (component, component.ext):
-                target = Target(link, each, applying)
+                target = Target(self, link, each, applying)
                 link.targets[component.system, component.component, each.is_extended] = target
-                tasks.start_soon(self._publish_changes, target)
+                tasks.start_soon(target.publish_changes)
         target = link.targets[key]
         if isinstance(event, Resynced):
             target.fetches += 1
-        self._check(target)
+        target.check()
         may_fetch = self._fetches and not component.core.station.listens_only
         if may_fetch and isinstance(event, Discovered | Found | Rebooted):
-            tasks.start_soon(self._load, target)
-
-    async def _load(self, target: Target) -> None:
-        """Fetch the table of a component that was heard, again if that ends without all of it."""
-        for delay in (0.0, *REFETCH_DELAYS):
-            await anyio.sleep(delay)
-            if delay and target.component.sync_state in (SyncState.SYNCED, SyncState.LOST):
-                return
-            with suppress(ParamClientError):
-                await self.fetch(target)
-
-    async def _load_known_metadata(self, target: Target) -> None:
-        """Load the metadata of the firmware of a component that this computer has, if any."""
-        component, store = target.component, self.metadata_store
-        identity = component.identity
-        if store is None or target.described == identity or component.is_extended:
-            return
-        target.metadata = await anyio.to_thread.run_sync(store.known, identity, component.component)
-        target.described = identity
-
-    async def _publish_changes(self, target: Target) -> None:
-        """Publish the changes of parameters until the client is closed.
-
-        First values are not published: a fetch has thousands, and its end is published.
-        """
-        with suppress(ParamClientError):
-            async for change in target.component.changes():
-                if change.kind != "first":
-                    self.feed.publish("change", **target.address, **target.change(change))
+            tasks.start_soon(target.fetch_complete)
 
     async def _check_regularly(self) -> None:
         while True:
             await anyio.sleep(CHECK_INTERVAL)
             for target in self.targets:
-                self._check(target)
-
-    def _check(self, target: Target) -> None:
-        """Publish the state of a component if it has changed."""
-        vehicle = target.state
-        state = {**vehicle, **dict.fromkeys(CHANGING_MEMBERS)}
-        if target.is_listed and state != target.published:
-            target.published = state
-            self.feed.publish("vehicle", **target.address, vehicle=vehicle)
+                target.check()
 
     def _set_state(self, link: ServiceLink, state: str, error: str | None = None) -> None:
         if (state, error) == (link.state, link.error):
@@ -414,9 +454,3 @@ class Hub:
         logger.log(level, "%s: %s%s", link.name, state, "" if error is None else f": {error}")
         link.state, link.error = state, error
         self.feed.publish("link", link=link.name, state=state, error=error)
-
-
-def _first(group: BaseExceptionGroup[BaseException]) -> BaseException:
-    """Return the first error of a group."""
-    error = group.exceptions[0]
-    return _first(error) if isinstance(error, BaseExceptionGroup) else error

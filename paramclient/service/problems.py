@@ -10,8 +10,8 @@ from typing import Any, Final
 
 from fastapi import Request
 from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, ConfigDict
-from pydantic_core import to_json
+from pydantic import BaseModel
+from pydantic_core import to_jsonable_python
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
@@ -36,13 +36,11 @@ STATUSES: Final[dict[int, tuple[type[ParamClientError], ...]]] = {
 logger = logging.getLogger(__name__)
 
 
-class Problem(BaseModel):
+class Problem(BaseModel, extra="allow"):
     """A problem: `type` is a name for programs, `detail` a sentence for users.
 
     `error` is the exception of the library, if there is one; its attributes are further members.
     """
-
-    model_config = ConfigDict(extra="allow")
 
     type: str
     title: str
@@ -92,8 +90,8 @@ def problem_response(error: Exception) -> Response:
         name = type(error).__name__
         kind, detail = re.sub("(?<=[a-z])([A-Z])", r"-\1", name).lower(), str(error)
         public = {key: value for key, value in vars(error).items() if not key.startswith("_")}
-        text = to_json(public, inf_nan_mode="strings", bytes_mode="hex", fallback=str)
-        members = {**json.loads(text), "error": name}
+        members = to_jsonable_python(public, inf_nan_mode="strings", bytes_mode="hex", fallback=str)
+        members["error"] = name
     elif isinstance(error, RequestValidationError):
         faults = [
             {"where": ".".join(str(part)[:100] for part in fault["loc"]), "what": fault["msg"]}

@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Final
 
@@ -24,6 +25,7 @@ from paramclient.cli.json_apply import ApplyJson, PlanJson
 from paramclient.cli.json_output import (
     FetchJson,
     HistoryLineJson,
+    Json,
     ParamJson,
     SetJson,
     SnapshotJson,
@@ -38,15 +40,16 @@ from paramclient.files.formats import ENDINGS
 from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice
 from paramclient.model.paramset import ParamSet
+from paramclient.model.values import check_name
 from paramclient.protocol.set_results import SetOutcome, SetStatus
-from paramclient.provision import ApplyProgress, ApplyResult, apply, restore
+from paramclient.provision import ApplyProgress, apply, restore
 from paramclient.provision import plan as plan_of
 from paramclient.provision.restore_point import load_restore_point
 from paramclient.provision.vehicle_params import component_set, fetched_set, select_non_defaults
-from paramclient.service import bodies, documents
+from paramclient.service import bodies
 from paramclient.service.access import author_of, require_write
-from paramclient.service.documents import METRICS_MEDIA_TYPE, ParamsJson, metrics_text
 from paramclient.service.hub import Hub, Target
+from paramclient.service.metrics import METRICS_MEDIA_TYPE, metrics_text
 from paramclient.service.problems import ServiceError
 from paramclient.version import __version__
 
@@ -68,6 +71,7 @@ async def _hub_of(request: Request) -> Hub:
     return hub
 
 
+Author = Annotated[str, Depends(author_of)]
 HubArgument = Annotated[Hub, Depends(_hub_of)]
 System = Annotated[int, Path(ge=1, le=255)]
 ComponentId = Annotated[int, Path(ge=0, le=255)]
@@ -121,7 +125,7 @@ async def events(
 @reading.get("/api/stations")
 async def stations(hub: HubArgument) -> list[dict[str, Any]]:
     """Return the ground stations at the endpoints, with what the answers to them have saved."""
-    return [documents.station(each) for each in hub.gateway.stations]
+    return [each.state for each in hub.gateway.stations]
 
 
 @reading.get("/api/vehicles")
@@ -133,28 +137,35 @@ async def vehicles(hub: HubArgument) -> dict[str, Any]:
 # parameters
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ParamsJson(Json):
+    """Parameters by name, with the number of the last event whose effects they include."""
+
+    run: str
+    seq: int
+    params: Mapping[str, ParamJson | WrittenJson]
+
+
 @reading.get(f"{VEHICLE}/params")
 async def params(
-    hub: HubArgument,
     target: TargetArgument,
     names: Names = None,
     metadata: Annotated[bool, Query(description="Include the whole metadata of the parameters.")] = False,
     at: At = None,
 ) -> ParamsJson:
     """Return the known parameters by name, without traffic."""
-    position = hub.feed.position
+    position = target.hub.feed.position
     choice = NameChoice(names or ["*"])
     if at is not None:
-        state = await hub.state_at(target, at)
+        state = await target.state_at(at)
         earlier = {name: WrittenJson.of(each) for name, each in state.items() if choice.has(name)}
         return ParamsJson(**position, params=earlier)
     known = [each for name, each in target.component.params.items() if choice.has(name)]
 
     def encode() -> ParamsJson:
-        found = {
-            each.name: ParamJson.of_table(each, target.info(each.name), whole=metadata) for each in known
-        }
-        return ParamsJson(**position, params=found)
+        return ParamsJson(
+            **position, params={each.name: target.shown(each, whole=metadata) for each in known}
+        )
 
     return await anyio.to_thread.run_sync(encode)
 
@@ -167,53 +178,50 @@ async def param(
 ) -> ParamJson:
     """Return one parameter: the known value, else that of the vehicle."""
     known = None if live else target.component.params.get(name)
-    found = await target.component.get(name) if known is None else known
-    return ParamJson.of_table(found, target.info(name), whole=True)
+    return target.shown(known or await target.component.get(name), whole=True)
 
 
 @writing.put(f"{VEHICLE}/params/{{name:path}}")
 async def set_param(
-    request: Request, target: TargetArgument, name: str, body: bodies.WriteRequest
+    author: Author, target: TargetArgument, name: str, body: bodies.WriteRequest
 ) -> WriteJson:
     """Write one parameter, and verify the value that the vehicle reports."""
-    ((_, value),) = (await bodies.values_in_range({name: body.value}, target, force=body.force)).items()
+    values = await target.values({name: body.value}, force=body.force)
     options = body.model_dump(exclude={"value"})
-    result = await target.component.set(name, value, **options, author=author_of(request))
-    return documents.write(SetOutcome(name, value, SetStatus(result.status), result), target)
+    result = await target.component.set(name, values[name], **options, author=author)
+    return target.outcome(SetOutcome(name, values[name], SetStatus(result.status), result))
 
 
 @writing.patch(f"{VEHICLE}/params")
-async def set_params(
-    request: Request, target: TargetArgument, body: bodies.WriteManyRequest
-) -> dict[str, Any]:
+async def set_params(author: Author, target: TargetArgument, body: bodies.WriteManyRequest) -> dict[str, Any]:
     """Write several parameters in order, many at a time, and verify each.
 
     If a value is invalid or out of range, nothing is written. A value that the vehicle refuses does not stop
     the others. `error` says why not all could be tried, if so.
     """
-    values = await bodies.values_in_range(body.values, target, force=body.force)
+    values = await target.values(body.values, force=body.force)
     options = body.model_dump(exclude={"values"})
-    result = await target.component.set_many(values, **options, author=author_of(request))
-    results = [documents.write(each, target) for each in result.outcomes]
+    result = await target.component.set_many(values, **options, author=author)
+    results = [target.outcome(each) for each in result.outcomes]
     error = {} if result.error is None else {"error": str(result.error)}
     return dict(as_json({"vehicle": VehicleJson.of(target.component), "results": results} | error))
 
 
 @reading.post(f"{VEHICLE}/fetch")
-async def fetch(hub: HubArgument, target: TargetArgument, body: bodies.FetchRequest) -> FetchJson:
+async def fetch(target: TargetArgument, body: bodies.FetchRequest) -> FetchJson:
     """Fetch all parameters. Simultaneous requests share one download; the progress is in the events."""
-    component, client = target.component, target.link.client
-    result = await hub.fetch(target, refresh=body.refresh, timeout=body.timeout_s)
+    component = target.component
+    result = await target.fetch(refresh=body.refresh, timeout=body.timeout_s)
     if body.metadata:
-        await hub.load_metadata(target, timeout=body.timeout_s)
+        await target.load_metadata(timeout=body.timeout_s)
     known = dict(component.params)
     return FetchJson.of(
         component,
         result,
         known.values(),
-        bytes_received=0 if client is None else client.bytes_received,
-        bytes_sent=0 if client is None else client.bytes_sent,
-        described={} if target.metadata is None else target.metadata.defaults_of(known),
+        bytes_received=component.client.bytes_received,
+        bytes_sent=component.client.bytes_sent,
+        described=target.defaults_of(known),
     )
 
 
@@ -230,22 +238,19 @@ async def read_file(body: bodies.UploadedFile) -> dict[str, Any]:
 
 @reading.get(f"{VEHICLE}/file", response_class=Response)
 async def file(
-    hub: HubArgument,
     target: TargetArgument,
     file_format: Annotated[FileFormat, Query(alias="format")] = FileFormat.QGC,
     changed: Annotated[bool, Query(description="Only parameters that differ from the defaults.")] = False,
     at: At = None,
 ) -> Response:
     """Return the parameters as a file. They are fetched first, unless they are in sync."""
-    described: dict[str, int | float] = {}
     if at is not None:
-        found = await hub.state_at(target, at)
+        found = await target.state_at(at)
     else:
         fetched = await target.component.fetch_all()
         found = fetched_set(target.component, fetched, source=f"link {target.link.name}")
-        described = {} if target.metadata is None else target.metadata.defaults_of(found)
     if changed:
-        found = select_non_defaults(found, described)
+        found = select_non_defaults(found, target.defaults_of(found) if at is None else {})
     name = _file_name(found, file_format)
     found, _ = writable(found, file_format)
     data = await anyio.to_thread.run_sync(lambda: dumps(found, file_format=file_format, target=name))
@@ -267,118 +272,106 @@ def _file_name(params: ParamSet, file_format: FileFormat) -> str:
 
 async def _only_apply(target: TargetArgument) -> AsyncIterator[None]:
     """Run one apply or restore of a component at a time: two would undo each other's changes."""
-    try:
-        target.applying.acquire_nowait()
-    except anyio.WouldBlock:
-        raise ServiceError(409, "busy", "Another apply or restore of this vehicle is running.") from None
-    try:
+    if target.applying.locked():
+        raise ServiceError(409, "busy", "Another apply or restore of this vehicle is running.")
+    async with target.applying:
         yield
-    finally:
-        target.applying.release()
 
 
 @reading.post(f"{VEHICLE}/plan")
-async def plan(hub: HubArgument, target: TargetArgument, body: bodies.PlanRequest) -> PlanJson:
+async def plan(target: TargetArgument, body: bodies.PlanRequest) -> PlanJson:
     """Return which values an apply would write, in which order, and which it would skip, and why."""
-    component, wanted = target.component, await _wanted(hub, target, body)
+    component, wanted = target.component, await _wanted(target, body)
     found = await plan_of(component, wanted, include=body.include, info=target.metadata, force=body.force)
     return PlanJson.of(found, system=component.system, component=component.component)
 
 
 @writing.post(f"{VEHICLE}/apply", dependencies=[Depends(_only_apply)])
-async def apply_(
-    request: Request, hub: HubArgument, target: TargetArgument, body: bodies.ApplyRequest
-) -> ApplyJson:
+async def apply_(author: Author, target: TargetArgument, body: bodies.ApplyRequest) -> ApplyJson:
     """Write the wanted values in a working order, and verify each of them.
 
     The progress is in the events. If the client disconnects, the apply ends; written values stay.
     """
-    wanted = await _wanted(hub, target, body)
-    options = body.model_dump(exclude={"values", "file", "at", "only"}) | _context(request, hub, target)
-    return _applied(target, await apply(target.component, wanted, **options))
-
-
-@writing.post(f"{VEHICLE}/restore", dependencies=[Depends(_only_apply)])
-async def restore_(
-    request: Request, hub: HubArgument, target: TargetArgument, body: bodies.RestoreRequest
-) -> ApplyJson:
-    """Restore an earlier state, with the vehicle's own identity and calibration."""
-    if body.at is None:
-        state = (await hub.read_cache(load_restore_point, target)).state
-    else:
-        state = await hub.state_at(target, body.at)
-    options = body.model_dump(exclude={"at"}) | _context(request, hub, target)
-    return _applied(target, await restore(target.component, state, **options))
-
-
-async def _wanted(hub: Hub, target: Target, body: bodies.PlanRequest) -> ParamSet:
-    """Return the wanted parameters of a request."""
-    if body.file is not None:
-        found = await anyio.to_thread.run_sync(body.file.read_set, target)
-    elif body.at is not None:
-        found = await hub.state_at(target, body.at)
-    else:
-        found = await bodies.values_set(body.values or {}, target)
-    return found if body.only is None else found.only(body.only)
-
-
-def _applied(target: Target, result: ApplyResult) -> ApplyJson:
+    wanted = await _wanted(target, body)
+    options = body.model_dump(exclude={"values", "file", "at", "only"}) | _context(author, target)
+    result = await apply(target.component, wanted, **options)
     return ApplyJson.of(result, VehicleJson.of(target.component))
 
 
-def _context(request: Request, hub: Hub, target: Target) -> dict[str, Any]:
-    """Return the arguments of `apply` and `restore` that are not in the body."""
-    progress = _publisher(partial(hub.feed.publish, "apply", **target.address))
-    return {"info": target.metadata, "author": author_of(request), "progress": progress}
+@writing.post(f"{VEHICLE}/restore", dependencies=[Depends(_only_apply)])
+async def restore_(author: Author, target: TargetArgument, body: bodies.RestoreRequest) -> ApplyJson:
+    """Restore an earlier state, with the vehicle's own identity and calibration."""
+    if body.at is None:
+        state = (await target.cached(load_restore_point)).state
+    else:
+        state = await target.state_at(body.at)
+    options = body.model_dump(exclude={"at"}) | _context(author, target)
+    result = await restore(target.component, state, **options)
+    return ApplyJson.of(result, VehicleJson.of(target.component))
 
 
-def _publisher(publish: Callable[..., None]) -> Callable[[ApplyProgress], None]:
-    """Return a function that publishes each phase of an apply, and its progress at an interval."""
+async def _wanted(target: Target, body: bodies.PlanRequest) -> ParamSet:
+    """Return the wanted parameters of a request."""
+    if body.file is not None:
+        found = await anyio.to_thread.run_sync(body.file.read_set, target.component)
+    elif body.at is not None:
+        found = await target.state_at(body.at)
+    else:
+        values = await target.values(body.values or {})
+        found = ParamSet(
+            {check_name(name): value for name, value in values.items()},
+            is_extended=target.component.is_extended,
+        )
+    return found if body.only is None else found.only(body.only)
+
+
+def _context(author: str, target: Target) -> dict[str, Any]:
+    """Return the arguments of `apply` and `restore` that are not in the body.
+
+    Each phase is published, and its progress at an interval.
+    """
     phase, due_at = "", 0.0
 
     def progress(now: ApplyProgress) -> None:
         nonlocal phase, due_at
         if now.phase != phase or time.monotonic() >= due_at:
             phase, due_at = now.phase, time.monotonic() + PROGRESS_INTERVAL
-            publish(phase=now.phase, done=now.done, total=now.total)
+            target.publish("apply", phase=now.phase, done=now.done, total=now.total)
 
-    return progress
+    return {"info": target.metadata, "author": author, "progress": progress}
 
 
 # the past
 
 
 @reading.get(f"{VEHICLE}/snapshots")
-async def snapshots(hub: HubArgument, target: TargetArgument) -> dict[str, list[SnapshotJson]]:
+async def snapshots(target: TargetArgument) -> dict[str, list[SnapshotJson]]:
     """Return the snapshots, the newest last."""
-    found = await hub.read_cache(ParamCache.snapshots, target)
-    return {"snapshots": [SnapshotJson.of(each) for each in found]}
+    return {"snapshots": [SnapshotJson.of(each) for each in await target.cached(ParamCache.snapshots)]}
 
 
 @writing.post(f"{VEHICLE}/snapshots", status_code=201)
-async def create_snapshot(
-    hub: HubArgument, target: TargetArgument, body: bodies.SnapshotRequest
-) -> SnapshotJson:
+async def create_snapshot(target: TargetArgument, body: bodies.SnapshotRequest) -> SnapshotJson:
     """Store a snapshot of the known table."""
     component = target.component
     known = list(component.params.values())
     if not known:
         raise UsageError("no parameter of the vehicle is known")
     table = component_set(component, known, f"link {target.link.name}")
-    is_whole, crc = len(known) >= (component.count or math.inf), component.hash
+    about = {
+        "reason": body.reason,
+        "hash": component.hash,
+        "complete": len(known) >= (component.count or math.inf),
+    }
 
     def store(cache: ParamCache, _: str, number: int, **which: bool) -> SnapshotSummary:
-        vehicle, reason = component.identity, body.reason
-        return cache.store_snapshot(
-            vehicle, number, table, reason=reason, hash=crc, complete=is_whole, **which
-        )
+        return cache.store_snapshot(component.identity, number, table, **about, **which)
 
-    return SnapshotJson.of(await hub.read_cache(store, target))
+    return SnapshotJson.of(await target.cached(store))
 
 
 @reading.get(f"{VEHICLE}/history")
 async def history(
-    hub: HubArgument,
     target: TargetArgument,
     name: Annotated[str | None, Query(max_length=16)] = None,
     limit: Annotated[int, Query(ge=1, le=1_000)] = HISTORY_ENTRIES,
@@ -386,5 +379,5 @@ async def history(
 ) -> dict[str, list[HistoryLineJson]]:
     """Return the newest changes of values, the newest last."""
     begin = None if since is None else since.timestamp()
-    entries = await hub.read_cache(ParamCache.history, target, name, limit, begin)
+    entries = await target.cached(ParamCache.history, name, limit, begin)
     return {"history": [HistoryLineJson.of(each) for each in entries]}

@@ -7,7 +7,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import suppress
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import anyio
 import anyio.abc
@@ -137,6 +137,22 @@ class GroundStation:
     def may_sign(self) -> bool:
         """Whether what the station asks may be sent with the gateway's signature."""
         return self.endpoint.is_trusted or self.endpoint.signer is not None
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """The state of the station, as JSON. `saved_bytes` did not have to come over the vehicle's link."""
+        return {
+            "name": self.name,
+            "endpoint": self.endpoint.name,
+            "ids": sorted(f"{system}/{component}" for system, component in self.sources),
+            "mavlink": self.version,
+            "silence_s": round(self.silence, 3),
+            "requests": dict(self.requests),
+            "relayed": self.relayed,
+            "answered": self.answered,
+            "dropped": self.dropped,
+            "saved_bytes": self.saved,
+        }
 
     def received(self, seen: SeenFrame) -> None:
         """Take note of a frame of the station."""

@@ -1,23 +1,15 @@
-"""What the service tells of itself: JSON, and metrics in the text format of Prometheus.
-
-Parameters and results are as the command prints them.
-"""
+"""Metrics of the service, in the text format of Prometheus."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
-from paramclient.cli.json_output import Json, ParamJson, WriteJson, WrittenJson
-from paramclient.model.values import ParamType
 from paramclient.version import __version__
 
 if TYPE_CHECKING:
-    from paramclient.protocol.set_results import SetOutcome
-    from paramclient.service.hub import Hub, Target
-    from paramclient.service.stations import GroundStation
+    from paramclient.service.hub import Hub
 
 METRICS_MEDIA_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 """Media type of the metrics."""
@@ -32,41 +24,6 @@ _ESCAPES: Final = str.maketrans({"\\": r"\\", "\n": r"\n", '"': r"\""})
 
 Sample: TypeAlias = tuple[Mapping[str, object], float]
 """Labels and a value."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ParamsJson(Json):
-    """Parameters by name, with the number of the last event whose effects they include."""
-
-    run: str
-    seq: int
-    params: Mapping[str, ParamJson | WrittenJson]
-
-
-def write(outcome: SetOutcome, target: Target) -> WriteJson:
-    """Return the outcome of a write."""
-    known = target.component.params.get(outcome.name)
-    kind = ParamType.REAL64 if known is None else known.type_number
-    return WriteJson.of(outcome, kind, target.info(outcome.name))
-
-
-def station(found: GroundStation) -> dict[str, Any]:
-    """Return the state of a ground station. `saved_bytes` did not have to come over the vehicle's link."""
-    return {
-        "name": found.name,
-        "endpoint": found.endpoint.name,
-        "ids": sorted(f"{system}/{component}" for system, component in found.sources),
-        "mavlink": found.version,
-        "silence_s": round(found.silence, 3),
-        "requests": dict(found.requests),
-        "relayed": found.relayed,
-        "answered": found.answered,
-        "dropped": found.dropped,
-        "saved_bytes": found.saved,
-    }
-
-
-# metrics
 
 
 def metrics_text(hub: Hub) -> str:
