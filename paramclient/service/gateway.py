@@ -25,15 +25,7 @@ from paramclient.service.kept_table import Asker, KeptTable
 from paramclient.service.stations import GroundStation, MavlinkEndpoint, Source
 from paramclient.wire import messages
 from paramclient.wire.frames import TARGET_OFFSETS, Frame, bears_key
-from paramclient.wire.messages import (
-    AUTOPILOT_COMPONENT,
-    COMP_ID_ALL,
-    HASH_CHECK,
-    Message,
-    decode,
-    encode,
-    message_id,
-)
+from paramclient.wire.messages import COMP_ID_ALL, Message, decode, encode, message_id
 
 __all__ = ["GATEWAY_ADDRESS", "Gateway"]
 
@@ -55,21 +47,14 @@ SetRequest: TypeAlias = messages.ParamSet | messages.ParamExtSet
 Request: TypeAlias = ListRequest | ReadRequest | SetRequest | messages.FileTransfer
 """Messages of a station that the gateway answers."""
 PLAIN_ANSWERS: Final = {message_id(messages.ParamValue), message_id(messages.ParamError)}
-EXTENDED_REQUESTS: Final = {
-    message_id(each)
-    for each in (messages.ParamExtRequestList, messages.ParamExtRequestRead, messages.ParamExtSet)
-}
+EXTENDED_REQUESTS: Final = (messages.ParamExtRequestList, messages.ParamExtRequestRead, messages.ParamExtSet)
 EXTENDED_ANSWERS: Final = {message_id(messages.ParamExtValue), message_id(messages.ParamExtAck)}
 HEARTBEAT: Final = message_id(messages.Heartbeat)
 FILE_TRANSFER: Final = message_id(messages.FileTransfer)
 HARMLESS: Final = frozenset({HEARTBEAT, message_id(messages.SystemTime), 4, 66, 111})
 """What passes from the stations of a read-only endpoint, with PING, REQUEST_DATA_STREAM and TIMESYNC."""
 HARMLESS_COMMANDS: Final = (messages.MAV_CMD_REQUEST_MESSAGE, messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
-HARMLESS_OPCODES: Final = frozenset(Opcode) - {
-    Opcode.CREATE_FILE,
-    Opcode.WRITE_FILE,
-    Opcode.OPEN_FILE_WO,
-}
+HARMLESS_OPCODES: Final = {*Opcode} - {Opcode.CREATE_FILE, Opcode.WRITE_FILE, Opcode.OPEN_FILE_WO}
 """The requests of MAVFTP that write nothing."""
 
 logger = logging.getLogger(__name__)
@@ -179,7 +164,7 @@ class Gateway:
     def _answer(self, station: GroundStation, source: Source, message: Request, seen: SeenFrame) -> bool:
         """Answer a request about parameters; return False for one that passes to the vehicles."""
         address = (message.target_system, message.target_component)
-        extended = message_id(type(message)) in EXTENDED_REQUESTS
+        extended = isinstance(message, EXTENDED_REQUESTS)
         found = {table: link for link in self.links for table in link.tables(*address, extended=extended)}
         served = [table for table, link in found.items() if self._serves(station, table, link)]
         if not served:
@@ -188,7 +173,7 @@ class Gateway:
         if not is_list and len({table.source[0] for table in found}) > 1:
             return False  # for whichever vehicle: they answer themselves
         present = [table for table in served if not table.is_lost]
-        autopilots = [table for table in present if table.source[1] == AUTOPILOT_COMPONENT]
+        autopilots = [table for table in present if table.source[1] == messages.AUTOPILOT_COMPONENT]
         one = (autopilots or present)[:1]  # that answers a request which all components receive
         may_write = station.may_sign or not any(link.is_signed for link in found.values())
         asker = Asker(station, *source, may_write)
@@ -204,7 +189,7 @@ class Gateway:
                 for table in [each for each in present if each.known(which) is not None] or one:
                     table.read(asker, which)
             case messages.ParamSet() | messages.ParamExtSet():
-                if message.param_id != HASH_CHECK:  # it would stop the gateway's own list
+                if message.param_id != messages.HASH_CHECK:  # it would stop the gateway's own list
                     for table in one:
                         table.set(asker, message)
             case messages.FileTransfer(payload=payload):
@@ -219,10 +204,8 @@ class Gateway:
         is_double = any(each is not link and each.is_vehicle(table.source) for each in self.links)
         if is_double and table.source not in self._warned:
             self._warned.add(table.source)
-            logger.warning(
-                "%d/%d is on two links: stations are not answered from its table, and all frames pass",
-                *table.source,
-            )
+            what = "is on two links: stations are not answered from its table, and all frames pass"
+            logger.warning("%d/%d %s", *table.source, what)
         return not is_double
 
     def _pass(self, station: GroundStation, seen: SeenFrame) -> None:

@@ -37,16 +37,15 @@ class FileQuery(NamedTuple):
     with_defaults: bool = False
 
     @classmethod
-    def of(cls, path: str) -> FileQuery | None:
-        """Parse a path; None for that of another file, and for options that a vehicle refuses."""
-        name, _, text = path.partition("?")
-        given = {"start": "0", "count": "0", "withdefaults": "0"}
-        known = given.keys()
-        given |= dict(each.partition("=")[::2] for each in text.split("&") if each)
-        are_numbers = all(each.isascii() and each.isdecimal() and len(each) <= 5 for each in given.values())
-        if name != PARAM_FILE or given.keys() != known or not are_numbers:
+    def of(cls, request: Packet) -> FileQuery | None:
+        """Parse the path in a request; None for another file, and for options that a vehicle refuses."""
+        name, _, text = request.data.split(b"\0", 1)[0].decode("latin-1").partition("?")
+        given = dict(each.partition("=")[::2] for each in text.split("&") if each)
+        numbers = [given.pop(each, "0") for each in ("start", "count", "withdefaults")]
+        are_numbers = all(each.isascii() and each.isdecimal() and len(each) <= 5 for each in numbers)
+        if name != PARAM_FILE or given or not are_numbers:
             return None
-        start, length, defaults = (int(given[each]) for each in known)
+        start, length, defaults = map(int, numbers)
         return cls(start, length, bool(defaults)) if defaults < 2 else None
 
 
@@ -62,12 +61,9 @@ class Rows(NamedTuple):
         Without the defaults, a file that is asked for with defaults has the magic of one without.
         """
         end = query.start + query.length if query.length else None
-        return encode(
-            self.entries[query.start : end],
-            total=len(self.entries),
-            with_defaults=query.with_defaults and self.has_defaults,
-            read_size=read_size,
-        )
+        with_defaults = query.with_defaults and self.has_defaults
+        rows, total = self.entries[query.start : end], len(self.entries)
+        return encode(rows, total=total, with_defaults=with_defaults, read_size=read_size)
 
 
 def rows_of(session: Session) -> Rows | None:
@@ -158,7 +154,7 @@ class KeptFile:
             case Opcode.READ_FILE | Opcode.BURST_READ_FILE if key in self._open:
                 self._send(asker, request, self._open[key])
                 return True
-            case Opcode.CREATE_FILE | Opcode.OPEN_FILE_WO if FileQuery.of(_path_of(request)) is not None:
+            case Opcode.CREATE_FILE | Opcode.OPEN_FILE_WO if FileQuery.of(request) is not None:
                 if len(self._uploads) < OPEN_FILES_MAX:
                     self._uploads.add(key)
             case Opcode.TERMINATE_SESSION | Opcode.RESET_SESSIONS:
@@ -172,7 +168,7 @@ class KeptFile:
 
     def _begin(self, asker: Asker, request: Packet, route: Callable[[], None]) -> bool:
         """Open the file, or answer its checksum; wait for a fetch that may bring the table."""
-        key, query = (asker, request.session), FileQuery.of(_path_of(request))
+        key, query = (asker, request.session), FileQuery.of(request)
         opened = self._open.get(key)
         if request.opcode == Opcode.OPEN_FILE_RO and opened is not None:
             if (opened.query, opened.sequence) == (query, request.sequence):
@@ -250,7 +246,3 @@ def _message(asker: Asker, packet: Packet) -> FileTransfer:
 
 def _opened(request: Packet, rows: Rows) -> Packet:
     return reply(request, (ENTRY_SIZE * len(rows.entries)).to_bytes(4, "little"))
-
-
-def _path_of(request: Packet) -> str:
-    return request.data.split(b"\0", 1)[0].decode("latin-1")

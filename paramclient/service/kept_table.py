@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple, TypeAlias, TypeVar
 
 import anyio
 
@@ -65,6 +65,7 @@ CODES: Final = (
 NO_ANSWER: Final = ParamErrorCode.COMPONENT_NOT_FOUND
 """The code for a component that does not answer."""
 
+Key = TypeVar("Key")
 Which: TypeAlias = "str | int"
 SetKey: TypeAlias = tuple[str, bytes, int]
 """Name, bytes and type in a set."""
@@ -143,20 +144,7 @@ def is_decoded(session: Session) -> bool:
     )
 
 
-class _Announcer(Stream[Change]):
-    """Passes each change on at once."""
-
-    most = 0
-
-    def __init__(self, take: Callable[[Change], None]) -> None:
-        super().__init__()
-        self._take = take
-
-    def push(self, item: Change) -> None:
-        self._take(item)
-
-
-class KeptTable:
+class KeptTable(Stream[Change]):
     """The parameters of one component in one protocol, plain or extended.
 
     Args:
@@ -168,7 +156,10 @@ class KeptTable:
         changes: the number of changes so far.
     """
 
+    most = 0  # changes are taken at once, and none is queued
+
     def __init__(self, component: Component, announce: Callable[[KeptTable, Message], None]) -> None:
+        super().__init__()
         self.component = component
         self.session = component.session
         self.source = (component.system, component.component)
@@ -179,12 +170,11 @@ class KeptTable:
         self._unknown: dict[Which, float] = {}
         self._reads: dict[Which, set[Asker]] = {}
         self._sets: dict[SetKey, set[Asker]] = {}
-        self._waiting: dict[GroundStation, set[int]] = {}  # for a list, and the indices that each has
-        self._waiting_count: int | None = None
+        self._listing: dict[GroundStation, set[int]] = {}  # for a list, and the indices that each has
+        self._listing_count: int | None = None
         self._loaded: anyio.Event | None = None  # while a fetch runs
         self._asking = anyio.CapacityLimiter(ASKED_AT_ONCE)
-        self._announcer = _Announcer(self._changed)  # a stream lives as long as it is referenced
-        component.subscribers.add(self._announcer)
+        component.subscribers.add(self)
 
     # the state
 
@@ -236,12 +226,13 @@ class KeptTable:
         """Have a table checked in the background that was not confirmed for a while."""
         self.component.watch.check(older_than=PROOF_AGE_MAX)
 
-    def _changed(self, change: Change) -> None:
+    def push(self, item: Change) -> None:
+        """Take a change, and announce it unless it is a first value."""
         self.changes += 1
-        if change.new is not None:
-            self._unknown.pop(change.name, None)
-            if change.kind != "first" and not self.is_lost:
-                self._announce(self, value_of(self.session, change.new))
+        if item.new is not None:
+            self._unknown.pop(item.name, None)
+            if item.kind != "first" and not self.is_lost:
+                self._announce(self, value_of(self.session, item.new))
 
     # lists
 
@@ -252,7 +243,7 @@ class KeptTable:
             self.check()
             station.stream((self, "list"), self.source, self._current(values))
         else:
-            self._waiting.setdefault(station, set())
+            self._listing.setdefault(station, set())
             self.load()
 
     def take_over(self, station: GroundStation) -> None:
@@ -295,7 +286,7 @@ class KeptTable:
             self._send_known()
         finally:
             self._loaded = None
-            self._waiting.clear()
+            self._listing.clear()
             loaded.set()
 
     async def _send_progress(self) -> None:
@@ -304,19 +295,19 @@ class KeptTable:
         while True:
             await anyio.sleep(PROGRESS_INTERVAL)
             self._send_known()
-            if anyio.current_time() >= late_at and not all(self._waiting.values()):
+            if anyio.current_time() >= late_at and not all(self._listing.values()):
                 late_at = math.inf
                 self.component.core.spawn(read, self.session, 0)
 
     def _send_known(self) -> None:
         """Send the values of the list that the stations do not have; another count begins it again."""
-        if self._waiting_count != self.session.table.count:
-            self._waiting_count = self.session.table.count
-            for sent in self._waiting.values():
+        if self._listing_count != self.session.table.count:
+            self._listing_count = self.session.table.count
+            for sent in self._listing.values():
                 sent.clear()
         whole = self.list_if_current
-        values = (whole or listed(self.session)) if self._waiting else []
-        for station, sent in self._waiting.items():
+        values = (whole or listed(self.session)) if self._listing else []
+        for station, sent in self._listing.items():
             new = [value for value in values if value.param_index not in sent]
             sent.update(value.param_index for value in new)
             if whole is not None:
@@ -335,10 +326,7 @@ class KeptTable:
             asker.station.say(value, self.source)
         elif self._is_unknown(which):
             self._refuse([asker], which, ParamErrorCode.DOES_NOT_EXIST)
-        elif which in self._reads:
-            self._reads[which].add(asker)
-        elif len(self._reads) < PENDING_MAX:
-            self._reads[which] = {asker}
+        elif _begins(self._reads, which, asker):
             self.component.core.spawn(self._read, which)
 
     def known(self, which: Which) -> ReportedValue | None:
@@ -360,8 +348,7 @@ class KeptTable:
         try:
             with anyio.move_on_after(READ_TIMEOUT):
                 value = await self._find(which)
-                for asker in self._reads[which]:
-                    asker.station.say(value, self.source)
+                self._say(self._reads[which], value)
         except (errors.UnknownParameter, errors.Refused) as error:
             if len(self._unknown) >= UNKNOWN_NAMES_MAX:
                 self._unknown.clear()
@@ -394,10 +381,7 @@ class KeptTable:
             self._reject([asker], key, ParamErrorCode.READ_ONLY)
         elif not asker.may_write:
             self._reject([asker], key, ParamErrorCode.PERMISSION_DENIED)
-        elif key in self._sets:
-            self._sets[key].add(asker)
-        elif len(self._sets) < PENDING_MAX:
-            self._sets[key] = {asker}
+        elif _begins(self._sets, key, asker):
             self.component.core.spawn(self._set, key, f"station {asker.system}/{asker.component}")
 
     async def _set(self, key: SetKey, author: str) -> None:
@@ -438,11 +422,13 @@ class KeptTable:
         result = await self.component.set(name, value, author=author)
         done = value_of(session, result.param)
         if is_extended:
-            answer = messages.ParamExtAck(name, done.raw, number, ExtAckResult.ACCEPTED)
-            for asker in askers:
-                asker.station.say(answer, self.source)
+            self._say(askers, messages.ParamExtAck(name, done.raw, number, ExtAckResult.ACCEPTED))
         else:
             self._announce(self, done)
+
+    def _say(self, askers: Iterable[Asker], message: Message) -> None:
+        for asker in askers:
+            asker.station.say(message, self.source)
 
     def _reject(self, askers: Iterable[Asker], key: SetKey, code: int) -> None:
         """Refuse a set, and show the value that stays."""
@@ -450,14 +436,12 @@ class KeptTable:
         if self.session.dialect.has_ack:
             is_value = code in (ExtAckResult.VALUE_UNSUPPORTED, ParamErrorCode.TYPE_MISMATCH)
             result = ExtAckResult.VALUE_UNSUPPORTED if is_value else ExtAckResult.FAILED
-            for asker in askers:
-                asker.station.say(messages.ParamExtAck(name, raw, number, result), self.source)
+            self._say(askers, messages.ParamExtAck(name, raw, number, result))
             return
         self._refuse(askers, name, code)
         value = self.known(name)
         if value is not None and code in (ParamErrorCode.READ_ONLY, ParamErrorCode.VALUE_OUT_OF_RANGE):
-            for asker in askers:
-                asker.station.say(value, self.source)
+            self._say(askers, value)
 
     def _refuse(self, askers: Iterable[Asker], which: Which, code: int) -> None:
         """Send a PARAM_ERROR to each asker, with its ids: others would take it for their own requests."""
@@ -465,6 +449,14 @@ class KeptTable:
         for station, system, component, _ in askers:
             if not (self.session.dialect.has_ack or self.is_lost):
                 station.say(messages.ParamError(system, component, name, index, code), self.source)
+
+
+def _begins(pending: dict[Key, set[Asker]], key: Key, asker: Asker) -> bool:
+    """Add an asker to those who wait for a read or a set; return whether it is the first, and to be done."""
+    is_first = key not in pending and len(pending) < PENDING_MAX
+    if is_first or key in pending:
+        pending.setdefault(key, set()).add(asker)
+    return is_first
 
 
 def _code_of(error: ParamClientError) -> int:

@@ -1,4 +1,4 @@
-"""Routes: the service, vehicles and their parameters, files, plan, apply, restore, snapshots, history.
+"""Routes with their request bodies: the service, vehicles, parameters, files, apply, snapshots, history.
 
 With `?ext=true`, the routes of parameters are about the extended parameters of a component.
 """
@@ -8,34 +8,27 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import AsyncIterator, Mapping
+from base64 import b64decode
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, ClassVar, Final, Self, TypeAlias
 
 import anyio
 import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Path, Query, Request
 from fastapi.responses import PlainTextResponse, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
-from pydantic import AwareDatetime
+from pydantic import AwareDatetime, BaseModel, BeforeValidator, Field, model_validator
+from pydantic import StrictFloat as Real
+from pydantic import StrictInt as Whole
 
 from paramclient.cache import ParamCache, SnapshotSummary
+from paramclient.cli import json_output as shapes
 from paramclient.cli.json_apply import ApplyJson, PlanJson
-from paramclient.cli.json_output import (
-    FetchJson,
-    HistoryLineJson,
-    Json,
-    ParamJson,
-    SetJson,
-    SnapshotJson,
-    VehicleJson,
-    WriteJson,
-    WrittenJson,
-    as_json,
-)
+from paramclient.client.component import Component
 from paramclient.errors import UsageError
-from paramclient.files import FileFormat, dumps, writable
+from paramclient.files import FileFormat, ParamFile, dumps, loads, writable
 from paramclient.files.formats import ENDINGS
 from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice
@@ -46,10 +39,7 @@ from paramclient.provision import ApplyProgress, apply, restore
 from paramclient.provision import plan as plan_of
 from paramclient.provision.restore_point import load_restore_point
 from paramclient.provision.vehicle_params import component_set, fetched_set, select_non_defaults
-from paramclient.service import bodies
-from paramclient.service.access import author_of, require_write
 from paramclient.service.hub import Hub, Target
-from paramclient.service.metrics import METRICS_MEDIA_TYPE, metrics_text
 from paramclient.service.problems import ServiceError
 from paramclient.version import __version__
 
@@ -60,6 +50,199 @@ HISTORY_ENTRIES: Final = 100
 """Default number of entries of a history."""
 PROGRESS_INTERVAL: Final = 0.25
 """Seconds between two progress events of an apply or restore."""
+
+FILE_BYTES_MAX: Final = 2 * 2**20
+"""Maximum size of a parameter file in bytes; a table of 10,000 parameters takes 1 MB."""
+VALUES_MAX: Final = 10_000
+"""Maximum number of values of a request: more than a vehicle has."""
+METRICS_MEDIA_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
+"""Media type of the metrics."""
+STATION_SUMS: Final = {
+    "relayed": "Frames of vehicles.",
+    "answered": "Answers from the tables.",
+    "saved": "Bytes of answers that were not sent over the link of a vehicle.",
+    "dropped": "Frames dropped because a station did not read.",
+}
+"""Help texts of the sums over the connected stations of an endpoint, by attribute of `GroundStation`."""
+_ESCAPES: Final = str.maketrans({"\\": r"\\", "\n": r"\n", '"': r"\""})
+
+Sample: TypeAlias = tuple[Mapping[str, object], float]
+"""Labels and a value."""
+_PAGE_NAME: Final = re.compile(r"[A-Za-z0-9._ -]{1,64}")
+
+# request bodies
+
+
+class Body(BaseModel, extra="forbid"):
+    """A request body. An unknown member is refused, so that a misspelt one is not ignored.
+
+    Attributes:
+        one_of: members of which exactly one is needed.
+    """
+
+    one_of: ClassVar[tuple[str, ...]] = ()
+
+    @model_validator(mode="after")
+    def _has_one(self) -> Self:
+        if self.one_of and sum(getattr(self, each) is not None for each in self.one_of) != 1:
+            raise ValueError(f"exactly one of {', '.join(self.one_of)} is needed")
+        return self
+
+
+def _parse_number(given: object) -> object:
+    return int(given) if isinstance(given, str) and given.isdecimal() else given
+
+
+def _decode(given: object) -> object:
+    return b64decode(given, validate=True) if isinstance(given, str) else given
+
+
+def _check_text(given: object) -> object:
+    if not isinstance(given, str):
+        raise ValueError("a time is text in ISO 8601, as 2026-11-20T14:00:00Z")
+    return given
+
+
+Name = Annotated[str, Field(min_length=1, max_length=16)]
+Value = Annotated[
+    Whole | Annotated[Real, Field(allow_inf_nan=False)] | Annotated[str, Field(max_length=400)],
+    Field(
+        description='A number, also as text such as "NaN", or the name of a value in the metadata; of an '
+        "extended parameter also text, or bytes as hex:00ff."
+    ),
+]
+Values = Annotated[dict[Name, Value], Field(min_length=1, max_length=VALUES_MAX)]
+Seconds = Annotated[float | None, Field(gt=0, le=86_400, description="Timeout in seconds.")]
+Patterns = Annotated[
+    tuple[Annotated[str, Field(min_length=1, max_length=64)], ...], Field(max_length=VALUES_MAX)
+]
+Moment = Annotated[
+    Annotated[Whole, Field(ge=1, lt=1 << 62)] | Annotated[AwareDatetime, BeforeValidator(_check_text)],
+    BeforeValidator(_parse_number),
+    Field(description="The number of a snapshot, or a time with its zone."),
+]
+Force = Annotated[
+    bool, Field(description="Write values outside the range in the metadata, NaN and infinities.")
+]
+Durable = Annotated[bool, Field(description="Respond after value and history are on the disk.")]
+
+
+class WriteOptions(Body):
+    """Options of writes; see `Component.set`."""
+
+    settle: Annotated[float, Field(ge=0, le=60, alias="settle_s")] = 0.0
+    force: Force = False
+    durable: Durable = False
+    timeout: Annotated[Seconds, Field(alias="timeout_s")] = None
+
+
+class WriteRequest(WriteOptions):
+    """One value."""
+
+    value: Value
+
+
+class WriteManyRequest(WriteOptions):
+    """Several values, by name; written in this order, many at a time."""
+
+    values: Values
+
+
+class FetchRequest(Body):
+    """Options of a fetch; see `Component.fetch_all`. `metadata` also loads the metadata from the vehicle."""
+
+    refresh: bool = False
+    metadata: bool = False
+    timeout_s: Seconds = None
+
+
+class UploadedFile(Body):
+    """A parameter file, as text or in base64. Its name can indicate its format; `component` selects a set."""
+
+    one_of = ("text", "base64")
+    name: Annotated[str, Field(max_length=255)] = ""
+    text: Annotated[str, Field(max_length=FILE_BYTES_MAX)] | None = None
+    base64: Annotated[bytes, BeforeValidator(_decode), Field(max_length=FILE_BYTES_MAX)] | None = None
+    format: FileFormat | None = None
+    component: Annotated[int, Field(ge=1, le=255)] | None = None
+
+    def read(self, *, partial: bool = False) -> ParamFile:
+        """Parse the file; see `files.loads`. Blocks for up to seconds.
+
+        Raises:
+            FileError: the file is invalid.
+        """
+        data = (self.text or "").encode("utf-8", "surrogatepass") if self.base64 is None else self.base64
+        return loads(data, source=self.name, file_format=self.format, partial=partial)
+
+    def read_set(self, component: Component) -> ParamSet:
+        """Parse the file, and return its set for a component; see `read`."""
+        file = self.read()
+        is_of_several = len({each.system for each in file.sets}) > 1
+        chosen = component.component if self.component is None else self.component
+        return file.choose(chosen, system=component.system if is_of_several else None)
+
+
+class PlanRequest(Body):
+    """Wanted parameters: exactly one of `values`, `file` and `at`, limited to `only`."""
+
+    one_of = ("values", "file", "at")
+    values: Values | None = None
+    file: UploadedFile | None = None
+    at: Moment | None = None
+    only: Patterns | None = None
+    include: Patterns = ()
+    force: Force = False
+
+
+class RunOptions(Body):
+    """Options of an apply or restore; see `paramclient.provision.apply`."""
+
+    include: Patterns = ()
+    force: Force = False
+    reboot: bool = False
+    allow_armed: bool = False
+    timeout: Annotated[Seconds, Field(alias="timeout_s")] = None
+
+
+class ApplyRequest(RunOptions, PlanRequest):
+    """Wanted parameters with options."""
+
+    partial: bool = False
+    durable: Durable = False
+
+
+class RestoreRequest(RunOptions):
+    """The state to restore; without `at`, the state before the last apply."""
+
+    at: Moment | None = None
+
+
+class SnapshotRequest(Body):
+    """Reason of a snapshot."""
+
+    reason: Annotated[str, Field(min_length=1, max_length=200)]
+
+
+# the subject and the author of a request
+
+
+async def author_of(request: Request) -> str:
+    """Return the author of the changes of a request: the name of the token, and that in X-Author, if any."""
+    name: str = request.state.holder.name
+    page = request.headers.get("x-author", "")
+    return f"{name} ({page})" if _PAGE_NAME.fullmatch(page) else name
+
+
+async def require_write(request: Request) -> None:
+    """Reject a request with a token that may not write.
+
+    Raises:
+        ServiceError: 403, it may not.
+    """
+    if request.state.holder.role != "write":
+        raise ServiceError(403, "forbidden", "This request requires a token that may write.")
+
 
 reading = APIRouter()
 writing = APIRouter(dependencies=[Depends(require_write)])
@@ -78,7 +261,7 @@ ComponentId = Annotated[int, Path(ge=0, le=255)]
 LinkName = Annotated[
     str | None, Query(max_length=200, description="Name of the link, if several have the ids.")
 ]
-At = Annotated[bodies.Moment | None, Query(description="An earlier state: a snapshot's number, or a time.")]
+At = Annotated[Moment | None, Query(description="An earlier state: a snapshot's number, or a time.")]
 Names = Annotated[list[str] | None, Query(max_length=64, description="Names, or patterns such as MC_*.")]
 Ext = Annotated[bool, Query(description="The extended parameters (PARAM_EXT_*).")]
 
@@ -138,12 +321,12 @@ async def vehicles(hub: HubArgument) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ParamsJson(Json):
+class ParamsJson(shapes.Json):
     """Parameters by name, with the number of the last event whose effects they include."""
 
     run: str
     seq: int
-    params: Mapping[str, ParamJson | WrittenJson]
+    params: Mapping[str, shapes.ParamJson | shapes.WrittenJson]
 
 
 @reading.get(f"{VEHICLE}/params")
@@ -158,7 +341,7 @@ async def params(
     choice = NameChoice(names or ["*"])
     if at is not None:
         state = await target.state_at(at)
-        earlier = {name: WrittenJson.of(each) for name, each in state.items() if choice.has(name)}
+        earlier = {name: shapes.WrittenJson.of(each) for name, each in state.items() if choice.has(name)}
         return ParamsJson(**position, params=earlier)
     known = [each for name, each in target.component.params.items() if choice.has(name)]
 
@@ -175,7 +358,7 @@ async def param(
     target: TargetArgument,
     name: str,
     live: Annotated[bool, Query(description="Read it from the vehicle, also if it is known.")] = False,
-) -> ParamJson:
+) -> shapes.ParamJson:
     """Return one parameter: the known value, else that of the vehicle."""
     known = None if live else target.component.params.get(name)
     return target.shown(known or await target.component.get(name), whole=True)
@@ -183,8 +366,8 @@ async def param(
 
 @writing.put(f"{VEHICLE}/params/{{name:path}}")
 async def set_param(
-    author: Author, target: TargetArgument, name: str, body: bodies.WriteRequest
-) -> WriteJson:
+    author: Author, target: TargetArgument, name: str, body: WriteRequest
+) -> shapes.WriteJson:
     """Write one parameter, and verify the value that the vehicle reports."""
     values = await target.values({name: body.value}, force=body.force)
     options = body.model_dump(exclude={"value"})
@@ -193,7 +376,7 @@ async def set_param(
 
 
 @writing.patch(f"{VEHICLE}/params")
-async def set_params(author: Author, target: TargetArgument, body: bodies.WriteManyRequest) -> dict[str, Any]:
+async def set_params(author: Author, target: TargetArgument, body: WriteManyRequest) -> dict[str, Any]:
     """Write several parameters in order, many at a time, and verify each.
 
     If a value is invalid or out of range, nothing is written. A value that the vehicle refuses does not stop
@@ -204,23 +387,25 @@ async def set_params(author: Author, target: TargetArgument, body: bodies.WriteM
     result = await target.component.set_many(values, **options, author=author)
     results = [target.outcome(each) for each in result.outcomes]
     error = {} if result.error is None else {"error": str(result.error)}
-    return dict(as_json({"vehicle": VehicleJson.of(target.component), "results": results} | error))
+    return dict(
+        shapes.as_json({"vehicle": shapes.VehicleJson.of(target.component), "results": results} | error)
+    )
 
 
 @reading.post(f"{VEHICLE}/fetch")
-async def fetch(target: TargetArgument, body: bodies.FetchRequest) -> FetchJson:
+async def fetch(target: TargetArgument, body: FetchRequest) -> shapes.FetchJson:
     """Fetch all parameters. Simultaneous requests share one download; the progress is in the events."""
     component = target.component
     result = await target.fetch(refresh=body.refresh, timeout=body.timeout_s)
     if body.metadata:
         await target.load_metadata(timeout=body.timeout_s)
     known = dict(component.params)
-    return FetchJson.of(
+    return shapes.FetchJson.of(
         component,
         result,
         known.values(),
-        bytes_received=component.client.bytes_received,
-        bytes_sent=component.client.bytes_sent,
+        bytes_received=component.core.link_task.bytes_received,
+        bytes_sent=component.core.link_task.bytes_sent,
         described=target.defaults_of(known),
     )
 
@@ -229,10 +414,10 @@ async def fetch(target: TargetArgument, body: bodies.FetchRequest) -> FetchJson:
 
 
 @reading.post("/api/files")
-async def read_file(body: bodies.UploadedFile) -> dict[str, Any]:
+async def read_file(body: UploadedFile) -> dict[str, Any]:
     """Parse a parameter file of any format, without names that no vehicle can have. It is not stored."""
     file = await anyio.to_thread.run_sync(partial(body.read, partial=True))
-    sets = as_json([SetJson.with_sources(each, {}) for each in file.sets])
+    sets = shapes.as_json([shapes.SetJson.with_sources(each, {}) for each in file.sets])
     return {"file": file.source, "format": file.file_format, "notes": file.notes, "components": sets}
 
 
@@ -279,7 +464,7 @@ async def _only_apply(target: TargetArgument) -> AsyncIterator[None]:
 
 
 @reading.post(f"{VEHICLE}/plan")
-async def plan(target: TargetArgument, body: bodies.PlanRequest) -> PlanJson:
+async def plan(target: TargetArgument, body: PlanRequest) -> PlanJson:
     """Return which values an apply would write, in which order, and which it would skip, and why."""
     component, wanted = target.component, await _wanted(target, body)
     found = await plan_of(component, wanted, include=body.include, info=target.metadata, force=body.force)
@@ -287,7 +472,7 @@ async def plan(target: TargetArgument, body: bodies.PlanRequest) -> PlanJson:
 
 
 @writing.post(f"{VEHICLE}/apply", dependencies=[Depends(_only_apply)])
-async def apply_(author: Author, target: TargetArgument, body: bodies.ApplyRequest) -> ApplyJson:
+async def apply_(author: Author, target: TargetArgument, body: ApplyRequest) -> ApplyJson:
     """Write the wanted values in a working order, and verify each of them.
 
     The progress is in the events. If the client disconnects, the apply ends; written values stay.
@@ -295,11 +480,11 @@ async def apply_(author: Author, target: TargetArgument, body: bodies.ApplyReque
     wanted = await _wanted(target, body)
     options = body.model_dump(exclude={"values", "file", "at", "only"}) | _context(author, target)
     result = await apply(target.component, wanted, **options)
-    return ApplyJson.of(result, VehicleJson.of(target.component))
+    return ApplyJson.of(result, shapes.VehicleJson.of(target.component))
 
 
 @writing.post(f"{VEHICLE}/restore", dependencies=[Depends(_only_apply)])
-async def restore_(author: Author, target: TargetArgument, body: bodies.RestoreRequest) -> ApplyJson:
+async def restore_(author: Author, target: TargetArgument, body: RestoreRequest) -> ApplyJson:
     """Restore an earlier state, with the vehicle's own identity and calibration."""
     if body.at is None:
         state = (await target.cached(load_restore_point)).state
@@ -307,10 +492,10 @@ async def restore_(author: Author, target: TargetArgument, body: bodies.RestoreR
         state = await target.state_at(body.at)
     options = body.model_dump(exclude={"at"}) | _context(author, target)
     result = await restore(target.component, state, **options)
-    return ApplyJson.of(result, VehicleJson.of(target.component))
+    return ApplyJson.of(result, shapes.VehicleJson.of(target.component))
 
 
-async def _wanted(target: Target, body: bodies.PlanRequest) -> ParamSet:
+async def _wanted(target: Target, body: PlanRequest) -> ParamSet:
     """Return the wanted parameters of a request."""
     if body.file is not None:
         found = await anyio.to_thread.run_sync(body.file.read_set, target.component)
@@ -345,29 +530,28 @@ def _context(author: str, target: Target) -> dict[str, Any]:
 
 
 @reading.get(f"{VEHICLE}/snapshots")
-async def snapshots(target: TargetArgument) -> dict[str, list[SnapshotJson]]:
+async def snapshots(target: TargetArgument) -> dict[str, list[shapes.SnapshotJson]]:
     """Return the snapshots, the newest last."""
-    return {"snapshots": [SnapshotJson.of(each) for each in await target.cached(ParamCache.snapshots)]}
+    return {"snapshots": [shapes.SnapshotJson.of(each) for each in await target.cached(ParamCache.snapshots)]}
 
 
 @writing.post(f"{VEHICLE}/snapshots", status_code=201)
-async def create_snapshot(target: TargetArgument, body: bodies.SnapshotRequest) -> SnapshotJson:
+async def create_snapshot(target: TargetArgument, body: SnapshotRequest) -> shapes.SnapshotJson:
     """Store a snapshot of the known table."""
     component = target.component
     known = list(component.params.values())
     if not known:
         raise UsageError("no parameter of the vehicle is known")
     table = component_set(component, known, f"link {target.link.name}")
-    about = {
-        "reason": body.reason,
-        "hash": component.hash,
-        "complete": len(known) >= (component.count or math.inf),
-    }
+    is_whole, crc = len(known) >= (component.count or math.inf), component.hash
 
     def store(cache: ParamCache, _: str, number: int, **which: bool) -> SnapshotSummary:
-        return cache.store_snapshot(component.identity, number, table, **about, **which)
+        vehicle, reason = component.identity, body.reason
+        return cache.store_snapshot(
+            vehicle, number, table, reason=reason, hash=crc, complete=is_whole, **which
+        )
 
-    return SnapshotJson.of(await target.cached(store))
+    return shapes.SnapshotJson.of(await target.cached(store))
 
 
 @reading.get(f"{VEHICLE}/history")
@@ -376,8 +560,52 @@ async def history(
     name: Annotated[str | None, Query(max_length=16)] = None,
     limit: Annotated[int, Query(ge=1, le=1_000)] = HISTORY_ENTRIES,
     since: Annotated[AwareDatetime | None, Query(description="Only from this time on.")] = None,
-) -> dict[str, list[HistoryLineJson]]:
+) -> dict[str, list[shapes.HistoryLineJson]]:
     """Return the newest changes of values, the newest last."""
     begin = None if since is None else since.timestamp()
     entries = await target.cached(ParamCache.history, name, limit, begin)
-    return {"history": [HistoryLineJson.of(each) for each in entries]}
+    return {"history": [shapes.HistoryLineJson.of(each) for each in entries]}
+
+
+# metrics
+
+
+def metrics_text(hub: Hub) -> str:
+    """Return the current metrics."""
+    lines = []
+    for name, text, samples in _metrics(hub):
+        kind = "counter" if name.endswith("_total") else "gauge"
+        lines += [f"# HELP paramclient_{name} {text}", f"# TYPE paramclient_{name} {kind}"]
+        for labels, value in samples:
+            pairs = [f'{label}="{str(each).translate(_ESCAPES)}"' for label, each in labels.items()]
+            lines.append(f"paramclient_{name}{{{','.join(pairs)}}} {float(value)}")
+    return "\n".join([*lines, ""])
+
+
+def _metrics(hub: Hub) -> Iterator[tuple[str, str, Sequence[Sample]]]:
+    """Yield name, help text and samples of each metric. The name of a counter ends with `_total`."""
+    yield "info", "Version of paramclient.", [({"version": __version__}, 1)]
+    yield "uptime_seconds", "Seconds since the start.", [({}, time.monotonic() - hub.started)]
+    yield "events_total", "Published events.", [({}, hub.feed.seq)]
+
+    links = [({"link": link.name}, link) for link in hub.links.values()]
+    yield "link_open", "1 if the link is open.", [(at, link.state == "open") for at, link in links]
+    opened = [(at, link.client) for at, link in links if link.client is not None]
+    yield "link_bytes_received_total", "Received bytes.", [(at, each.bytes_received) for at, each in opened]
+    yield "link_bytes_sent_total", "Sent bytes.", [(at, each.bytes_sent) for at, each in opened]
+
+    tables = [(target.address, target.component) for target in hub.targets]
+    is_up = [(at, each.sync_state != "lost") for at, each in tables]
+    yield "component_up", "1 if the vehicle is not lost.", is_up
+    is_synced = [(at, each.sync_state == "synced") for at, each in tables]
+    yield "component_synced", "1 if the table matches that of the vehicle.", is_synced
+    sizes = [(at, len(each.params)) for at, each in tables]
+    yield "component_parameters", "Parameters in the table.", sizes
+    times = [(at, each.round_trip) for at, each in tables if each.round_trip is not None]
+    yield "component_round_trip_seconds", "Smoothed round-trip time in seconds.", times
+
+    endpoints = [({"endpoint": each.name}, each.stations.values()) for each in hub.gateway.endpoints]
+    yield "stations", "Connected ground stations.", [(at, len(stations)) for at, stations in endpoints]
+    for name, text in STATION_SUMS.items():
+        sums = [(at, sum(getattr(each, name) for each in stations)) for at, stations in endpoints]
+        yield f"stations_{name}", text, sums

@@ -323,6 +323,15 @@ async def test_rule_2_the_parameter_file_in_the_requested_pieces(size: int, quer
         assert not vehicle.messages(FileTransfer)
 
 
+@in_simulated_time
+@pytest.mark.parametrize("query", ["?colour=1", "?start=x", "?withdefaults=2"])
+async def test_rule_2_a_query_that_the_table_does_not_answer_is_passed(query: str) -> None:
+    async with in_sync(ArduPilotVehicle()) as (_, vehicle, station):
+        data = f"@PARAM/param.pck{query}".encode()
+        assert await station.ask_file(Opcode.OPEN_FILE_RO, data=data)
+        assert vehicle.messages(FileTransfer)
+
+
 def test_rule_2_a_file_with_defaults_that_are_unknown_is_one_without() -> None:
     entries = [PackedParam("A", ParamType.INT8, 5), PackedParam("B", ParamType.REAL32, 7)]
     plain, full = FileQuery(), FileQuery(with_defaults=True)
