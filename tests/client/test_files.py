@@ -158,6 +158,7 @@ async def test_a_scope_around_a_client_ends_it_whatever_the_link_does(fault: str
         tap.data_to_send()
     assert bool(vehicle.open_files) == (fault in ("deaf", "dropped", "failed"))
     assert not tasks_beside()
+    assert isinstance(await outcome(files.checksum("/x")), ClientClosed)
 
 
 @in_simulated_time
