@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 __all__ = ["Report", "Result", "Row"]
 
 OK = "ok"
-SLOWER = "slower"
 SKIPPED = "skipped"
 FAILED = "FAILED"
 Result = str
-"""`OK`; `SLOWER`: all is right, but it took longer than is promised; `SKIPPED`; or `FAILED`."""
+"""`OK`, `SKIPPED` or `FAILED`."""
 
 
 @dataclass(frozen=True)

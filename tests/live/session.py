@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +14,7 @@ from tests.live.choice import Choice
 from tests.live.journal import Journal
 from tests.live.relay import CLEAN, Conditions, Relay
 
-__all__ = ["DISCOVERY_TIMEOUT", "Check", "CheckFailed", "Measured", "Session", "Skip"]
+__all__ = ["DISCOVERY_TIMEOUT", "Check", "CheckFailed", "Session", "Skip"]
 
 DISCOVERY_TIMEOUT: Final = 15.0
 """Seconds to wait for the vehicle's heartbeat at the beginning of a check."""
@@ -31,42 +31,22 @@ class Skip(Exception):
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What a check has found.
-
-    Attributes:
-        text: as it stands in the table.
-        seconds: what is held against the promise, or None where nothing is.
-    """
-
-    text: str
-    seconds: float | None = None
-
-
-@dataclass(frozen=True)
 class Check:
     """One row of the table.
 
     Attributes:
         name: what is checked.
-        run: does it.
+        run: does it, and returns what it has found, as it stands in the table.
         promise: what the documentation promises, in words.
-        seconds: by kind of autopilot, the seconds that it promises; a slower run is no failure.
         writes: whether it changes parameters, which an armed vehicle or `--read-only` forbids.
         kinds: the autopilots for which it has a meaning; None for all.
     """
 
     name: str
-    run: Callable[[Session], Awaitable[Measured]]
+    run: Callable[[Session], Awaitable[str]]
     promise: str = ""
-    seconds: Mapping[str, float] = field(default_factory=dict)
     writes: bool = False
     kinds: tuple[str, ...] | None = None
-
-    def promise_for(self, kind: str) -> str:
-        """Return what is promised for this kind of autopilot, in words."""
-        limit = f"{self.seconds[kind]:g} s" if kind in self.seconds else ""
-        return ", ".join(filter(None, (limit, self.promise)))
 
 
 @dataclass
