@@ -290,12 +290,6 @@ async def health(request: Request, hub: HubArgument) -> dict[str, Any]:
     return found | {"role": holder.role, "up_s": round(time.monotonic() - hub.started, 1), "links": links}
 
 
-@reading.get("/metrics")
-async def metrics(hub: HubArgument) -> PlainTextResponse:
-    """Return the metrics for Prometheus in text format."""
-    return PlainTextResponse(metrics_text(hub), media_type=METRICS_MEDIA_TYPE)
-
-
 @reading.get("/api/events", response_class=EventSourceResponse)
 async def events(
     hub: HubArgument, last_event_id: Annotated[str | None, Header()] = None
@@ -570,8 +564,9 @@ async def history(
 # metrics
 
 
-def metrics_text(hub: Hub) -> str:
-    """Return the current metrics."""
+@reading.get("/metrics")
+async def metrics(hub: HubArgument) -> PlainTextResponse:
+    """Return the metrics for Prometheus in text format."""
     lines = []
     for name, text, samples in _metrics(hub):
         kind = "counter" if name.endswith("_total") else "gauge"
@@ -579,7 +574,7 @@ def metrics_text(hub: Hub) -> str:
         for labels, value in samples:
             pairs = [f'{label}="{str(each).translate(_ESCAPES)}"' for label, each in labels.items()]
             lines.append(f"paramclient_{name}{{{','.join(pairs)}}} {float(value)}")
-    return "\n".join([*lines, ""])
+    return PlainTextResponse("\n".join([*lines, ""]), media_type=METRICS_MEDIA_TYPE)
 
 
 def _metrics(hub: Hub) -> Iterator[tuple[str, str, Sequence[Sample]]]:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from importlib import resources
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias
 
 import anyio
 import uvicorn
@@ -69,8 +69,7 @@ TOKEN_FILE_BYTES_MAX: Final = 100_000
 _LINE: Final = re.compile(r"([A-Za-z0-9._-]{1,32})\s+(read|write)\s+sha256:([0-9a-f]{64})")
 
 
-@dataclass(frozen=True, slots=True)
-class TokenHolder:
+class TokenHolder(NamedTuple):
     """Holder of a token.
 
     Attributes:
@@ -178,20 +177,13 @@ RESPONSE_HEADERS: Final = {
 """Headers of all responses: the page loads nothing from other sites, and no other page can frame it."""
 
 
-class AccessMiddleware:
-    """Finds the holder of the token of a request. Rejects requests without a valid one, and writes of other
-    sites, before their body is received.
+def guard(app: ASGIApp, tokens: Tokens | None) -> ASGIApp:
+    """Return an application that finds the holder of the token of each request.
 
-    Args:
-        app: the application.
-        tokens: the valid tokens; None lets every request read and write.
+    It rejects requests without a valid one, and writes of other sites, before their body is received.
     """
 
-    def __init__(self, app: ASGIApp, tokens: Tokens | None) -> None:
-        self._app = app
-        self._tokens = tokens
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def guarded(scope: Scope, receive: Receive, send: Send) -> None:
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
@@ -200,46 +192,38 @@ class AccessMiddleware:
             await send(message)
 
         try:
-            headers = Headers(scope=scope)
-            if scope["method"] not in SAFE_METHODS:
-                _check_origin(headers)
-            holder = self._holder(headers)
-            if holder is None and scope["path"].startswith(PROTECTED):
-                detail = "This service requires a token in the header Authorization: Bearer TOKEN."
-                raise ServiceError(401, "unauthorized", detail)
-            scope.setdefault("state", {})["holder"] = holder
+            scope.setdefault("state", {})["holder"] = _holder_of(scope, tokens)
         except ServiceError as error:
             await problem_response(error)(scope, receive, send_with_headers)
-            return
-        await self._app(scope, receive, send_with_headers)
+        else:
+            await app(scope, receive, send_with_headers)
 
-    def _holder(self, headers: Headers) -> TokenHolder | None:
-        """Return the holder of the token of a request; None without a token.
+    return guarded
 
-        Raises:
-            ServiceError: 401, the token is wrong.
-        """
-        if self._tokens is None:
-            return LOCAL
-        given = headers.get("authorization")
-        if given is None:
-            return None
+
+def _holder_of(scope: Scope, tokens: Tokens | None) -> TokenHolder | None:
+    """Return the holder of the token of a request; None without a token where none is needed.
+
+    Raises:
+        ServiceError: 401, a token is missing or wrong; 403, a page of another site would change something.
+    """
+    headers = Headers(scope=scope)
+    origin, given = headers.get("origin"), headers.get("authorization")
+    is_write = scope["method"] not in SAFE_METHODS
+    if is_write and origin is not None and origin.partition("://")[2] != headers.get("host"):
+        raise ServiceError(403, "other-origin", f"Pages of {origin[:200]} may not change anything here.")
+    if tokens is None:
+        return LOCAL
+    if given is not None:
         scheme, _, token = given.partition(" ")
-        holder = self._tokens.holder(token.strip()) if scheme.lower() == "bearer" else None
+        holder = tokens.holder(token.strip()) if scheme.lower() == "bearer" else None
         if holder is None:
             raise ServiceError(401, "unauthorized", "The token is not valid for this service.")
         return holder
-
-
-def _check_origin(headers: Headers) -> None:
-    """Check that a request that may change something is not from a page of another site.
-
-    Raises:
-        ServiceError: 403, it is.
-    """
-    origin = headers.get("origin")
-    if origin is not None and origin.partition("://")[2] != headers.get("host"):
-        raise ServiceError(403, "other-origin", f"Pages of {origin[:200]} may not change anything here.")
+    if scope["path"].startswith(PROTECTED):
+        detail = "This service requires a token in the header Authorization: Bearer TOKEN."
+        raise ServiceError(401, "unauthorized", detail)
+    return None
 
 
 def cancel_on_disconnect(app: ASGIApp) -> ASGIApp:
@@ -284,7 +268,7 @@ def create_app(hub: Hub, *, tokens: Tokens | None = None) -> FastAPI:
     app.state.hub = hub
     app.add_middleware(RequestBodyLimitMiddleware, max_body_size=BODY_BYTES_MAX)
     app.add_middleware(cancel_on_disconnect)
-    app.add_middleware(AccessMiddleware, tokens=tokens)
+    app.add_middleware(guard, tokens=tokens)
     if tokens is None:
         app.add_middleware(TrustedHostMiddleware, allowed_hosts=LOOPBACK_NAMES, www_redirect=False)
     for router in routes.ROUTERS:
@@ -294,8 +278,7 @@ def create_app(hub: Hub, *, tokens: Tokens | None = None) -> FastAPI:
     return app
 
 
-@dataclass(frozen=True, slots=True)
-class Listening:
+class Listening(NamedTuple):
     """Listening address of the service.
 
     Attributes:
@@ -376,9 +359,8 @@ async def serve(
     listening = Listening() if listening is None else listening
     stop = anyio.Event() if stop is None else stop
     if tokens is None and not listening.is_loopback:
-        raise UsageError(
-            f"{listening.host} is not a loopback address: a service for other computers needs --tokens FILE"
-        )
+        what = "is not a loopback address: a service for other computers needs --tokens FILE"
+        raise UsageError(f"{listening.host} {what}")
     config = uvicorn.Config(
         create_app(hub, tokens=tokens),
         lifespan="off",
