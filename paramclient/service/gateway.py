@@ -36,7 +36,7 @@ GROUND_STATION_SYSTEM: Final = 255
 """The system id of ground stations by default, and of a client."""
 OWN_TYPE: Final = 18
 """MAV_TYPE_ONBOARD_CONTROLLER, for the same reason."""
-GROUND_STATION_PARAMS: Final = ("SYSID_MYGCS", "MAV_GCS_SYSID")
+GROUND_STATION_PARAMS: Final = frozenset({"SYSID_MYGCS", "MAV_GCS_SYSID"})
 """ArduPilot's parameter with the system id of its ground station, whose heartbeats it watches."""
 LOOP_TIME: Final = 2.0
 """Seconds after which a frame that was sent is not taken for its own copy any more."""
@@ -236,12 +236,9 @@ class VehicleLink(Tap):
         self.signing: set[Source] = set()
         self._gateway = gateway
         self._client = client
+        self._station = client.core.station
         self._tables: dict[Session, KeptTable] = {}
         self.file = cache(KeptFile)
-
-    @property
-    def _own_address(self) -> Source:
-        return self._client.core.station.own_address
 
     @property
     def is_signed(self) -> bool:
@@ -258,7 +255,7 @@ class VehicleLink(Tap):
 
     def accepts(self, data: bytes, peer: Hashable) -> bool:
         """Return whether received data is no datagram of the gateway that has come back over another peer."""
-        peers = (node.peer for node in self._client.core.station.nodes.values())
+        peers = (node.peer for node in self._station.nodes.values())
         return not self._gateway.copies.has(data) or peer in peers
 
     def sent(self, frame: bytes) -> None:
@@ -273,37 +270,32 @@ class VehicleLink(Tap):
         """Pass the frames of a chunk on; the client has taken them before."""
         for seen in frames:
             source = (seen.frame.system, seen.frame.component)
-            if source != self._own_address:
+            if source != self._station.own_address:
                 self.systems.add(source[0])
                 if seen.is_signed:
                     self.signing.add(source)
-                if seen.frame.message_id == HEARTBEAT:
-                    self._avoid_watched_id(source)
+                node = self._station.nodes.get(source)
+                if seen.frame.message_id == HEARTBEAT and node is not None:
+                    for name in node.plain.table.params.keys() & GROUND_STATION_PARAMS:
+                        self.avoid(node.plain.table.params[name].value)
                 self._gateway.pass_on(self, seen, peer)
 
-    def avoid(self, system: int) -> None:
+    def avoid(self, system: object) -> None:
         """Take another system id if a ground station has ours, or a vehicle watches it as that of one."""
-        own, component = self._own_address
+        own, component = self._station.own_address
         if own == system:
             systems = {source[0] for each in self._gateway.stations for source in each.sources}
             free = (each for each in range(own - 1, 0, -1) if each not in systems | self.systems)
-            self._client.core.station.own_address = (next(free, own), component)
-
-    def _avoid_watched_id(self, source: Source) -> None:
-        node = self._client.core.station.nodes.get(source)
-        params = {} if node is None else node.plain.table.params
-        own = self._own_address[0]
-        if any(name in params and params[name].value == own for name in GROUND_STATION_PARAMS):
-            self.avoid(own)
+            self._station.own_address = (next(free, own), component)
 
     def is_vehicle(self, source: Source) -> bool:
         """Return whether a component with parameters is heard under these ids."""
-        node = self._client.core.station.nodes.get(source)
+        node = self._station.nodes.get(source)
         return node is not None and node.identification.has_parameters and not node.presence.is_lost
 
     def tables(self, system: int, component: int, *, extended: bool) -> Iterator[KeptTable]:
         """Return the tables of the components with an address; 0 stands for all."""
-        for node in list(self._client.core.station.nodes.values()):
+        for node in list(self._station.nodes.values()):
             is_meant = system in (0, node.system) and component in (COMP_ID_ALL, node.component)
             if is_meant and node.identification.has_parameters:
                 yield self._table(node, extended=extended)
@@ -311,16 +303,15 @@ class VehicleLink(Tap):
     def table_of_answer(self, seen: SeenFrame, peer: Hashable) -> KeptTable | None:
         """Return the table to which a value or an answer belongs; None for another frame."""
         frame = seen.frame
-        node = self._client.core.station.nodes.get((frame.system, frame.component))
+        node = self._station.nodes.get((frame.system, frame.component))
         if node is None or node.peer != peer:
             return None
         table = self._table(node, extended=False)  # from its first frame on, for its changes
         extended = self._table(node, extended=True)
         if frame.message_id in EXTENDED_ANSWERS:
             return extended
-        is_answer = frame.message_id in PLAIN_ANSWERS or (
-            frame.message_id == FILE_TRANSFER and _target_of(frame) == self._own_address[0]
-        )
+        is_for_us = _target_of(frame) == self._station.own_address[0]
+        is_answer = frame.message_id in PLAIN_ANSWERS or (frame.message_id == FILE_TRANSFER and is_for_us)
         return table if is_answer else None
 
     def _table(self, node: Node, *, extended: bool) -> KeptTable:

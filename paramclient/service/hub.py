@@ -99,9 +99,9 @@ class Target:
     @property
     def is_listed(self) -> bool:
         """Whether it is in lists: extended parameters are if there are some, or usually."""
-        component = self.component
-        is_usual = expects_extended(component.identity.vehicle_type, component.component)
-        return not component.is_extended or is_usual or bool(component.params)
+        each = self.component
+        is_found = not each.is_extended or bool(each.params)
+        return is_found or expects_extended(each.identity.vehicle_type, each.component)
 
     @property
     def state(self) -> dict[str, Any]:

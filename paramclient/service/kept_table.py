@@ -12,8 +12,8 @@ from paramclient import errors
 from paramclient.client.component import Component
 from paramclient.client.streams import Stream
 from paramclient.errors import ExtAckResult, ParamClientError, ParamErrorCode
-from paramclient.model.ext_values import EXT_VALUE_SIZE, ext_bytes, ext_param
-from paramclient.model.values import WIRE_SIZE, Encoding, Param, ParamType, Trust, as_reported, decode_value
+from paramclient.model.ext_values import EXT_VALUE_SIZE, ext_bytes
+from paramclient.model.values import WIRE_SIZE, Encoding, Param, ParamType, Trust, as_reported
 from paramclient.protocol.dialect import ReportedValue
 from paramclient.protocol.events import Change
 from paramclient.protocol.reads import read
@@ -104,12 +104,11 @@ def value_of(session: Session, param: Param, *, index: int | None = None) -> Rep
         index = NO_INDEX if param.index is None or is_ardupilot else param.index
     if session.dialect.has_ack:
         raw = ext_bytes(param).ljust(EXT_VALUE_SIZE, b"\0")
-        return messages.ParamExtValue(param.name, raw, param.type_number, count, index)
-    if param.is_raw:
+    elif param.is_raw:
         raw = param.bits.to_bytes(WIRE_SIZE, "little")
     else:
         raw = as_reported(param.bits, param.type_number, session.table.encoding)
-    return messages.ParamValue(param.name, raw, param.type_number, count, index)
+    return session.dialect.value(param.name, raw, param.type_number, count, index)
 
 
 def digest_of(session: Session) -> messages.ParamValue | None:
@@ -415,10 +414,7 @@ class KeptTable(Stream[Change]):
             system, component = self.source
             what = f"{name} of {system}/{component} has another type"
             raise errors.TypeMismatch(what, system=system, component=component, name=name)
-        if is_extended:
-            value = ext_param(name, raw, number).settable
-        else:
-            value, _ = decode_value(raw, known, session.table.encoding)
+        value = session.dialect.param(name, raw, known, None, session.table.encoding).settable
         result = await self.component.set(name, value, author=author)
         done = value_of(session, result.param)
         if is_extended:

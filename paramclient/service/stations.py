@@ -405,8 +405,7 @@ def parse_endpoint(text: str) -> MavlinkEndpoint:
     options = dict(each.partition("=")[::2] for each in query.split("&") if each)
     for each, value in options.items():
         if each not in ("readonly", "trusted", "sign") or bool(value) != (each == "sign"):
-            raise UsageError(
-                f"{each!r} is not an option of an endpoint; these are readonly, trusted and sign=KEYFILE"
-            )
+            what = "is not an option of an endpoint; these are readonly, trusted and sign=KEYFILE"
+            raise UsageError(f"{each!r} {what}")
     key = read_key(options["sign"]) if "sign" in options else None
     return MavlinkEndpoint(link, is_readonly="readonly" in options, is_trusted="trusted" in options, key=key)
