@@ -1,9 +1,8 @@
 """The service: links and cache of this computer over HTTP, with a web page. Needs the extra `service`.
 
-- `event_feed`: events for any number of listeners, with resume.
 - `gateway`: passes frames between vehicles and ground stations; `kept_table`: answers for one component from
   its table; `kept_file`: from its parameter file; `stations`: endpoints, queues and sequence numbers.
-- `hub`: opens the links, follows the parameters of their components, and reads the cache.
+- `hub`: opens the links, follows the parameters of their components, reads the cache, and keeps the events.
 - `problems`: errors as problem documents (RFC 9457).
 - `routes`: all routes, their request bodies, and the metrics. JSON is as the command prints it.
 - `server`: tokens, and the checks of each request; the application and the page; uvicorn, start and shutdown.

@@ -392,12 +392,8 @@ def _readdressed(message: ListRequest, frame: Frame, target: Source) -> bytes:
 
 def _is_harmless(frame: Frame, message: Message | None) -> bool:
     """Return whether a frame changes nothing on a vehicle."""
-    match message:
-        case messages.CommandLong(command=command):
-            return command in HARMLESS_COMMANDS
-        case messages.FileTransfer(payload=payload):
-            return Packet.unpack(payload).opcode in HARMLESS_OPCODES
-        case messages.ParamSet() | messages.ParamExtSet():
-            return False
-        case _:
-            return frame.message_id in HARMLESS or isinstance(message, Request)
+    if isinstance(message, messages.CommandLong):
+        return message.command in HARMLESS_COMMANDS
+    if isinstance(message, messages.FileTransfer):
+        return Packet.unpack(message.payload).opcode in HARMLESS_OPCODES
+    return isinstance(message, ListRequest | ReadRequest) or frame.message_id in HARMLESS
