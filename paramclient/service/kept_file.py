@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import anyio
@@ -133,7 +134,7 @@ class KeptFile:
 
     def __init__(self, table: KeptTable) -> None:
         self._table = table
-        self._rows: tuple[object, Rows | None] = (None, None)
+        self._rows_at = lru_cache(1)(lambda state: rows_of(table.session))
         self._open: dict[Hashable, _OpenFile] = {}
         self._opening: set[Hashable] = set()
         self._uploads: set[Hashable] = set()
@@ -169,12 +170,11 @@ class KeptFile:
     def _begin(self, asker: Asker, request: Packet, route: Callable[[], None]) -> bool:
         """Open the file, or answer its checksum; wait for a fetch that may bring the table."""
         key, query = (asker, request.session), FileQuery.of(request)
-        opened = self._open.get(key)
-        if request.opcode == Opcode.OPEN_FILE_RO and opened is not None:
-            if (opened.query, opened.sequence) == (query, request.sequence):
-                self._say(asker, _opened(request, opened.rows))
-                return True
-            del self._open[key]
+        opened = self._open.pop(key, None) if request.opcode == Opcode.OPEN_FILE_RO else None
+        if opened is not None and (opened.query, opened.sequence) == (query, request.sequence):
+            self._open[key] = opened
+            self._say(asker, _opened(request, opened.rows))
+            return True
         if query is None or not self._is_served:
             return False
         if self._table.list_if_current is None:
@@ -183,7 +183,7 @@ class KeptFile:
                 self._opening.add(opening)
                 self._table.component.core.spawn(self._begin_later, opening, asker, request, route)
             return True
-        rows = self._current_rows()
+        rows = self._rows_at(self._table.state_key)
         if rows is None or query.start >= len(rows.entries):
             return False
         self._table.check()
@@ -216,12 +216,6 @@ class KeptFile:
         session = self._table.session
         is_likely = session.identification.is_ardupilot and session.identification.may_serve_file
         return is_likely if session.serves_file is None else session.serves_file
-
-    def _current_rows(self) -> Rows | None:
-        key = self._table.state_key
-        if self._rows[0] != key:
-            self._rows = (key, rows_of(self._table.session))
-        return self._rows[1]
 
     def _send(self, asker: Asker, request: Packet, file: _OpenFile) -> None:
         """Send a part of an open file: the first read says in which pieces it is read."""

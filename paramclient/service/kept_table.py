@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache
 from typing import Final, NamedTuple, TypeAlias, TypeVar
 
 import anyio
@@ -126,6 +127,14 @@ def listed(session: Session) -> list[ReportedValue]:
     return [value_of(session, param, index=index) for index, param in known if param is not None]
 
 
+def whole_list(session: Session) -> list[ReportedValue] | None:
+    """Return the answers to a request for the list; None if not all values are known to be the vehicle's."""
+    values, table, digest = listed(session), session.table, digest_of(session)
+    if not values or not table.is_complete or len(values) < len(table.names):
+        return None
+    return values if digest is None else [digest, *values]
+
+
 def known_param(session: Session, name: str | None) -> Param | None:
     """Return a parameter whose value is known to be the vehicle's."""
     param = None if name is None else session.table.params.get(name)
@@ -164,7 +173,7 @@ class KeptTable(Stream[Change]):
         self.source = (component.system, component.component)
         self.changes = 0
         self._announce = announce
-        self._snapshot: tuple[object, list[ReportedValue]] = (None, [])
+        self._list_at = lru_cache(1)(lambda state: whole_list(component.session))
         self._unserved_until = -math.inf
         self._unknown: dict[Which, float] = {}
         self._reads: dict[Which, set[Asker]] = {}
@@ -214,12 +223,7 @@ class KeptTable(Stream[Change]):
     def list_if_current(self) -> list[ReportedValue] | None:
         """The answers to a request for the list; None while the table is not complete and in sync."""
         key = self.state_key
-        if key is not None and self._snapshot[0] != key:
-            values, table = listed(self.session), self.session.table
-            is_whole = table.is_complete and len(values) == len(table.names)
-            digest = digest_of(self.session)
-            self._snapshot = (key, (values if digest is None else [digest, *values]) if is_whole else [])
-        return (self._snapshot[1] or None) if key is not None else None
+        return None if key is None else self._list_at(key)
 
     def check(self) -> None:
         """Have a table checked in the background that was not confirmed for a while."""
@@ -311,9 +315,9 @@ class KeptTable(Stream[Change]):
             sent.update(value.param_index for value in new)
             if whole is not None:
                 station.stream((self, "list"), self.source, self._current(new))
-                continue
-            for value in new:
-                station.say(value, self.source)
+            else:
+                for value in new:
+                    station.say(value, self.source)
 
     # single values
 

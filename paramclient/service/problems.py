@@ -87,8 +87,8 @@ def problem_response(error: Exception) -> Response:
         status, kind, detail, members = error.status, error.kind, str(error), error.members
     elif isinstance(error, ParamClientError):
         status = next((status for status, kinds in STATUSES.items() if isinstance(error, kinds)), 500)
-        name = type(error).__name__
-        kind, detail = re.sub("(?<=[a-z])([A-Z])", r"-\1", name).lower(), str(error)
+        name, detail = type(error).__name__, str(error)
+        kind = re.sub("(?<=[a-z])([A-Z])", r"-\1", name).lower()
         public = {key: value for key, value in vars(error).items() if not key.startswith("_")}
         members = to_jsonable_python(public, inf_nan_mode="strings", bytes_mode="hex", fallback=str)
         members["error"] = name

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import suppress
 from typing import Any, Final, TypeAlias
@@ -115,8 +115,8 @@ class GroundStation:
         self.requests: Counter[str] = Counter()
         self.list_passed_at = -math.inf
         self.relayed = self.answered = self.dropped = self.saved = 0
-        self._has_sent_version_2 = False
-        self._numbering: dict[Source, Numbering] = {}
+        self._versions: set[int] = set()
+        self._numbering: defaultdict[Source, Numbering] = defaultdict(Numbering)
         self._queue: deque[tuple[Source, bytes | Message | None]] = deque()  # relayed, inserted, withheld
         self._streams: dict[Hashable, tuple[Source, Iterator[Message]]] = {}
         self._is_turn_of_streams = False
@@ -159,8 +159,8 @@ class GroundStation:
         self.received_at = anyio.current_time()
         if len(self.sources) < SOURCES_MAX:
             self.sources.add((seen.frame.system, seen.frame.component))
-        self._has_sent_version_2 |= seen.frame.version == 2
-        self.version = 2 if self._has_sent_version_2 else 1
+        self._versions.add(seen.frame.version)
+        self.version = max(self._versions)
 
     def relay(self, seen: SeenFrame) -> None:
         """Queue a frame of a vehicle."""
@@ -230,7 +230,7 @@ class GroundStation:
     def _next_of_queue(self) -> bytes | None:
         while self._queue:
             source, item = self._queue.popleft()
-            numbering = self._numbering.setdefault(source, Numbering())
+            numbering = self._numbering[source]
             if item is None:
                 numbering.withhold()
             elif not isinstance(item, bytes):
@@ -251,7 +251,7 @@ class GroundStation:
         return None
 
     def _inserted(self, source: Source, message: Message) -> bytes:
-        number = self._numbering.setdefault(source, Numbering()).insert()
+        number = self._numbering[source].insert()
         system, component = source
         data = encode(message, system=system, component=component, sequence=number, version=self.version)
         if self.endpoint.signer is not None:
@@ -260,6 +260,10 @@ class GroundStation:
         self.answered += 1
         self.saved += len(data)
         return data
+
+
+Take: TypeAlias = Callable[[GroundStation, SeenFrame], None]
+"""Called with each frame of a station."""
 
 
 class MavlinkEndpoint:
@@ -292,9 +296,9 @@ class MavlinkEndpoint:
         self.name = self.link.name
         self.is_readonly = is_readonly
         self.is_trusted = is_trusted
-        self.signer: Signer | None = None
         self.stations: dict[Peer | None, GroundStation] = {}
         self.sending: Callable[[bytes], None] = lambda data: None
+        self.signer: Signer | None = None
         self._verifier: Verifier | None = None
         if key is not None:
             self.signer, self._verifier = Signing(key, SigningPolicy.SIGNED_ONLY, ANSWER_LINK_ID).begin()
@@ -321,7 +325,7 @@ class MavlinkEndpoint:
                 raise
             logger.warning("%s", error)
 
-    async def run(self, take: Callable[[GroundStation, SeenFrame], None]) -> None:
+    async def run(self, take: Take) -> None:
         """Receive frames of the stations and send theirs to them, until cancelled.
 
         Args:
@@ -338,9 +342,7 @@ class MavlinkEndpoint:
             with anyio.CancelScope(shield=True):
                 await self.link.close()
 
-    async def _read(
-        self, take: Callable[[GroundStation, SeenFrame], None], tasks: anyio.abc.TaskGroup
-    ) -> None:
+    async def _read(self, take: Take, tasks: anyio.abc.TaskGroup) -> None:
         cutter = FrameCutter(stream=self.link.is_stream)
         while True:
             try:
