@@ -103,14 +103,13 @@ def reply(
 def answers_of(request: Packet, content: bytes) -> Iterator[Packet]:
     """Return the answers to a read, or to a burst: all that follows, and then the end of the file."""
     size = min(request.size or DATA_SIZE_MAX, DATA_SIZE_MAX)
-    step, offset = 1, request.offset
-    while offset < len(content):
-        data = content[offset : offset + size]
-        yield reply(request, data, offset=offset, step=step)
+    offsets = range(request.offset, len(content), size)
+    for step, offset in enumerate(offsets, 1):
+        yield reply(request, content[offset : offset + size], offset=offset, step=step)
         if request.opcode != Opcode.BURST_READ_FILE:
             return
-        step, offset = step + 1, offset + len(data)
-    yield reply(request, error=FileErrorCode.EOF, offset=offset, step=step)
+    end = max(request.offset, len(content))
+    yield reply(request, error=FileErrorCode.EOF, offset=end, step=len(offsets) + 1)
 
 
 @dataclass(slots=True)

@@ -50,7 +50,6 @@ HISTORY_ENTRIES: Final = 100
 """Default number of entries of a history."""
 PROGRESS_INTERVAL: Final = 0.25
 """Seconds between two progress events of an apply or restore."""
-
 FILE_BYTES_MAX: Final = 2 * 2**20
 """Maximum size of a parameter file in bytes; a table of 10,000 parameters takes 1 MB."""
 VALUES_MAX: Final = 10_000
@@ -65,10 +64,11 @@ STATION_SUMS: Final = {
 }
 """Help texts of the sums over the connected stations of an endpoint, by attribute of `GroundStation`."""
 _ESCAPES: Final = str.maketrans({"\\": r"\\", "\n": r"\n", '"': r"\""})
+_PAGE_NAME: Final = re.compile(r"[A-Za-z0-9._ -]{1,64}")
 
 Sample: TypeAlias = tuple[Mapping[str, object], float]
 """Labels and a value."""
-_PAGE_NAME: Final = re.compile(r"[A-Za-z0-9._ -]{1,64}")
+
 
 # request bodies
 
