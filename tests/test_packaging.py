@@ -28,7 +28,7 @@ SOURCES = {
 }
 PLUGIN = "pytest_paramclient.py"
 SERVED = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient/service/page").glob("*.*")}
-TABLES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient/sim/tables").glob("*.csv")}
+TABLES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient/sim/tables").glob("*.*")}
 
 
 @pytest.fixture(scope="module")
