@@ -107,13 +107,17 @@ async def prove(session: Session) -> None:
         TableDiffers: its table is too different.
         LinkError: the link is closed for good.
     """
+    vehicles = session.identification.vehicles
     if not await is_free(session.channel):
         raise ChecksumUnavailable(BUSY)
     async with session.channel.ftp:
         try:
             for _ in range(PROOFS_MAX):
                 proof = _Proof(session, _rows(session.table))
-                if await proof.run() and proof.take_over():
+                is_proven = await proof.run()
+                if session.identification.vehicles != vehicles:
+                    raise ChecksumUnavailable("another vehicle has taken the address")
+                if is_proven and proof.take_over():
                     return
         except FileTransferError as error:
             if error.code == FileErrorCode.UNKNOWN_COMMAND:
@@ -293,7 +297,7 @@ class _Proof:
 
         async def read_one(at: int, guess: int) -> None:
             row = self._rows[at]
-            if _has_just_moved(row, guess, now - table.moments[row.name]):
+            if _has_just_moved(row, guess, now - table.moments.get(row.name, now)):
                 self._take(at, guess, now)
                 return
             try:

@@ -68,32 +68,35 @@ async def ask(session: Session, *, refresh: bool = False) -> Answer:
     return Answer(is_current=True, digest=digest)
 
 
-async def settle(session: Session, before: Digest | None, listed: Digest | None) -> tuple[bool, str]:
+async def settle(session: Session, before: Digest | None, listed: Digest | None, notes: list[str]) -> bool:
     """Compare a table that was just downloaded with PX4's hash. Return whether it was the same meanwhile, as
-    far as known, and a note or "".
+    far as known.
 
     Args:
         session: the component's.
         before: the hash before the download, or None.
         listed: the hash in the downloaded list, or None.
+        notes: takes a sentence for the user, if there is one to tell.
 
     Raises:
         LinkError: the link is closed for good.
     """
     table = session.table
     if listed is not None and listed.count == table.count and table.confirm(listed.hash):
-        return True, ""
+        return True
     after = await _request(session)
     if after is None:
-        return True, ""
+        return True
     if after.count == table.count:
         if table.confirm(after.hash):
-            return True, ""
+            return True
         before = listed or before
         if before is not None and before.hash == after.hash:
-            return True, UNPROVEN
+            notes.append(UNPROVEN)
+            return True
     table.unconfirm()
-    return False, CHANGED_MEANWHILE
+    notes.append(CHANGED_MEANWHILE)
+    return False
 
 
 async def _request(session: Session) -> Digest | None:

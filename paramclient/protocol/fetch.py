@@ -15,7 +15,6 @@ from paramclient.model.params import ParamMap
 from paramclient.model.values import Param
 from paramclient.model.wording import first_of
 from paramclient.protocol.checksum import is_moving
-from paramclient.protocol.dialect import Digest
 from paramclient.protocol.digest import Answer, ask, settle
 from paramclient.protocol.file_download import FileUnavailable, download_file
 from paramclient.protocol.ftp import SILENT_LOST
@@ -159,9 +158,6 @@ async def fetch_all(
         LinkError: the link is closed for good.
     """
 
-    async def work() -> FetchResult:
-        return await _Fetch(session, policy).run(refresh=refresh)
-
     began = anyio.current_time()
 
     def observe(received: int, total: int | None) -> None:
@@ -170,7 +166,8 @@ async def fetch_all(
 
     session.observers.add(observe)
     try:
-        result: FetchResult = await session.fetching.join(work)
+        fetch = _Fetch(session, policy)
+        result: FetchResult = await session.fetching.join(lambda: fetch.run(refresh=refresh))
     finally:
         session.observers.discard(observe)
     return result
@@ -204,7 +201,8 @@ class _Fetch:
                 await self._read_unverified()
             elif self.table.unverified():
                 self.notes.append(NOT_REFRESHED)
-            return self._result("cache")
+            if not self._is_replaced():
+                return self._result("cache")
         if answer.reason:
             self.notes.append(UNCONFIRMED.format(answer.reason))
         if self.policy is Policy.HASH_ONLY:
@@ -217,7 +215,8 @@ class _Fetch:
                 break
             source = await self._download()
             is_whole = self.table.is_complete and not self.listed.missing
-            if not self._is_replaced() and (not is_whole or await self._is_settled(digest)):
+            is_done = not is_whole or await settle(self.session, digest, self.listed.digest, self.notes)
+            if is_done and not self._is_replaced():
                 break
             digest = None
         if answer.is_other:
@@ -265,16 +264,11 @@ class _Fetch:
             self.table.complete()
         return "stream"
 
-    async def _is_settled(self, before: Digest | None) -> bool:
-        is_settled, note = await settle(self.session, before, self.listed.digest)
-        self.notes += [note] if note else []
-        return is_settled
-
     async def _read_unverified(self) -> None:
         """Read the values that the digest does not cover."""
         names = self.table.unverified()
         await read_many(self.session, names)
-        if left := [name for name in names if self.table.moments[name] < self._began]:
+        if left := [name for name in names if self.table.moments.get(name, math.inf) < self._began]:
             self.notes.append(NOT_READ.format(first_of(left, SHOWN_MAX)))
 
     def _unconfirmed(self) -> FetchResult:

@@ -166,7 +166,8 @@ async def read_file(
     """
     async with channel.ftp, _opened(channel, path, open_attempts) as (session, size):
         reader = _FileReader(channel, session, path, size_max)
-        reader.progress = None if progress is None else (lambda received: progress(received, size))
+        if progress is not None:
+            reader.progress = lambda received: progress(received, size)
         reader.begun = begun
         try:
             return await reader.read()
@@ -372,7 +373,7 @@ class _FileReader:
     """The read of one open file: a burst from beginning to end, and single reads of lost blocks."""
 
     def __init__(self, channel: Channel, session: int, path: str, size_max: int) -> None:
-        self.progress: Callable[[int], None] | None = None
+        self.progress: Callable[[int], None] = lambda received: None
         self.begun: Callable[[bytes], None] = lambda head: None
         self._channel = channel
         self._session = session
@@ -496,12 +497,11 @@ class _FileReader:
                 size=DATA_SIZE_MAX,
                 copies=copies,
             )
+            data = answer.data
         except FileTransferError as error:
             if error.code != FileErrorCode.EOF:
                 raise
             data = b""
-        else:
-            data = answer.data
         finally:
             self._reads -= 1
             window.release()
@@ -519,8 +519,7 @@ class _FileReader:
             self.begun(data)
         self._pieces.take(offset, data)
         self._last = anyio.current_time()
-        if self.progress is not None:
-            self.progress(self._pieces.received)
+        self.progress(self._pieces.received)
 
 
 def _answer(message: Message) -> Packet | None:

@@ -63,12 +63,14 @@ class ListResult:
         lost: values of the list that were lost, and read one by one or by another list.
         repeated: values received more than once.
         digest: PX4's, which begins its list; it is of the table at that moment.
+        has_gap: whether values between the first and the last received one are missing.
     """
 
     missing: list[int] = field(default_factory=list)
     lost: int = 0
     repeated: int = 0
     digest: Digest | None = None
+    has_gap: bool = False
 
 
 async def download_list(session: Session) -> ListResult:
@@ -178,6 +180,7 @@ class _Download:
                 await self._next_pass()
                 fruitless = fruitless + 1 if self._missing() == missing else 0
         self.result.missing = missing = self._missing()
+        self.result.has_gap = any(min(self._received) < each < self._reached for each in missing)
         if self.table.is_growing and not self.channel.is_silent(self._began):
             missing.pop()  # it has no more
 

@@ -255,6 +255,7 @@ async def _read_list(session: Session, inbox: Inbox, which: str | int) -> Report
     """
     answers: list[ReportedValue] = []
     failures: list[ParamClientError] = []
+    has_gap = True
 
     async def take() -> None:
         while not answers:
@@ -267,7 +268,7 @@ async def _read_list(session: Session, inbox: Inbox, which: str | int) -> Report
         tasks.start_soon(take)
         try:
             for _ in range(1 + session.listing.is_running):  # one that runs may have passed the parameter
-                await session.listing.join(lambda: download_list(session))
+                has_gap = (await session.listing.join(lambda: download_list(session))).has_gap
         except ParamClientError as error:
             failures.append(error)
         tasks.cancel_scope.cancel()
@@ -275,10 +276,9 @@ async def _read_list(session: Session, inbox: Inbox, which: str | int) -> Report
         return answers[0]
     if failures and not isinstance(failures[0], NoReply):
         raise failures[0]
-    names = session.table.names
-    is_lost = bool(failures) or session.channel.is_lost
-    if is_lost or not names or max(names) - min(names) >= len(names):
+    if session.channel.is_lost or has_gap:
         return None
+    names = session.table.names
     is_short = not session.table.is_complete
     sent = f": its list has {len(names)} of {session.table.count} parameters"
     raise _unknown(session, which, sent * is_short)

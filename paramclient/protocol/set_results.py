@@ -137,10 +137,6 @@ class SetManyResult:
         """The number of values with each status."""
         return Counter(outcome.status for outcome in self.outcomes)
 
-    def of(self, status: SetStatus) -> list[SetOutcome]:
-        """Return the outcomes with this status, in order."""
-        return [outcome for outcome in self.outcomes if outcome.status is status]
-
     def __repr__(self) -> str:
         counts = ", ".join(f"{count} {status}" for status, count in self.counts.items())
         whose = f"{self.system}/{self.component}"

@@ -308,9 +308,9 @@ class _Write:
         until = anyio.current_time() + EXT_PROGRESS_TIMEOUT
         while isinstance(answer, ParamExtAck) and answer.param_result == ExtAckResult.IN_PROGRESS:
             now = anyio.current_time()
+            answer = await channel.wait_for(inbox, self._accept, now, 0, EXT_PROGRESS_READ) or answer
             if now >= until or channel.is_lost:
                 break
-            answer = await channel.wait_for(inbox, self._accept, now, 0, EXT_PROGRESS_READ) or answer
             await self._confirm()
             with suppress(NoReply):  # the final acknowledgement may be lost
                 shown = await self._read(inbox)
@@ -433,14 +433,12 @@ async def _settled(session: Session, vehicles: int, result: SetResult, seconds: 
     channel = session.channel
     with channel.gate.until_closed(), channel.waiting_until(anyio.current_time() + seconds):
         await anyio.sleep_forever()
-    if channel.is_lost:
-        return replace(result, note=UNWATCHED)
-    try:
-        now = await read_param(session, result.name)
-        await session.confirm(vehicles)
-    except NoReply:
-        return replace(result, note=UNWATCHED)
-    return result if now.same_value(result.param) else replace(result, status="adjusted", param=now)
+    with suppress(NoReply):
+        if not channel.is_lost:
+            now = await read_param(session, result.name)
+            await session.confirm(vehicles)
+            return result if now.same_value(result.param) else replace(result, status="adjusted", param=now)
+    return replace(result, note=UNWATCHED)
 
 
 async def _read_writable(session: Session, name: str) -> Param:
@@ -448,13 +446,18 @@ async def _read_writable(session: Session, name: str) -> Param:
 
     Raises:
         UsageError: the parameter is an integer, and the values contradict the encoding.
+        NoReply: the component was lost meanwhile.
     """
-    await _known(session, name)
+    param, began = await _known(session, name), anyio.current_time()
+    if session.dialect.has_ack:  # its values need no encoding
+        return param
     with session.channel.gate.until_closed(or_failed=True):
         await session.identification.encoding_certain()
+    if session.channel.is_lost:
+        raise NoReply(f"the encoding of {session.channel}", attempts=0, waited=anyio.current_time() - began)
     param = await _known(session, name)
     is_integer = isinstance(param.type, ParamType) and param.type.is_integer
-    if is_integer and not session.dialect.has_ack and session.identification.chosen is None:
+    if is_integer and session.identification.chosen is None:
         if not session.table.evidence:  # 0 is the same in both, and files have no encoding
             await session.seeking.join(lambda: _seek_evidence(session))
         if doubt := session.encoding_doubt:

@@ -465,7 +465,7 @@ class _Run:
             raise
         finally:
             self._written_at = anyio.current_time()
-        not_tried = done.of(SetStatus.NOT_TRIED)
+        not_tried = [each for each in done.outcomes if each.status is SetStatus.NOT_TRIED]
         self.sent -= {outcome.name for outcome in not_tried} - before
         if done.error is not None:
             raise done.error

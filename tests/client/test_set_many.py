@@ -60,7 +60,7 @@ async def test_each_value_has_an_outcome_of_its_own() -> None:
         assert isinstance(result["NO_SUCH"].error, UnknownParameter)
         assert isinstance(result["PARAM_03"].error, Refused)
         assert isinstance(result["PARAM_04"].error, UsageError)
-        assert [each.name for each in result.of(SetStatus.ADJUSTED)] == ["COUNT"]
+        assert [each.name for each in result.outcomes if each.status is SetStatus.ADJUSTED] == ["COUNT"]
         assert result["COUNT"].requested == 7.6
         assert result["COUNT"].result is not None
         assert result["COUNT"].result.actual == vehicle.params["COUNT"].value

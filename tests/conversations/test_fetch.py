@@ -9,7 +9,7 @@ import anyio
 import pytest
 
 from paramclient.errors import NoReply, ParamErrorCode
-from paramclient.model.values import Trust
+from paramclient.model.values import ParamType, Trust
 from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle, px4_table
 from paramclient.wire.messages import HASH_CHECK, FileTransfer, Message, ParamError, ParamRequestRead
@@ -28,6 +28,15 @@ def new_vehicle(kind: str, **options: object) -> Vehicle:
     }
     vehicle: Vehicle = makers[kind](**options)  # type: ignore[operator]  # classes with different options
     return vehicle
+
+
+def two_vehicles(kind: str) -> tuple[Vehicle, Vehicle]:
+    """Return two vehicles with other hardware ids and five other values."""
+    ids = [{"uid": number} if kind == "px4" else {"uid2": bytes([number]) * 12} for number in (1, 2)]
+    first, other = (new_vehicle(kind, **each) for each in ids)
+    for name in [each.name for each in other.listed if each.type is ParamType.REAL32][:5]:
+        other.set_param(name, 0.0625)
+    return first, other
 
 
 def check_right(vehicle: Vehicle, result: FetchResult) -> None:
@@ -172,9 +181,7 @@ def test_a_vehicle_that_is_lost_after_its_hash_is_told_as_lost(backend: str) -> 
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
 def test_a_vehicle_that_takes_the_address_during_a_fetch_is_fetched_whole(kind: str, backend: str) -> None:
     async def main() -> None:
-        ids = ({"uid": n} if kind == "px4" else {"uid2": bytes([n]) * 12} for n in (1, 2))
-        first, other = (new_vehicle(kind, **each) for each in ids)
-        other.values["ASPD_SCALE_1" if kind == "px4" else "PILOT_THR_FILT"] = 42.0
+        first, other = two_vehicles(kind)
         place = Tap(Air.symmetric([first], delay=0.05))
         async with converse(place) as conversation:
             node = await conversation.node()
@@ -193,6 +200,25 @@ def test_a_vehicle_that_takes_the_address_during_a_fetch_is_fetched_whole(kind: 
             assert results[0].notes[-1].startswith("Another vehicle has taken the address")
 
     run(main, backend=backend)
+
+
+@pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
+@pytest.mark.parametrize("later", [0.0, 0.02, 0.1])
+def test_a_vehicle_that_takes_the_address_of_a_fetched_one_is_fetched_whole(kind: str, later: float) -> None:
+    async def main() -> None:
+        first, other = two_vehicles(kind)
+        place = Tap(Air.symmetric([first], delay=0.05))
+        async with converse(place) as conversation:
+            node = await conversation.node()
+            await fetch_all(node.plain)
+            await anyio.sleep(5.0)
+            conversation.station.interrupt()
+            place.endpoint = Air.symmetric([other], delay=0.05)
+            conversation.station.resume(anyio.current_time())
+            await anyio.sleep(later)
+            check_right(other, await fetch_all(node.plain))
+
+    run(main)
 
 
 def test_a_vehicle_that_never_answers_is_no_reply() -> None:
