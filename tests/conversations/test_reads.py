@@ -33,7 +33,7 @@ EVERY = pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
 @EVERY
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 async def test_reads_by_name_and_index_bring_the_vehicles_values(make: type[Vehicle], loss: float) -> None:
-    vehicle = make()  # type: ignore[call-arg]  # any vehicle
+    vehicle = make()
     async with converse(Air.symmetric([vehicle], loss=loss, delay=0.02, seed=3)) as conversation:
         node = await conversation.node()
         for index, param in list(enumerate(vehicle.listed))[::300]:
@@ -51,7 +51,7 @@ async def test_reads_by_name_and_index_bring_the_vehicles_values(make: type[Vehi
 async def test_a_vehicle_that_answers_other_reads_has_no_such_parameter(
     make: type[Vehicle], which: str | int
 ) -> None:
-    vehicle = make()  # type: ignore[call-arg]  # any vehicle
+    vehicle = make()
     async with converse(vehicle) as conversation:
         node = await conversation.node()
         await read(node.plain, vehicle.listed[0].name)

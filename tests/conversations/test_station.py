@@ -361,7 +361,7 @@ async def test_a_vehicle_with_a_new_system_id_is_another_component_with_the_same
 async def test_a_reboot_on_command_happens_once_and_returns_when_the_vehicle_is_back(
     make: type[Vehicle], loss: float
 ) -> None:
-    vehicle = make()  # type: ignore[call-arg]  # each has defaults
+    vehicle = make()
     async with converse(Air.symmetric([vehicle], loss=loss, delay=0.02, seed=5)) as conversation:
         node = await conversation.node()
         await node.identification.settled()
@@ -505,7 +505,7 @@ async def test_a_stream_may_cut_frames_anywhere_for_each_peer() -> None:
 @virtual_on_both
 @MAKES
 async def test_a_whole_session_in_mavlink_1(make: type[Vehicle]) -> None:
-    vehicle = make(mavlink_version=1)  # type: ignore[call-arg]  # each has defaults
+    vehicle = make(mavlink_version=1)
     async with converse(vehicle) as conversation:
         session = (await conversation.node()).plain
         await session.identification.settled()
