@@ -396,14 +396,15 @@ def update_of(
     """
     table = session.table
 
+    def unix(moment: float) -> float:
+        return round(moment + ahead, 6)  # a printed time, whose digits are cut off, is never later
+
     def observed(param: Param, moment: float, by: str = BY_VEHICLE) -> StoredParam:
         is_volatile = param.name in table.volatile if table.volatile or table.volatile_is_known else None
-        return StoredParam.of(table.with_default(param), moment + ahead, is_volatile, by)
+        return StoredParam.of(table.with_default(param), unix(moment), is_volatile, by)
 
     params = [
-        StoredParam.gone(each.name, moment + ahead)
-        if each.new is None
-        else observed(each.new, moment, each.by)
+        StoredParam.gone(each.name, unix(moment)) if each.new is None else observed(each.new, moment, each.by)
         for each, moment in changes
     ]
     if is_whole:

@@ -294,6 +294,20 @@ async def test_a_silent_component_with_a_cached_table_delays_no_other_component(
         assert everything.silent.keys() == {(2, 1)}
 
 
+@in_simulated_time
+async def test_no_change_is_printed_with_a_later_time_than_it_is_kept_with(path: Path) -> None:
+    async with ParamClient(small_px4(), cache=path) as client:
+        component = await client.component()
+        await component.fetch_all()
+        for value in range(20):
+            await asyncio.sleep(1 / 3)
+            await component.set("PARAM_01", 100 + value)
+    with ParamCache(path) as cache:
+        times = [each.at for each in history_of(cache, "PARAM_01")]
+    assert len(times) == 20
+    assert times == [round(each, 6) for each in times]  # digits below would be rounded up, then cut off
+
+
 # Who it is
 
 
