@@ -166,8 +166,9 @@ async def fetch_all(
 
     session.observers.add(observe)
     try:
-        fetch = _Fetch(session, policy)
-        result: FetchResult = await session.fetching.join(lambda: fetch.run(refresh=refresh))
+        result: FetchResult = await session.fetching.join(
+            lambda: _Fetch(session, policy).run(refresh=refresh)
+        )
     finally:
         session.observers.discard(observe)
     return result
@@ -215,8 +216,9 @@ class _Fetch:
                 break
             source = await self._download()
             is_whole = self.table.is_complete and not self.listed.missing
-            is_done = not is_whole or await settle(self.session, digest, self.listed.digest, self.notes)
-            if is_done and not self._is_replaced():
+            if not self._is_replaced() and (
+                not is_whole or await settle(self.session, digest, self.listed.digest, self.notes)
+            ):
                 break
             digest = None
         if answer.is_other:

@@ -220,9 +220,7 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
     is_proven = not isinstance(which, str) or session.serves_reads.get(str)
     if control is None or is_proven or control.param_id == which:
         return control
-    await anyio.sleep(
-        session.channel.timing.timeout(0)
-    )  # for its other answers, which would be taken for one
+    await anyio.sleep(session.channel.timing.timeout(0))  # its other answers would be taken for one by name
     return await _try(session, control.param_id)
 
 
