@@ -22,7 +22,7 @@ from paramclient.links.replay import ReplayLink
 from paramclient.links.tlog import Record, open_log, read_records
 from paramclient.logs.logged_params import ImportedTable
 from paramclient.logs.telemetry import import_log
-from paramclient.model.values import Encoding, bits_of, bits_of_wire, from_bits
+from paramclient.model.values import Encoding, bits_of, decode_value
 from paramclient.wire import messages
 from paramclient.wire.frames import Framer
 from paramclient.wire.messages import NO_INDEX, Message
@@ -105,13 +105,12 @@ def _check_import(kept: ParamCache, tables: Sequence[ImportedTable], records: Se
         table = kept.load(summary.key, summary.component)
         assert table is not None
         words = {
-            (spelt, kind, bits_of(from_bits(bits, kind, is_raw=is_raw), kind))
+            (spelt, kind, bits_of(decode_value(raw, kind, encoding)[0], kind))
             for (_, component), each in said.items()
             if component == summary.component
             for name, kind, raw in each
             for spelt in (name, name.translate(_CAPITALS))  # names of ArduPilot are stored in capitals
             for encoding in Encoding
-            for bits, is_raw in [bits_of_wire(raw, kind, encoding)]
         }
         for name, param in table.params.items():
             kind = param.type_number

@@ -38,6 +38,7 @@ __all__ = [
     "check_number",
     "check_portable_name",
     "check_value",
+    "decode_value",
     "encode_value",
     "encoding_of",
     "format_value",
@@ -247,7 +248,7 @@ _set_name, _set_value, _set_type, _set_index, _set_bits, *_set_rest = (
 )
 _set_trust, _set_default, _set_is_raw, _set_type_number = _set_rest
 
-# Constants for `bits_of_wire`, which runs for every received value: enumeration members are slower than
+# Constants for `decode_value`, which runs for every received value: enumeration members are slower than
 # numbers.
 _REAL32 = int(ParamType.REAL32)
 _REAL64 = int(ParamType.REAL64)
@@ -347,7 +348,7 @@ def check_number(value: object, wanted: str = "a parameter value is a number") -
     raise UsageError(f"{wanted}, not {type(value).__name__}")
 
 
-def bits_of_wire(raw: bytes, number: int, encoding: Encoding) -> tuple[int, bool]:
+def decode_value(raw: bytes, number: int, encoding: Encoding) -> tuple[WireValue, int]:
     """Decode the four wire bytes of a value.
 
     Args:
@@ -356,8 +357,14 @@ def bits_of_wire(raw: bytes, number: int, encoding: Encoding) -> tuple[int, bool
         encoding: the component's encoding.
 
     Returns:
-        The bits of the value (see `Param.bits`), and whether it stays raw bytes.
+        The value, and its bits (see `Param.bits`).
     """
+    bits, is_raw = bits_of_wire(raw, number, encoding)
+    return from_bits(bits, number, is_raw=is_raw), bits
+
+
+def bits_of_wire(raw: bytes, number: int, encoding: Encoding) -> tuple[int, bool]:
+    """Return the bits of a value, as `decode_value` does, and whether the value stays raw bytes."""
     bits = int.from_bytes(raw, "little")
     if number == _REAL32:
         return bits, False
@@ -430,7 +437,7 @@ def encode_value(value: WireValue, number: int, encoding: Encoding) -> bytes:
 def as_reported(bits: int, number: int, encoding: Encoding) -> bytes:
     """Return the four wire bytes with which a vehicle reports a value of these bits and this type.
 
-    Not the inverse of `bits_of_wire`: a C-casting vehicle rounds integers beyond 24 bits to the next float32,
+    Not the inverse of `decode_value`: a C-casting vehicle rounds integers beyond 24 bits to the next float32,
     and a message holds only the first four bytes of an 8-byte type.
     """
     if encoding is Encoding.C_CAST and number in _BOUNDS:

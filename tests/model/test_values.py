@@ -21,9 +21,9 @@ from paramclient.model.values import (
     Trust,
     WireValue,
     bits_of,
-    bits_of_wire,
     check_name,
     check_value,
+    decode_value,
     encode_value,
     format_value,
     from_bits,
@@ -91,11 +91,6 @@ def test_a_plain_param_of_the_type_custom_is_one_of_an_unknown_type() -> None:
     written = WrittenParam.of(param.with_trust(Trust.CACHED))
     assert (written.type, written.is_raw, written.settable) == (ParamType.UNKNOWN, True, b"abc\n")
     assert written.is_held_by(param)
-
-
-def decode_value(raw: bytes, number: int, encoding: Encoding) -> tuple[WireValue, int]:
-    bits, is_raw = bits_of_wire(raw, number, encoding)
-    return from_bits(bits, number, is_raw=is_raw), bits
 
 
 # Byte-wise
