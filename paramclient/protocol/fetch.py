@@ -166,9 +166,12 @@ async def fetch_all(
 
     session.observers.add(observe)
     try:
-        result: FetchResult = await session.fetching.join(
-            lambda: _Fetch(session, policy).run(refresh=refresh)
-        )
+        while True:
+            result: FetchResult = await session.fetching.join(
+                lambda: _Fetch(session, policy).run(refresh=refresh)
+            )
+            if not refresh or result.source != "cache":  # else another caller began it
+                break
     finally:
         session.observers.discard(observe)
     return result

@@ -136,9 +136,8 @@ def hint_of_link(station: Station, bytes_received: int) -> str:
             return f"Heard on {link} so far: only {listed}, and no vehicle.{cause}"
         unnamed = "" if _autopilots(nodes) else " None is an autopilot; one that is named in full is asked."
         return f"Heard on {link} so far: {listed}.{unnamed}"
-    frames = station.framing[0]
-    if frames:
-        return f"{counted(frames, 'MAVLink frame')} arrived on {link}, but no heartbeat."
+    if station.frames:
+        return f"{counted(station.frames, 'MAVLink frame')} arrived on {link}, but no heartbeat."
     if bytes_received:
         return f"{bytes_received:,} bytes arrived on {link}, but no valid MAVLink frame."
     return f"Nothing was received on {link}.{cause}"

@@ -111,14 +111,9 @@ class Station:
         return any(node.channel.inboxes for node in self.nodes.values())
 
     @property
-    def framing(self) -> tuple[int, int, int]:
-        """Received frames, bytes outside of frames, and damaged frames among these."""
-        framers = [self._datagrams, *self._framers.values()]
-        return (
-            sum(framer.frames for framer in framers),
-            sum(framer.skipped for framer in framers),
-            sum(framer.damaged for framer in framers),
-        )
+    def frames(self) -> int:
+        """Frames that were received."""
+        return sum(framer.frames for framer in (self._datagrams, *self._framers.values()))
 
     def check_may_send(self) -> None:
         """Check that requests can be sent.

@@ -51,6 +51,7 @@ EXT_PROGRESS_TIMEOUT: Final = 60.0
 """Seconds for a component that reports progress to finish: a camera formats a card meanwhile."""
 EXT_PROGRESS_READ: Final = 2.0
 """Seconds after which a read shows the value meanwhile: the final acknowledgement may be lost."""
+EXT_TAKEN: Final = (ExtAckResult.ACCEPTED, ExtAckResult.IN_PROGRESS)
 BATCH_SIZE: Final = 20
 """Sets in flight: bursts of 20 to a PX4 and 30 to an ArduPilot were all acknowledged (measured)."""
 LATE_ANSWER_TIME: Final = 0.3
@@ -216,13 +217,10 @@ async def write_many(
             done(outcomes[place])
     elapsed = anyio.current_time() - began
     if scope.cancelled_caught:
-        error = NoReply(f"{len(pairs)} writes to {session.channel}", attempts=0, waited=elapsed)
-        failures.insert(0, error)
-        open_states = (SetStatus.NOT_TRIED, SetStatus.UNKNOWN)
-        outcomes = [
-            replace(each, error=error) if each.status in open_states and each.error is None else each
-            for each in outcomes
-        ]
+        failures.insert(0, NoReply(f"{len(pairs)} writes to {session.channel}", attempts=0, waited=elapsed))
+        for place, each in enumerate(outcomes):
+            if each.error is None and each.status in (SetStatus.NOT_TRIED, SetStatus.UNKNOWN):
+                outcomes[place] = replace(each, error=failures[0])
     return SetManyResult(*session.channel.target, tuple(outcomes), failures[0] if failures else None, elapsed)
 
 
@@ -316,12 +314,17 @@ class _Write:
                 shown = await self._read(inbox)
                 if self._is_wanted(shown):
                     return shown
-        if isinstance(answer, Param) and answer.type_number == self.before.type_number:
+        refused = None
+        if isinstance(answer, ParamExtAck) and answer.param_result not in EXT_TAKEN:
+            refused = self._ext_refusal(answer.param_result)
+        elif isinstance(answer, Param) and answer.type_number == self.before.type_number:
             return answer
         if not channel.is_silent(self._began):
             with suppress(NoReply):  # only a read shows a changed type, or an extended parameter's value
-                return await self._read(inbox)
-        raise NoReply(what, attempts=self.attempts, waited=anyio.current_time() - self._began)
+                shown = await self._read(inbox)
+                if refused is None or self._is_wanted(shown):  # it was the refusal of another set
+                    return shown
+        raise refused or NoReply(what, attempts=self.attempts, waited=anyio.current_time() - self._began)
 
     async def _wanted_behind(self, inbox: Inbox, since: float) -> Param | None:
         """Return the wanted value if it comes behind answers to earlier reads, queued by a slow link."""
@@ -347,9 +350,7 @@ class _Write:
         """Return an acknowledgement: PARAM_EXT_ACK, the wanted value, or any in another type."""
         session, encoding = self.session, self.session.table.encoding
         if isinstance(message, ParamExtAck):
-            if message.param_result in (ExtAckResult.ACCEPTED, ExtAckResult.IN_PROGRESS):
-                return message
-            raise self._ext_refusal(message.param_result)
+            return message
         if isinstance(message, ParamError):
             raise refusal(session, self.name, message.error)
         if isinstance(message, StatusText):
@@ -371,7 +372,7 @@ class _Write:
         """Return the parameter as the component reports it now."""
         self.session.acknowledging.discard(self.name)
         param = await read_param(self.session, self.name)
-        while inbox:
+        while inbox and not self.session.dialect.has_ack:
             self._accept(await inbox.next())  # a refusal that came behind the value
         return param
 

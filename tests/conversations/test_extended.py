@@ -6,6 +6,7 @@ import anyio
 import pytest
 
 from paramclient.errors import (
+    ExtAckResult,
     NoReply,
     SetFailed,
     UnknownParameter,
@@ -15,7 +16,7 @@ from paramclient.errors import (
 from paramclient.model.values import WireValue
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read
-from paramclient.protocol.set_results import SetStatus
+from paramclient.protocol.set_results import SetResult, SetStatus
 from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, Camera, PX4Vehicle
 from paramclient.wire.messages import (
@@ -139,6 +140,25 @@ async def test_a_change_by_another_station_is_seen_by_its_acknowledgement() -> N
         conversation.hear(ParamExtAck("CAM_ISO", b"\x90\x01".ljust(128, b"\0"), 5, 0), component=100)
         assert session.table.params["CAM_ISO"].value == 400
         assert conversation.changes[-1].by == "station 254/190"
+
+
+@virtual_on_both
+async def test_the_refusal_of_another_stations_set_is_not_taken_for_ours() -> None:
+    async with converse(Air.symmetric([Camera()], delay=0.05)) as conversation:
+        session = (await conversation.node(*CAMERA)).extended
+        await fetch_all(session)
+        results: list[SetResult] = []
+
+        async def set_mode() -> None:
+            results.append(await write(session, "CAM_MODE", 2))
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(set_mode)
+            await anyio.sleep(0.02)
+            refusal = ParamExtAck("CAM_MODE", bytes(128), 5, ExtAckResult.VALUE_UNSUPPORTED)
+            conversation.hear(refusal, component=100)
+        assert (results[0].status, results[0].actual) == ("accepted", 2)
+        assert session.table.params["CAM_MODE"].value == 2
 
 
 @virtual

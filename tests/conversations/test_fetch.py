@@ -138,6 +138,28 @@ def test_fetches_at_once_share_one_and_a_cancelled_caller_ends_only_its_own(back
 
 
 @BACKENDS
+def test_a_refresh_downloads_also_where_the_hash_is_being_asked(backend: str) -> None:
+    async def main() -> None:
+        vehicle = PX4Vehicle()
+        async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
+            node = await conversation.node()
+            await fetch_all(node.plain)
+            sources: dict[bool, str] = {}
+
+            async def fetch(refresh: bool) -> None:
+                sources[refresh] = (await fetch_all(node.plain, refresh=refresh)).source
+
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(fetch, False)
+                await anyio.sleep(0.02)
+                tasks.start_soon(fetch, True)
+            assert sources == {False: "cache", True: "stream"}
+            assert vehicle.requests["PARAM_REQUEST_LIST"] == 2
+
+    run(main, backend=backend)
+
+
+@BACKENDS
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
 def test_a_lost_vehicle_ends_a_fetch_within_7_s_with_what_came(kind: str, backend: str) -> None:
     async def main() -> None:
