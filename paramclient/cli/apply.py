@@ -12,8 +12,8 @@ import anyio
 from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode, code_of
-from paramclient.cli.json_apply import ApplyJson, ApplyRowJson, PlanJson
-from paramclient.cli.json_output import VehicleJson
+from paramclient.cli.json_apply import apply_json, plan_json, rows_json
+from paramclient.cli.json_output import JsonObject
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
 from paramclient.cli.options import ApplyFlags
 from paramclient.cli.output import Coloured, Status, can_ask, confirm, report, say
@@ -157,8 +157,8 @@ class _Planned:
     job: ApplyJob
     plan: Plan
 
-    def as_json(self) -> PlanJson:
-        return PlanJson.of(self.plan, **self.job.session.ids, full=self.job.flags.full)
+    def as_json(self) -> JsonObject:
+        return plan_json(self.plan, self.job.session.component, full=self.job.flags.full)
 
     def rows(self) -> Iterator[Sequence[object]]:
         has_started = False
@@ -292,12 +292,12 @@ class ApplyJob:
             )
         return self
 
-    def as_json(self) -> object:
+    def as_json(self) -> JsonObject:
         """Return the JSON of the result; after an interruption, of the outcomes so far."""
         if self.result is None:
-            rows = ApplyRowJson.of_all(self._so_far)
+            rows = rows_json(self._so_far)
             return {**self.session.ids, "complete": False, "params": rows, "error": "interrupted"}
-        return ApplyJson.of(self.result, VehicleJson.of(self.session.component), full=self.flags.full)
+        return apply_json(self.result, self.session.component, full=self.flags.full)
 
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the cells of `APPLIED_COLUMNS`."""

@@ -8,7 +8,7 @@ from typing import Final
 
 from paramclient.cache import CachedComponent, CachedSummary, HistoryEntry, ParamCache, SnapshotSummary
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.json_output import HistoryLineJson, SnapshotJson
+from paramclient.cli.json_output import history_json, snapshot_json
 from paramclient.cli.options import CacheOptions, Positive
 from paramclient.cli.output import local_time, print_json, print_line, say, show
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
@@ -193,7 +193,7 @@ def history(
             entries = entries[-limit:] if limit else entries
     if snapshots:
         show(
-            {"snapshots": [SnapshotJson.of(each) for each in kept]},
+            {"snapshots": [snapshot_json(each) for each in kept]},
             ["id", "time", "component", "params", "hash", "reason"],
             map(_snapshot_cells, kept),
             json=options.json,
@@ -202,7 +202,7 @@ def history(
         )
     else:
         show(
-            {"history": [HistoryLineJson.of(each) for each in entries]},
+            {"history": [history_json(each) for each in entries]},
             ["time", "component", "name", "old", "new", "by"],
             map(_entry_cells, entries),
             json=options.json,

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.file_output import described, value_text
-from paramclient.cli.json_apply import DiffJson
+from paramclient.cli.json_apply import diff_json
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Coloured, print_json, print_table, printable, say
@@ -91,7 +91,7 @@ async def diff(
     shown = [entry for entry in outcome.entries if everything or entry.is_shown]
     if options.json:
         shown_sides = (sides.left, sides.right, sides.base)
-        print_json(DiffJson.of(outcome, *shown_sides, everything=everything, has_defaults=has_defaults))
+        print_json(diff_json(outcome, *shown_sides, everything=everything, has_defaults=has_defaults))
     else:
         if shown:
             _print(outcome, shown, sides)

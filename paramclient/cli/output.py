@@ -22,7 +22,6 @@ from typing import ClassVar, Final, Self, TextIO
 import anyio
 import anyio.to_thread
 
-from paramclient.cli.json_output import as_json
 from paramclient.model.values import Param
 from paramclient.protocol.fetch import Progress
 
@@ -133,8 +132,8 @@ def by_index(params: Iterable[Param]) -> list[Param]:
 
 
 def print_json(item: object) -> None:
-    """Print an object of `paramclient.cli.json_output`, or a mapping or list of them, on one line; flush."""
-    print(json.dumps(as_json(item), allow_nan=False), flush=True)
+    """Print an object on one line, and flush."""
+    print(json.dumps(item, allow_nan=False), flush=True)
 
 
 def print_line(text: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
-from paramclient.cli.json_output import ParamJson
+from paramclient.cli.json_output import JsonObject, param_json
 from paramclient.cli.metadata import DESCRIBED_COLUMNS, described_cells, info_of
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import Default, add_default, default_of
@@ -74,10 +74,10 @@ class ParamTable:
                 *(() if self.metadata is None else described_cells(self.metadata, param)),
             )
 
-    def as_json(self, *, whole: bool) -> dict[str, ParamJson]:
+    def as_json(self, *, whole: bool) -> JsonObject:
         """Return the parameters by name; with `whole`, with all their metadata."""
         return {
-            each.name: ParamJson.of(each, info_of(self.metadata, each.name), whole=whole)
+            each.name: param_json(each, info_of(self.metadata, each.name), whole=whole)
             for each in self.params
         }
 

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 
 from paramclient.cli.default_sources import find_defaults, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode, code_of
-from paramclient.cli.json_output import FetchJson
+from paramclient.cli.json_output import JsonObject, fetch_json
 from paramclient.cli.metadata import (
     MetadataChoice,
     from_file,
@@ -203,12 +203,10 @@ class _Fetched:
             f"bytes received, {self.traffic['bytes_sent']:,} sent{link}{crc}"
         )
 
-    def as_json(self) -> FetchJson:
+    def as_json(self) -> JsonObject:
         """Return the JSON object."""
         table = self.table
-        return FetchJson.of(
-            self.session.component, self.result, table.params, described=table.described, **self.traffic
-        )
+        return fetch_json(self.session.component, self.result, table.params, table.described)
 
     def rows(self) -> Iterable[Sequence[object]]:
         """Return the rows of the table."""
@@ -222,7 +220,7 @@ class _Read:
     table: ParamTable
     errors: Mapping[str, ParamClientError]
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> JsonObject:
         """Return the JSON of the parameters with all their metadata, and of the errors."""
         failed = {name: str(error) for name, error in self.errors.items()}
         return {"params": self.table.as_json(whole=True)} | ({"errors": failed} if failed else {})

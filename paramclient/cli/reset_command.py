@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from paramclient.cli.default_sources import say_sources
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.json_output import VehicleJson, as_json
+from paramclient.cli.json_output import JsonObject, vehicle_json
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session, request_from_vehicle
 from paramclient.cli.options import LinkOptions, Settle
 from paramclient.cli.output import Coloured, by_index, can_ask, confirm, report, say
@@ -152,12 +152,12 @@ class _ResetJob(WriteJob):
         return max(super().code, ExitCode.INCOMPLETE if is_part else ExitCode.DONE)
 
     @property
-    def unwritten(self) -> dict[str, object]:
+    def unwritten(self) -> JsonObject:
         """The JSON of the names that are not written."""
         names = ("unchanged", "without_default", "read_only")
         return {name: [*getattr(self, name)] for name in names}
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> JsonObject:
         """Return the JSON of the vehicle, the outcomes, and the names that are not written."""
         return super().as_json() | self.unwritten
 
@@ -196,7 +196,7 @@ class _Planned:
 
     job: _ResetJob
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> JsonObject:
         """Return the JSON of the values that would be sent."""
         before = self.job.before
         values = [
@@ -208,7 +208,7 @@ class _Planned:
             }
             for name, value in self.job.writes
         ]
-        vehicle = as_json(VehicleJson.of(self.job.session.component))
+        vehicle = vehicle_json(self.job.session.component)
         return {"vehicle": vehicle, "dry_run": True, "values": values, **self.job.unwritten}
 
     def rows(self) -> Iterator[Sequence[object]]:

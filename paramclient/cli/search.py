@@ -8,7 +8,7 @@ from typing import Final
 from paramclient.cache import CachedComponent, HistoryEntry, ParamCache
 from paramclient.cli.cached import load_tables
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.json_output import HistoryLineJson, InfoJson, ParamJson
+from paramclient.cli.json_output import JsonObject, history_json, info_json, table_param_json
 from paramclient.cli.metadata import (
     MetadataChoice,
     from_file,
@@ -108,7 +108,7 @@ def info(
         changes = [cache.history(each.key, each.component, spelled, CHANGES_SHOWN) for each in tables]
     if options.json:
         values = [_value_json(*each, spelled, described) for each in zip(tables, changes, strict=True)]
-        known = None if described is None else InfoJson.of(described)
+        known = None if described is None else info_json(described)
         print_json({"name": spelled, "metadata": known, "vehicles": values})
         return ExitCode.DONE
     print_descriptions([spelled], Metadata.of([described] if described is not None else []))
@@ -155,7 +155,7 @@ class _Known:
         """Return the tables with this parameter."""
         return [table for table in self.tables if name in table.params]
 
-    def as_json(self, name: str) -> dict[str, object]:
+    def as_json(self, name: str) -> JsonObject:
         """Return the JSON of a found parameter; `vehicles` are the keys of the vehicles that have it."""
         described = self.info(name)
         description = None if described is None else described.short_description or None
@@ -188,7 +188,7 @@ def _rank(name: str, described: ParamInfo | None, lowered_words: Iterable[str]) 
 
 def _value_json(
     table: CachedComponent, changes: Sequence[HistoryEntry], name: str, described: ParamInfo | None
-) -> dict[str, object]:
+) -> JsonObject:
     """Return the JSON of the cached value of one vehicle, with its last changes."""
     default = None if described is None else described.default
     return {
@@ -197,8 +197,8 @@ def _value_json(
         "component": table.component,
         "autopilot": autopilot_name(table.autopilot),
         "heard_at": time_text(table.heard_at[name]),
-        "param": ParamJson.of_table(table.params[name], described=default),
-        "changes": [HistoryLineJson.of(each) for each in changes],
+        "param": table_param_json(table.params[name], described=default),
+        "changes": [history_json(each) for each in changes],
     }
 
 

@@ -15,7 +15,7 @@ import anyio.to_thread
 
 from paramclient.cache import CachedSummary
 from paramclient.cli.exit_codes import ExitCode, code_of
-from paramclient.cli.json_output import as_json
+from paramclient.cli.json_output import JsonObject
 from paramclient.cli.options import LinkOptions, TrafficOptions
 from paramclient.cli.output import Status, local_time, print_json, print_table, report, say
 from paramclient.client.client import ParamClient
@@ -243,7 +243,7 @@ class Done(Generic[T]):
 class Shown(Protocol):
     """What a subcommand prints of one vehicle: an object of JSON, or the rows of a table."""
 
-    def as_json(self) -> object:
+    def as_json(self) -> JsonObject:
         """Return the object."""
 
     def rows(self) -> Iterable[Sequence[object]]:
@@ -307,7 +307,7 @@ class Sessions(list[CommandSession]):
             if rows:
                 print_table([*(["vehicle"] if named else []), *columns], rows, right=right)
         elif self.is_all:
-            vehicles = [session.ids | as_json(result.as_json()) for session, result in found]
+            vehicles = [session.ids | result.as_json() for session, result in found]
             failures = [session.ids | {"error": str(error)} for session, error in failed]
             print_json({"vehicles": vehicles} | ({"errors": failures} if errors else {}))
         else:

@@ -14,7 +14,7 @@ import anyio
 from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode, code_of
-from paramclient.cli.json_output import VehicleJson, WriteJson, as_json
+from paramclient.cli.json_output import JsonObject, outcome_json, vehicle_json
 from paramclient.cli.metadata import (
     MetadataChoice,
     from_file,
@@ -320,13 +320,13 @@ class WriteJob:
         """The exit code for all outcomes."""
         return max((code_of(each.error) for each in self.arrived if each.error), default=ExitCode.DONE)
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> JsonObject:
         """Return the JSON of the vehicle and the outcomes."""
         results = [
-            WriteJson.of(each, self._type_of(each), info_of(self.described, each.name))
+            outcome_json(each, self._type_of(each), info_of(self.described, each.name))
             for each in self.outcomes
         ]
-        return {"vehicle": as_json(VehicleJson.of(self.session.component)), "results": as_json(results)}
+        return {"vehicle": vehicle_json(self.session.component), "results": results}
 
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the rows; the reported value with its meaning, if that is known."""

@@ -10,7 +10,7 @@ from paramclient.cli.cached import extended_sizes, load_tables, show_summaries
 from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.file_output import described
-from paramclient.cli.json_output import SetJson
+from paramclient.cli.json_output import JsonObject, set_json
 from paramclient.cli.logs import cache_of_log
 from paramclient.cli.metadata import (
     MetadataChoice,
@@ -147,7 +147,7 @@ class _View:
         if changed:
             self._shown.keep_changed()
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> JsonObject:
         """Return the JSON of the table."""
         table = self.table
         return {
@@ -199,7 +199,7 @@ def _show_file(file: ParamFile, given: Metadata | None, options: CacheOptions, *
                 shown.append((differing, {name: each for name, each in found.items() if each is not None}))
     if options.json:
         components = [
-            SetJson.with_sources(each, {name: default.source.value for name, default in defaults.items()})
+            set_json(each, {name: default.source for name, default in defaults.items()})
             for each, defaults in shown
         ]
         print_json({"file": file.source, "format": file.file_format.value, "components": components})

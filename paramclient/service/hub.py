@@ -21,7 +21,7 @@ import anyio.to_thread
 from fastapi.sse import ServerSentEvent
 
 from paramclient.cache import ParamCache
-from paramclient.cli.json_output import ParamJson, VehicleJson, WriteJson, as_json
+from paramclient.cli.json_output import JsonObject, outcome_json, table_param_json, vehicle_json
 from paramclient.client.cache_writer import choose_cache
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
@@ -191,7 +191,7 @@ class Target:
         component, now = self.component, self.progress
         return {
             **self.address,
-            **as_json(VehicleJson.of(component)),
+            **vehicle_json(component),
             "link_state": self.link.state,
             "encoding": component.encoding.value,
             "count": component.count,
@@ -228,7 +228,7 @@ class Target:
         with suppress(ParamClientError):
             async for found in self.component.changes():
                 if found.kind != "first":
-                    old, new = (as_json(each and self.shown(each)) for each in (found.old, found.new))
+                    old, new = (each and self.shown(each) for each in (found.old, found.new))
                     self.publish("change", name=found.name, old=old, new=new, by=found.by, kind=found.kind)
 
     # fetches and metadata
@@ -281,15 +281,15 @@ class Target:
         """Return the defaults in the metadata, by name."""
         return {} if self.metadata is None else self.metadata.defaults_of(names)
 
-    def shown(self, param: Param, *, whole: bool = False) -> ParamJson:
+    def shown(self, param: Param, *, whole: bool = False) -> JsonObject:
         """Return a parameter of the table as JSON; with `whole`, with all its metadata."""
-        return ParamJson.of_table(param, self.info(param.name), whole=whole)
+        return table_param_json(param, self.info(param.name), whole=whole)
 
-    def outcome(self, found: SetOutcome) -> WriteJson:
+    def outcome(self, found: SetOutcome) -> JsonObject:
         """Return the outcome of a write as JSON."""
         known = self.component.params.get(found.name)
         kind = ParamType.REAL64 if known is None else known.type_number
-        return WriteJson.of(found, kind, self.info(found.name))
+        return outcome_json(found, kind, self.info(found.name))
 
     async def values(self, given: Mapping[str, Scalar], *, force: bool = True) -> dict[str, WireValue]:
         """Return the values of a request; with `force`, they may be outside the range in the metadata.

@@ -10,7 +10,6 @@ import re
 import time
 from base64 import b64decode
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, ClassVar, Final, Self, TypeAlias
 
@@ -24,8 +23,16 @@ from pydantic import StrictFloat as Real
 from pydantic import StrictInt as Whole
 
 from paramclient.cache import ParamCache, SnapshotSummary
-from paramclient.cli import json_output as shapes
-from paramclient.cli.json_apply import ApplyJson, PlanJson
+from paramclient.cli.json_apply import apply_json, plan_json
+from paramclient.cli.json_output import (
+    JsonObject,
+    fetch_json,
+    history_json,
+    set_json,
+    snapshot_json,
+    vehicle_json,
+    written_json,
+)
 from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.files import FileFormat, ParamFile, dumps, loads, writable
@@ -314,35 +321,24 @@ async def vehicles(hub: HubArgument) -> dict[str, Any]:
 # parameters
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ParamsJson(shapes.Json):
-    """Parameters by name, with the number of the last event whose effects they include."""
-
-    run: str
-    seq: int
-    params: Mapping[str, shapes.ParamJson | shapes.WrittenJson]
-
-
 @reading.get(f"{VEHICLE}/params")
 async def params(
     target: TargetArgument,
     names: Names = None,
     metadata: Annotated[bool, Query(description="Include the whole metadata of the parameters.")] = False,
     at: At = None,
-) -> ParamsJson:
-    """Return the known parameters by name, without traffic."""
+) -> JsonObject:
+    """Return the known parameters by name, and the last event whose effects they include, without traffic."""
     position = target.hub.feed.position
     choice = NameChoice(names or ["*"])
     if at is not None:
         state = await target.state_at(at)
-        earlier = {name: shapes.WrittenJson.of(each) for name, each in state.items() if choice.has(name)}
-        return ParamsJson(**position, params=earlier)
+        earlier = {name: written_json(each) for name, each in state.items() if choice.has(name)}
+        return {**position, "params": earlier}
     known = [each for name, each in target.component.params.items() if choice.has(name)]
 
-    def encode() -> ParamsJson:
-        return ParamsJson(
-            **position, params={each.name: target.shown(each, whole=metadata) for each in known}
-        )
+    def encode() -> JsonObject:
+        return {**position, "params": {each.name: target.shown(each, whole=metadata) for each in known}}
 
     return await anyio.to_thread.run_sync(encode)
 
@@ -352,16 +348,14 @@ async def param(
     target: TargetArgument,
     name: str,
     live: Annotated[bool, Query(description="Read it from the vehicle, also if it is known.")] = False,
-) -> shapes.ParamJson:
+) -> JsonObject:
     """Return one parameter: the known value, else that of the vehicle."""
     known = None if live else target.component.params.get(name)
     return target.shown(known or await target.component.get(name), whole=True)
 
 
 @writing.put(f"{VEHICLE}/params/{{name:path}}")
-async def set_param(
-    author: Author, target: TargetArgument, name: str, body: WriteRequest
-) -> shapes.WriteJson:
+async def set_param(author: Author, target: TargetArgument, name: str, body: WriteRequest) -> JsonObject:
     """Write one parameter, and verify the value that the vehicle reports."""
     values = await target.values({name: body.value}, force=body.force)
     options = body.model_dump(exclude={"value"})
@@ -381,27 +375,18 @@ async def set_params(author: Author, target: TargetArgument, body: WriteManyRequ
     result = await target.component.set_many(values, **options, author=author)
     results = [target.outcome(each) for each in result.outcomes]
     error = {} if result.error is None else {"error": str(result.error)}
-    return dict(
-        shapes.as_json({"vehicle": shapes.VehicleJson.of(target.component), "results": results} | error)
-    )
+    return {"vehicle": vehicle_json(target.component), "results": results, **error}
 
 
 @reading.post(f"{VEHICLE}/fetch")
-async def fetch(target: TargetArgument, body: FetchRequest) -> shapes.FetchJson:
+async def fetch(target: TargetArgument, body: FetchRequest) -> JsonObject:
     """Fetch all parameters. Simultaneous requests share one download; the progress is in the events."""
     component = target.component
     result = await target.fetch(refresh=body.refresh, timeout=body.timeout_s)
     if body.metadata:
         await target.load_metadata(timeout=body.timeout_s)
     known = dict(component.params)
-    return shapes.FetchJson.of(
-        component,
-        result,
-        known.values(),
-        bytes_received=component.core.link_task.bytes_received,
-        bytes_sent=component.core.link_task.bytes_sent,
-        described=target.defaults_of(known),
-    )
+    return fetch_json(component, result, known.values(), target.defaults_of(known))
 
 
 # files
@@ -411,7 +396,7 @@ async def fetch(target: TargetArgument, body: FetchRequest) -> shapes.FetchJson:
 async def read_file(body: UploadedFile) -> dict[str, Any]:
     """Parse a parameter file of any format, without names that no vehicle can have. It is not stored."""
     file = await anyio.to_thread.run_sync(partial(body.read, partial=True))
-    sets = shapes.as_json([shapes.SetJson.with_sources(each, {}) for each in file.sets])
+    sets = [set_json(each) for each in file.sets]
     return {"file": file.source, "format": file.file_format, "notes": file.notes, "components": sets}
 
 
@@ -458,15 +443,15 @@ async def _only_apply(target: TargetArgument) -> AsyncIterator[None]:
 
 
 @reading.post(f"{VEHICLE}/plan")
-async def plan(target: TargetArgument, body: PlanRequest) -> PlanJson:
+async def plan(target: TargetArgument, body: PlanRequest) -> JsonObject:
     """Return which values an apply would write, in which order, and which it would skip, and why."""
     component, wanted = target.component, await _wanted(target, body)
     found = await plan_of(component, wanted, include=body.include, info=target.metadata, force=body.force)
-    return PlanJson.of(found, system=component.system, component=component.component)
+    return plan_json(found, component)
 
 
 @writing.post(f"{VEHICLE}/apply", dependencies=[Depends(_only_apply)])
-async def apply_(author: Author, target: TargetArgument, body: ApplyRequest) -> ApplyJson:
+async def apply_(author: Author, target: TargetArgument, body: ApplyRequest) -> JsonObject:
     """Write the wanted values in a working order, and verify each of them.
 
     The progress is in the events. If the client disconnects, the apply ends; written values stay.
@@ -474,11 +459,11 @@ async def apply_(author: Author, target: TargetArgument, body: ApplyRequest) -> 
     wanted = await _wanted(target, body)
     options = body.model_dump(exclude={"values", "file", "at", "only"}) | _context(author, target)
     result = await apply(target.component, wanted, **options)
-    return ApplyJson.of(result, shapes.VehicleJson.of(target.component))
+    return apply_json(result, target.component)
 
 
 @writing.post(f"{VEHICLE}/restore", dependencies=[Depends(_only_apply)])
-async def restore_(author: Author, target: TargetArgument, body: RestoreRequest) -> ApplyJson:
+async def restore_(author: Author, target: TargetArgument, body: RestoreRequest) -> JsonObject:
     """Restore an earlier state, with the vehicle's own identity and calibration."""
     if body.at is None:
         state = (await target.cached(load_restore_point)).state
@@ -486,7 +471,7 @@ async def restore_(author: Author, target: TargetArgument, body: RestoreRequest)
         state = await target.state_at(body.at)
     options = body.model_dump(exclude={"at"}) | _context(author, target)
     result = await restore(target.component, state, **options)
-    return ApplyJson.of(result, shapes.VehicleJson.of(target.component))
+    return apply_json(result, target.component)
 
 
 async def _wanted(target: Target, body: PlanRequest) -> ParamSet:
@@ -524,13 +509,13 @@ def _context(author: str, target: Target) -> dict[str, Any]:
 
 
 @reading.get(f"{VEHICLE}/snapshots")
-async def snapshots(target: TargetArgument) -> dict[str, list[shapes.SnapshotJson]]:
+async def snapshots(target: TargetArgument) -> JsonObject:
     """Return the snapshots, the newest last."""
-    return {"snapshots": [shapes.SnapshotJson.of(each) for each in await target.cached(ParamCache.snapshots)]}
+    return {"snapshots": [snapshot_json(each) for each in await target.cached(ParamCache.snapshots)]}
 
 
 @writing.post(f"{VEHICLE}/snapshots", status_code=201)
-async def create_snapshot(target: TargetArgument, body: SnapshotRequest) -> shapes.SnapshotJson:
+async def create_snapshot(target: TargetArgument, body: SnapshotRequest) -> JsonObject:
     """Store a snapshot of the known table."""
     component = target.component
     known = list(component.params.values())
@@ -545,7 +530,7 @@ async def create_snapshot(target: TargetArgument, body: SnapshotRequest) -> shap
             vehicle, number, table, reason=reason, hash=crc, complete=is_whole, **which
         )
 
-    return shapes.SnapshotJson.of(await target.cached(store))
+    return snapshot_json(await target.cached(store))
 
 
 @reading.get(f"{VEHICLE}/history")
@@ -554,11 +539,11 @@ async def history(
     name: Annotated[str | None, Query(max_length=16)] = None,
     limit: Annotated[int, Query(ge=1, le=1_000)] = HISTORY_ENTRIES,
     since: Annotated[AwareDatetime | None, Query(description="Only from this time on.")] = None,
-) -> dict[str, list[shapes.HistoryLineJson]]:
+) -> JsonObject:
     """Return the newest changes of values, the newest last."""
     begin = None if since is None else since.timestamp()
     entries = await target.cached(ParamCache.history, name, limit, begin)
-    return {"history": [shapes.HistoryLineJson.of(each) for each in entries]}
+    return {"history": [history_json(each) for each in entries]}
 
 
 # metrics

@@ -8,7 +8,7 @@ import struct
 
 import pytest
 
-from paramclient.cli.json_output import InfoJson, ParamJson, as_json
+from paramclient.cli.json_output import info_json, param_json, table_param_json
 from paramclient.metadata import ParamInfo
 from paramclient.model.notation import bits_written, typed, value_json
 from paramclient.model.paramset import WrittenParam
@@ -40,13 +40,13 @@ def param(value: WireValue, kind: ParamType | int = ParamType.REAL32) -> Param:
 def test_values_are_exact(value: WireValue, kind: ParamType | int, shown: object) -> None:
     member = value_json(value, kind)
     assert (type(member), repr(member)) == (type(shown), repr(shown))
-    text = json.dumps(as_json(ParamJson.of(param(value, kind))), allow_nan=False)
+    text = json.dumps(param_json(param(value, kind)), allow_nan=False)
     assert repr(json.loads(text)["value"]) == repr(shown)
 
 
 def test_bits_have_the_width_of_the_type() -> None:
-    assert ParamJson.of(param(1, ParamType.UINT64)).bits == "0000000000000001"
-    assert ParamJson.of(param(1, ParamType.INT8)).bits == "00000001"
+    assert param_json(param(1, ParamType.UINT64))["bits"] == "0000000000000001"
+    assert param_json(param(1, ParamType.INT8))["bits"] == "00000001"
     assert bits_written(WrittenParam("P", 1.0, ParamType.REAL32)) == "3f800000"
     assert bits_written(WrittenParam("P", 1.0)) is None
     assert bits_written(WrittenParam("P", 300, ParamType.INT8)) is None
@@ -61,7 +61,7 @@ def test_an_integer_written_for_a_float_becomes_a_float() -> None:
 def test_a_parameter_of_a_table_has_its_default_its_trust_and_its_meaning() -> None:
     info = ParamInfo("P", units="m", values={1.5: "half"}, minimum=0, maximum=math.inf, default=2)
     known = Param("P", 1.5, ParamType.REAL32, 4, bits_of(1.5, ParamType.REAL32), Trust.VERIFIED, 1.25)
-    assert as_json(ParamJson.of_table(known, info)) == {
+    assert table_param_json(known, info) == {
         "name": "P",
         "value": 1.5,
         "type": "REAL32",
@@ -74,11 +74,11 @@ def test_a_parameter_of_a_table_has_its_default_its_trust_and_its_meaning() -> N
         "text": "half",
         "units": "m",
     }
-    described = as_json(ParamJson.of_table(param(2.0), info))
+    described = table_param_json(param(2.0), info)
     assert (described["default"], described["default_source"], described["is_default"]) == (
         2.0,
         "metadata",
         True,
     )
-    assert as_json(InfoJson.of(ParamInfo("P"))) == {}
-    assert list(as_json(ParamJson.of(param(1.5)))) == ["value", "type", "index", "bits"]
+    assert info_json(ParamInfo("P")) == {}
+    assert list(param_json(param(1.5))) == ["value", "type", "index", "bits"]
