@@ -119,14 +119,15 @@ async def test_progress_extends_the_wait_and_a_lost_result_is_requested_again(se
 
 
 @virtual_on_both
-async def test_a_camera_that_is_lost_while_it_reports_progress_ends_the_set_within_7_s() -> None:
-    endpoint = Silence(Camera(slow={"CAM_MODE": 3.0}), at=1e9)
+@pytest.mark.parametrize("after", [0.5, 1.9, 2.1])
+async def test_a_camera_that_is_lost_while_it_reports_progress_ends_the_set(after: float) -> None:
+    endpoint = Silence(Camera(slow={"CAM_MODE": 10.0}), at=1e9)
     async with converse(endpoint) as conversation:
         session = (await conversation.node(*CAMERA)).extended
         await fetch_all(session)
-        endpoint.at = anyio.current_time() + 0.5
+        endpoint.at = anyio.current_time() + after
         result = await write_many(session, [("CAM_MODE", 2), ("CAM_ISO", 200)])
-        assert anyio.current_time() - endpoint.at < 7.0
+        assert anyio.current_time() - endpoint.at < 6.0
         assert [each.status for each in result.outcomes] == [SetStatus.UNKNOWN, SetStatus.ACCEPTED]
         assert isinstance(result.error, NoReply)
 
