@@ -306,10 +306,10 @@ class _Write:
         until = anyio.current_time() + EXT_PROGRESS_TIMEOUT
         while isinstance(answer, ParamExtAck) and answer.param_result == ExtAckResult.IN_PROGRESS:
             now = anyio.current_time()
-            if now >= until or channel.is_lost:
+            if now >= until or channel.is_silent(self._began):
                 break
             answer = await channel.wait_for(inbox, self._accept, now, 0, EXT_PROGRESS_READ) or answer
-            if channel.is_lost:
+            if channel.is_silent(self._began):
                 break
             await self._confirm()
             with suppress(NoReply):  # the final acknowledgement may be lost
