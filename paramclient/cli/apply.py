@@ -25,7 +25,6 @@ from paramclient.cli.sources import (
     fill_pattern,
     is_file,
     open_file,
-    read_rules,
     resolve,
 )
 from paramclient.errors import FileError, NoReply, UsageError
@@ -83,7 +82,6 @@ async def apply(
     partial: bool = False,
     durable: bool = False,
     over: Annotated[str | None, Parameter(name="--overlay")] = None,
-    renames: str | None = None,
     metadata: MetadataChoice = None,
     options: ApplyFlags = _OPTIONS,
 ) -> int:
@@ -105,14 +103,12 @@ async def apply(
         durable: End only when the values and their history are on the disk and survive a power loss.
         over: A file whose parameters replace and extend those of FILE, with {uid} or {system} in its name
             for the vehicle's ids.
-        renames: A JSON file of names that firmware versions have changed. A parameter that the vehicle does
-            not have is looked up under its other name.
         metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for the
             ranges of values, and for parameters that take effect only after a reboot.
     """
     check_pattern("the file of --overlay", over, options)
     check_pattern("the file of --backup", options.backup, options)
-    given, rules = from_file(metadata), read_rules(renames)
+    given = from_file(metadata)
     opened = open_file(file, partial=partial) if is_file(file) else None
     params = None
     if opened is None:
@@ -127,7 +123,7 @@ async def apply(
             assert base is not None
             wanted = base if over is None else await _with_overlay(base, over, session)
             info = given or await known_of_session(session, metadata)
-            more: ApplyOptions = {"info": info, "renames": rules, "partial": partial, "durable": durable}
+            more: ApplyOptions = {"info": info, "partial": partial, "durable": durable}
             return ApplyJob(session, wanted, options, more)
 
         jobs = [Done(each, result=await job(each)) for each in found]
@@ -253,7 +249,6 @@ class ApplyJob:
                 include=(*self.own, *self.flags.include),
                 info=self.more.get("info"),
                 force=self.flags.force,
-                renames=self.more.get("renames"),
             )
             return _Planned(job=self, plan=made)
         raise NoReply(f"the parameters of {self.session.label}", attempts=0, waited=left or 0.0)
@@ -407,13 +402,12 @@ async def run_jobs(found: Sessions, loaded: Sequence[Done[ApplyJob]]) -> int:
 
 
 def _cells(row: ApplyRow, reason: str) -> list[object]:
-    name = "" if row.renamed is None else f"{row.renamed.name} on this vehicle"
     return [
         row.name,
         _text(row.before, row),
-        _text(row.target.settable, row),
+        _text(row.wanted.settable, row),
         Coloured(row.status, _STYLES.get(row.status, "")),
-        "; ".join(filter(None, (name, reason))),
+        reason,
     ]
 
 

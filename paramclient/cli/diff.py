@@ -15,7 +15,7 @@ from paramclient.cli.json_apply import diff_json
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Coloured, print_json, print_table, printable, say
-from paramclient.cli.sources import is_file, names_vehicle, read_rules, resolve_all
+from paramclient.cli.sources import is_file, names_vehicle, resolve_all
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.comparison import ChangedSide, Comparison, Difference, DifferenceStatus, compare
@@ -45,7 +45,6 @@ async def diff(
     only: tuple[str, ...] = (),
     partial: bool = False,
     everything: Annotated[bool, Parameter(name="--all")] = False,
-    renames: str | None = None,
     metadata: MetadataChoice = None,
     extended: bool = False,
     options: LinkOptions = _OPTIONS,
@@ -63,13 +62,10 @@ async def diff(
         partial: Leave out parameters that only the right side has; if the right side is a file and the left
             one is not, those that only the left side has.
         everything: Also print parameters that do not differ.
-        renames: A JSON file of names that firmware versions have changed. A parameter that only one side has
-            is compared with the parameter of its other name.
         metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
         extended: Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them.
     """
     chosen = from_file(metadata, offline=True)
-    rules = read_rules(renames)
     third_source = [] if base is None or base == DEFAULTS else [base]
     if left == right and not is_file(left) and not names_vehicle(left):
         raise UsageError(
@@ -79,15 +75,13 @@ async def diff(
     first, second, *third = await resolve_all([left, right, *third_source], options, extended=extended)
     is_right_partial = partial and is_file(right) and not is_file(left)
     if is_right_partial:
-        named = second if rules is None else rules.apply_to(second, first)
-        first = replace(first, params={name: first[name] for name in first if name in named})
-    known = first if rules is None else rules.apply_to(first, second)
-    sides = _Sides([known, second, *third], options, chosen)
+        first = replace(first, params={name: first[name] for name in first if name in second})
+    sides = _Sides([first, second, *third], options, chosen)
     has_defaults = base == DEFAULTS
-    before = sides.defaults(known, second) if has_defaults else next(iter(third), None)
+    before = sides.defaults(first, second) if has_defaults else next(iter(third), None)
     if partial and not is_right_partial:
-        second = replace(second, params={name: second[name] for name in second if name in known})
-    outcome = compare(first, second, base=before, names=only or None, renames=rules)
+        second = replace(second, params={name: second[name] for name in second if name in first})
+    outcome = compare(first, second, base=before, names=only or None)
     shown = [entry for entry in outcome.entries if everything or entry.is_shown]
     if options.json:
         shown_sides = (sides.left, sides.right, sides.base)
@@ -124,8 +118,7 @@ class _Sides:
 
     def units(self, entry: Difference) -> str:
         """Return the units of a parameter, or ""."""
-        right_name = entry.name if entry.renamed is None else entry.renamed.name
-        return units_of(self.left, entry.name) or units_of(self.right, right_name)
+        return units_of(self.left, entry.name) or units_of(self.right, entry.name)
 
 
 # Tables
@@ -182,10 +175,6 @@ def _with_bits(param: WrittenParam | None) -> str | None:
 def _comparison_text(entry: Difference) -> str:
     """Return the comparison of an entry in words."""
     more = []
-    if entry.renamed is not None:
-        is_converted = entry.left is not None and entry.renamed.settable != entry.left.settable
-        value = f", where left is {value_text(entry.renamed)}" if is_converted else ""
-        more.append(f"{entry.renamed.name} on the right{value}")
     if entry.types_differ:
         more.append(" and ".join(_type(each) for each in (entry.left, entry.right)))
     if entry.is_rounding:

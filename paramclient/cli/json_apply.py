@@ -52,9 +52,8 @@ def diff_json(
     """
 
     def entry_json(entry: Difference) -> JsonObject:
-        renamed, given = entry.renamed, [each for each in (entry.left, entry.right) if each is not None]
-        right_name = entry.name if renamed is None else renamed.name
-        found = [side and side.find(name) for side, name in ((left, entry.name), (right, right_name))]
+        given = [each for each in (entry.left, entry.right) if each is not None]
+        found = [side and side.find(entry.name) for side in (left, right)]
         source = None
         if has_defaults and entry.base is not None:
             is_given = any(each.default is not None for each in given)
@@ -69,9 +68,7 @@ def diff_json(
             **known_members(default_source=source),
             "changed_side": entry.changed_side,
             **known_members(
-                units=short_text(next((info.units for info in found if info and info.units), None)),
-                renamed=renamed and compared_json(renamed, right),
-                right_name=renamed and right_name,
+                units=short_text(next((info.units for info in found if info and info.units), None))
             ),
         }
 
@@ -101,12 +98,12 @@ def rows_json(rows: Iterable[ApplyRow]) -> JsonObject:
             "status": row.status,
             "type": None if row.type is None else type_name(row.type),
             "before": value(row.before),
-            "wanted": value(row.target.settable),
+            "wanted": value(row.wanted.settable),
             "actual": value(row.actual),
             "category": row.category,
             "reason": row.reason,
             "nearest": row.nearest,
-        } | known_members(vehicle_name=row.renamed and row.renamed.name)
+        }
 
     return {row.name: row_json(row) for row in rows}
 
@@ -115,10 +112,10 @@ def plan_json(plan: Plan, component: Component, *, full: bool = False) -> JsonOb
     """Return the plan for a vehicle, with unchanged parameters only if `full`."""
 
     def step_json(row: ApplyRow) -> JsonObject:
-        value, kind = typed(row.target.settable, row.type)
+        value, kind = typed(row.wanted.settable, row.type)
         assert row.before is not None, "only parameters that the vehicle has are set"
         return {
-            "name": row.target.name,
+            "name": row.name,
             "value": value_json(value, kind),
             "type": type_name(kind),
             "before": value_json(row.before, kind),

@@ -24,12 +24,11 @@ from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import STDIN, report
 from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
 from paramclient.errors import FileError, NotInCache, UnknownVehicle, UsageError
-from paramclient.files import LARGEST_FILE, ParamFile, loads, read_file, read_renames
+from paramclient.files import LARGEST_FILE, ParamFile, loads, read_file
 from paramclient.files.formats import AUTOPILOT, ENDINGS
 from paramclient.links import FORMS, parse_link
 from paramclient.logs.onboard import is_onboard_log, read_onboard_log
 from paramclient.model.paramset import ParamSet
-from paramclient.model.renames import Renames
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.vehicle_params import cached_set, fetched_set
 
@@ -44,7 +43,6 @@ __all__ = [
     "is_pattern_name",
     "names_vehicle",
     "open_file",
-    "read_rules",
     "resolve",
     "resolve_all",
     "source_of",
@@ -231,15 +229,6 @@ def open_file(path: str, *, partial: bool = False) -> ParamFile:
     for note in file.notes:
         report(f"{file.source}: {note}")
     return file
-
-
-def read_rules(path: str | None) -> Renames | None:
-    """Read the file of --renames; return None without the option.
-
-    Raises:
-        FileError: the file cannot be read, or is invalid.
-    """
-    return None if path is None else read_renames(path)
 
 
 def choose(file: ParamFile, component: int | None, system: int | None) -> ParamSet:

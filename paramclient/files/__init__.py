@@ -6,13 +6,11 @@
 - `lists`, `json_format`: lists of ground stations, JSON.
 - `reading`: one file while it is read: its text, its parameters, its notes and its faults.
 - `other_files`: files that are mistaken for parameter files.
-- `rename_file`: files of names that firmware versions have changed.
 """
 
 from paramclient.files.conversion import dumps, loads, read_file, writable, write_file
 from paramclient.files.disk import LARGEST_FILE
 from paramclient.files.formats import FileFormat, ParamFile
-from paramclient.files.rename_file import loads_renames, read_renames
 
 __all__ = [
     "LARGEST_FILE",
@@ -20,9 +18,7 @@ __all__ = [
     "ParamFile",
     "dumps",
     "loads",
-    "loads_renames",
     "read_file",
-    "read_renames",
     "writable",
     "write_file",
 ]

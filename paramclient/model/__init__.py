@@ -8,6 +8,5 @@ words.
 - `comparison`, `notation`: comparison of sets, JSON notation.
 - `names`: selection of names, similar names, switches of groups.
 - `px4_hash`: PX4's hash of its parameters, and the ones that it excludes.
-- `renames`: names that firmware versions have changed, and the conversion of their values.
 - `wording`: counts and lists of names in messages.
 """

@@ -13,7 +13,6 @@ from enum import StrEnum
 from paramclient.errors import UsageError
 from paramclient.model.names import NameChoice
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.renames import Renames
 from paramclient.model.values import ParamType, Value, WireValue, bits_of, from_bits, same_bits
 
 __all__ = [
@@ -54,14 +53,11 @@ class Difference:
     """The comparison of one name.
 
     Attributes:
-        name: param_id; that of the left side, if the right side has the parameter under another name.
+        name: param_id.
         left, right: the parameter on each side, or None; at least one is not None.
-        base: the parameter in the base, or None; under the name and with the value for the right side, if
-            left and right have different names.
+        base: the parameter in the base, or None.
         status: how left and right compare, by value alone (see `types_differ`).
         changed_side: which side differs from the base; None without a base, or if the base lacks the name.
-        renamed: the left parameter under the name and with the value for the right side, if the right side
-            has another name (see `Renames`); else None.
     """
 
     name: str
@@ -70,7 +66,6 @@ class Difference:
     base: WrittenParam | None
     status: DifferenceStatus
     changed_side: ChangedSide | None
-    renamed: WrittenParam | None = None
 
     @property
     def is_same(self) -> bool:
@@ -84,7 +79,7 @@ class Difference:
     @property
     def types_differ(self) -> bool:
         """Whether both sides have a type and the types differ. `INT32 1` equals `REAL32 1.0`."""
-        left = self._left
+        left = self.left
         return (
             left is not None
             and self.right is not None
@@ -99,11 +94,11 @@ class Difference:
         A vehicle with the C-cast encoding reports integers beyond 24 bits rounded this way, so the values
         may be equal on board. Only a packed parameter file holds the exact value.
         """
-        if self.status is not DifferenceStatus.DIFFERENT or self._left is None or self.right is None:
+        if self.status is not DifferenceStatus.DIFFERENT or self.left is None or self.right is None:
             return False
-        if self._left.is_raw or self.right.is_raw:
+        if self.left.is_raw or self.right.is_raw:
             return False
-        left, right = self._left.value, self.right.value
+        left, right = self.left.value, self.right.value
         if not (isinstance(left, int) and isinstance(right, int)):
             return False
         rounded = _bits(left, ParamType.REAL32)
@@ -112,11 +107,6 @@ class Difference:
             and rounded == _bits(right, ParamType.REAL32)
             and from_bits(rounded, ParamType.REAL32) in (left, right)
         )
-
-    @property
-    def _left(self) -> WrittenParam | None:
-        """The left parameter as it compares with the right one."""
-        return self.left if self.renamed is None else self.renamed
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +154,6 @@ def compare(
     *,
     base: ParamSet | None = None,
     names: Iterable[str] | None = None,
-    renames: Renames | None = None,
 ) -> Comparison:
     """Compare two sets with `same_value`.
 
@@ -173,26 +162,15 @@ def compare(
             Names that only the base has are ignored.
         names: names or shell patterns (`MC_*`, `SERVO?_TRIM`), case-sensitive, to compare only the names
             that match.
-        renames: names that firmware versions have changed. A left parameter that the right side does not
-            have is compared with the right one of its other name. A name that both sides have is compared
-            as it is.
 
     Raises:
         UsageError: a pattern matches no name of either side. Without this error, a misspelt name would
-            compare as equal. Or two names of one side are one parameter of the other side.
+            compare as equal.
     """
-    renamed: Mapping[str, WrittenParam] = {}
-    if renames is not None:
-        renamed = renames.renamed(left, right)
-        renames.renamed(right, left)  # raises for two right names of one left parameter
-    paired = {param.name for param in renamed.values()}
     chosen = left.keys() | right.keys()
     if names is not None:
-        matching = _chosen(chosen, [names] if isinstance(names, str) else names)
-        chosen = matching | {name for name, param in renamed.items() if param.name in matching}
-    entries = (
-        _compared(name, left, right, base, renamed.get(name), renames) for name in sorted(chosen - paired)
-    )
+        chosen = _chosen(chosen, [names] if isinstance(names, str) else names)
+    entries = (_compared(name, left.get(name), right.get(name), base) for name in sorted(chosen))
     return Comparison(left, right, base, tuple(entries))
 
 
@@ -257,31 +235,11 @@ def _chosen(known: Collection[str], patterns: Iterable[str]) -> set[str]:
 
 
 def _compared(
-    name: str,
-    left: ParamSet,
-    right: ParamSet,
-    base: ParamSet | None,
-    renamed: WrittenParam | None,
-    renames: Renames | None,
+    name: str, left: WrittenParam | None, right: WrittenParam | None, base: ParamSet | None
 ) -> Difference:
-    ours = left.get(name) if renamed is None else renamed
-    theirs = right.get(name if renamed is None else renamed.name)
-    before = None if base is None else _in_base(name, base, renamed, renames)
-    status = _status(ours, theirs)
-    changed_side = _changed_side(ours, theirs, before, status)
-    return Difference(name, left.get(name), theirs, before, status, changed_side, renamed)
-
-
-def _in_base(
-    name: str, base: ParamSet, renamed: WrittenParam | None, renames: Renames | None
-) -> WrittenParam | None:
-    """Return the base's parameter under the name and with the value for the right side, or None."""
-    shared = name if renamed is None else renamed.name
-    before = base.get(shared)
-    if before is not None or renames is None:
-        return before
-    other = renames.find(shared, base)
-    return None if other is None else renames.convert(base[other], shared)
+    before = None if base is None else base.get(name)
+    status = _status(left, right)
+    return Difference(name, left, right, before, status, _changed_side(left, right, before, status))
 
 
 def _status(left: WrittenParam | None, right: WrittenParam | None) -> DifferenceStatus:

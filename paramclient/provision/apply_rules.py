@@ -141,9 +141,9 @@ class Choice:
                 )
         self._names = NameChoice(globs)
 
-    def has(self, names: Iterable[str], category: str) -> bool:
-        """Return whether a parameter with these names, which is left out for `category`, is included."""
-        return category in self._categories or any(map(self._names.has, names))
+    def has(self, name: str, category: str) -> bool:
+        """Return whether a parameter that is left out for `category` is included."""
+        return category in self._categories or self._names.has(name)
 
 
 @cache

@@ -36,7 +36,6 @@ from paramclient.provision.inspection import (
     inspect,
     reread,
     wait_for_identity,
-    with_other_names,
 )
 from paramclient.provision.planning import (
     WRONG,
@@ -128,8 +127,6 @@ class ApplyResult(Rows):
 
 class ApplyOptions(PlanOptions, total=False):
     """Options of `apply` and `restore`, besides those of `PlanOptions`.
-
-    After each stage that reveals parameters, names of `renames` are looked up again.
 
     Attributes:
         partial: skip invalid values and names that the vehicle does not have, and write the remaining values;
@@ -252,9 +249,9 @@ class _Run:
         if self._plan.problems and not self.partial:
             raise InvalidParameters(self._plan.problems)
         for row in self._plan.to_write:
-            if self._rules.is_action(row.target.name) and self._resets(row) and not self.reboot:
+            if self._rules.is_action(row.name) and self._resets(row) and not self.reboot:
                 raise UsageError(
-                    f"{row.target.name} resets other parameters to their defaults at the next start of the "
+                    f"{row.name} resets other parameters to their defaults at the next start of the "
                     "vehicle; it can only be set with reboot=True"
                 )
         if self.before_writing is not None and (self._plan.to_write or self._must_reboot([])):
@@ -346,7 +343,7 @@ class _Run:
         stages = []
         may_appear = bool(self._plan.of(ApplyStatus.LATER))
         for stage in self._plan.stages:
-            if rows := tuple(row for row in stage.rows if self._may_write(row.target.name)):
+            if rows := tuple(row for row in stage.rows if self._may_write(row.name)):
                 stages.append(replace(stage, rows=rows))
                 if (stage.reveals and may_appear) or (stage.reboot_first and self.reboot):
                     break
@@ -369,27 +366,25 @@ class _Run:
     def _pending_system_id(self) -> int | None:
         """Return the system id that is set and takes effect after a reboot, or None."""
         for row in self._plan.of(ApplyStatus.UNCHANGED):
-            if self._rules.has("system_id", row.target.name) and row.before != self.component.system:
+            if self._rules.has("system_id", row.name) and row.before != self.component.system:
                 return row.before if isinstance(row.before, int) else None
         return None
 
     def _resets(self, row: ApplyRow) -> bool:
-        return self._rules.has("resets", row.target.name)
+        return self._rules.has("resets", row.name)
 
     # Reads
 
     async def _inspect(self) -> None:
         absent = frozenset[str]() if self._before is None else self._inspection.absent
-        await self._read(
-            inspect(self.component, self.wanted, self.planned.get("renames"), absent), verifies=True
-        )
+        await self._read(inspect(self.component, self.wanted, absent), verifies=True)
 
     async def _verify(self) -> None:
         """Read the wanted parameters: by name if that is faster than the whole table, else the table.
 
         Always reads the table if a switch may have revealed parameters whose names are not known.
         """
-        names = [row.target.name for row in self._plan.of(ApplyStatus.SET, ApplyStatus.UNCHANGED)]
+        names = [row.name for row in self._plan.of(ApplyStatus.SET, ApplyStatus.UNCHANGED)]
         if self._plan.of(ApplyStatus.LATER) or not self._inspection.is_reading_faster(len(names)):
             await self._inspect()
         else:
@@ -397,11 +392,10 @@ class _Run:
 
     async def _read_revealed(self, done: Stage) -> None:
         """Read by name the parameters that a stage may have revealed. This verifies no write."""
-        later = [row.name for row in self._plan.of(ApplyStatus.LATER)]
-        names = with_other_names(later, (), self.planned.get("renames"))
+        names = [row.name for row in self._plan.of(ApplyStatus.LATER)]
         if self.component.autopilot == "ardupilot":  # a switch reveals the names with its own prefix
-            groups = tuple(row.target.name.rpartition("_")[0] for row in done.rows)
-            names = tuple(name for name in names if name.startswith(groups))
+            groups = tuple(row.name.rpartition("_")[0] for row in done.rows)
+            names = [name for name in names if name.startswith(groups)]
         await self._read(reread(self.component, self._inspection, names))
 
     async def _read(self, reading: Awaitable[Inspection], *, verifies: bool = False) -> None:
@@ -437,7 +431,7 @@ class _Run:
             await self._write(stage.rows)
             return
         for row in stage.rows:
-            if self._rules.has("system_id", row.target.name):
+            if self._rules.has("system_id", row.name):
                 await self._write_system_id(row)
             else:
                 await self._write([row])
@@ -449,13 +443,13 @@ class _Run:
             ParamClientError: not all values were tried.
         """
         self._check_same_vehicle()
-        by_name = {row.target.name: row for row in rows}
+        by_name = {row.name: row for row in rows}
         before = frozenset(self.sent)
         self.sent.update(by_name)
         self._written_at = math.inf
         try:
             done = await self.component.set_many(
-                [(name, row.target.settable) for name, row in by_name.items()],
+                [(name, row.wanted.settable) for name, row in by_name.items()],
                 force=self.planned.get("force", False),
                 author=self.author,
                 progress=lambda outcome: self._take(by_name[outcome.name], outcome),
@@ -493,7 +487,7 @@ class _Run:
 
     async def _write_system_id(self, row: ApplyRow) -> None:
         """Set the system id, and continue with the vehicle under its new one."""
-        component, name, system = self.component, row.target.name, int(row.target.value)
+        component, name, system = self.component, row.name, int(row.wanted.value)
         own = component.identity
         for known in component.client.components.values():
             is_ours = own.has_own_uid and known.identity.uid == own.uid  # under an earlier id
@@ -548,7 +542,7 @@ class _Run:
         self._reboot_for.clear()
         await self._inspect()
         for row in self._plan.to_write:
-            if row.target.name in kept and row.target.name not in self._settled:
+            if row.name in kept and row.name not in self._settled:
                 reason = "the vehicle acknowledged the value, and has another one after the reboot"
                 self._settle(row, ApplyStatus.ADJUSTED, reason)
 
@@ -577,23 +571,23 @@ class _Run:
     # Outcomes
 
     def _count_write(self, row: ApplyRow) -> None:
-        self._written[row.target.name] += 1
+        self._written[row.name] += 1
         if row.needs_reboot:
-            self._reboot_for[row.target.name] = None
+            self._reboot_for[row.name] = None
 
     def _accept(self, row: ApplyRow, note: str = "") -> None:
         self._count_write(row)
-        self._notes[row.target.name] = note
+        self._notes[row.name] = note
         self._report("writing", self._outcome(row, ApplyStatus.ACCEPTED, note))
 
     def _settle(self, row: ApplyRow, status: ApplyStatus, reason: str, category: str = "") -> None:
         """Record an outcome that only the verification may still change, and report it."""
-        self._settled[row.target.name] = settled = self._outcome(row, status, reason, category)
+        self._settled[row.name] = settled = self._outcome(row, status, reason, category)
         self._report("writing", settled)
 
     def _outcome(self, row: ApplyRow, status: ApplyStatus, reason: str = "", category: str = "") -> ApplyRow:
         """Return a row of the plan with its outcome, and with the values before and as last sent."""
-        name = row.target.name
+        name = row.name
         before = None if self._before is None else self._before.get(name)
         held = self.component.params.get(name)
         return replace(
@@ -609,12 +603,12 @@ class _Run:
         if self.progress is not None:
             done = self._settled.keys() | self._written.keys()
             to_write = [] if self._before is None else self._plan.to_write
-            left = sum(each.target.name not in done for each in to_write)
+            left = sum(each.name not in done for each in to_write)
             self.progress(ApplyProgress(phase, len(done), len(done) + left, row))
 
     def _final_row(self, planned: ApplyRow) -> ApplyRow:
         """Return the row of a parameter at the end of the run."""
-        name, reported = planned.target.name, planned.before
+        name, reported = planned.name, planned.before
         is_acknowledged, is_sent = bool(self._written[name]), name in self.sent
 
         def row(status: ApplyStatus, reason: str = "", category: str = "") -> ApplyRow:

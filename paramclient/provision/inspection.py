@@ -12,7 +12,6 @@ import anyio
 from paramclient.client.component import Component
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.renames import Renames
 from paramclient.model.values import Param, ParamType, Settable, Trust
 from paramclient.provision.planning import Plan, PlanOptions, check_component, plan_from
 from paramclient.provision.vehicle_params import component_set
@@ -26,7 +25,6 @@ __all__ = [
     "reread",
     "wait_for_identity",
     "wanted_set",
-    "with_other_names",
 ]
 
 READS_IN_PROGRESS_MAX: Final = 64
@@ -65,7 +63,7 @@ async def plan(component: Component, wanted: Wanted, **options: Unpack[PlanOptio
     wanted = wanted_set(component, wanted)
     plan_from({}, wanted, autopilot=component.autopilot, **options)  # errors before the vehicle is read
     await wait_for_identity(component)
-    inspection = await inspect(component, wanted, options.get("renames"))
+    inspection = await inspect(component, wanted)
     return plan_from(
         inspection.table,
         wanted,
@@ -124,7 +122,6 @@ class Inspection:
 async def inspect(
     component: Component,
     wanted: ParamSet,
-    renames: Renames | None = None,
     absent: frozenset[str] = frozenset(),
 ) -> Inspection:
     """Update the table, and read by name the wanted parameters that it does not have.
@@ -137,7 +134,6 @@ async def inspect(
     Args:
         component: the vehicle.
         wanted: the wanted parameters.
-        renames: other names of the wanted parameters, which are read if the table lacks the wanted name.
         absent: names that the vehicle is known not to have, unless they are listed by now.
 
     Raises:
@@ -156,16 +152,15 @@ async def inspect(
     listed = {name: param for name, param in params.items() if param.index is not None}
     table = {name: param for name, param in listed.items() if param.trust is not Trust.CACHED}
     complete = fetched.complete and len(table) == len(listed)
-    names = with_other_names(wanted, table, renames)
     if complete and component.is_extended:  # the list has all of them
-        absent |= frozenset(names).difference(params)
+        absent |= frozenset(wanted).difference(params)
     elif complete and component.autopilot == "ardupilot":
-        absent |= _in_no_hidden_group(table, names).difference(params)
+        absent |= _in_no_hidden_group(table, wanted).difference(params)
     missing = frozenset(fetched.missing)
     given_up = {name for name, param in table.items() if param.index in missing}
     if fetched.source == "cache" and fetched.hash is None:  # the cache policy did not verify it
         given_up |= before.intersection(table)
-    to_read = [name for name in names if name not in table and name not in absent]
+    to_read = [name for name in wanted if name not in table and name not in absent]
     found, unreported = await _read_names(component, [*given_up, *to_read], given_up)
     known = (param for name, param in (table | found).items() if name not in unreported)
     return Inspection(
@@ -207,18 +202,6 @@ async def reread(
         table=replace(inspection.table, params=reported, at=time.time()),
         absent=(inspection.absent | unknown).difference(found),
     )
-
-
-def with_other_names(
-    names: Iterable[str], present: Container[str], renames: Renames | None
-) -> tuple[str, ...]:
-    """Return names, each followed by its other names unless it is among `present`; each name once."""
-    found: dict[str, None] = {}
-    for name in names:
-        found[name] = None
-        if renames is not None and name not in present:
-            found.update(dict.fromkeys(renames.other_names(name)))
-    return tuple(found)
 
 
 async def _read_names(

@@ -17,7 +17,6 @@ from paramclient.errors import UsageError
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite, version_difference
 from paramclient.model.names import nearest_names
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.renames import Renames
 from paramclient.model.values import (
     Encoding,
     Param,
@@ -81,14 +80,11 @@ class PlanOptions(TypedDict, total=False):
         include: categories (`CATEGORIES`) and globs of names to set although the list leaves them out.
         info: metadata by name.
         force: allow NaN and infinity for every autopilot.
-        renames: names that firmware versions have changed. A wanted parameter that the vehicle does not have
-            is planned under its other name, if the vehicle has that one.
     """
 
     include: str | Iterable[str]
     info: Mapping[str, ParamInfo] | None
     force: bool
-    renames: Renames | None
 
 
 class ApplyStatus(StrEnum):
@@ -133,8 +129,6 @@ class ApplyRow:
             `WRONG`; else "".
         reason: the reason for the status as a sentence; may be "".
         nearest: for a parameter that the vehicle does not have, the most similar names, most similar first.
-        renamed: the wanted parameter under the vehicle's name and with the value for it, if the vehicle has
-            the parameter under another name (see `Renames`); else None.
         needs_reboot: whether a change takes effect after a reboot.
     """
 
@@ -146,7 +140,6 @@ class ApplyRow:
     category: str = ""
     reason: str = ""
     nearest: tuple[str, ...] = ()
-    renamed: WrittenParam | None = None
     needs_reboot: bool = False
 
     @property
@@ -155,14 +148,9 @@ class ApplyRow:
         return self.wanted.name
 
     @property
-    def target(self) -> WrittenParam:
-        """The wanted parameter with the name and the value that the vehicle is to have."""
-        return self.wanted if self.renamed is None else self.renamed
-
-    @property
     def differs(self) -> bool:
         """Whether the vehicle had another value than the wanted one, or no such parameter."""
-        return self.before is None or not _is_same(self.target.settable, self.before, self.type)
+        return self.before is None or not _is_same(self.wanted.settable, self.before, self.type)
 
     @property
     def is_as_wanted(self) -> bool:
@@ -183,12 +171,11 @@ class ApplyRow:
 
     def __str__(self) -> str:
         kind = ParamType.REAL32 if self.type is None else self.type
-        now = self.target.settable if self.actual is None else self.actual
+        now = self.wanted.settable if self.actual is None else self.actual
         is_changed = self.before is not None and not _is_same(now, self.before, self.type)
         before = f"{format_value(self.before, kind)} ->" if self.before is not None and is_changed else "="
-        name = self.name if self.renamed is None else f"{self.name} (here {self.renamed.name})"
         why = f": {self.why}" if self.why else ""
-        return f"{name} {before} {format_value(now, kind)}, {self.status}{why}"
+        return f"{self.name} {before} {format_value(now, kind)}, {self.status}{why}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,7 +271,7 @@ class Plan(Rows):
     @property
     def reboot_for(self) -> tuple[str, ...]:
         """The names of values to write that take effect after a reboot."""
-        return tuple(row.target.name for row in self.to_write if row.needs_reboot)
+        return tuple(row.name for row in self.to_write if row.needs_reboot)
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{count} {status}" for status, count in self.counts.items())
@@ -319,8 +306,7 @@ def plan_from(
 
     Raises:
         UsageError: an element of `include` is neither a category nor a glob; `current` and `wanted` are of
-            different components or autopilots, or one has plain and the other extended parameters; or two
-            wanted names are one parameter of `current`.
+            different components or autopilots, or one has plain and the other extended parameters.
     """
     identity = None
     if isinstance(current, ParamSet):
@@ -374,20 +360,15 @@ class _Planner:
     include: str | Iterable[str] = ()
     info: Mapping[str, ParamInfo] | None = None
     force: bool = False
-    renames: Renames | None = None
 
     def __post_init__(self) -> None:
         self.described = self.info or {}
         self.choice = Choice(self.include)
-        self.names = self.renames or Renames()
         self.rules = rules_for(self.autopilot, is_extended=self.wanted.is_extended)
-        self.renamed = self.names.renamed(self.wanted, self.current)
-        targets = (self.renamed.get(name, param) for name, param in self.wanted.items())
-        self.targets = {param.name: param for param in targets}
 
     def plan(self) -> Plan:
         """Return the plan."""
-        rows = self.settle_missing({name: self.row(each) for name, each in self.wanted.items()})
+        rows = self.settle_missing({each.name: self.row(each) for each in self.wanted.values()})
         awaiting_reboot = self.awaiting_reboot(rows)
         may_be_hidden = self.belongs_to(awaiting_reboot)
         file, own = self.wanted.identity, self.identity
@@ -400,7 +381,7 @@ class _Planner:
                 if row.status is ApplyStatus.INVALID
                 or (row.status is ApplyStatus.SKIPPED and row.category == MISSING and not may_be_hidden(name))
             },
-            extra=tuple(name for name in self.current if name not in self.targets),
+            extra=tuple(name for name in self.current if name not in self.wanted),
             unchecked=tuple(name for name, row in rows.items() if self.is_unchecked(row)),
             firmware=() if file is None or own is None else (file, own),
             awaiting_reboot=awaiting_reboot,
@@ -408,64 +389,57 @@ class _Planner:
 
     def is_unchecked(self, row: ApplyRow) -> bool:
         """Return whether the range of a value to write was to be checked, and is not known."""
-        name, value = row.target.name, row.target.settable
+        name, value = row.name, row.wanted.settable
         is_to_check = row.status is ApplyStatus.SET and not isinstance(value, str | bytes)
-        return is_to_check and name not in self.described and not self.choice.has([name], OUT_OF_RANGE)
+        return is_to_check and name not in self.described and not self.choice.has(name, OUT_OF_RANGE)
 
     def row(self, wanted: WrittenParam) -> ApplyRow:
         """Return the row of one parameter; `settle_missing` completes rows of missing parameters."""
-        renamed = self.renamed.get(wanted.name)
-        target = wanted if renamed is None else renamed
-        current: Param | WrittenParam | None = self.current.get(target.name)
+        name = wanted.name
+        current: Param | WrittenParam | None = self.current.get(name)
         before = None if current is None else current.settable
-        kind = target.type_number if current is None or current.type_number is None else current.type_number
-        info = self.described.get(target.name)
+        kind = wanted.type_number if current is None or current.type_number is None else current.type_number
+        info = self.described.get(name)
         vehicle_type = None if self.identity is None else self.identity.vehicle_type
-        needs_reboot = self.rules.needs_reboot(target.name, vehicle_type)
+        needs_reboot = self.rules.needs_reboot(name, vehicle_type)
         needs_reboot = needs_reboot or (info is not None and info.reboot_required)
-        names = dict.fromkeys((target.name, wanted.name))  # the list may know only one of two names
 
         def verdict(status: ApplyStatus, category: str = "", reason: str = "") -> ApplyRow:
-            return ApplyRow(
-                wanted, status, before, None, kind, category, reason, (), renamed, needs_reboot=needs_reboot
-            )
+            return ApplyRow(wanted, status, before, None, kind, category, reason, needs_reboot=needs_reboot)
 
-        for each in names:
-            rule = self.rules.left_out(each, self._value_to_be)
-            if rule is not None and not self.choice.has(names, rule.category):
-                return verdict(ApplyStatus.SKIPPED, rule.category, f"left out: it {rule.reason}")
+        rule = self.rules.left_out(name, self._value_to_be)
+        if rule is not None and not self.choice.has(name, rule.category):
+            return verdict(ApplyStatus.SKIPPED, rule.category, f"left out: it {rule.reason}")
         if before is None:
             return verdict(ApplyStatus.LATER, MISSING)
-        if _is_same(target.settable, before, kind):
+        if _is_same(wanted.settable, before, kind):
             return verdict(ApplyStatus.UNCHANGED)
-        if info is not None and info.is_read_only and not self.choice.has(names, READ_ONLY):
+        if info is not None and info.is_read_only and not self.choice.has(name, READ_ONLY):
             return verdict(ApplyStatus.SKIPPED, READ_ONLY, "left out: it can only be read")
-        wrong = self._find_fault(target, before, kind)
-        if wrong is None or (wrong[0] == OUT_OF_RANGE and self.choice.has(names, OUT_OF_RANGE)):
+        wrong = self._find_fault(wanted, before, kind)
+        if wrong is None or (wrong[0] == OUT_OF_RANGE and self.choice.has(name, OUT_OF_RANGE)):
             return verdict(ApplyStatus.SET)
-        category, reason = wrong
-        reason = reason if renamed is None else f"as {target.name}, {reason}"
-        return verdict(ApplyStatus.INVALID, category, reason)
+        return verdict(ApplyStatus.INVALID, *wrong)
 
     def stages(self, rows: Mapping[str, ApplyRow]) -> tuple[Stage, ...]:
         """Return the stages, in order."""
         left = [row for row in rows.values() if row.status is ApplyStatus.SET]
 
         def pop(fits: Callable[[str], bool]) -> tuple[ApplyRow, ...]:
-            taken = tuple(row for row in left if fits(row.target.name))
-            left[:] = [row for row in left if not fits(row.target.name)]
+            taken = tuple(row for row in left if fits(row.name))
+            left[:] = [row for row in left if not fits(row.name)]
             return taken
 
         last = pop(lambda name: self.rules.has("last", name))
         frame = pop(lambda name: self.rules.has("frame", name))
-        turned_off = pop(lambda name: self.rules.reveals(name) and self.targets[name].settable == 0)
+        turned_off = pop(lambda name: self.rules.reveals(name) and self.wanted[name].settable == 0)
         switches = pop(self.rules.reveals)
         is_any_missing = any(row.status is ApplyStatus.LATER for row in rows.values())
         waits = [
             is_any_missing and any(row.needs_reboot for row in revealing) for revealing in (frame, switches)
         ]
-        resets = any(self.rules.has("resets", row.target.name) for row in frame)
-        last = tuple(sorted(last, key=lambda row: self.rules.has("system_id", row.target.name)))
+        resets = any(self.rules.has("resets", row.name) for row in frame)
+        last = tuple(sorted(last, key=lambda row: self.rules.has("system_id", row.name)))
         stages = (
             Stage("frame parameters", frame, reveals=True, reboot_first=resets or waits[0]),
             Stage("switches that reveal parameters", switches, reveals=True, reboot_first=waits[1]),
@@ -476,16 +450,16 @@ class _Planner:
         return tuple(stage for stage in stages if stage.rows)
 
     def belongs_to(self, switches: Iterable[str]) -> Callable[[str], bool]:
-        """Return a function that decides whether a wanted name, or its other name, is of a switch's group."""
+        """Return a function that decides whether a wanted name is of a switch's group."""
         groups = tuple(switch.rpartition("_")[0] + "_" for switch in switches)
-        return lambda name: any(each.startswith(groups) for each in (name, *self.names.other_names(name)))
+        return lambda name: name.startswith(groups)
 
     def awaiting_reboot(self, rows: Mapping[str, ApplyRow]) -> tuple[str, ...]:
         """Return switches whose missing group may appear after a reboot."""
         missing = [name for name, row in rows.items() if row.category == MISSING]
         return tuple(
             name
-            for name, row in ((row.target.name, row) for row in rows.values())
+            for name, row in rows.items()
             if row.status is ApplyStatus.UNCHANGED
             and row.before != 0
             and row.needs_reboot
@@ -499,7 +473,7 @@ class _Planner:
         Adds the similar names that the vehicle has.
         """
         names = [name for name, row in rows.items() if row.status is ApplyStatus.LATER]
-        unnamed = self.current.keys() - self.targets.keys()
+        unnamed = self.current.keys() - self.wanted.keys()
         spelled = {name.upper(): name for name in self.current} if names else {}
         settled = dict(rows)
         may_be_revealed = self._revealed_names(rows)
@@ -507,10 +481,8 @@ class _Planner:
             nearest: tuple[str, ...] = ()
             if len(names) <= SUGGESTIONS_MAX:
                 nearest = nearest_names(name, unnamed | {spelled.get(name.upper(), name)})
-            may_appear = any(map(may_be_revealed, (name, *self.names.other_names(name))))
-            reason = "; ".join(filter(None, ("not on this vehicle", self.names.missing_note(name))))
-            status = ApplyStatus.LATER if may_appear else ApplyStatus.SKIPPED
-            settled[name] = replace(rows[name], status=status, reason=reason, nearest=nearest)
+            status = ApplyStatus.LATER if may_be_revealed(name) else ApplyStatus.SKIPPED
+            settled[name] = replace(rows[name], status=status, reason="not on this vehicle", nearest=nearest)
         return settled
 
     def _revealed_names(self, rows: Mapping[str, ApplyRow]) -> Callable[[str], bool]:
@@ -523,11 +495,11 @@ class _Planner:
         """
         groups: set[str] = set()
         for row in rows.values():
-            name = row.target.name
+            name = row.name
             if row.status is not ApplyStatus.SET or self.rules.has("last", name):
                 continue
             is_switch = self.rules.reveals(name)
-            if is_switch and row.target.settable == 0:
+            if is_switch and row.wanted.settable == 0:
                 continue
             if self.rules.has("brings_any", name) or (not is_switch and self.rules.has("frame", name)):
                 return lambda _: True
@@ -575,7 +547,7 @@ class _Planner:
 
     def _value_to_be(self, name: str) -> WireValue | None:
         """Return the wanted value of a parameter, or else its present value."""
-        param: Param | WrittenParam | None = self.targets.get(name) or self.current.get(name)
+        param: Param | WrittenParam | None = self.wanted.get(name) or self.current.get(name)
         return None if param is None else param.settable
 
 

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from paramclient.errors import UsageError
 from paramclient.model.comparison import (
     ChangedSide,
     Comparison,
@@ -19,7 +18,6 @@ from paramclient.model.comparison import (
     same_value,
 )
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.renames import Rename, Renames
 from paramclient.model.values import ParamType, WireValue, from_bits
 
 INT32, REAL32, REAL64 = ParamType.INT32, ParamType.REAL32, ParamType.REAL64
@@ -195,49 +193,3 @@ def test_defaults_of_leaves_out_unknown_and_differing_defaults() -> None:
     changed_side = {entry.name: entry.changed_side for entry in compare(old, new, base=base).entries}
     assert changed_side == {"A": ChangedSide.BOTH, "B": None, "C": None, "D": ChangedSide.RIGHT}
     assert len(defaults_of(of(A=1))) == 0
-
-
-# Renamed parameters
-
-CENTIMETRES = Renames([Rename("OLD", "NEW", 0.01), Rename("NEW", "NEWEST")], "names.json")
-
-
-def test_a_parameter_is_compared_with_that_of_its_other_name() -> None:
-    outcome = compare(of(OLD=750, A=1), of(NEW=7.5, A=1), renames=CENTIMETRES)
-    assert outcome.is_same
-    assert [entry.name for entry in outcome.entries] == ["A", "OLD"]
-    entry = outcome.entries[1]
-    assert entry.left == WrittenParam("OLD", 750)
-    assert entry.right == WrittenParam("NEW", 7.5)
-    assert entry.renamed == WrittenParam("NEW", 7.5)
-    back = compare(of(NEWEST=7.0), of(OLD=750), renames=CENTIMETRES)
-    assert [(each.name, each.status) for each in back.entries] == [("NEWEST", DifferenceStatus.DIFFERENT)]
-    assert back.entries[0].renamed == WrittenParam("OLD", 700)
-
-
-@pytest.mark.parametrize("is_mirrored", [False, True])
-def test_two_names_of_one_side_that_are_one_parameter_of_the_other_are_an_error(is_mirrored: bool) -> None:
-    sides = [of(OLD=1, NEW=1), of(NEWEST=1)]
-    left, right = reversed(sides) if is_mirrored else sides
-    with pytest.raises(UsageError, match="OLD and NEW are both NEWEST by names"):
-        compare(left, right, renames=CENTIMETRES)
-
-
-@given(SETS, SETS, st.permutations("ABCDEFGH"), st.sampled_from([1, 0.5, -2]))
-def test_renamed_parameters_compare_alike_in_both_directions(
-    left: ParamSet, right: ParamSet, names: list[str], factor: float
-) -> None:
-    first, second, third, fourth, *_ = names
-    renames = Renames([Rename(first, second), Rename(third, fourth, factor), Rename(second, third)])
-    try:
-        there = compare(left, right, renames=renames)
-    except UsageError:
-        with pytest.raises(UsageError):
-            compare(right, left, renames=renames)
-        return
-    back = compare(right, left, renames=renames)
-    pairs = {(entry.left and entry.left.name, entry.right and entry.right.name) for entry in there.entries}
-    assert {
-        (entry.right and entry.right.name, entry.left and entry.left.name) for entry in back.entries
-    } == pairs
-    assert len(there.entries) == len(back.entries)

@@ -47,7 +47,7 @@ def copy_of(table: tuple[SimParam, ...]) -> dict[str, Param]:
 
 
 def order(made: Plan) -> list[list[str]]:
-    return [[row.target.name for row in stage.rows] for stage in made.stages]
+    return [[row.name for row in stage.rows] for stage in made.stages]
 
 
 def only_row(made: Plan) -> tuple[ApplyStatus, str, str]:
@@ -69,7 +69,7 @@ def test_every_wanted_parameter_gets_a_status() -> None:
         "PICTH_P": ApplyStatus.SKIPPED,
     }
     (row,) = made.to_write
-    assert (row.name, row.target.settable, row.type, row.before) == ("PITCH_P", 6.5, ParamType.REAL32, 4.0)
+    assert (row.name, row.wanted.settable, row.type, row.before) == ("PITCH_P", 6.5, ParamType.REAL32, 4.0)
     assert made.extra == ("OTHER",)
     assert not made.complete
     assert repr(made) == "<Plan 1 unchanged, 1 set, 2 skipped, 1 invalid in 1 stages>"
@@ -275,7 +275,7 @@ def test_raw_bytes_are_compared_with_raw_bytes() -> None:
     table = held(ODD=(77, b"\x01\x02\x03\x04"))
     assert plan_from(table, written(ODD=b"\x01\x02\x03\x04")).complete
     (row,) = plan_from(table, written(ODD=b"\x01\x02\x03\x05")).to_write
-    assert row.target.settable == b"\x01\x02\x03\x05"
+    assert row.wanted.settable == b"\x01\x02\x03\x05"
     assert plan_from(table, written(ODD=5)).rows["ODD"].status is ApplyStatus.INVALID
     made = plan_from(held(NUMBER=1), written(NUMBER=b"\x01\x02\x03\x04"))
     assert only_row(made) == (
