@@ -18,8 +18,7 @@ from __future__ import annotations
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component, ComponentState
-from paramclient.client.events import Discovered, Event, Events, Found, Lost, Rebooted, Resynced
-from paramclient.client.files import Ftp
+from paramclient.client.events import Event, Events
 from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.signing import Signing, read_key
 from paramclient.client.streams import Changes
@@ -75,7 +74,6 @@ __all__ = [
     "Comparison",
     "Component",
     "ComponentState",
-    "Discovered",
     "Encoding",
     "Event",
     "Events",
@@ -83,12 +81,9 @@ __all__ = [
     "FetchedAll",
     "FileError",
     "FileTransferError",
-    "Found",
-    "Ftp",
     "Identity",
     "InvalidParameters",
     "LinkError",
-    "Lost",
     "NoReply",
     "NotDurable",
     "NotInCache",
@@ -102,9 +97,7 @@ __all__ = [
     "ParamType",
     "Policy",
     "Progress",
-    "Rebooted",
     "Refused",
-    "Resynced",
     "SetManyResult",
     "SetOutcome",
     "SetResult",

@@ -11,17 +11,16 @@ from pathlib import Path
 from types import ModuleType
 
 from paramclient import metadata, provision
-from paramclient.client import client, component, events, files, streams
+from paramclient.client import client, component, events, streams
 from paramclient.provision import inspection
 
 STUB = Path(__file__).parent.parent / "paramclient" / "sync" / "__init__.pyi"
 
 CLASSES: dict[ModuleType, list[str]] = {
-    files: ["Ftp"],
     component: ["Component"],
     inspection: ["Wanted"],
     streams: ["Changes"],
-    events: ["Discovered", "Lost", "Found", "Rebooted", "Resynced", "Event", "Events"],
+    events: ["Event", "Events"],
     client: ["ParamClient"],
 }
 FUNCTIONS: list[Callable[..., object]] = [

@@ -28,7 +28,6 @@ from paramclient import (
 )
 from paramclient.sync import (
     Component,
-    Discovered,
     ParamClient,
     apply,
     for_each,
@@ -51,7 +50,7 @@ def test_a_whole_session(tmp_path: Path) -> None:
     with client:
         found = next(events)
         vehicle = client.only_component()
-        assert isinstance(found, Discovered)
+        assert found.kind == "discovered"
         assert found.component is vehicle is client.component() is client.components[1, 1]
         assert client.autopilots == client.find_autopilots(expect=1) == [vehicle]
         assert isinstance(vehicle, Component)
@@ -76,7 +75,7 @@ def test_a_whole_session(tmp_path: Path) -> None:
         with pytest.raises(NoReply):
             vehicle.ext.fetch_all(timeout=0.05)
         with pytest.raises(FileTransferError):
-            client.ftp(vehicle).read("/no/such/file")
+            vehicle.read_file("/no/such/file")
     assert next(changes).name == NAME, "what was queued"
     with pytest.raises(ClientClosed):
         changes.next(timeout=1.0)

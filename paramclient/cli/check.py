@@ -259,7 +259,7 @@ class _Report:
         self.json["hash"] = found
         try:
             if self._identification.is_ardupilot:
-                crc = await client.ftp(self._component).checksum(PARAM_FILE, timeout=self._left())
+                crc = await self._component.file_checksum(PARAM_FILE, timeout=self._left())
             else:
                 crc = (await self._component.get(HASH_CHECK, timeout=self._left())).bits
         except (FileTransferError, NoReply, VehicleError) as error:
@@ -380,8 +380,7 @@ class _Report:
         found |= dict.fromkeys(("size", "elapsed_s", "parameters", "defaults", "error"))
         self.json["files"] = found
         try:
-            ftp = self._client.ftp(self._component)
-            data = await ftp.read(PARAM_FILE + WITH_DEFAULTS, timeout=self._deadline.left())
+            data = await self._component.read_file(PARAM_FILE + WITH_DEFAULTS, timeout=self._deadline.left())
             elapsed = anyio.current_time() - began
             content = param_pck.decode(data)
         except (FileTransferError, NoReply, PackError) as error:

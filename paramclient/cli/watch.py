@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
-from typing import Final, TypeAlias
+from typing import Final
 
 import anyio
 
@@ -15,7 +15,7 @@ from paramclient.cli.output import local_time, print_json, print_line, say
 from paramclient.cli.param_names import check_given, choose_names, may_appear
 from paramclient.cli.read_commands import get_chosen, report_all
 from paramclient.cli.session import CommandSession, Sessions, sessions
-from paramclient.client.events import Discovered, Events, Found, Lost, Rebooted, Resynced
+from paramclient.client.events import Event, Events
 from paramclient.client.streams import Changes
 from paramclient.errors import CacheError, ParamClientError
 from paramclient.model.names import NameChoice, is_pattern
@@ -28,8 +28,6 @@ from paramclient.protocol.events import Change
 __all__ = ["watch"]
 
 _DEFAULTS: Final = LinkOptions()
-
-_ComponentEvent: TypeAlias = Lost | Found | Rebooted | Resynced
 
 
 async def watch(url: str, /, *names: str, extended: bool = False, options: LinkOptions = _DEFAULTS) -> int:
@@ -121,11 +119,11 @@ async def _print_changes(
 
 async def _print_events(session: CommandSession, events: Events) -> None:
     async for event in events:
-        if not isinstance(event, Discovered) and event.component.node is session.component.node:
+        if event.kind != "discovered" and event.component.node is session.component.node:
             _print(session, event, _event_text(event))
 
 
-def _print(session: CommandSession, item: Change | _ComponentEvent, text: str) -> None:
+def _print(session: CommandSession, item: Change | Event, text: str) -> None:
     if session.options.json:
         ids = session.ids if session.choice.is_all else {}
         print_json({"time": time_text(session.now)} | ids | _json(item))
@@ -133,7 +131,7 @@ def _print(session: CommandSession, item: Change | _ComponentEvent, text: str) -
         print_line(f"{local_time(session.now)}  {text}")
 
 
-def _json(item: Change | _ComponentEvent) -> dict[str, object]:
+def _json(item: Change | Event) -> dict[str, object]:
     """Return the JSON of a change or an event, without its time."""
     if isinstance(item, Change):
         old, new = (
@@ -142,13 +140,13 @@ def _json(item: Change | _ComponentEvent) -> dict[str, object]:
         )
         return {"name": item.name, "old": old, "new": new, "by": item.by, "kind": item.kind}
     event: dict[str, object] = {
-        "event": type(item).__name__.lower(),
+        "event": item.kind,
         "system": item.component.system,
         "component": item.component.component,
     }
-    if isinstance(item, Lost | Found):
+    if item.silence is not None:
         event["silence_s"] = round(item.silence, 4)
-    if isinstance(item, Resynced):
+    if item.kind == "resynced":
         event |= {"changed": list(item.changed), "hash": hash_text(item.hash)}
     return event
 
@@ -165,15 +163,15 @@ def _change_text(change: Change) -> str:
     return f"{change.name}  {old} -> {new}  ({change.by})"
 
 
-def _event_text(event: _ComponentEvent) -> str:
-    match event:
-        case Lost():
-            text = f"lost: nothing received for {event.silence:.1f} s"
-        case Found():
-            text = f"found after {event.silence:.1f} s"
-        case Rebooted():
-            text = "rebooted"
-        case Resynced():
-            count = len(event.changed)
-            text = f"resynced: {count or 'no'} {'value' if count == 1 else 'values'} had changed"
+def _event_text(event: Event) -> str:
+    text: str = event.kind
+    if event.silence is not None:
+        text += (
+            f": nothing received for {event.silence:.1f} s"
+            if text == "lost"
+            else f" after {event.silence:.1f} s"
+        )
+    elif text == "resynced":
+        count = len(event.changed)
+        text += f": {count or 'no'} {'value' if count == 1 else 'values'} had changed"
     return f"{event.component.system}/{event.component.component} {text}"

@@ -7,17 +7,15 @@ import os
 from collections.abc import Callable, Mapping
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import anyio
 
 from paramclient.cache import ParamCache
-from paramclient.client import events
 from paramclient.client.cache_writer import CacheWriter, choose_cache
 from paramclient.client.component import Component
 from paramclient.client.core import ClientCore
-from paramclient.client.events import Events
-from paramclient.client.files import Ftp
+from paramclient.client.events import Event, Events
 from paramclient.client.fleet_fetch import FetchedAll, fetch_components
 from paramclient.client.recording import Capture
 from paramclient.client.signing import Signing, refused_in_words
@@ -27,7 +25,6 @@ from paramclient.errors import AnotherVehicle, ClientClosed, NoReply, ParamClien
 from paramclient.links import Link, ReplayLink, SimLink, create_link
 from paramclient.model.values import Encoding
 from paramclient.model.wording import counted
-from paramclient.protocol import events as protocol
 from paramclient.protocol import selection
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.fetch import Policy
@@ -132,7 +129,7 @@ class ParamClient:
         self.cache = choose_cache(cache, is_log=is_log)
         self.watch_interval = watch_interval
         self._components: dict[Address, Component] = {}
-        self._events: Subscribers[events.Event] = Subscribers()
+        self._events: Subscribers[Event] = Subscribers()
         capture = None if tlog is None else Capture(tlog)
         self._traffic = Traffic() if traffic else None
         self.core = core = ClientCore(
@@ -215,9 +212,9 @@ class ParamClient:
     def events(self) -> Events:
         """Return a stream of component events from now on: `async for event in client.events()`.
 
-        The events are Discovered, Lost, Found, Rebooted and Resynced. The stream continues across a
-        reconnection of the link, and ends with a replayed log. It queues at most 1,000 events for a slow
-        consumer and then drops the oldest. Cancelling the iteration loses no event.
+        The stream continues across a reconnection of the link, and ends with a replayed log. It queues at
+        most 1,000 events for a slow consumer and then drops the oldest. Cancelling the iteration loses no
+        event.
 
         Raises:
             LinkError: while iterating, after the queued events: the link failed permanently, or the client
@@ -225,10 +222,6 @@ class ParamClient:
         """
         self._events.add(stream := Events())
         return stream
-
-    def ftp(self, component: Component) -> Ftp:
-        """Return the MAVFTP file calls of a component."""
-        return Ftp(component)
 
     async def component(
         self,
@@ -448,31 +441,24 @@ class ParamClient:
         """Follow a new component."""
         component = self._components[node.address] = Component(self, node, node.plain)
         node.emit = partial(self._emit, component)
-        self._events.push(events.Discovered(component))
+        self._events.push(Event(component, "discovered"))
         self.core.spawn(component.join_vehicle)
 
-    def _emit(self, component: Component, event: protocol.ComponentEvent) -> None:
+    def _emit(self, component: Component, kind: Any, **facts: Any) -> None:
         """Tell the subscribers and the cache what has happened to a component."""
-        match event:
-            case protocol.Identified():
+        match kind:
+            case "identified":
                 for each in self._components.values():
                     if each.vehicle is component.node:
                         self.core.spawn(each.load)
                 return
-            case protocol.Replaced():
+            case "replaced":
                 self.core.cache_writer.forget(component.node)
                 return
-            case protocol.Lost(silence=silence):
-                self._events.push(events.Lost(component, silence))
-            case protocol.Found(silence=silence):
-                self._events.push(events.Found(component, silence))
-            case protocol.Rebooted():
-                self._events.push(events.Rebooted(component))
-            case protocol.Resynced(changed=changed, hash=confirmed):
-                self._events.push(events.Resynced(component, changed, confirmed))
-        if isinstance(event, protocol.Found | protocol.Rebooted):
-            component.watch.doubt()
-            component.ext.watch.doubt()
+            case "found" | "rebooted":
+                component.watch.doubt()
+                component.ext.watch.doubt()
+        self._events.push(Event(component, kind, **facts))
         self.core.link_task.notify()
 
     def _end_streams(self) -> None:

@@ -29,9 +29,9 @@ from paramclient.model.values import (
     check_portable_name,
     check_value,
 )
-from paramclient.protocol import commands
+from paramclient.protocol import commands, ftp
 from paramclient.protocol.addresses import Address, peer_in_words
-from paramclient.protocol.events import Change, Resynced
+from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, FetchSource, Policy, Progress, fetch_all, result_of
 from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.protocol.node import Node
@@ -102,7 +102,7 @@ class Component:
 
     All calls may be cancelled at any point; later calls are not affected. While a link reconnects, calls wait
     for up to `LINK_TIMEOUT` (10 s). After that, and when the client is closed, they raise LinkError. The
-    table of a lost component (see `Lost`) is kept, and its values are *cached* until the vehicle has
+    table of a lost component (see `Event`) is kept, and its values are *cached* until the vehicle has
     confirmed them.
 
     Attributes:
@@ -223,7 +223,7 @@ class Component:
 
     @property
     def silence(self) -> float:
-        """Seconds since its last message. After 5 s the component is lost, see `Lost`."""
+        """Seconds since its last message. After 5 s the component is lost, see `Event`."""
         return max(0.0, anyio.current_time() - self.node.presence.received_at)
 
     @property
@@ -484,9 +484,9 @@ class Component:
         self.subscribers.push(change)
         self.core.cache_writer.changed(self.node, self.session, change)
 
-    def _resynced(self, event: Resynced) -> None:
+    def _resynced(self, changed: tuple[str, ...]) -> None:
         self.core.cache_writer.fetched(self.node, self.session, is_whole=True)
-        self.node.emit(event)
+        self.node.emit("resynced", changed=changed, hash=self.session.table.hash)
 
     async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
         """Give the vehicle a signing key with SETUP_SIGNING, or with None, disable its signing.
@@ -540,6 +540,44 @@ class Component:
             if system is None or not moves:
                 return self
             return await self.client.successor(self, system, timeout=None)
+
+    async def read_file(
+        self,
+        path: str,
+        *,
+        size_max: int = ftp.FILE_SIZE_MAX,
+        progress: Callable[[int, int | None], None] | None = None,
+        timeout: float | None = None,
+    ) -> bytes:
+        """Read a file over MAVFTP. Its session on board is closed, also on cancellation.
+
+        A vehicle serves one file at a time: calls run one after the other.
+
+        Args:
+            path: of the file, as the component names it.
+            size_max: bytes, at most.
+            progress: called with the bytes received and the size, which is an estimate for generated files.
+            timeout: seconds; None waits as long as the component answers.
+
+        Raises:
+            UsageError: the path is not valid, or the client only listens.
+            FileTransferError: the component refused it, or the file is larger than `size_max`.
+            NoReply: it does not answer.
+            LinkError: the link failed, or the client was closed.
+        """
+        self.core.station.check_may_send()
+        with self.limited(timeout, f"{path} of {self.node.channel}"):
+            return await ftp.read_file(self.node.channel, path, size_max=size_max, progress=progress)
+
+    async def file_checksum(self, path: str, *, timeout: float | None = None) -> int:
+        """Return the CRC-32 of a file, computed by the component; see `crc32_px4`.
+
+        Raises:
+            UsageError, FileTransferError, NoReply, LinkError: as from `read_file`.
+        """
+        self.core.station.check_may_send()
+        with self.limited(timeout, f"{path} of {self.node.channel}"):
+            return await ftp.checksum(self.node.channel, path)
 
     def changes(self) -> Changes:
         """Return a stream of parameter changes from now on: `async for change in component.changes()`.

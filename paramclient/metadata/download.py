@@ -15,7 +15,6 @@ from typing import Final, ParamSpec, TypeVar
 import anyio.to_thread
 
 from paramclient.client.component import Component
-from paramclient.client.files import Ftp
 from paramclient.errors import FileError, UsageError
 from paramclient.metadata.formats import PACKED_SIZE_MAX, json_of, naming, read_content, unpacked
 from paramclient.metadata.info import Metadata
@@ -49,7 +48,7 @@ async def metadata_of(
         store: the metadata cache; True for the one beside the client's cache, if it has one; False for none.
         timeout: seconds for the complete operation; None for the number of attempts, which depends on the
             link.
-        progress: as in `Ftp.read`, for each of the two files.
+        progress: as in `Component.read_file`, for each of the two files.
 
     Raises:
         FileError: the metadata is only on the internet (`source` is the address), is on an unknown
@@ -110,9 +109,9 @@ class _Files:
             content = await _in_thread(self.kept.get, crc)
             if content is not None:
                 return content
-        files, path = self._on_board(uri)
+        server, path = self._on_board(uri)
         try:
-            content = await files.read(path, progress=self.progress, size_max=PACKED_SIZE_MAX)
+            content = await server.read_file(path, progress=self.progress, size_max=PACKED_SIZE_MAX)
         except UsageError as error:
             raise FileError(f"announced by {self.label}: {error}", source=uri) from error
         if crc is not None:
@@ -123,8 +122,8 @@ class _Files:
                 await _in_thread(self.kept.put, content, crc)
         return content
 
-    def _on_board(self, uri: str) -> tuple[Ftp, str]:
-        """Return server and path of `mftp://PATH`, or of `mftp://[;comp=ID]PATH` on another component."""
+    def _on_board(self, uri: str) -> tuple[Component, str]:
+        """Return component and path of `mftp://PATH`, or of `mftp://[;comp=ID]PATH` on another component."""
         found = _ON_BOARD.fullmatch(uri)
         if found is None:
             raise FileError(
@@ -140,7 +139,7 @@ class _Files:
             raise FileError(
                 f"announced by {self.label}, but component {number} has not been heard", source=uri
             )
-        return Ftp(other), path
+        return other, path
 
 
 def _places_of_parameters(general: bytes, source: str) -> list[tuple[str, int | None]]:

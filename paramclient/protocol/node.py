@@ -12,7 +12,6 @@ from paramclient.model.values import Encoding
 from paramclient.protocol.addresses import Address, Peer, PeerAddress
 from paramclient.protocol.channel import WINDOW_PX4, Channel, Gate
 from paramclient.protocol.dialect import EXTENDED, PLAIN, Digest
-from paramclient.protocol.events import ComponentEvent, Found, Identified, Lost, Rebooted, Replaced
 from paramclient.protocol.identity import HEARTBEAT_WAIT, Identification
 from paramclient.protocol.presence import SYSTEM_TIME, Presence
 from paramclient.protocol.session import Session, Shared, Spawn
@@ -52,7 +51,9 @@ class Node:
     Attributes:
         channel, presence, identification: the parts.
         plain, extended: the parameters.
-        emit: called with each event.
+        emit: called with what happens: "identified" (as far as it ever is), "lost" and "found" with the
+            `silence` in seconds, "rebooted", "replaced" (another vehicle uses the address: everything known
+            is invalid).
         address, peer, since: as given; a vehicle may move to another peer.
         system, component, is_split: what the address has.
         rival: another live peer that uses the same ids, and when it was heard; None without one.
@@ -88,7 +89,7 @@ class Node:
         self.plain = Session(self.channel, self.identification, PLAIN, spawn, self.identified)
         self.extended = Session(self.channel, self.identification, EXTENDED, spawn, self.identified)
         self.sessions = (self.plain, self.extended)
-        self.emit: Callable[[ComponentEvent], None] = lambda event: None
+        self.emit: Callable[..., None] = lambda kind, **facts: None
         self.version = 2
         self.generation = 0
         self._spawn = spawn
@@ -101,7 +102,7 @@ class Node:
         self.version = version
         if presence.is_lost:
             presence.is_lost = False
-            self.emit(Found(silence))
+            self.emit("found", silence=silence)
             self._spawn(self.identify)
         elif silence > REBOOT_SILENCE_MIN and self.identification.is_settled:
             self._spawn(self._request_clock)
@@ -134,7 +135,7 @@ class Node:
                 if self.identification.version(message):
                     self._replace()
                 self._settle_encoding()
-                self.emit(Identified())
+                self.emit("identified")
         self.channel.dispatch(message)
 
     async def identified(self) -> None:
@@ -150,7 +151,7 @@ class Node:
         """Doubt all values: the vehicle has rebooted, and may have measured or loaded others."""
         self.presence.rebooted(now)
         self._doubt()
-        self.emit(Rebooted())
+        self.emit("rebooted")
         self._spawn(self.identify)
 
     def resumed(self) -> None:
@@ -188,7 +189,7 @@ class Node:
         self.generation += 1
         for session in self.sessions:
             session.table.clear()
-        self.emit(Replaced())
+        self.emit("replaced")
 
     async def identify(self) -> None:
         """Request the identity, unless that is in progress."""
@@ -199,7 +200,7 @@ class Node:
         await self.identified()
         self._settle_encoding()
         if not was_settled and self.identification.capabilities is None:
-            self.emit(Identified())
+            self.emit("identified")
         if not self.identification.is_encoding_certain:
             await anyio.sleep(HEARTBEAT_WAIT)
             self.identification.miss_heartbeat()
@@ -228,7 +229,7 @@ class Node:
             if not presence.is_lost and silence >= timeout:
                 presence.is_lost = True
                 self._doubt()
-                self.emit(Lost(silence))
+                self.emit("lost", silence=silence)
                 if self.channel.gate.is_open:
                     self.channel.lose()
             await anyio.sleep(min(max(timeout - silence, 0.001), 1.0) if not presence.is_lost else 1.0)

@@ -13,7 +13,6 @@ import anyio
 from paramclient.errors import LinkError, NoReply
 from paramclient.model.values import Param, Trust
 from paramclient.protocol.digest import ask, may_confirm
-from paramclient.protocol.events import Resynced
 from paramclient.protocol.fetch import Policy, differing, fetch_all
 from paramclient.protocol.presence import Presence
 from paramclient.protocol.session import Session
@@ -50,7 +49,8 @@ class Watch:
 
     Args:
         session, presence: the component's.
-        emit: called with a `Resynced` after a check that a sign of change has caused, or that found one.
+        resynced: called with the names that had changed, after a check that a sign of change has caused, or
+            that found one.
         interval: seconds between two checks of an idle table; None: 30 for a vehicle that confirms tables, no
             checks of others; 0 for none.
         policy: any but AUTO disables the checks.
@@ -63,14 +63,14 @@ class Watch:
         self,
         session: Session,
         presence: Presence,
-        emit: Callable[[Resynced], None],
+        resynced: Callable[[tuple[str, ...]], None],
         *,
         interval: float | None = None,
         policy: Policy = Policy.AUTO,
     ) -> None:
         self._session = session
         self._presence = presence
-        self._emit = emit
+        self._resynced = resynced
         self._interval = interval
         self._policy = policy
         self.confirmed_at = -math.inf
@@ -185,4 +185,4 @@ class Watch:
         self.confirmed_at = anyio.current_time()
         changed = differing(before, table.params)
         if was_doubted or changed:
-            self._emit(Resynced(changed, table.hash))
+            self._resynced(changed)

@@ -25,7 +25,7 @@ from paramclient.cli.json_output import JsonObject, outcome_json, table_param_js
 from paramclient.client.cache_writer import choose_cache
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
-from paramclient.client.events import Discovered, Event, Found, Rebooted, Resynced
+from paramclient.client.events import Event
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo, metadata_of
@@ -512,11 +512,11 @@ class Hub:
                 link.targets[component.system, component.component, each.is_extended] = target
                 tasks.start_soon(target.publish_changes)
         target = link.targets[key]
-        if isinstance(event, Resynced):
+        if event.kind == "resynced":
             target.fetches += 1
         target.check()
         may_fetch = self._fetches and not component.core.station.listens_only
-        if may_fetch and isinstance(event, Discovered | Found | Rebooted):
+        if may_fetch and event.kind in ("discovered", "found", "rebooted"):
             tasks.start_soon(target.fetch_complete)
 
     async def _check_regularly(self) -> None:

@@ -18,22 +18,16 @@ The functions have the arguments and the results of those in `paramclient.provis
 from __future__ import annotations
 
 from paramclient import metadata, provision
-from paramclient.client.events import Discovered, Event, Found, Lost, Rebooted, Resynced
+from paramclient.client.events import Event
 from paramclient.provision.inspection import Wanted
-from paramclient.sync.proxy import Changes, Component, Events, Ftp, ParamClient, blocking, for_each
+from paramclient.sync.proxy import Changes, Component, Events, ParamClient, blocking, for_each
 
 __all__ = [
     "Changes",
     "Component",
-    "Discovered",
     "Event",
     "Events",
-    "Found",
-    "Ftp",
-    "Lost",
     "ParamClient",
-    "Rebooted",
-    "Resynced",
     "Wanted",
     "apply",
     "for_each",

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Self, TypeAlias, Unpack
+from typing import Literal, Self, TypeAlias, Unpack
 
 from paramclient.cache import ParamCache
 from paramclient.client.client import COMPONENT_TIMEOUT
@@ -33,15 +33,9 @@ from paramclient.wire.signing import SigningKey, SigningReport
 __all__ = [
     "Changes",
     "Component",
-    "Discovered",
     "Event",
     "Events",
-    "Found",
-    "Ftp",
-    "Lost",
     "ParamClient",
-    "Rebooted",
-    "Resynced",
     "Wanted",
     "apply",
     "for_each",
@@ -49,20 +43,6 @@ __all__ = [
     "plan",
     "restore",
 ]
-
-class Ftp:
-    "The files of a component over MAVFTP; see `ParamClient.ftp`."
-    def read(
-        self,
-        path: str,
-        *,
-        size_max: int = ftp.FILE_SIZE_MAX,
-        progress: Callable[[int, int | None], None] | None = None,
-        timeout: float | None = None,
-    ) -> bytes:
-        """Read a file. Its session on board is closed, also on cancellation."""
-    def checksum(self, path: str, *, timeout: float | None = None) -> int:
-        """Return the CRC-32 of a file, computed by the component; see `crc32_px4`."""
 
 class Component:
     "One component of a vehicle; see `ParamClient.component`."
@@ -109,7 +89,7 @@ class Component:
         """Whether the vehicle is armed, from `base_mode` of its last heartbeat."""
     @property
     def silence(self) -> float:
-        """Seconds since its last message. After 5 s the component is lost, see `Lost`."""
+        """Seconds since its last message. After 5 s the component is lost, see `Event`."""
     @property
     def round_trip(self) -> float | None:
         """Smoothed round-trip time in seconds; None before the first response."""
@@ -151,6 +131,17 @@ class Component:
         """Give the vehicle a signing key with SETUP_SIGNING, or with None, disable its signing."""
     def reboot(self, *, system: int | None = None, timeout: float | None = REBOOT_TIMEOUT) -> Component:
         """Reboot the vehicle, and wait until it is back and identified. Written values are saved before."""
+    def read_file(
+        self,
+        path: str,
+        *,
+        size_max: int = ftp.FILE_SIZE_MAX,
+        progress: Callable[[int, int | None], None] | None = None,
+        timeout: float | None = None,
+    ) -> bytes:
+        """Read a file over MAVFTP. Its session on board is closed, also on cancellation."""
+    def file_checksum(self, path: str, *, timeout: float | None = None) -> int:
+        """Return the CRC-32 of a file, computed by the component; see `crc32_px4`."""
     def changes(self) -> Changes:
         """Return a stream of parameter changes from now on: `async for change in component.changes()`."""
 
@@ -162,40 +153,14 @@ class Changes(Iterator[Change]):
     def next(self, timeout: float | None = None) -> Change: ...
 
 @dataclass(frozen=True, slots=True)
-class Discovered:
-    "The first message of a component has arrived."
+class Event:
+    "What has happened to a component."
 
     component: Component
-
-@dataclass(frozen=True, slots=True)
-class Lost:
-    "A component is lost: it has sent heartbeats before, and no message for the heartbeat timeout: 5 s,"
-
-    component: Component
-    silence: float
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    "A lost component sends again. The client requests its identity and checks its table."
-
-    component: Component
-    silence: float
-
-@dataclass(frozen=True, slots=True)
-class Rebooted:
-    "A vehicle has rebooted: its clock has jumped back, or its heartbeat reports MAV_STATE_BOOT."
-
-    component: Component
-
-@dataclass(frozen=True, slots=True)
-class Resynced:
-    "A table that was stale, or possibly stale, matches the vehicle again."
-
-    component: Component
-    changed: tuple[str, ...]
-    hash: int | None
-
-Event: TypeAlias = Discovered | Lost | Found | Rebooted | Resynced
+    kind: Literal["discovered", "lost", "found", "rebooted", "resynced"]
+    silence: float | None = None
+    changed: tuple[str, ...] = ()
+    hash: int | None = None
 
 class Events(Iterator[Event]):
     "Stream of the component events since its creation; see `ParamClient.events`."
@@ -242,8 +207,6 @@ class ParamClient:
         """Bytes of all sent frames, including heartbeats."""
     def events(self) -> Events:
         """Return a stream of component events from now on: `async for event in client.events()`."""
-    def ftp(self, component: Component) -> Ftp:
-        """Return the MAVFTP file calls of a component."""
     def component(
         self,
         system: int | None = None,

@@ -22,11 +22,11 @@ import anyio
 from anyio.from_thread import BlockingPortal, start_blocking_portal
 
 import paramclient.client.client as asynchronous
-from paramclient.client import component, events, files, streams
+from paramclient.client import component, events, streams
 from paramclient.errors import ClientClosed, ParamClientError, UsageError
 from paramclient.provision.fleet import FleetResult
 
-__all__ = ["Changes", "Component", "Events", "Ftp", "ParamClient", "blocking", "for_each"]
+__all__ = ["Changes", "Component", "Events", "ParamClient", "blocking", "for_each"]
 
 THREAD_NAME: Final = "paramclient blocking client"
 """Name of the thread of a client, in debuggers."""
@@ -212,10 +212,6 @@ class ParamClient(Proxy, of=asynchronous.ParamClient):
 
 class Component(Proxy, of=component.Component):
     """See `paramclient.Component`."""
-
-
-class Ftp(Proxy, of=files.Ftp):
-    """See `paramclient.Ftp`."""
 
 
 class Stream(Proxy, Iterator[Any]):

@@ -9,8 +9,7 @@ from typing import Any
 import anyio
 import pytest
 
-from paramclient import ClientClosed, NoReply, ParamClient
-from paramclient.client.files import Ftp
+from paramclient import ClientClosed, NoReply
 from paramclient.errors import FileTransferError, LinkError
 from paramclient.links import SimLink
 from paramclient.model.values import ParamType
@@ -28,16 +27,12 @@ def with_files(**options: Any) -> ArduPilotVehicle:
     return vehicle
 
 
-async def files_of(client: ParamClient) -> Ftp:
-    return client.ftp(await client.component())
-
-
 @in_simulated_time
 async def test_the_progress_of_a_read_is_reported() -> None:
     reported: list[tuple[int, int | None]] = []
     async with a_client(with_files()) as client:
-        files = await files_of(client)
-        await files.read("/APM/LOGS/1.BIN", progress=lambda *state: reported.append(state))
+        component = await client.component()
+        await component.read_file("/APM/LOGS/1.BIN", progress=lambda *state: reported.append(state))
     received = [state[0] for state in reported]
     assert received == sorted(received)
     assert received[-1] == len(LOG)
@@ -49,22 +44,22 @@ async def test_the_progress_of_a_read_is_reported() -> None:
 async def test_a_file_that_is_too_long_is_not_taken() -> None:
     vehicle = with_files()
     async with a_client(vehicle) as client:
-        files = await files_of(client)
+        component = await client.component()
         with pytest.raises(FileTransferError, match="longer than 1000 bytes"):
-            await files.read("/APM/LOGS/1.BIN", size_max=1000)
+            await component.read_file("/APM/LOGS/1.BIN", size_max=1000)
         await anyio.sleep(2.0)
         assert not vehicle.open_files
-        assert await files.read("/APM/a.txt", size_max=5) == b"hello"
+        assert await component.read_file("/APM/a.txt", size_max=5) == b"hello"
 
 
 @in_simulated_time
 async def test_a_time_limit_ends_a_read_and_closes_the_file() -> None:
     vehicle = with_files()
     async with a_client(vehicle) as client:
-        files = await files_of(client)
+        component = await client.component()
         began = anyio.current_time()
         with pytest.raises(NoReply, match=r"/APM/LOGS/1.BIN of 1/1"):
-            await files.read("/APM/LOGS/1.BIN", timeout=0.3)
+            await component.read_file("/APM/LOGS/1.BIN", timeout=0.3)
         assert anyio.current_time() - began < 1.41  # the vehicle ends its burst of a second before it closes
         await anyio.sleep(1.0)
         assert not vehicle.open_files
@@ -131,8 +126,8 @@ async def test_a_scope_around_a_client_ends_it_whatever_the_link_does(fault: str
 
     with anyio.CancelScope() as scope:
         async with a_client(link) as client:
-            files = await files_of(client)
-            reading = asyncio.ensure_future(outcome(files.read("/APM/LOGS/1.BIN")))
+            component = await client.component()
+            reading = asyncio.ensure_future(outcome(component.read_file("/APM/LOGS/1.BIN")))
             await anyio.sleep(0.3)
             assert vehicle.open_files
             tap.is_deaf = fault == "deaf"
@@ -158,7 +153,7 @@ async def test_a_scope_around_a_client_ends_it_whatever_the_link_does(fault: str
         tap.data_to_send()
     assert bool(vehicle.open_files) == (fault in ("deaf", "dropped", "failed"))
     assert not tasks_beside()
-    assert isinstance(await outcome(files.checksum("/x")), ClientClosed)
+    assert isinstance(await outcome(component.file_checksum("/x")), ClientClosed)
 
 
 @in_simulated_time
@@ -197,7 +192,7 @@ async def test_the_file_is_closed_when_its_content_is_given() -> None:
             assert (await component.fetch_all(refresh=True)).source == "ftp"
             assert not vehicle.open_files
             assert anyio.current_time() - began < 0.55
-        assert await client.ftp(component).read("/APM/a.txt") == b"hello"
+        assert await component.read_file("/APM/a.txt") == b"hello"
         assert not vehicle.open_files
 
 
@@ -205,8 +200,8 @@ async def test_the_file_is_closed_when_its_content_is_given() -> None:
 async def test_a_read_goes_on_when_the_link_is_back() -> None:
     link = FlakyLink(with_files())
     async with a_client(link) as client:
-        files = await files_of(client)
-        reading = asyncio.ensure_future(files.read("/APM/LOGS/1.BIN"))
+        component = await client.component()
+        reading = asyncio.ensure_future(component.read_file("/APM/LOGS/1.BIN"))
         await anyio.sleep(0.3)
         await link.drop()
         assert await reading == LOG
@@ -216,13 +211,13 @@ async def test_a_read_goes_on_when_the_link_is_back() -> None:
 async def test_a_link_that_stays_disconnected_ends_it() -> None:
     link = FlakyLink(with_files())
     async with a_client(link) as client:
-        files = await files_of(client)
-        reading = asyncio.ensure_future(outcome(files.read("/APM/LOGS/1.BIN")))
+        component = await client.component()
+        reading = asyncio.ensure_future(outcome(component.read_file("/APM/LOGS/1.BIN")))
         await anyio.sleep(0.3)
         await link.drop(stays_offline=True)
         assert isinstance(await reading, LinkError)
         with pytest.raises(LinkError):
-            await files.read("/APM/a.txt")
+            await component.read_file("/APM/a.txt")
 
 
 @in_simulated_time

@@ -127,7 +127,7 @@ async def test_calls_that_send_are_refused_at_once() -> None:
             lambda: component.get("PARAM_01"),
             lambda: component.get(0),
             lambda: component.set("PARAM_01", 1),
-            lambda: client.ftp(component).read("@PARAM/param.pck"),
+            lambda: component.read_file("@PARAM/param.pck"),
             lambda: component.fetch_all(refresh=True),
             lambda: client.fetch_all(refresh=True),
         ]

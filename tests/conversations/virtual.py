@@ -19,7 +19,7 @@ from trio.testing import MockClock
 
 from paramclient.errors import ParamClientError
 from paramclient.links.sim import SimLink
-from paramclient.protocol.events import Change, ComponentEvent
+from paramclient.protocol.events import Change
 from paramclient.protocol.node import Node
 from paramclient.protocol.station import Station
 from paramclient.sim import Endpoint
@@ -113,14 +113,14 @@ class Conversation:
 
     Attributes:
         station: the station.
-        events: of all components.
+        events: of all components: kinds, and what they tell.
         changes: of all parameters.
         sent: the frames that the station has sent.
     """
 
     def __init__(self, station: Station) -> None:
         self.station = station
-        self.events: list[ComponentEvent] = []
+        self.events: list[tuple[str, dict[str, Any]]] = []
         self.changes: list[Change] = []
         self.sent: list[bytes] = []
         self._sequence = 0
@@ -141,9 +141,9 @@ class Conversation:
             await anyio.sleep(0.01)
         return self.station.nodes[system, component]
 
-    def of(self, kind: type[T]) -> list[T]:
-        """Return the events of a kind."""
-        return [event for event in self.events if isinstance(event, kind)]
+    def of(self, kind: str) -> list[dict[str, Any]]:
+        """Return the events of a kind, as what they tell."""
+        return [facts for each, facts in self.events if each == kind]
 
 
 @asynccontextmanager
@@ -160,7 +160,7 @@ async def converse(endpoint: Endpoint, **options: Any) -> AsyncIterator[Conversa
         wake[0].set()
 
     def discovered(node: Node) -> None:
-        node.emit = conversation.events.append
+        node.emit = lambda kind, **facts: conversation.events.append((kind, facts))
         for session in node.sessions:
             session.table.changed = conversation.changes.append
 

@@ -17,7 +17,6 @@ from paramclient import (
     Component,
     FetchResult,
     ParamClient,
-    Rebooted,
 )
 from paramclient.client.events import Events
 from paramclient.errors import (
@@ -223,7 +222,7 @@ def _open_file_and_die(link: str, system: int) -> None:
     async def read() -> None:
         async with ParamClient(link, cache=False, component=192) as client:
             vehicle = await client.component(system)
-            await client.ftp(vehicle).read(PARAMETER_FILE, progress=die)
+            await vehicle.read_file(PARAMETER_FILE, progress=die)
 
     try:
         anyio.run(read)
@@ -524,5 +523,5 @@ async def count_reboots(events: Events) -> int:
     count = 0
     with anyio.move_on_after(NOTICING_TIME):
         async for event in events:
-            count += isinstance(event, Rebooted)
+            count += event.kind == "rebooted"
     return count
