@@ -467,9 +467,7 @@ class Component:
         self._last = result
         logger.debug("%s: %r", self.core.link.name, result)
         if not result.params and self.policy is not Policy.AUTO:
-            raise CacheError(
-                f"nothing is cached of {self.system}/{self.component}, and nothing may be downloaded"
-            )
+            raise CacheError(f"nothing is cached of {self.node.channel}, and nothing may be downloaded")
         if result.source == "cache" and result.hash is None:
             self.watch.unconfirmed()
         elif result.complete:
@@ -643,9 +641,8 @@ class Component:
         self.core.station.check_may_send()
         if self.node.has_rival(anyio.current_time()):
             words = node_in_words(self.node)
-            raise AmbiguousVehicle(
-                f"two vehicles use the ids {words}; nothing was written.", vehicles=[words], choose_by="peer"
-            )
+            what = f"two vehicles use the ids {words}; nothing was written."
+            raise AmbiguousVehicle(what, vehicles=[words], choose_by="peer")
         if durable:
             if self.core.cache is not None:
                 with anyio.move_on_after(CACHE_TIMEOUT):
@@ -657,8 +654,8 @@ class Component:
         try:
             await self.core.cache_writer.write_durably(self.node)
         except CacheError as error:
-            address = f"{self.system}/{self.component}"
-            raise NotDurable(f"{address} has accepted {what}, but it is not on the disk: {error}") from error
+            where = self.node.channel
+            raise NotDurable(f"{where} has accepted {what}, but it is not on the disk: {error}") from error
 
     @contextmanager
     def limited(self, timeout: float | None, what: str) -> Iterator[anyio.CancelScope]:

@@ -57,8 +57,7 @@ async def fetch_components(
 
     async def fetch(address: Address, component: Component) -> None:
         try:
-            what = f"the parameters of {component.system}/{component.component}"
-            with component.limited(None, what) as scopes[address]:
+            with component.limited(None, f"the parameters of {component.node.channel}") as scopes[address]:
                 results[address] = await component.fetch_all(refresh=refresh, timeout=timeout)
         except (NoReply, CacheError) as error:
             silent[address] = error
