@@ -5,20 +5,19 @@ from __future__ import annotations
 import asyncio
 import inspect
 import logging
-import re
 import signal
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from types import FrameType
 from typing import Final
 
 import anyio
-from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, UnknownOptionError
+from cyclopts import App, CycloptsError, MissingArgumentError, Parameter
 
 from paramclient.cli.exit_codes import ExitCode, code_of, text_of
-from paramclient.cli.output import STDIN, in_local_time, printable, report, say
-from paramclient.errors import CacheError, ParamClientError
+from paramclient.cli.output import STDIN, report, say
+from paramclient.errors import ParamClientError
 from paramclient.version import __version__
 
 __all__ = ["on_end_signal", "run"]
@@ -40,18 +39,16 @@ def run(arguments: Sequence[str]) -> int:
         try:
             words = [STDIN if word == "-" else word for word in arguments]
             command, bound, _ = _app.parse_args(words, exit_on_error=False, print_error=False)
-            if _is_verbose(bound.arguments):
+            given = bound.arguments
+            if given.get("verbose", getattr(given.get("options"), "verbose", False)):
                 printer.show_steps()
             call = partial(command, *bound.args, **bound.kwargs)
-            work = call if inspect.iscoroutinefunction(command) else call()
-            # a subcommand that has asked the user a question returns the function to await after that
-            code = anyio.run(_until_signal, work) if callable(work) else work
+            code = anyio.run(_until_signal, call) if inspect.iscoroutinefunction(command) else call()
         except CycloptsError as error:
             report(_usage_text(error))
             return ExitCode.USAGE
         except ParamClientError as error:
-            text = text_of(error, takes_all=not {"signing", "check", "--extended"} & {*arguments})
-            report(in_local_time(text) if isinstance(error, CacheError) else text)
+            report(text_of(error, takes_all=arguments[0] != "signing"))
             return code_of(error)
         except BrokenPipeError:
             raise
@@ -73,19 +70,12 @@ def _shows_help(arguments: Sequence[str]) -> bool:
 
 def _usage_text(error: CycloptsError) -> str:
     """Return an error of the arguments as one line, with the usage if an argument is missing."""
-    if isinstance(error, MissingArgumentError) and (usage := _usage_of(error.command_chain)):
-        return f"{error} {usage}"
-    if isinstance(error, UnknownOptionError) and _ONE_HYPHEN.fullmatch(error.token.value):
-        return f"Unknown option: {error.token.value}. Did you mean -{error.token.value}?"
-    return str(error)
-
-
-def _usage_of(words: Iterable[str] | None) -> str | None:
-    """Return the usage line of a subcommand; None if it is made of the names of the function's arguments."""
+    if not isinstance(error, MissingArgumentError):
+        return str(error)
     app = _app
-    for word in words or ():
+    for word in error.command_chain or ():
         app = app[word]
-    return app.usage
+    return f"{error} {app.usage or ''}".rstrip()
 
 
 def _load(app: App) -> None:
@@ -146,11 +136,8 @@ class _LogPrinter(logging.Handler):
             report(f"{record.levelname.lower()}: {record.getMessage()}")
         else:
             name = record.name.removeprefix("paramclient.")
-            say(printable(f"{record.relativeCreated / 1000:8.3f} {name}: {record.getMessage()}"))
+            say(f"{record.relativeCreated / 1000:8.3f} {name}: {record.getMessage()}")
 
-
-_ONE_HYPHEN: Final = re.compile(r"-[a-z][a-z-]+")
-"""A long option with one hyphen instead of two."""
 
 _logger: Final = logging.getLogger("paramclient")
 
@@ -165,11 +152,6 @@ def _warnings_shown() -> Iterator[_LogPrinter]:
     finally:
         _logger.removeHandler(handler)
         _logger.setLevel(level)
-
-
-def _is_verbose(arguments: Mapping[str, object]) -> bool:
-    options = arguments.get("options")
-    return bool(arguments.get("verbose", getattr(options, "verbose", False)))
 
 
 def _examples(*lines: str) -> str:
@@ -225,7 +207,7 @@ def _add(group: App, function: str, arguments: str | None = None, *examples: str
     )
 
 
-_add(_app, "read_commands:fetch", "URL", "sim:px4 --only 'MC_*'", "tcp:127.0.0.1:5760 --vehicle 3 --json")
+_add(_app, "read_commands:fetch", "URL [NAME...]", "sim:px4 'MC_*'", "tcp:127.0.0.1:5760 --vehicle 3 --json")
 _add(_app, "read_commands:get", "URL NAME [NAME...]", "udpin:0.0.0.0:14550 MC_ROLL_P 'MC_PITCH*'")
 _add(
     _app,

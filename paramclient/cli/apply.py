@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, ClassVar, Final
 
 import anyio
 from cyclopts import Parameter
@@ -50,12 +50,6 @@ __all__ = ["ApplyJob", "apply", "run_jobs"]
 
 APPLY_NAMES_MAX: Final = 10
 """Parameters that a line names, so that it stays short; it gives the number of further ones."""
-PLAN_COLUMNS: Final = ("stage", "name", "before", "wanted", "status", "reason")
-"""Columns of a table of plans."""
-APPLIED_COLUMNS: Final = ("name", "before", "wanted", "now", "status", "reason")
-"""Columns of a table of results."""
-APPLY_NUMBERS: Final = "before wanted now stage"
-"""The right-aligned columns of both."""
 _STYLES: Final = {
     ApplyStatus.SET: "green",
     ApplyStatus.LATER: "yellow",
@@ -150,6 +144,8 @@ async def _with_overlay(base: ParamSet, pattern: str, session: CommandSession) -
 class _Planned:
     """The plan for one vehicle, as it is printed."""
 
+    columns: ClassVar[Sequence[str]] = ("stage", "name", "before", "wanted", "status", "reason")
+
     job: ApplyJob
     plan: Plan
 
@@ -218,6 +214,8 @@ class ApplyJob:
         arrived: the outcomes so far.
         result: the result at the end.
     """
+
+    columns: ClassVar[Sequence[str]] = ("name", "before", "wanted", "now", "status", "reason")
 
     session: CommandSession
     wanted: ParamSet
@@ -375,7 +373,7 @@ async def run_jobs(found: Sessions, loaded: Sequence[Done[ApplyJob]]) -> int:
         plans = [each.result for each in made if each.result is not None]
         if flags.dry_run or any(each.has_work for each in plans):
             made += [Done(each.session, error=each.error) for each in failed]
-            code = found.show(made, PLAN_COLUMNS, APPLY_NUMBERS)
+            code = found.show(made)
             if not flags.json:
                 for each in plans:
                     each.say_summary()
@@ -383,13 +381,10 @@ async def run_jobs(found: Sessions, loaded: Sequence[Done[ApplyJob]]) -> int:
             return max([code, *(each.check() for each in plans)])
         if any(each.has_work for each in plans) and not await confirm("go on?"):
             return ExitCode.INCOMPLETE
-    await found.report_unheard()
     try:
         done = await ready.work(lambda session: jobs[session].run(files.get(session))) if ready else []
     except anyio.get_cancelled_exc_class():
-        found.show(
-            [Done(session, result=job) for session, job in jobs.items()], APPLIED_COLUMNS, APPLY_NUMBERS
-        )
+        found.show([Done(session, result=job) for session, job in jobs.items()])
         rows = [row for job in jobs.values() for row in job.arrived.values()]
         unproven = sum(row.status is ApplyStatus.ACCEPTED for row in rows)
         say(
@@ -397,7 +392,7 @@ async def run_jobs(found: Sessions, loaded: Sequence[Done[ApplyJob]]) -> int:
             f"flight; {'; '.join(dict.fromkeys(job.to_continue for job in jobs.values()))}"
         )
         raise
-    code = found.show([*done, *failed], APPLIED_COLUMNS, APPLY_NUMBERS)
+    code = found.show([*done, *failed])
     return max([code, *(each.result.say_summary() for each in done if each.result is not None)])
 
 

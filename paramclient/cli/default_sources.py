@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import Final
 
 from paramclient.cli.metadata import known_of_session
-from paramclient.cli.output import printable, report, say
+from paramclient.cli.output import report, say
 from paramclient.cli.session import CommandSession
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import Default, DefaultSource
@@ -78,7 +78,7 @@ def say_sources(label: str, defaults: Iterable[Default | None]) -> None:
     described = sources.count(DefaultSource.METADATA)
     if described:
         what = f"{described} of {counted(len(sources), 'default')} from the metadata of the firmware"
-        say(printable(f"{label}: {what}, which does not have the defaults of an airframe"))
+        say(f"{label}: {what}, which does not have the defaults of an airframe")
 
 
 def report_no_defaults(hint: str = DEFAULTS_HINT) -> None:

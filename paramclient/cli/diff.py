@@ -14,7 +14,7 @@ from paramclient.cli.file_output import described, value_text
 from paramclient.cli.json_apply import diff_json
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import Coloured, print_json, print_table, printable, say
+from paramclient.cli.output import Coloured, print_json, print_table, say
 from paramclient.cli.sources import is_file, names_vehicle, resolve_all
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata
@@ -90,9 +90,9 @@ async def diff(
         if shown:
             _print(outcome, shown, sides)
         for line in _summary(outcome):
-            say(printable(line))
+            say(line)
         if not partial and (hint := _partial_hint(outcome, left, right)):
-            say(printable(hint))
+            say(hint)
     return ExitCode.DONE if outcome.is_same else ExitCode.DIFFERENT
 
 

@@ -46,12 +46,7 @@ def code_of(error: ParamClientError) -> ExitCode:
 
 
 def text_of(error: ParamClientError, *, takes_all: bool) -> str:
-    """Return the message of an error for the command line, with options in place of Python arguments.
-
-    Args:
-        error: the error.
-        takes_all: whether the subcommand can work on all vehicles.
-    """
+    """Return the message of an error for the command line, with options in place of Python arguments."""
     if isinstance(error, AmbiguousVehicle) and error.choose_by:
         address = error.vehicles[0].partition(" ")[0] if error.vehicles else "1/1"
         all_too = ", or all with --vehicle all" if takes_all and error.choose_by == "system" else ""

@@ -4,12 +4,10 @@ The annotations are evaluated at once: cyclopts would look up the names of inher
 subclass.
 """
 
-import getpass
 import math
-import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Final, TypeAlias, TypedDict
+from typing import Annotated, Final, TypeAlias
 
 from cyclopts import Group, Parameter
 from cyclopts.validators import Number
@@ -18,7 +16,7 @@ from paramclient.client.component import SETTLE_MAX
 from paramclient.client.signing import Signing, key_from_environment, read_key
 from paramclient.errors import UsageError
 from paramclient.model.values import Encoding
-from paramclient.wire.signing import SigningKey, SigningPolicy
+from paramclient.wire.signing import SigningKey
 
 __all__ = [
     "CONNECTION",
@@ -31,15 +29,12 @@ __all__ = [
     "LinkOptions",
     "Seconds",
     "Settle",
-    "SigningOptions",
     "TrafficOptions",
     "Verbose",
 ]
 
 SOURCE_SYSTEM: Final = 255
 """The usual system id of ground stations, and the default of `ParamClient`."""
-SOURCE_COMPONENT: Final = 190
-"""MAV_COMP_ID_MISSIONPLANNER, the usual component id of ground stations, and the default of `ParamClient`."""
 
 CONNECTION: Final = Parameter(group=Group("Connection", sort_key=9))
 """Options of the link, which stand at the end of the help."""
@@ -48,13 +43,6 @@ IN_ID_RANGE: Final = Parameter(validator=Number(gte=1, lte=255))
 """Of a system or component id."""
 Id: TypeAlias = Annotated[int | None, IN_ID_RANGE]
 """A system or component id, or none."""
-
-
-class SourceIds(TypedDict):
-    """Own ids, as arguments of a client."""
-
-    system: int
-    component: int
 
 
 def _check_seconds(_: object, seconds: float | None) -> None:
@@ -85,37 +73,15 @@ class CacheOptions:
 
 
 @Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class KeyOptions:
-    """The signing key and this computer's own ids, of subcommands that open a link."""
+    """The signing key and this computer's own id, of subcommands that open a link."""
 
     signing_key: Annotated[Path | None, CONNECTION] = None
     """A file with the key. Default: that of the environment."""
 
-    signing_passphrase: Annotated[bool, CONNECTION] = False
-    """Ask for a passphrase, and derive the key from it."""
-
-    source_system: Annotated[Id, CONNECTION] = None
+    source_system: Annotated[int, IN_ID_RANGE, CONNECTION] = SOURCE_SYSTEM
     """System id of this computer. Default: 255."""
-
-    source_component: Annotated[Id, CONNECTION] = None
-    """Component id of this computer. Default: 190."""
-
-    _typed: ClassVar[SigningKey | None] = None  # a class variable, because each field would be an option
-
-    def __post_init__(self) -> None:
-        if self.signing_passphrase:
-            if self.signing_key is not None:
-                raise UsageError("--signing-key and --signing-passphrase exclude each other")
-            object.__setattr__(self, "_typed", _typed_passphrase())
-
-    @property
-    def source(self) -> SourceIds:
-        """The arguments `system` and `component` of `ParamClient`."""
-        return {
-            "system": SOURCE_SYSTEM if self.source_system is None else self.source_system,
-            "component": SOURCE_COMPONENT if self.source_component is None else self.source_component,
-        }
 
     @property
     def key(self) -> SigningKey | None:
@@ -124,33 +90,18 @@ class KeyOptions:
         Raises:
             UsageError: the key cannot be read.
         """
-        if self._typed is not None:
-            return self._typed
         return key_from_environment() if self.signing_key is None else read_key(self.signing_key)
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SigningOptions(KeyOptions):
-    """Options of subcommands that sign sent frames and check received ones."""
-
-    signing_policy: Annotated[SigningPolicy, CONNECTION] = SigningPolicy.UNSIGNED_RADIOS
-    """With a key: which received frames are accepted."""
 
     @property
     def signing(self) -> Signing | None:
-        """The signing argument of `ParamClient`.
-
-        Raises:
-            UsageError: the key cannot be read.
-        """
+        """The signing argument of `ParamClient`, with errors as `key`."""
         key = self.key
-        return None if key is None else Signing(key, self.signing_policy)
+        return None if key is None else Signing(key)
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True, slots=True)
-class TrafficOptions(SigningOptions):
+class TrafficOptions(KeyOptions):
     """Options of subcommands that open a link."""
 
     json: bool = False
@@ -196,22 +147,6 @@ class LinkOptions(TrafficOptions):
         if self.no_cache and self.cache is not None:
             raise UsageError("--cache and --no-cache exclude each other")
         return not self.no_cache if self.cache is None else self.cache
-
-
-def _typed_passphrase() -> SigningKey:
-    """Ask for a passphrase without echo; return its key.
-
-    Must be called outside of the event loop, in which Ctrl-C would not interrupt it.
-
-    Raises:
-        UsageError: stdin is not a terminal, or no passphrase was entered.
-    """
-    if not sys.stdin.isatty():
-        raise UsageError("--signing-passphrase needs a terminal to enter the passphrase")
-    try:
-        return SigningKey.from_passphrase(getpass.getpass("Signing passphrase: "))
-    except EOFError:
-        raise UsageError("no passphrase was given") from None
 
 
 @Parameter(name="*")

@@ -23,7 +23,7 @@ from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.file_output import noun_of
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import print_json, printable, report, say
+from paramclient.cli.output import print_json, report, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
 from paramclient.cli.sources import (
     check_link,
@@ -137,7 +137,7 @@ async def save(
                 table = done.session.component.params
                 params = [table[name] for name in done.result if changed and name in table]
                 add(done.result, await find_defaults(done.session, metadata, given, params))
-            await opened.report_others()
+            opened.report_others()
     for fault in faults:
         report(fault)
     sets = [_writable(each, written) for each in (_chosen(sets, only) if only else sets)]
@@ -245,4 +245,4 @@ def _show(files: Mapping[Path, Sequence[ParamSet]], file_format: FileFormat, *, 
         return
     for file, sets in files.items():
         contents = ", ".join(f"{counted(len(each), noun_of(each))} of {address(each)}" for each in sets)
-        say(printable(f"{contents} written to {file} ({file_format})"))
+        say(f"{contents} written to {file} ({file_format})")

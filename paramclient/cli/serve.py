@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 from paramclient.cli.app import on_end_signal
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.options import SigningOptions, Verbose
+from paramclient.cli.options import KeyOptions, Verbose
 from paramclient.cli.output import print_line, say
 from paramclient.errors import UsageError
 
@@ -19,7 +19,7 @@ __all__ = ["serve", "token"]
 
 SERVICE_LIBRARIES: Final = ("fastapi", "uvicorn")
 """Libraries that the extra `service` installs."""
-_UNSIGNED: Final = SigningOptions()
+_UNSIGNED: Final = KeyOptions()
 
 
 async def serve(
@@ -32,7 +32,7 @@ async def serve(
     listen_only: bool = False,
     tokens: Path | None = None,
     verbose: Verbose = False,
-    options: SigningOptions = _UNSIGNED,
+    options: KeyOptions = _UNSIGNED,
 ) -> int:
     """Open links and the cache, and share them with ground stations, programs and browsers.
 
@@ -73,7 +73,7 @@ async def serve(
         mavlink=mavlink,
         listen_only=listen_only,
         signing=options.signing,
-        **options.source,
+        system=options.source_system,
     )
     stop = anyio.Event()
 

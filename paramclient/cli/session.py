@@ -7,28 +7,24 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Final, Generic, Protocol, TypeVar
+from typing import Final, Generic, Protocol, TypeVar
 
 import anyio
-import anyio.to_thread
 
-from paramclient.cache import CachedSummary
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.json_output import JsonObject
 from paramclient.cli.options import LinkOptions, TrafficOptions
-from paramclient.cli.output import Status, local_time, print_json, print_table, report, say
+from paramclient.cli.output import Status, print_json, print_table, report, say
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
-from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, ParamClientError, UsageError
+from paramclient.errors import AmbiguousVehicle, NoReply, ParamClientError, UsageError
 from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.model.identity import version_text
 from paramclient.model.values import Trust
-from paramclient.model.wording import counted, first_of
-from paramclient.protocol.fetch import FetchResult, Policy
-from paramclient.protocol.identity import HEARTBEAT_WAIT, expects_extended, kind_in_words
+from paramclient.model.wording import first_of
+from paramclient.protocol.fetch import FetchResult
+from paramclient.protocol.identity import HEARTBEAT_WAIT, expects_extended
 from paramclient.protocol.selection import address_in_words, hint_of_link, node_in_words
-from paramclient.wire.messages import MAV_AUTOPILOT_INVALID
 
 __all__ = [
     "ChosenVehicle",
@@ -36,7 +32,6 @@ __all__ = [
     "Deadline",
     "Done",
     "Sessions",
-    "check_link_argument",
     "listen",
     "received_in_words",
     "sessions",
@@ -49,11 +44,6 @@ VEHICLE_TIMEOUT: Final = 10.0
 RECHECK_TIMEOUT: Final = 2.5
 """Seconds to check that the vehicle is still the only one: no wait is needed unless the vehicle or the link
 was lost in between."""
-UNHEARD_AGE_MAX: Final = 86_400.0
-"""Seconds since a vehicle in the cache was heard, up to which a command names it if it is not heard now: one
-day, because a vehicle of an earlier one is probably not here any more."""
-CACHE_LIST_TIMEOUT: Final = 0.5
-"""Seconds to wait for the list of vehicles in the cache, which takes milliseconds from a local one."""
 OTHERS_SHOWN_MAX: Final = 5
 """Other vehicles that a line names, so that it stays readable; it gives the number of further ones."""
 FIRMWARE_TIMEOUT: Final = 0.5
@@ -61,13 +51,16 @@ FIRMWARE_TIMEOUT: Final = 0.5
 UID_POLL_INTERVAL: Final = 0.05
 """Seconds between two checks whether a vehicle with a hardware id was heard."""
 
-T = TypeVar("T")
-S = TypeVar("S", bound="Shown")
+NUMBERS: Final = "value index default before wanted requested actual now stage"
+"""Right-aligned columns of tables."""
 
-_PARAMETER: Final = re.compile(r"[A-Z][A-Z0-9]*_[A-Z0-9_]*(=.*)?", re.IGNORECASE)
-"""A text that is probably the name of a parameter, or NAME=VALUE: it has an underscore."""
-_ADDRESS: Final = re.compile(r"([0-9]{1,3})(?:/([0-9]{1,3}))?")
-_UID: Final = re.compile(r"uid:([0-9a-f]{6,})", re.IGNORECASE)
+Result = TypeVar("Result", covariant=True)
+
+_VEHICLE: Final = re.compile(
+    r"(?P<system>[0-9]{1,3})(/(?P<component>[0-9]{1,3}))?|uid:(?P<uid>[0-9a-f]{6,})|(?P<all>all)",
+    re.IGNORECASE,
+)
+"""What --vehicle takes."""
 
 
 class Deadline:
@@ -112,21 +105,17 @@ class ChosenVehicle:
         """
         if text is None:
             return cls()
-        if text.lower() == "all":
-            if one:
-                raise UsageError(f"--vehicle all is not possible here: {one}; name one vehicle")
-            return cls(is_all=True)
-        if found := _UID.fullmatch(text):
-            return cls(uid=found[1].lower())
-        if (found := _ADDRESS.fullmatch(text)) is None:
+        if (found := _VEHICLE.fullmatch(text)) is None:
             raise UsageError(
                 f"--vehicle {text}: a vehicle is written as 4, as 4/1 (system and component id), as uid: and "
                 "at least 6 digits of its hardware id, or as all"
             )
-        ids = [int(each) for each in found.groups() if each is not None]
-        if not all(each <= 255 for each in ids) or ids[0] == 0:
+        if found["all"] and one:
+            raise UsageError(f"--vehicle all is not possible here: {one}; name one vehicle")
+        system, component = (int(found[name]) if found[name] else None for name in ("system", "component"))
+        if system == 0 or max(system or 0, component or 0) > 255:
             raise UsageError(f"--vehicle {text}: system ids are 1 to 255, component ids 0 to 255")
-        return cls(system=ids[0], component=ids[1] if len(ids) > 1 else None)
+        return cls(system, component, found["uid"] and found["uid"].lower(), bool(found["all"]))
 
     @property
     def is_named(self) -> bool:
@@ -157,7 +146,7 @@ class CommandSession:
         return f"{self.component.system}/{self.component.component}"
 
     @property
-    def ids(self) -> dict[str, Any]:
+    def ids(self) -> JsonObject:
         """The address as members of JSON."""
         return {"system": self.component.system, "component": self.component.component}
 
@@ -187,17 +176,16 @@ class CommandSession:
 
     async def fetch(self, *, refresh: bool = False) -> FetchResult:
         """Fetch the table; after an interruption, print what was received and kept."""
-        title = f"fetching {self.label}"
+        component, title = self.component, f"fetching {self.label}"
         with Status(f"{title}: waiting for the first response", title) as status:
             try:
-                return await self.component.fetch_all(
+                return await component.fetch_all(
                     refresh=refresh, timeout=self.deadline.left(), progress=status.update
                 )
             except anyio.get_cancelled_exc_class():
-                count, params = self.component.count, self.component.params.values()
-                of = "" if count is None else f" of {count}"
+                received = sum(each.trust is not Trust.CACHED for each in component.params.values())
+                of = "" if component.count is None else f" of {component.count}"
                 kept = "not kept, without a cache" if self.client.cache is None else "kept in the cache"
-                received = sum(each.trust is not Trust.CACHED for each in params)
                 say(f"interrupted: {received}{of} {self.noun}s of {self.label} received and {kept}")
                 raise
 
@@ -232,16 +220,20 @@ class CommandSession:
 
 
 @dataclass(frozen=True, slots=True)
-class Done(Generic[T]):
+class Done(Generic[Result]):
     """The outcome of the work on one vehicle: its result, or the error that ended it."""
 
     session: CommandSession
-    result: T | None = None
+    result: Result | None = None
     error: ParamClientError | None = None
 
 
 class Shown(Protocol):
     """What a subcommand prints of one vehicle: an object of JSON, or the rows of a table."""
+
+    @property
+    def columns(self) -> Sequence[str]:
+        """The headings."""
 
     def as_json(self) -> JsonObject:
         """Return the object."""
@@ -258,12 +250,7 @@ class Sessions(list[CommandSession]):
         """Whether all vehicles of the link are meant."""
         return self[0].choice.is_all
 
-    @property
-    def _names_vehicles(self) -> bool:
-        """Whether a table says which vehicle it shows: several are heard, and none was named."""
-        return self.is_all or (not self[0].choice.is_named and len(self[0].client.autopilots) > 1)
-
-    async def work(self, work: Callable[[CommandSession], Awaitable[T]]) -> list[Done[T]]:
+    async def work(self, work: Callable[[CommandSession], Awaitable[Result]]) -> list[Done[Result]]:
         """Work on all vehicles concurrently; return the outcomes. A failure of one does not stop the others.
 
         Raises:
@@ -271,7 +258,7 @@ class Sessions(list[CommandSession]):
         """
         if not self.is_all:
             return [Done(self[0], await work(self[0]))]
-        done: dict[int, Done[T]] = {}
+        done: dict[int, Done[Result]] = {}
 
         async def run(place: int, session: CommandSession) -> None:
             try:
@@ -284,28 +271,28 @@ class Sessions(list[CommandSession]):
                 tasks.start_soon(run, place, session)
         return [done[place] for place in sorted(done)]
 
-    def show(
-        self, done: Sequence[Done[S]], columns: Sequence[str], right: str = "", *, errors: bool = True
-    ) -> int:
+    def show(self, done: Sequence[Done[Shown]], *, errors: bool = True) -> int:
         """Print the results as one table or as JSON, then the failures; return the exit code for these.
+
+        A table says which vehicle it shows if several are heard, and none was named.
 
         Args:
             done: the outcomes.
-            columns: the headings of the table.
-            right: as in `print_table`.
             errors: whether JSON of all vehicles has the failures; else each outcome has its own error.
         """
+        first = self[0]
         found = [(each.session, each.result) for each in done if each.result is not None]
         failed = [(each.session, each.error) for each in done if each.error is not None]
-        if not self[0].options.json:
-            named = self._names_vehicles
+        if not first.options.json:
+            is_named = self.is_all or (not first.choice.is_named and len(first.client.autopilots) > 1)
+            columns = max([result.columns for _, result in found], key=len, default=())
             rows = [  # a vehicle without metadata has fewer cells
-                [*([session.address] if named else []), *cells, *[None] * (len(columns) - len(cells))]
+                [*([session.address] if is_named else []), *cells, *[None] * (len(columns) - len(cells))]
                 for session, result in found
                 for cells in result.rows()
             ]
             if rows:
-                print_table([*(["vehicle"] if named else []), *columns], rows, right=right)
+                print_table([*(["vehicle"] if is_named else []), *columns], rows, right=NUMBERS)
         elif self.is_all:
             vehicles = [session.ids | result.as_json() for session, result in found]
             failures = [session.ids | {"error": str(error)} for session, error in failed]
@@ -316,37 +303,25 @@ class Sessions(list[CommandSession]):
             report(f"{session.label}: {error}")
         return max((code_of(error) for _, error in failed), default=ExitCode.DONE)
 
-    async def report_unheard(self) -> None:
-        """Report vehicles of the link in the cache that were not heard, if --vehicle names none."""
-        if not self[0].choice.is_named:
-            for sentence in await _unheard_in_words(self[0]):
-                report(f"{sentence} --vehicle chooses one")
-
-    async def report_others(self) -> None:
+    def report_others(self) -> None:
         """Report other vehicles of the link, if --vehicle did not choose the one that was used.
 
         For subcommands that only read: they use the first vehicle heard, which may be another one next time.
-        A short command may end before another vehicle is heard; the cache knows those of earlier commands.
         """
-        first = self[0]
-        if first.choice.is_named and not self.is_all:
-            return
-        used, others = {each.component.node for each in self}, [*first.client.autopilots]
+        first, used = self[0], {each.component.node for each in self}
+        others = first.client.autopilots
         if self.is_all:
-            others = [each for each in first.client.components.values() if _has_parameters(each)]
-        listed = first_of(
-            [node_in_words(each.node) for each in others if each.node not in used], OTHERS_SHOWN_MAX
-        )
-        unheard = await _unheard_in_words(first)
-        if self.is_all:
-            if listed:
-                report(f"--vehicle all chooses autopilots. Also heard, and not asked: {listed}")
-            for sentence in unheard:
-                report(sentence)
-        elif listed or unheard:
-            also = [f"Also on this link: {listed}."] if listed else []
-            used_first = f"{first.label} was used, the first vehicle heard."
-            report(f"{' '.join([used_first, *also, *unheard])} --vehicle chooses one")
+            components = first.client.components.values()
+            others = [each for each in components if each.node.identification.has_parameters]
+        words = [node_in_words(each.node) for each in others if each.node not in used]
+        listed = first_of(words, OTHERS_SHOWN_MAX)
+        if words and self.is_all:
+            report(f"--vehicle all chooses autopilots. Also heard, and not asked: {listed}")
+        elif words and not first.choice.is_named:
+            report(
+                f"{first.label} was used, the first vehicle heard. Also on this link: {listed}. "
+                "--vehicle chooses one"
+            )
 
 
 @asynccontextmanager
@@ -355,7 +330,6 @@ async def sessions(
     options: LinkOptions,
     *,
     writes: bool = False,
-    policy: Policy = Policy.AUTO,
     is_live: bool = False,
     extended: bool = False,
 ) -> AsyncIterator[Sessions]:
@@ -365,7 +339,6 @@ async def sessions(
         url: the link.
         options: the vehicle, and the options of the link.
         writes: whether several vehicles are an error, unless --vehicle names one or all.
-        policy: as in `ParamClient`.
         is_live: read a log in real time; otherwise it is read at full speed, unless its name gives a speed.
         extended: use the extended parameters. Otherwise --extended is suggested for a camera.
 
@@ -375,18 +348,16 @@ async def sessions(
         NoReply: the vehicle was not heard.
         LinkError: the link cannot be opened, or failed.
     """
-    check_link_argument(url)
     one = "--extended works on one vehicle" if extended else ""
     choice, deadline = ChosenVehicle.parse(options.vehicle, one=one), Deadline(options.timeout)
     async with ParamClient(
         url if is_live else _at_full_speed(url),
         cache=None if options.place is True else options.place,
         encoding=options.encoding,
-        policy=policy,
         listen_only=options.listen_only,
         tlog=options.tlog,
         signing=options.signing,
-        **options.source,
+        system=options.source_system,
     ) as client:
         timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
         if choice.is_all:
@@ -416,28 +387,8 @@ def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> P
         signing=options.signing,
         listen_only=listen_only,
         tlog=options.tlog,
-        **options.source,
+        system=options.source_system,
     )
-
-
-def check_link_argument(text: str) -> None:
-    """Check that the first argument of a subcommand is not the file or the parameter that follows the link.
-
-    Any other text that is not a link fails when the link is opened.
-
-    Raises:
-        UsageError: it is the name of a file or a parameter.
-    """
-    try:
-        parse_link(text)
-    except UsageError:
-        found = "the name of a parameter" if _PARAMETER.fullmatch(text) else ""
-        with suppress(OSError, ValueError):  # a text that is too long or has a NUL is not a file name
-            found = "a file" if Path(text).is_file() else found
-        if found:
-            raise UsageError(
-                f"{text} is {found}: the first argument is the link, such as udpin:0.0.0.0:14550 or sim:px4"
-            ) from None
 
 
 def _at_full_speed(url: str) -> str:
@@ -466,46 +417,48 @@ async def wait_for_vehicle(
         ParamClientError: as from `ParamClient.component` and `ParamClient.only_component`.
     """
     if choice.uid is not None:
-        awaited = f"a vehicle with hardware id {choice.uid}"
-        with _waiting(client, awaited):
-            return await _find_by_uid(client, choice.uid, awaited, timeout)
-    address, deadline = (choice.system, choice.component), Deadline(timeout)
+        return await _find_by_uid(client, choice.uid, timeout)
+    address = (choice.system, choice.component)
     with _waiting(client, address_in_words(*address)):
         if not only:
             return await client.component(*address, timeout=timeout)
         try:
             return await client.only_component(*address, timeout=timeout)
         except AmbiguousVehicle:  # of the first two; the user chooses among all that are heard
-            await anyio.sleep(deadline.left(HEARTBEAT_WAIT) or 0.0)
+            await anyio.sleep(HEARTBEAT_WAIT if timeout is None else min(HEARTBEAT_WAIT, timeout))
             with suppress(NoReply):
                 await client.only_component(*address, timeout=RECHECK_TIMEOUT)
             raise
 
 
-async def _find_by_uid(client: ParamClient, uid: str, awaited: str, timeout: float | None) -> Component:
+async def _find_by_uid(client: ParamClient, uid: str, timeout: float | None) -> Component:
     """Wait for the autopilot with a hardware id, and with the beginning of one also for a second.
 
     Raises:
         AmbiguousVehicle: several have this beginning.
         NoReply: none has it.
     """
-    began, has_looked = anyio.current_time(), False
-    with anyio.move_on_after(timeout):
-        while True:
-            found = [each for each in client.autopilots if (each.identity.uid or "").startswith(uid)]
-            if len(found) > 1:
-                words = [node_in_words(each.node) for each in found]
-                raise AmbiguousVehicle(
-                    f"{len(found)} vehicles on this link have hardware ids that begin with {uid}: "
-                    f"{', '.join(words)}.",
-                    vehicles=words,
-                    choose_by="system",
-                )
-            if found and (has_looked or found[0].identity.uid == uid):
-                return found[0]
-            has_looked = bool(found)
+
+    def fitting() -> list[Component]:
+        return [each for each in client.autopilots if (each.identity.uid or "").startswith(uid)]
+
+    began, awaited = anyio.current_time(), f"a vehicle with hardware id {uid}"
+    with _waiting(client, awaited), anyio.move_on_after(timeout):
+        while not (found := fitting()):
             client.core.station.gate.check()
-            await anyio.sleep(HEARTBEAT_WAIT if found else UID_POLL_INTERVAL)
+            await anyio.sleep(UID_POLL_INTERVAL)
+        if found[0].identity.uid != uid:
+            await anyio.sleep(HEARTBEAT_WAIT)
+            found = fitting()
+        if len(found) > 1:
+            words = [node_in_words(each.node) for each in found]
+            raise AmbiguousVehicle(
+                f"{len(found)} vehicles on this link have hardware ids that begin with {uid}: "
+                f"{', '.join(words)}.",
+                vehicles=words,
+                choose_by="system",
+            )
+        return found[0]
     waited = anyio.current_time() - began
     raise NoReply(awaited, attempts=0, waited=waited, hint=received_in_words(client))
 
@@ -524,34 +477,3 @@ async def wait_for_firmware(vehicles: Sequence[Component], deadline: Deadline) -
     with anyio.move_on_after(deadline.left(FIRMWARE_TIMEOUT)):
         for each in vehicles:
             await each.wait_until_identified(FIRMWARE_TIMEOUT)
-
-
-def _has_parameters(component: Component) -> bool:
-    return component.node.identification.has_parameters
-
-
-async def _unheard_in_words(session: CommandSession) -> list[str]:
-    """Return a sentence about vehicles of the link in the cache that were not heard; none without any.
-
-    Vehicles that were heard last more than `UNHEARD_AGE_MAX` ago are left out, and so are those with the
-    system id of a heard one.
-    """
-    cache, link = session.client.cache, session.client.link.name
-    known: list[CachedSummary] = []
-    if cache is not None:
-        with anyio.move_on_after(CACHE_LIST_TIMEOUT), suppress(CacheError):
-            known = await anyio.to_thread.run_sync(cache.components, abandon_on_cancel=True)
-    heard = {each.system for each in session.client.components.values()}
-    unheard: dict[int, str] = {}
-    for each in known:
-        at = max(each.updated_at, each.synced_at or 0.0)
-        is_here = each.identity.link == link and session.now - at <= UNHEARD_AGE_MAX
-        if is_here and each.autopilot != MAV_AUTOPILOT_INVALID and each.system not in heard:
-            kind = kind_in_words(each.autopilot, each.identity.vehicle_type)
-            words = f"{each.system}/{each.component} {kind}".rstrip()
-            unheard.setdefault(each.system, f"{words} (last {local_time(at)})")
-    if not unheard:
-        return []
-    listed = first_of([unheard[system] for system in sorted(unheard)], OTHERS_SHOWN_MAX)
-    was = "was" if len(unheard) == 1 else "were"
-    return [f"{counted(len(unheard), 'vehicle')} of this link in the cache {was} not heard: {listed}."]

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -13,7 +10,7 @@ from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import CONNECTION, KeyOptions, Seconds, Verbose
-from paramclient.cli.output import print_json, print_line, printable
+from paramclient.cli.output import can_ask, confirm, print_json, print_line
 from paramclient.cli.session import VEHICLE_TIMEOUT, ChosenVehicle, Deadline, wait_for_vehicle
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
@@ -53,13 +50,11 @@ class SigningTarget(KeyOptions):
 _DEFAULTS: Final = SigningTarget()
 
 
-def setup(
-    url: str, /, *, present_key: Path | None = None, options: SigningTarget = _DEFAULTS
-) -> Callable[[], Awaitable[int]]:
+async def setup(url: str, /, *, present_key: Path | None = None, options: SigningTarget = _DEFAULTS) -> int:
     """Set the signing key of a vehicle, and verify that the vehicle signs with it.
 
-    The key is taken from --signing-key, --signing-passphrase or the environment. It is sent unencrypted: use
-    a link that no other person or program can read.
+    The key is taken from --signing-key or the environment. It is sent unencrypted: use a link that no other
+    person or program can read.
 
     Args:
         url: The link, such as serial:/dev/ttyACM0:115200.
@@ -68,50 +63,37 @@ def setup(
     """
     key = options.key
     if key is None:
-        raise UsageError("no key is given; name one with --signing-key FILE or --signing-passphrase")
+        raise UsageError("no key is given; name one with --signing-key FILE, or set one in the environment")
     present = None if present_key is None else read_key(present_key)
-    _confirm(options, f"The key will be sent over {url} in clear text.")
-    return partial(_change, url, options, key, present)
+    return await _change(url, options, key, present, f"The key will be sent over {url} in clear text.")
 
 
-def disable(url: str, /, *, options: SigningTarget = _DEFAULTS) -> Callable[[], Awaitable[int]]:
+async def disable(url: str, /, *, options: SigningTarget = _DEFAULTS) -> int:
     """Remove the signing key of a vehicle, and verify that it neither signs nor requires signed frames.
 
-    The current key (--signing-key, --signing-passphrase or the environment) is needed if the vehicle requires
-    signed frames: PX4 always does, ArduPilot not over USB.
+    The current key (--signing-key or the environment) is needed if the vehicle requires signed frames: PX4
+    always does, ArduPilot not over USB.
 
     Args:
         url: The link.
     """
-    key = options.key
-    _confirm(options, f"The vehicle on {url} will then accept commands from any sender.")
-    return partial(_change, url, options, None, key)
-
-
-def _confirm(options: SigningTarget, consequence: str) -> None:
-    """Ask whether the link is safe, unless --link-is-safe is given.
-
-    Raises:
-        UsageError: the answer is no, or stdin is not a terminal.
-    """
-    if options.link_is_safe:
-        return
-    if not sys.stdin.isatty():
-        raise UsageError(
-            "nothing was sent; add --link-is-safe if no other person or program can listen on this link"
-        )
-    question = "Can no other person or program listen or send on this link? [y/N] "
-    sys.stderr.write(f"{printable(consequence)} {question}")
-    sys.stderr.flush()
-    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
-        raise UsageError("nothing was sent")
+    consequence = f"The vehicle on {url} will then accept commands from any sender."
+    return await _change(url, options, None, options.key, consequence)
 
 
 async def _change(
-    url: str, options: SigningTarget, key: SigningKey | None, present: SigningKey | None
+    url: str, options: SigningTarget, key: SigningKey | None, present: SigningKey | None, consequence: str
 ) -> int:
     """Send SETUP_SIGNING with a key or with none, signed with the present one if known, and verify it."""
     choice = ChosenVehicle.parse(options.vehicle, one="a signing key is set on one vehicle at a time")
+    if not options.link_is_safe:
+        if not can_ask():
+            raise UsageError(
+                "nothing was sent; add --link-is-safe if no other person or program can listen on this link"
+            )
+        question = "Can no other person or program listen or send on this link?"
+        if not await confirm(f"{consequence} {question}"):
+            raise UsageError("nothing was sent")
     deadline, link = Deadline(options.timeout), create_link(url)
     async with _client(link, options, present) as client:
         timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
@@ -138,7 +120,7 @@ async def _change(
 
 def _client(link: Link, options: SigningTarget, key: SigningKey | None) -> ParamClient:
     signing = None if key is None else Signing(key, SigningPolicy.ACCEPT_ALL)
-    return ParamClient(link, cache=False, traffic=True, signing=signing, **options.source)
+    return ParamClient(link, cache=False, traffic=True, signing=signing, system=options.source_system)
 
 
 async def _read_value(

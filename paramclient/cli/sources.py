@@ -121,7 +121,7 @@ async def resolve_all(
             async with sessions(url, options, writes=writes, extended=extended) as opened:
                 found[url] = await whole_table(opened[0])
                 if not writes:
-                    await opened.report_others()
+                    opened.report_others()
         except Exception as error:  # raised here, the task group would wrap it in a group
             errors.append(error)
             tasks.cancel_scope.cancel()

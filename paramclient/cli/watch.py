@@ -60,7 +60,7 @@ async def _watch(session: CommandSession, given: Sequence[str], found: Sessions)
     everything = counted(len(session.component.params), session.noun)
     say(f"watching {', '.join(given) or everything} of {session.label}")
     if session is found[0]:
-        await found.report_others()
+        found.report_others()
     choice = NameChoice(given) if given else None
     async with task_group() as tasks:
         if given and not any(map(is_pattern, given)) and known is not None:

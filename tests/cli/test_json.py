@@ -89,7 +89,7 @@ def both() -> Air:
 FETCH: Final = "fetch URL"
 FETCH_EXTENDED: Final = "fetch URL --vehicle 1/100 --extended"
 CASES: Final = {
-    "fetch_px4": Case(quad, (FETCH + " --json", FETCH + " --only MC_* --json")),
+    "fetch_px4": Case(quad, (FETCH + " --json", FETCH + " MC_* --json")),
     "fetch_ardupilot": Case(copter, (FETCH + " --json", FETCH + " --changed --json")),
     "fetch_odd_values": Case(odd, (FETCH + " --json",)),
     "fetch_all": Case(both, (FETCH + " --vehicle all --json",)),

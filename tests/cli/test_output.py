@@ -16,11 +16,6 @@ from paramclient.cli.time_arguments import parse_time
 from paramclient.sim import PX4Vehicle
 from tests.commands import Command, Put
 
-COLUMNS = ["name", "value", "type", "index", "trust"]
-ROWS = [
-    ("MC_ROLL_P", "4.0", "REAL32", 547, "live"),
-    ("CAL_MAG0_XCOMP_1", "-16777216.5", "REAL32", 12, "verified"),
-]
 Print = Callable[..., list[str]]
 
 
@@ -35,15 +30,6 @@ def printed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
         return re.sub("\x1b\\[[0-9;]*m", "", capsys.readouterr().out).splitlines()
 
     return call
-
-
-@pytest.mark.parametrize("width", [16, 24, 40, 53, 54, 80])
-def test_no_value_is_broken_in_two(printed: Print, width: int) -> None:
-    lines = printed(width, COLUMNS, ROWS, right="value index")
-    assert max(map(len, lines)) <= max(width, 18)  # the longest value is whole in any case
-    words = " ".join(lines).split()
-    assert words == [*COLUMNS, *(str(cell) for row in ROWS for cell in row)]
-    assert (len(lines) == 3) == (width >= 54)
 
 
 def test_sentences_in_the_last_column_are_wrapped_at_spaces(printed: Print) -> None:
@@ -106,15 +92,6 @@ def test_times_are_local_with_their_zone_and_can_be_parsed_back(command: Command
     assert parse_time(line["time"], time.time() + 1000) == pytest.approx(
         parse_time(history.rows[1][0], time.time() + 1000)
     )
-
-
-@pytest.mark.usefixtures("in_zone")
-def test_messages_of_the_cache_have_local_times(command: Command, put: Put) -> None:
-    assert command("fetch", put(PX4Vehicle(table={"A": 1}))).code == 0
-    failed = command("restore", put(PX4Vehicle(table={"A": 1})), "2026-01-02 03:00", "--dry-run")
-    assert failed.code == 5
-    assert "at 2026-01-02T03:00:00+05:30 is not known: the history begins at" in failed.err
-    assert re.search(r"begins at [0-9-]{10}T[0-9:]{8}\+05:30", failed.err)
 
 
 # closed outputs

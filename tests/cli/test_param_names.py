@@ -75,24 +75,14 @@ def test_without_a_table_of_the_vehicle_names_of_the_cache_are_suggested(command
 
 
 def test_fetch_prints_only_what_is_chosen(command: Command, put: Put) -> None:
-    fetched = command("fetch", put(px4()), "--only", "mc_*", "--only", "SYS_AUTOSTART", "--json")
+    fetched = command("fetch", put(px4()), "mc_*", "SYS_AUTOSTART", "--json")
     assert fetched.code == 0
     assert (fetched.json["received"], set(fetched.json["params"])) == (4, set(TABLE))
-    some = command("fetch", put(px4()), "--only", "mc_[ry]*")
+    some = command("fetch", put(px4()), "mc_[ry]*")
     assert [row[0] for row in some.rows[1:]] == ["MC_ROLL_P", "MC_YAW_P"]
-    wrong = command("fetch", put(px4()), "--only", "MC_ROLLP")
+    wrong = command("fetch", put(px4()), "MC_ROLLP")
     assert (wrong.code, wrong.out) == (2, "")
     assert "called MC_ROLLP (did you mean MC_ROLL_P?)" in wrong.err
-
-
-def test_fetch_with_a_name_says_how_to_ask_for_names(command: Command, put: Put) -> None:
-    url = put(px4())
-    wrong = command("fetch", url, "MC_*")
-    assert (wrong.code, wrong.out) == (2, "")
-    assert f"`paramclient get {url} 'MC_*'`" in wrong.err
-    assert f"`paramclient fetch {url} --only 'MC_*'`" in wrong.err
-    for words in wrong.err.split("`")[1::2]:
-        assert command(*words.replace("'", "").split()[1:]).code == 0
 
 
 def test_save_writes_only_what_is_chosen(command: Command, put: Put, tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ def tables(command: Command, put: Put) -> None:
     """Cache the tables of two vehicles."""
     px4 = PX4Vehicle(metadata=True)
     assert command("fetch", put(px4)).code == 0
-    assert command("set", put(px4), "MC_ROLL_P", 6.5, "MC_ROLL_P", 7.5).code == 0
+    for value in (6.5, 7.5):
+        assert command("set", put(px4), "MC_ROLL_P", value).code == 0
     assert command("get", put(px4), "MC_ROLL_P", "--metadata", "vehicle").code == 0
     assert command("fetch", put(ArduPilotVehicle(system=2))).code == 0
 

@@ -101,7 +101,7 @@ def test_reset_writes_to_every_vehicle(command: Command, put: Put, tmp_path: Pat
     done = command(*words)
     assert done.code == 0, done.err
     assert [row[:5] for row in done.rows] == [
-        ["vehicle", "name", "before", "default", "now"],
+        ["vehicle", "name", "before", "requested", "actual"],
         *([address, "A", "1.0", "2.5", "2.5"] for address in ("1/1", "4/1")),
     ]
     assert [each.values["A"] for each in vehicles] == [2.5, 2.5]

@@ -15,7 +15,6 @@ import pytest
 from paramclient import CacheError, NotDurable, ParamCache, ParamClient, UsageError
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.provision import apply
-from tests.commands import behind, in_process, leaping
 from tests.shell import in_simulated_time, small_px4
 
 NAME = "PARAM_01"
@@ -96,18 +95,3 @@ async def test_a_durable_apply_ends_on_the_disk(tmp_path: Path) -> None:
             result = await apply(component, wanted, durable=True)
         assert isinstance(result.error, CacheError)
         assert vehicle.values[NAME] == 6.0
-
-
-def test_the_command_says_what_is_not_on_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    leaping(monkeypatch)
-    command, put = in_process(capsys), behind(monkeypatch, "sim:px4")
-    vehicle = small_px4()
-    words = ("set", put(vehicle), NAME, "5", "--durable")
-    assert command(*words, "--cache", tmp_path / "cache").code == 0
-    assert command(*words, "--no-cache").code == 2
-    with no_disk():
-        ended = command("set", put(vehicle), NAME, "6", "--durable", "--cache", tmp_path / "cache")
-    assert ended.code == 5
-    assert "1/1 has accepted PARAM_01, but it is not on the disk" in ended.err

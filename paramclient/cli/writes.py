@@ -1,0 +1,205 @@
+"""Writes of set and reset: the values for each vehicle, one outcome for each, and what is printed of them."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import anyio
+
+from paramclient.cli.exit_codes import ExitCode, code_of
+from paramclient.cli.json_output import JsonObject, outcome_json, vehicle_json
+from paramclient.cli.metadata import info_of, meaning_of
+from paramclient.cli.output import Coloured, Status, report, say
+from paramclient.cli.param_names import suggest
+from paramclient.cli.session import CommandSession, Done, Sessions
+from paramclient.errors import ParamClientError, UnknownParameter, UsageError
+from paramclient.metadata import Metadata
+from paramclient.model.values import Param, ParamType, WireValue, format_value
+from paramclient.model.wording import counted, first_of
+from paramclient.protocol.fetch import Progress
+from paramclient.protocol.set_results import SetOutcome, SetStatus
+
+__all__ = ["WriteJob", "write_all"]
+
+WRITE_NAMES_MAX: Final = 10
+"""Parameters that a line names, so that it stays short; it gives the number of further ones."""
+_STYLES: Final = {
+    SetStatus.ACCEPTED: "green",
+    SetStatus.ADJUSTED: "yellow",
+    SetStatus.REFUSED: "red",
+    SetStatus.UNKNOWN: "bold red",
+    SetStatus.NOT_TRIED: "dim",
+}
+"""Styles of the outcomes."""
+
+
+@dataclass
+class WriteJob:
+    """The values for one vehicle in the order of the writes, and the outcomes so far.
+
+    Attributes:
+        session: the vehicle.
+        writes: the values by name.
+        described: the metadata of the vehicle, or None.
+        before: the parameters before the writes, or empty.
+        more: further members of the JSON object.
+        arrived: the outcomes so far, by name.
+    """
+
+    session: CommandSession
+    writes: Mapping[str, WireValue]
+    described: Metadata | None
+    before: Mapping[str, Param] = field(default_factory=dict)
+    more: JsonObject = field(default_factory=dict)
+    arrived: dict[str, SetOutcome] = field(default_factory=dict)
+
+    async def write(self, *, settle: float, force: bool) -> None:
+        """Write the values as `Component.set_many` does; afterwards each has an outcome in any case."""
+        session, began = self.session, anyio.current_time()
+        is_announced = False
+
+        def update(outcome: SetOutcome) -> None:
+            nonlocal is_announced
+            is_wrong = isinstance(outcome.error, UnknownParameter | UsageError)
+            if not (is_announced or is_wrong or outcome.status is SetStatus.NOT_TRIED):
+                is_announced = True
+                session.announce_write()
+            self.arrived[outcome.name] = outcome
+            elapsed = anyio.current_time() - began
+            status.update(Progress.after(len(self.arrived), len(self.writes), elapsed))
+
+        label = session.label
+        with Status(f"waiting for {label} to acknowledge PARAM_SET", f"setting {label}") as status:
+            try:
+                done = await session.component.set_many(
+                    self.writes, progress=update, timeout=session.deadline.left(), settle=settle, force=force
+                )
+                outcomes = done.outcomes
+            except ParamClientError as error:  # raised only if nothing was written
+                pairs = self.writes.items()
+                outcomes = tuple(SetOutcome(*pair, SetStatus.NOT_TRIED, error=error) for pair in pairs)
+        unknown = {each.name: each.error for each in outcomes if isinstance(each.error, UnknownParameter)}
+        better = await suggest(session, {**unknown})
+        self.arrived = {
+            each.name: replace(each, error=better.get(each.name, each.error)) for each in outcomes
+        }
+
+    @property
+    def outcomes(self) -> list[SetOutcome]:
+        """One outcome for each value; *unknown* for those without one, after an interruption."""
+        return [
+            self.arrived.get(name) or SetOutcome(name, value, SetStatus.UNKNOWN)
+            for name, value in self.writes.items()
+        ]
+
+    @property
+    def summary(self) -> str:
+        """The numbers of outcomes in words: `2 of 4 set, 1 refused, 1 not tried on 1/1 PX4 …`."""
+        counts = Counter(each.status for each in self.outcomes)
+        done = counts.pop(SetStatus.ACCEPTED, 0) + counts.pop(SetStatus.ADJUSTED, 0)
+        others = [f"{counts[status]} {status}" for status in SetStatus if status in counts]
+        return f"{', '.join([f'{done} of {len(self.writes)} set', *others])} on {self.session.receiver}"
+
+    @property
+    def code(self) -> int:
+        """The exit code for all outcomes."""
+        errors = [each.error for each in self.arrived.values() if each.error is not None]
+        return max(map(code_of, errors), default=ExitCode.DONE)
+
+    def as_json(self) -> JsonObject:
+        """Return the JSON of the vehicle and the outcomes."""
+        results = [
+            outcome_json(each, self._type_of(each), info_of(self.described, each.name))
+            for each in self.outcomes
+        ]
+        return {"vehicle": vehicle_json(self.session.component), "results": results, **self.more}
+
+    @property
+    def columns(self) -> list[str]:
+        """The headings."""
+        return ["name", *(["before"] if self.before else []), "requested", "actual", "status"]
+
+    def rows(self) -> Iterator[Sequence[object]]:
+        """Yield the rows; the reported value with its meaning, if that is known."""
+        for each in self.outcomes:
+            kind, name = self._type_of(each), each.name
+            before = [_text(self.before[name])] if self.before else []
+            requested = kind if self.before or isinstance(each.requested, bytes) else ParamType.REAL64
+            actual = None if each.reported is None else format_value(each.reported, kind)
+            meaning = None if each.reported is None else meaning_of(self.described, name, each.reported)
+            yield (
+                *(name, *before, format_value(each.requested, requested)),
+                f"{actual} ({meaning})" if meaning else actual,
+                Coloured(each.status, _STYLES[each.status]),
+            )
+
+    def report(self) -> None:
+        """Print remarks, and errors: one line for all values without a response, and for one cause."""
+        prefix, errors = self.session.prefix, dict[object, list[SetOutcome]]()
+        for each in self.arrived.values():
+            info = info_of(self.described, each.name)
+            if each.is_set and info is not None and info.reboot_required:
+                say(f"{prefix}{each.name} takes effect after a reboot")
+            if each.result is not None and each.result.note:
+                say(f"{prefix}{each.name}: {each.result.note}")
+            if each.error is not None:
+                is_open = each.status in (SetStatus.UNKNOWN, SetStatus.NOT_TRIED)
+                cause = (each.status, type(each.error)) if is_open else str(each.error)
+                errors.setdefault(cause, []).append(each)
+        for group in errors.values():
+            names, text = [each.name for each in group], str(group[0].error)
+            is_named = len(names) == 1 and names[0] in re.split(r"[ ,:;]", text)
+            report(f"{prefix}{'' if is_named else first_of(names, WRITE_NAMES_MAX) + ': '}{text}")
+
+    def _type_of(self, outcome: SetOutcome) -> ParamType | int:
+        """Return the vehicle's type of a parameter; REAL32 if it is not known."""
+        if outcome.result is not None:
+            return outcome.result.param.type_number
+        known = self.session.component.params.get(outcome.name)
+        return ParamType.REAL32 if known is None else known.type_number
+
+
+async def write_all(
+    found: Sessions, jobs: Sequence[WriteJob], *, settle: float = 0.0, force: bool = False
+) -> int:
+    """Write the values of all vehicles, and print the outcomes, also those so far after an interruption.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        AmbiguousVehicle, NoReply, LinkError: as from `CommandSession.check_only`; nothing was written.
+    """
+    by_session, done = {job.session: job for job in jobs}, [Done(job.session, job) for job in jobs]
+    began = anyio.current_time()
+
+    if any(job.writes for job in jobs):
+        for each in found:
+            await each.check_only()
+        try:
+            await found.work(lambda each: by_session[each].write(settle=settle, force=force))
+        except anyio.get_cancelled_exc_class():
+            found.show(done, errors=False)
+            unknown = sum(each.status is SetStatus.UNKNOWN for job in jobs for each in job.outcomes)
+            say(
+                f"interrupted: the outcome of {counted(unknown, 'value')} is not known, and the vehicle may "
+                "have them; run it again to continue"
+            )
+            raise
+    found.show(done, errors=False)
+    for job in jobs:
+        client = job.session.client
+        traffic = f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent"
+        if not job.session.options.json:
+            elapsed = anyio.current_time() - began
+            say(f"{job.summary}{'' if found.is_all else f' in {elapsed:.2f} s, {traffic}'}")
+        job.report()
+    return max(job.code for job in jobs)
+
+
+def _text(param: Param) -> str:
+    return format_value(param.settable, param.type_number)
