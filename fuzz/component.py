@@ -22,7 +22,7 @@ import anyio.lowlevel
 
 from fuzz.draw import Draw
 from paramclient.errors import LinkError, ParamClientError
-from paramclient.model.values import Encoding, Param, Trust, WireValue, is_portable_name, known_type
+from paramclient.model.values import Encoding, Param, ParamType, Trust, WireValue, is_portable_name
 from paramclient.protocol import session as session_module
 from paramclient.protocol import station as station_module
 from paramclient.protocol import table as table_module
@@ -441,7 +441,7 @@ class _Session:
         entries = [self.entry(node.system, index, count) for index in range(count if how & 1 else how % 8)]
         params = [
             Param(
-                *(each.param_id, 0.0, known_type(9), each.param_index),
+                *(each.param_id, 0.0, ParamType(9), each.param_index),
                 *(int.from_bytes(each.raw, "little"), Trust.CACHED),
             )
             for each in entries

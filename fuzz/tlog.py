@@ -113,7 +113,7 @@ def _check_import(kept: ParamCache, tables: Sequence[ImportedTable], records: Se
             for encoding in Encoding
         }
         for name, param in table.params.items():
-            kind = param.type_number
+            kind = param.type
             assert (name, kind, bits_of(param.settable, kind)) in words
         assert set(table.heard_at.values()) <= times
         lines = list(kept.history(summary.key))

@@ -117,7 +117,7 @@ class StoredParam(NamedTuple):
         Raises:
             UsageError: the type does not hold the value.
         """
-        number, default = int(param.type_number or 0), param.default
+        number, default = int(param.type or 0), param.default
         bits, index = (param.bits, param.index) if isinstance(param, Param) else (param.bits_as(number), None)
         return cls(
             param.name,

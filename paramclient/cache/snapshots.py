@@ -114,7 +114,7 @@ def rows_of(params: ParamSet) -> list[StoredParam]:
     Raises:
         UsageError: the type of a parameter is unknown, or does not hold its value.
     """
-    untyped = [name for name, each in params.items() if each.type_number is None]
+    untyped = [name for name, each in params.items() if each.type is None]
     if untyped:
         raise UsageError(f"a snapshot has the type of each parameter; that of {untyped[0]} is not known")
     return [StoredParam.of(each, 0.0) for each in params.values()]
@@ -142,9 +142,7 @@ def _param_set(
 ) -> ParamSet:
     known = table.summary
     system = known.identity.system
-    return ParamSet.of(
-        params, component=known.component, system=system, identity=identity, at=at, source=source
-    )
+    return ParamSet({each.name: each for each in params}, known.component, system, identity, at, source)
 
 
 def _second(at: float) -> str:

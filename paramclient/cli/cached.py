@@ -250,4 +250,4 @@ def _snapshot_cells(each: SnapshotSummary) -> Sequence[object]:
 
 
 def _value(param: Param | None) -> str | None:
-    return None if param is None else format_value(param.settable, param.type_number)
+    return None if param is None else format_value(param.settable, param.type)

@@ -21,7 +21,6 @@ from paramclient.metadata import Metadata
 from paramclient.model.comparison import ChangedSide, Comparison, Difference, DifferenceStatus, compare
 from paramclient.model.notation import bits_written
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import type_name
 from paramclient.provision.vehicle_params import collect_defaults
 
 __all__ = ["diff"]
@@ -183,7 +182,7 @@ def _comparison_text(entry: Difference) -> str:
 
 
 def _type(param: WrittenParam | None) -> str:
-    return "" if param is None or param.type_number is None else type_name(param.type_number)
+    return "" if param is None or param.type is None else param.type.name
 
 
 def _summary(outcome: Comparison) -> list[str]:

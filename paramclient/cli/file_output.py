@@ -34,4 +34,4 @@ def value_text(param: WrittenParam) -> str:
 
 
 def _text(value: WireValue, param: WrittenParam) -> str:
-    return format_value(value, ParamType.REAL32 if param.type_number is None else param.type_number)
+    return format_value(value, ParamType.REAL32 if param.type is None else param.type)

@@ -17,7 +17,7 @@ from paramclient.model.comparison import ChangedSide, DifferenceStatus
 from paramclient.model.defaults import DefaultSource
 from paramclient.model.identity import version_text
 from paramclient.model.notation import Scalar, typed, value_json
-from paramclient.model.values import WireValue, type_name
+from paramclient.model.values import ParamType, WireValue
 from paramclient.provision.planning import ApplyStatus
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def rows_json(rows: Iterable[ApplyRow]) -> JsonObject:
 
         return {
             "status": row.status,
-            "type": None if row.type is None else type_name(row.type),
+            "type": None if row.type is None else ParamType(row.type).name,
             "before": value(row.before),
             "wanted": value(row.wanted.settable),
             "actual": value(row.actual),
@@ -117,7 +117,7 @@ def plan_json(plan: Plan, component: Component, *, full: bool = False) -> JsonOb
         return {
             "name": row.name,
             "value": value_json(value, kind),
-            "type": type_name(kind),
+            "type": ParamType(kind).name,
             "before": value_json(row.before, kind),
             "needs_reboot": row.needs_reboot,
         }

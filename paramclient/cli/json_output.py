@@ -22,7 +22,7 @@ from paramclient.model.notation import (
     value_json,
     value_written,
 )
-from paramclient.model.values import Param, ParamType, format_value, type_name
+from paramclient.model.values import Param, ParamType, format_value
 from paramclient.protocol.identity import kind_in_words
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def short_text(text: str | None) -> str | None:
 
 def param_value(param: Param | None) -> Scalar | None:
     """Return the value of a parameter; None for None."""
-    return None if param is None else value_json(param.settable, param.type_number)
+    return None if param is None else value_json(param.settable, param.type)
 
 
 def info_json(info: ParamInfo) -> JsonObject:
@@ -106,11 +106,11 @@ def param_json(
     default = default_of(param, described if info is None else info.default)
     return {
         "value": param_value(param),
-        "type": type_name(param.type_number),
+        "type": param.type.name,
         "index": param.index,
         "bits": bits_text(param),
     } | known_members(
-        default=default and value_json(default.value, param.type_number),
+        default=default and value_json(default.value, param.type),
         default_source=default and default.source,
         text=info and short_text(info.text(param.settable)),
         units=info and short_text(info.units),
@@ -148,7 +148,7 @@ def compared_json(param: WrittenParam, metadata: Metadata | None = None) -> Json
     info = None if metadata is None else metadata.find(param.name)
     return {
         "value": value_written(param.settable, param),
-        "type": None if param.type_number is None else type_name(param.type_number),
+        "type": None if param.type is None else param.type.name,
         "bits": bits_written(param),
     } | known_members(text=info and short_text(info.text(param.settable)))
 

@@ -8,7 +8,7 @@ from paramclient.cli.json_output import JsonObject, param_json
 from paramclient.cli.metadata import DESCRIBED_COLUMNS, described_cells, info_of
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import Default, add_default, default_of
-from paramclient.model.values import Param, format_value, type_name
+from paramclient.model.values import Param, format_value
 
 __all__ = ["RIGHT", "ParamTable"]
 
@@ -66,8 +66,8 @@ class ParamTable:
         for param in self.params:
             yield (
                 param.name,
-                format_value(param.settable, param.type_number),
-                type_name(param.type_number),
+                format_value(param.settable, param.type),
+                param.type.name,
                 param.index,
                 *([] if self._more is None else [self._more[1](param)]),
                 *([_default_text(self._known(param))] * self._shows_defaults),
@@ -86,4 +86,4 @@ class ParamTable:
 
 
 def _default_text(param: Param) -> str | None:
-    return None if param.default is None else format_value(param.default, param.type_number)
+    return None if param.default is None else format_value(param.default, param.type)

@@ -17,7 +17,7 @@ from paramclient.cli.output import Status, by_index, milliseconds, report, say
 from paramclient.cli.param_names import check_given, choose_names, learn_spelling, suggest
 from paramclient.cli.param_table import ParamTable
 from paramclient.cli.session import CommandSession, sessions
-from paramclient.errors import ParamClientError, UsageError
+from paramclient.errors import ParamClientError
 from paramclient.model.names import NameChoice, is_pattern
 from paramclient.model.notation import hash_text
 from paramclient.model.values import Param, Trust
@@ -199,9 +199,7 @@ def _keep(tables: Sequence[ParamTable], chosen: Sequence[str]) -> None:
         UsageError: one of them fits no parameter of any table.
     """
     received = {param.name for each in tables for param in each.params}
-    kept, unmatched = NameChoice(chosen).choose(received)
-    if unmatched:
-        raise UsageError(f"no parameter is called {unmatched}")
+    kept = NameChoice(chosen).choose(received)
     for each in tables:
         each.keep(kept)
 

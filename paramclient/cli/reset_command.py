@@ -154,7 +154,7 @@ class _Plan:
             {
                 "name": param.name,
                 "value": param_value(param),
-                "default": value_json(default.value, param.type_number),
+                "default": value_json(default.value, param.type),
                 "source": default.source,
             }
             for param, default in self.writes
@@ -165,7 +165,7 @@ class _Plan:
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the values that would be sent, then the parameters without a known default."""
         for param, default in self.writes:
-            text = format_value(default.value, param.type_number)
+            text = format_value(default.value, param.type)
             yield param.name, _text(param), text, f"default of {default.source}"
         for param in self.without_default:
             yield param.name, _text(param), None, Coloured("no known default", "yellow")
@@ -231,8 +231,8 @@ async def _known(session: CommandSession, choice: str | None, params: Sequence[P
 
 
 def _text(param: Param) -> str:
-    return format_value(param.settable, param.type_number)
+    return format_value(param.settable, param.type)
 
 
 def _has_value(param: Param, value: WireValue) -> bool:
-    return same_bits(param.type_number, param.bits, bits_of(value, param.type_number))
+    return same_bits(param.type, param.bits, bits_of(value, param.type))

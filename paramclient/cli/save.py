@@ -204,9 +204,7 @@ def _chosen(sets: Sequence[ParamSet], only: Sequence[str]) -> list[ParamSet]:
     Raises:
         UsageError: a name or pattern fits no parameter of any set.
     """
-    names, unmatched = NameChoice(only).choose({name for each in sets for name in each})
-    if unmatched and sets:
-        raise UsageError(f"no parameter is called {unmatched}")
+    names = NameChoice(only).choose({name for each in sets for name in each}) if sets else ()
     parts = [replace(each, params={n: param for n, param in each.items() if n in names}) for each in sets]
     return [each for each in parts if each]
 

@@ -25,7 +25,7 @@ from paramclient.metadata import Metadata, ParamInfo
 from paramclient.model.defaults import DefaultSource, default_of
 from paramclient.model.identity import autopilot_name, has_autopilot
 from paramclient.model.notation import time_text
-from paramclient.model.values import Param, check_name, format_value, type_name
+from paramclient.model.values import Param, check_name, format_value
 from paramclient.model.wording import counted
 
 __all__ = ["info", "search"]
@@ -209,11 +209,11 @@ def _lines_of(
     param = table.params[name]
     meaning = "" if described is None else described.text(param.settable) or ""
     yield f"{table.system}/{table.component} {autopilot_name(table.autopilot)} ({table.key})"
-    yield f"  value: {_value(param)}{f' ({meaning})' if meaning else ''}, {type_name(param.type_number)}"
+    yield f"  value: {_value(param)}{f' ({meaning})' if meaning else ''}, {param.type.name}"
     default = default_of(param, None if described is None else described.default)
     if default is not None:
         origin = " (from the metadata)" if default.source is DefaultSource.METADATA else ""
-        yield f"  default of the firmware: {format_value(default.value, param.type_number)}{origin}"
+        yield f"  default of the firmware: {format_value(default.value, param.type)}{origin}"
     yield f"  heard: {local_time(table.heard_at[name])}"
     for entry in changes:
         new = "removed" if entry.new is None else _value(entry.new)
@@ -221,4 +221,4 @@ def _lines_of(
 
 
 def _value(param: Param) -> str:
-    return format_value(param.settable, param.type_number)
+    return format_value(param.settable, param.type)

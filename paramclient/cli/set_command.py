@@ -150,7 +150,7 @@ async def _prepare_extended(session: CommandSession, wanted: dict[str, str], *_:
     for error in errors.values():
         if not isinstance(error, UnknownParameter):  # the write reports that
             raise error
-    types, writes = {param.name: param.type_number for param in params}, dict[str, WireValue]()
+    types, writes = {param.name: param.type for param in params}, dict[str, WireValue]()
     for given, text in wanted.items():
         name = spelling(given, component)
         writes[name] = parse_ext_value(name, text, types[name]) if name in types else text

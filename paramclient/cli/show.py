@@ -33,7 +33,7 @@ from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice
 from paramclient.model.notation import hash_text, time_or_none, typed
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import format_value, type_name
+from paramclient.model.values import format_value
 
 __all__ = ["show"]
 
@@ -217,9 +217,9 @@ def _print_set(params: ParamSet, more: str) -> None:
     rows = [
         (
             param.name,
-            format_value(*typed(param.settable, param.type_number)),
-            None if param.default is None else format_value(*typed(param.default, param.type_number)),
-            None if param.type_number is None else type_name(param.type_number),
+            format_value(*typed(param.settable, param.type)),
+            None if param.default is None else format_value(*typed(param.default, param.type)),
+            None if param.type is None else param.type.name,
             param.comment or None,
         )
         for param in params.values()

@@ -135,7 +135,7 @@ def _json(item: Change | Event) -> dict[str, object]:
     """Return the JSON of a change or an event, without its time."""
     if isinstance(item, Change):
         old, new = (
-            None if param is None else value_json(param.settable, param.type_number)
+            None if param is None else value_json(param.settable, param.type)
             for param in (item.old, item.new)
         )
         return {"name": item.name, "old": old, "new": new, "by": item.by, "kind": item.kind}
@@ -153,7 +153,7 @@ def _json(item: Change | Event) -> dict[str, object]:
 
 def _change_text(change: Change) -> str:
     old, new = (
-        "none" if param is None else format_value(param.settable, param.type_number)
+        "none" if param is None else format_value(param.settable, param.type)
         for param in (change.old, change.new)
     )
     if change.kind == "added":

@@ -158,9 +158,9 @@ class WriteJob:
     def _type_of(self, outcome: SetOutcome) -> ParamType | int:
         """Return the vehicle's type of a parameter; REAL32 if it is not known."""
         if outcome.result is not None:
-            return outcome.result.param.type_number
+            return outcome.result.param.type
         known = self.session.component.params.get(outcome.name)
-        return ParamType.REAL32 if known is None else known.type_number
+        return ParamType.REAL32 if known is None else known.type
 
 
 async def write_all(
@@ -202,4 +202,4 @@ async def write_all(
 
 
 def _text(param: Param) -> str:
-    return format_value(param.settable, param.type_number)
+    return format_value(param.settable, param.type)

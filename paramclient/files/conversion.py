@@ -18,7 +18,7 @@ from paramclient.files.other_files import kind_of
 from paramclient.files.reading import Reading, time_of
 from paramclient.model.identity import autopilot_name, version_text
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, bits_of, check_name, from_bits, same_bits, type_name
+from paramclient.model.values import ParamType, bits_of, check_name, from_bits, same_bits
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol import param_pck
 
@@ -87,10 +87,10 @@ def _write_packed(params: ParamSet) -> bytes:
 
 def _pack_entry(_: ParamSet, param: WrittenParam) -> param_pck.PackedParam:
     """Return the entry of a parameter, or raise UsageError if the format cannot express it."""
-    kind = param.type_number
+    kind = param.type
     if not isinstance(kind, ParamType) or kind not in param_pck.PACKABLE:
         known = ", ".join(each.name for each in sorted(param_pck.PACKABLE))
-        has = "no type" if kind is None else f"the type {type_name(kind)}"
+        has = "no type" if kind is None else f"the type {ParamType(kind).name}"
         raise UsageError(f"{param.name} has {has}, and a packed file holds {known}")
     if param.is_raw:
         raise UsageError(f"{param.name} is not a number; json can keep it")

@@ -40,7 +40,6 @@ from paramclient.model.values import (
     bits_of,
     check_name,
     from_bits,
-    type_name,
 )
 
 __all__ = ["json_fields", "read_json", "read_json_text", "write_json"]
@@ -353,7 +352,7 @@ def _set_fields(params: ParamSet) -> dict[str, object]:
 
 def json_fields(params: ParamSet, param: WrittenParam) -> dict[str, object]:
     """Return the fields of a parameter, or raise UsageError if the format cannot express it."""
-    number, value = param.type_number, param.settable
+    number, value = param.type, param.settable
     if number is not None:
         param.bits_as(number)  # raises UsageError if the value does not fit
     elif isinstance(value, float) and not is_plain(value):
@@ -361,11 +360,11 @@ def json_fields(params: ParamSet, param: WrittenParam) -> dict[str, object]:
     if isinstance(value, str) and value.startswith(HEX):  # as text, it would read as bytes
         value = value.encode()
     is_exact = params.is_extended and isinstance(value, str | bytes)
-    kind = None if number is None else type_name(number)
+    kind = None if number is None else ParamType(number).name
     return _without_none(
         {
             "value": value_written(value, param),
-            "type": f"TYPE_{number}" if param.type is ParamType.UNKNOWN else kind,
+            "type": "TYPE_11" if param.is_raw and number == _CUSTOM else kind,
             "bits": None if is_exact else bits_written(param),
             "default": None if param.default is None else value_written(param.default, param),
             "comment": _encodable(param.comment) or None,

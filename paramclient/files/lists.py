@@ -252,13 +252,13 @@ def qgc_line(params: ParamSet, param: WrittenParam) -> str:
         raise UsageError(
             "this format needs the system id of each parameter, and the set has none: give it one"
         )
-    if not isinstance(param.type_number, ParamType):
+    if not isinstance(param.type, ParamType):
         raise UsageError(f"{param.name} has no type that MAVLink defines, and this format needs one")
     component = AUTOPILOT if params.component is None else params.component
     text = value_text(param)
     if isinstance(param.value, float) and not math.isfinite(param.value):
         text = text.lower().removesuffix("inity")  # Qt's notation
-    return f"{params.system}\t{component}\t{_writable_name(param)}\t{text}\t{int(param.type_number)}"
+    return f"{params.system}\t{component}\t{_writable_name(param)}\t{text}\t{int(param.type)}"
 
 
 def _whole(text: str, low: int, high: int, expected: str) -> int:

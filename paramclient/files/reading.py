@@ -15,7 +15,7 @@ from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import FileFormat, ParamFile
 from paramclient.model.notation import value_written
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, WireValue, bits_of, format_value, from_bits, type_name
+from paramclient.model.values import ParamType, WireValue, bits_of, format_value, from_bits
 from paramclient.model.wording import first_of
 
 __all__ = [
@@ -190,11 +190,10 @@ def _place(source: str, line: int | None) -> str:
 def _repetition(before: WrittenParam, at: str, param: WrittenParam, place: str) -> str:
     """Return the note on a name that occurs twice. 1 and 1.0 are the same value, −0.0 and 0.0 are not."""
     ignored, used = (
-        format_value(each.settable, ParamType.REAL64)
-        + ("" if each.type_number is None else f" ({type_name(each.type_number)})")
+        format_value(each.settable, ParamType.REAL64) + ("" if each.type is None else f" ({each.type.name})")
         for each in (before, param)
     )
-    same = (before.value, before.type_number, ignored[0]) == (param.value, param.type_number, used[0])
+    same = (before.value, before.type, ignored[0]) == (param.value, param.type, used[0])
     if same or ignored == used:
         return f"{param.name} occurs twice with the same value, in {at} and {place}."
     return f"{param.name} occurs twice: {used} in {place} is used, not {ignored} in {at}."

@@ -115,7 +115,7 @@ def _store(log: OnboardLog, cache: ParamCache) -> ImportedTable:
     times = [each.heard_at for each in stored]
     cache.merge([update(at=min(times)), update(at=max(times), params=stored)])
     notes = log.notes
-    if untyped := sum(param.type_number is None and name not in types for name, param in log.initial.items()):
+    if untyped := sum(param.type is None and name not in types for name, param in log.initial.items()):
         notes += (f"the log has no types: {untyped} parameters that no cached table has are REAL32",)
     ids = identity.system, AUTOPILOT, identity.autopilot
     return ImportedTable(identity.key, *ids, params=len(log.at_end()), notes=notes)
@@ -130,13 +130,13 @@ def _types(log: OnboardLog, cache: ParamCache) -> Mapping[str, ParamType | int]:
         for each in sorted(same, key=lambda each: (each.key, each.component) == own):
             table = cache.load(each.key, each.component)
             if table is not None:  # another process may have removed it
-                types |= {name: param.type_number for name, param in table.params.items()}
+                types |= {name: param.type for name, param in table.params.items()}
     return types
 
 
 def _stored(param: WrittenParam, types: Mapping[str, ParamType | int], at: float) -> StoredParam:
     """Return the observation of a logged value; as a REAL32 if its type is unknown or cannot hold it."""
-    kind = types.get(param.name, ParamType.REAL32) if param.type_number is None else param.type_number
+    kind = types.get(param.name, ParamType.REAL32) if param.type is None else param.type
     try:
         return StoredParam.of(WrittenParam(param.name, param.value, kind, param.default), at)
     except UsageError:

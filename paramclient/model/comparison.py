@@ -83,8 +83,8 @@ class Difference:
         return (
             left is not None
             and self.right is not None
-            and None not in (left.type_number, self.right.type_number)
-            and left.type_number != self.right.type_number
+            and None not in (left.type, self.right.type)
+            and left.type != self.right.type
         )
 
     @property
@@ -179,8 +179,7 @@ def non_defaults(params: ParamSet) -> ParamSet:
     differing = {
         name: param
         for name, param in params.items()
-        if param.default is not None
-        and not same_value(param, WrittenParam(name, param.default, param.type_number))
+        if param.default is not None and not same_value(param, WrittenParam(name, param.default, param.type))
     }
     return replace(params, params=differing)
 
@@ -196,7 +195,7 @@ def same_value(left: WrittenParam, right: WrittenParam) -> bool:
     Symmetric but not transitive: 16777217 equals 16777217.0, and 16777217.0 equals 16777216.
     """
     if left.is_raw or right.is_raw:
-        types = left.type_number, right.type_number
+        types = left.type, right.type
         return left.settable == right.settable and (None in types or types[0] == types[1])
     if left.value == right.value:  # equal in every type, and the common case: skips the slower comparison
         return True
@@ -220,7 +219,7 @@ def defaults_of(*sets: ParamSet) -> ParamSet:
     for each in sets:
         for name, param in each.items():
             if param.default is not None:
-                default = WrittenParam(name, param.default, param.type_number)
+                default = WrittenParam(name, param.default, param.type)
                 if not same_value(known.setdefault(name, default), default):
                     disputed.add(name)
     kept = {name: param for name, param in known.items() if name not in disputed}
@@ -266,7 +265,7 @@ def _changed_side(
 
 def _common_type(left: WrittenParam, right: WrittenParam) -> ParamType | int | None:
     """Return the type in which to compare two values, or None to compare them as numbers."""
-    kinds = {param.type_number for param in (left, right) if param.type_number is not None}
+    kinds = {param.type for param in (left, right) if param.type is not None}
     if ParamType.REAL32 in kinds:
         return ParamType.REAL32
     if kinds:

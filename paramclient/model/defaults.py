@@ -51,10 +51,10 @@ def default_of(param: Param | WrittenParam, described: WireValue | None = None) 
         return Default(param.default, DefaultSource.VEHICLE)
     if described is None or isinstance(described, bytes):
         return None
-    if param.type_number is None:
+    if param.type is None:
         return Default(described, DefaultSource.METADATA)
     try:
-        value = from_bits(bits_of(described, param.type_number), param.type_number)
+        value = from_bits(bits_of(described, param.type), param.type)
     except UsageError:  # not in the range of the type
         return None
     return None if isinstance(value, bytes) else Default(value, DefaultSource.METADATA)

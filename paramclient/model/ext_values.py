@@ -17,7 +17,6 @@ from paramclient.model.values import (
     byte_length,
     check_number,
     from_bits,
-    type_name,
 )
 
 __all__ = [
@@ -54,7 +53,7 @@ def ext_param(
 
 def ext_bytes(param: Param) -> bytes:
     """Return the bytes of the value of an extended parameter, without zeros at the end of text and bytes."""
-    return param.bits.to_bytes(_SIZES.get(param.type_number, byte_length(param.bits)), "little")
+    return param.bits.to_bytes(_SIZES.get(param.type, byte_length(param.bits)), "little")
 
 
 def check_ext_value(value: Settable) -> WireValue:
@@ -76,7 +75,7 @@ def encode_ext_value(value: WireValue, number: int) -> bytes:
         UsageError: the value does not fit the type: a number only fits a numeric type, text and bytes only
             CUSTOM, and bytes a type that MAVLink does not define.
     """
-    name, is_custom = type_name(number), number == ParamType.CUSTOM
+    name, is_custom = ParamType(number).name, number == ParamType.CUSTOM
     if number in _SIZES:
         if isinstance(value, str | bytes):
             raise UsageError(f"{value!r} is not a number, and the parameter is {name}")
@@ -100,7 +99,7 @@ def parse_ext_value(name: str, text: str, number: int) -> WireValue:
         if isinstance(value, str) and number in _SIZES:
             value = float(text) if number >= ParamType.REAL32 else int(text, 0)
     except ValueError:
-        raise UsageError(f"{name}: {text!r} is not a value of type {type_name(number)}") from None
+        raise UsageError(f"{name}: {text!r} is not a value of type {ParamType(number).name}") from None
     try:
         encode_ext_value(check_ext_value(value), number)
     except UsageError as error:

@@ -43,7 +43,7 @@ def value_json(value: WireValue, number: ParamType | int) -> Scalar:
 
 def value_written(value: WireValue, param: WrittenParam) -> Scalar:
     """Return a written value in strict JSON; without a type, as the number that was written."""
-    return value_json(value, ParamType.REAL64 if param.type_number is None else param.type_number)
+    return value_json(value, ParamType.REAL64 if param.type is None else param.type)
 
 
 def typed(value: WireValue, number: ParamType | int | None) -> tuple[WireValue, ParamType | int]:
@@ -58,15 +58,15 @@ def typed(value: WireValue, number: ParamType | int | None) -> tuple[WireValue, 
 
 def bits_text(param: Param) -> str:
     """Return `Param.bits` as hexadecimal digits: 16 for types of 8 bytes, else 8."""
-    return _digits(param.bits, param.type_number)
+    return _digits(param.bits, param.type)
 
 
 def bits_written(param: WrittenParam) -> str | None:
     """Return a written value's bits as hexadecimal digits; None without a type or beyond its range."""
-    if param.type_number is None:
+    if param.type is None:
         return None
     try:
-        return _digits(param.bits_as(param.type_number), param.type_number)
+        return _digits(param.bits_as(param.type), param.type)
     except UsageError:
         return None
 

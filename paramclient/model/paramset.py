@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import TypeVar, overload
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
 
 from paramclient.errors import UsageError
 from paramclient.model.ext_values import check_ext_value
 from paramclient.model.identity import Identity
-from paramclient.model.names import NameChoice, unknown_name
+from paramclient.model.names import ByName, NameChoice
 from paramclient.model.values import (
     WIRE_SIZE,
     Param,
@@ -21,8 +20,6 @@ from paramclient.model.values import (
     byte_length,
     check_value,
     format_value,
-    known_type,
-    repr_of_param,
     same_bits,
 )
 from paramclient.model.wording import counted
@@ -39,17 +36,16 @@ class WrittenParam:
         value: int for a written whole number, else float. A number without a type is kept as written: only
             the vehicle's own type shows which float32 it becomes (see `bits_as`). Where `is_raw`, the
             unsigned number of the four raw bytes, little-endian.
-        type: `ParamType`, UNKNOWN for a type that MAVLink does not define; None if the source has no types.
+        type: MAV_PARAM_TYPE, also of a number that MAVLink does not define; None if the source has no types.
         default: the firmware's default, or None if the source does not contain it as a number.
         comment: the comment in the file, without the comment character; "" for none.
         line: the line in the source file, from 1; None for other sources. Takes no part in equality.
         is_raw: whether the source has the four raw bytes instead of a number of the type (see
             `Param.is_raw`). Write such a value elsewhere as `settable`, not as `value`.
-        type_number: the number of the type, also of an unknown one; None if the source has no types.
 
     Args:
         value: as the attribute, or the four raw bytes.
-        type: as the attribute, or the number of an unknown type.
+        type: as the attribute, or its number.
     """
 
     name: str
@@ -59,7 +55,6 @@ class WrittenParam:
     comment: str
     line: int | None = field(compare=False)
     is_raw: bool
-    type_number: int | None
 
     def __init__(
         self,
@@ -70,20 +65,14 @@ class WrittenParam:
         comment: str = "",
         line: int | None = None,
         is_raw: bool = False,
-        type_number: int | None = None,
     ) -> None:
-        number = None if type is None else known_type(type or type_number or 0)
-        if isinstance(value, bytes) and (is_raw or number != ParamType.CUSTOM):
+        kind = None if type is None else ParamType(type)
+        if isinstance(value, bytes) and (is_raw or kind != ParamType.CUSTOM):
             value, is_raw = int.from_bytes(value, "little"), True
-        is_known = isinstance(number, ParamType) and not (is_raw and number == ParamType.CUSTOM)
-        kind = None if number is None else ParamType(number) if is_known else ParamType.UNKNOWN
         default = None if isinstance(default, bytes) else default
-        given = (name, value, kind, default, comment, line, is_raw, number)
-        for attribute, each in zip(self.__slots__, given, strict=True):
-            object.__setattr__(self, attribute, each)
-
-    def __repr__(self) -> str:
-        return repr_of_param(self)
+        given = (name, value, kind, default, comment, line, is_raw)
+        for attribute, each in zip(fields(self), given, strict=True):
+            object.__setattr__(self, attribute.name, each)
 
     @property
     def settable(self) -> WireValue:
@@ -96,7 +85,7 @@ class WrittenParam:
     @classmethod
     def of(cls, param: Param) -> WrittenParam:
         """Return the value, type and default of a table's parameter, without index and trust."""
-        return cls(param.name, param.settable, param.type_number, param.default, is_raw=param.is_raw)
+        return cls(param.name, param.settable, param.type, param.default, is_raw=param.is_raw)
 
     def bits_as(self, number: ParamType | int) -> int:
         """Return the bits (see `Param.bits`) of a parameter of this type with this value.
@@ -116,34 +105,37 @@ class WrittenParam:
         if self.is_raw or param.is_raw:
             return self.settable == param.settable
         try:
-            bits = self.bits_as(param.type_number)
+            bits = self.bits_as(param.type)
         except UsageError:
             return False
-        return same_bits(param.type_number, bits, param.bits)
+        return same_bits(param.type, bits, param.bits)
 
     def __str__(self) -> str:
-        kind = ParamType.REAL32 if self.type is None else self.type
+        kind = 0 if self.is_raw else ParamType.REAL32 if self.type is None else self.type
         return f"{self.name} = {format_value(self.settable, kind)}"
 
 
-T = TypeVar("T")
-
-
-def _untyped(name: str, value: WireValue) -> WrittenParam:
-    """Return a plain value; bytes that are not four, and text, are of an extended parameter."""
+def _written(name: str, given: WrittenParam | Param | Settable, is_extended: bool) -> WrittenParam:
+    """Return a parameter. Of plain values, text and bytes that are not four are extended ones."""
+    if isinstance(given, WrittenParam):
+        return given
+    if isinstance(given, Param):
+        return WrittenParam.of(given)
+    value = check_ext_value(given) if is_extended else check_value(given)
     is_raw = isinstance(value, bytes) and len(value) == WIRE_SIZE
     is_custom = isinstance(value, bytes | str) and not is_raw
     return WrittenParam(name, value, ParamType.CUSTOM if is_custom else None)
 
 
 @dataclass(frozen=True, slots=True, init=False)
-class ParamSet(Mapping[str, WrittenParam]):
+class ParamSet(ByName[WrittenParam]):
     """The parameters of one component by name, in the order of the source. Immutable.
 
-    `ParamSet({"MC_ROLL_P": 6.0})` holds plain values, as `Component.set_many` takes them.
+    `ParamSet(component.params)` is a copy of a vehicle's table. `ParamSet({"MC_ROLL_P": 6.0})` holds plain
+    values, as `Component.set_many` takes them.
 
     Attributes:
-        params: the parameters; as an argument, each may also be a plain value.
+        params: the parameters; as an argument, each may also be a `Param` or a plain value.
         component: component id, or None if the source does not contain it (then the autopilot's is meant).
         system: system id, or None if the source does not contain it.
         identity: the vehicle's identity, or None if the source does not contain it.
@@ -162,7 +154,7 @@ class ParamSet(Mapping[str, WrittenParam]):
 
     def __init__(
         self,
-        params: Mapping[str, WrittenParam | Settable],
+        params: Mapping[str, WrittenParam | Param | Settable],
         component: int | None = None,
         system: int | None = None,
         identity: Identity | None = None,
@@ -170,30 +162,10 @@ class ParamSet(Mapping[str, WrittenParam]):
         source: str = "",
         is_extended: bool = False,
     ) -> None:
-        check = check_ext_value if is_extended else check_value
-        written = {
-            name: each if isinstance(each, WrittenParam) else _untyped(name, check(each))
-            for name, each in params.items()
-        }
-        given = {"params": written, "component": component, "system": system, "identity": identity}
-        for attribute, value in {**given, "at": at, "source": source, "is_extended": is_extended}.items():
-            object.__setattr__(self, attribute, value)
-
-    @classmethod
-    def of(
-        cls,
-        params: Iterable[Param],
-        *,
-        component: int | None = None,
-        system: int | None = None,
-        identity: Identity | None = None,
-        at: float | None = None,
-        source: str = "",
-        is_extended: bool = False,
-    ) -> ParamSet:
-        """Return a copy of a table's parameters, such as `component.params.values()`."""
-        written = {param.name: WrittenParam.of(param) for param in params}
-        return cls(written, component, system, identity, at, source, is_extended)
+        written = {name: _written(name, value, is_extended) for name, value in params.items()}
+        given = (written, component, system, identity, at, source, is_extended)
+        for attribute, content in zip(fields(self), given, strict=True):
+            object.__setattr__(self, attribute.name, content)
 
     def only(self, patterns: Iterable[str]) -> ParamSet:
         """Return the set with only the selected parameters.
@@ -204,33 +176,8 @@ class ParamSet(Mapping[str, WrittenParam]):
         Raises:
             UsageError: a pattern matches no name. Without this error, a misspelt name would go unnoticed.
         """
-        chosen, useless = NameChoice(patterns).choose(self.keys())
-        if useless:
-            of = f" of {self.source}" if self.source else ""
-            raise UsageError(f"no parameter{of} is called {useless}")
+        chosen = NameChoice(patterns).choose(self.keys(), f" of {self.source}" if self.source else "")
         return replace(self, params={name: param for name, param in self.items() if name in chosen})
-
-    def __getitem__(self, name: str) -> WrittenParam:
-        try:
-            return self.params[name]
-        except KeyError:
-            raise unknown_name(name, self.params) from None
-
-    @overload
-    def get(self, name: str, /) -> WrittenParam | None: ...
-    @overload
-    def get(self, name: str, default: WrittenParam, /) -> WrittenParam: ...
-    @overload
-    def get(self, name: str, default: T, /) -> WrittenParam | T: ...
-    def get(self, name: str, default: WrittenParam | T | None = None, /) -> WrittenParam | T | None:
-        """Return the parameter with this name, or `default`."""
-        return self.params.get(name, default)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.params)
-
-    def __len__(self) -> int:
-        return len(self.params)
 
     def __repr__(self) -> str:
         origin = f" from {self.source}" if self.source else ""

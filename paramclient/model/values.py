@@ -14,12 +14,9 @@ import struct
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum, StrEnum
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final, SupportsFloat, SupportsIndex, TypeAlias
+from typing import Final, SupportsFloat, SupportsIndex, TypeAlias
 
 from paramclient.errors import UsageError
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 __all__ = [
     "HEX",
@@ -44,11 +41,8 @@ __all__ = [
     "format_value",
     "from_bits",
     "is_portable_name",
-    "known_type",
-    "repr_of_param",
     "same_bits",
     "shortest_float",
-    "type_name",
 ]
 
 Value: TypeAlias = int | float | str | bytes
@@ -65,6 +59,8 @@ HEX: Final = "hex:"
 """Begins the text of a value that is bytes, in hexadecimal."""
 WIRE_SIZE: Final = 4
 """Bytes of the value in PARAM_VALUE and PARAM_SET, of any type."""
+TYPE_NUMBER_MAX: Final = 255
+"""Largest number of a type: param_type has 8 bits."""
 NAME_LENGTH = 16
 """Bytes in param_id. Shorter names end with a NUL, names of 16 bytes have none."""
 PORTABLE_NAMES_CACHED: Final = 4096
@@ -76,10 +72,8 @@ _portable: Final = re.compile(r"(?=[^A-Za-z]*[A-Za-z])(?![@/])(?:(?![#,;=])[!-~]
 
 
 class ParamType(IntEnum):
-    """MAV_PARAM_TYPE."""
+    """MAV_PARAM_TYPE. A number that MAVLink does not define is one too: `ParamType(77).name` is `TYPE_77`."""
 
-    UNKNOWN = 0
-    """A type that MAVLink does not define; `Param.type_number` has its number."""
     UINT8 = 1
     INT8 = 2
     UINT16 = 3
@@ -91,17 +85,26 @@ class ParamType(IntEnum):
     REAL32 = 9
     REAL64 = 10
     CUSTOM = 11
-    """Text or bytes, of extended parameters only (MAV_PARAM_EXT_TYPE). A plain parameter of this number has
-    an unknown type."""
+    """Text or bytes, of extended parameters only (MAV_PARAM_EXT_TYPE). A plain parameter of this number is
+    raw."""
+
+    @classmethod
+    def _missing_(cls, number: object) -> ParamType | None:
+        if not isinstance(number, int) or not 0 <= number <= TYPE_NUMBER_MAX:
+            return None
+        kind = int.__new__(cls, number)
+        kind._name_ = f"TYPE_{number}"
+        kind._value_ = number
+        return kind
 
     @property
     def size(self) -> int:
-        """Size of a value of this type, in bytes; 4, the size in the message, for UNKNOWN and CUSTOM."""
+        """Size of a value of this type, in bytes; 4, the size in the message, for one that is no number."""
         return _LAYOUT[self].size if self in _LAYOUT else WIRE_SIZE
 
     @property
     def is_integer(self) -> bool:
-        return ParamType.UNKNOWN < self < ParamType.REAL32
+        return 0 < self < ParamType.REAL32
 
     @property
     def bounds(self) -> tuple[int, int]:
@@ -110,7 +113,7 @@ class ParamType(IntEnum):
         return (0, (1 << bits) - 1) if self % 2 else (-(1 << (bits - 1)), (1 << (bits - 1)) - 1)
 
 
-_LAYOUT = {ParamType(number): struct.Struct("<" + code) for number, code in enumerate("BbHhIiQqfd", start=1)}
+_LAYOUT = {number: struct.Struct("<" + code) for number, code in enumerate("BbHhIiQqfd", start=1)}
 _FLOAT32 = _LAYOUT[ParamType.REAL32]
 
 
@@ -141,7 +144,7 @@ class Param:
         value: int for integer types, float for REAL32 and REAL64, text or bytes for CUSTOM. A REAL32 is the
             shortest decimal that gives its float32: 6.1, not 6.099999904632568. Where `is_raw`, the unsigned
             number of the four wire bytes, little-endian.
-        type: MAV_PARAM_TYPE; `ParamType.UNKNOWN` for a type that MAVLink does not define.
+        type: MAV_PARAM_TYPE, also of a number that MAVLink does not define.
         index: the component's index of the parameter, or None while unknown (PX4 gives none to parameters
             not in use, ArduPilot none in responses by name).
         bits: the value's own bytes in its type, as a little-endian unsigned number. Two values are
@@ -152,11 +155,10 @@ class Param:
         is_raw: whether the wire bytes cannot be decoded as a number of the type: an unknown type, a 64-bit
             type in the byte-wise encoding, a C-cast float that the integer type cannot hold. Write such a
             value elsewhere as `settable`, not as `value`.
-        type_number: the number of the type, also of an unknown one.
 
     Args:
         value: as the attribute, or the four wire bytes, which make the parameter raw.
-        type: as the attribute, or the number of an unknown type.
+        type: as the attribute, or its number.
     """
 
     name: str
@@ -167,7 +169,6 @@ class Param:
     trust: Trust = Trust.LIVE
     default: Value | None = field(default=None, compare=False)
     is_raw: bool = False
-    type_number: int = 0
 
     def __init__(
         self,
@@ -179,25 +180,18 @@ class Param:
         trust: Trust = Trust.LIVE,
         default: WireValue | None = None,
         is_raw: bool = False,
-        type_number: int = 0,
     ) -> None:
         # The generated __init__ takes twice as long, and every PARAM_VALUE makes a Param.
-        number = known_type(type or type_number)
-        if isinstance(value, bytes) and (is_raw or number != _CUSTOM):
+        if isinstance(value, bytes) and (is_raw or type != _CUSTOM):
             value, is_raw = int.from_bytes(value, "little"), True
-        is_known = isinstance(number, ParamType) and not (is_raw and number == _CUSTOM)
         _set_name(self, name)
         _set_value(self, value)
-        _set_type(self, number if is_known else _UNKNOWN)
+        _set_type(self, _TYPES[type])
         _set_index(self, index)
         _set_bits(self, bits)
         _set_trust(self, trust)
         _set_default(self, None if isinstance(default, bytes) else default)
-        _set_is_raw(self, is_raw or not is_known)
-        _set_type_number(self, number)
-
-    def __repr__(self) -> str:
-        return repr_of_param(self)
+        _set_is_raw(self, is_raw or not 0 < type <= _CUSTOM)
 
     @property
     def settable(self) -> WireValue:
@@ -223,54 +217,31 @@ class Param:
     def same_value(self, other: Param) -> bool:
         """Return whether both have the same value in the same type (−0 equals 0, NaN is compared by bits)."""
         return (
-            self.type_number == other.type_number
+            self.type == other.type
             and self.is_raw == other.is_raw
-            and same_bits(self.type_number, self.bits, other.bits)
+            and same_bits(self.type, self.bits, other.bits)
         )
 
     def __str__(self) -> str:
-        return f"{self.name} = {format_value(self.settable, self.type)}"
+        return f"{self.name} = {format_value(self.settable, 0 if self.is_raw else self.type)}"
 
 
-def repr_of_param(param: DataclassInstance) -> str:
-    """Return the `repr` of a parameter: all fields, and `type_number` only of an unknown type."""
-    shown = [each.name for each in fields(param)]
-    if getattr(param, "type", None) is not ParamType.UNKNOWN:
-        shown.remove("type_number")
-    members = ", ".join(f"{name}={getattr(param, name)!r}" for name in shown)
-    return f"{type(param).__name__}({members})"
-
-
-_UNKNOWN: Final = ParamType.UNKNOWN
 _CUSTOM: Final = int(ParamType.CUSTOM)
 _set_name, _set_value, _set_type, _set_index, _set_bits, *_set_rest = (
     vars(Param)[each.name].__set__ for each in fields(Param)
 )
-_set_trust, _set_default, _set_is_raw, _set_type_number = _set_rest
+_set_trust, _set_default, _set_is_raw = _set_rest
+_TYPES: Final = tuple(map(ParamType, range(TYPE_NUMBER_MAX + 1)))
 
 # Constants for `decode_value`, which runs for every received value: enumeration members are slower than
 # numbers.
 _REAL32 = int(ParamType.REAL32)
 _REAL64 = int(ParamType.REAL64)
 _BYTEWISE = Encoding.BYTEWISE
-_LAYOUTS = {int(kind): layout for kind, layout in _LAYOUT.items()}
-_FITTING = {number: (1 << 8 * each.size) - 1 for number, each in _LAYOUTS.items() if each.size <= 4}
+_FITTING = {number: (1 << 8 * each.size) - 1 for number, each in _LAYOUT.items() if each.size <= 4}
 _BOUNDS = {int(kind): kind.bounds for kind in ParamType if kind.is_integer}
-TYPES_BY_NAME: Final = {kind.name: kind for kind in _LAYOUT}
+TYPES_BY_NAME: Final = {kind.name: kind for kind in map(ParamType, _LAYOUT)}
 """The types of numbers, by name."""
-
-
-def known_type(number: int) -> ParamType | int:
-    """Return the `ParamType` of a number, or the number where MAVLink defines no such type."""
-    return _TYPES[number] if number < len(_TYPES) else number
-
-
-_TYPES: tuple[ParamType | int, ...] = (0, *TYPES_BY_NAME.values(), ParamType.CUSTOM)
-
-
-def type_name(number: ParamType | int) -> str:
-    """Return the name of a type, `INT32`, `REAL32`, …, or `TYPE_77` for an unknown type."""
-    return ParamType(number).name if 1 <= number <= ParamType.CUSTOM else f"TYPE_{number}"
 
 
 def check_name(name: str) -> str:
@@ -410,9 +381,9 @@ def encode_value(value: WireValue, number: int, encoding: Encoding) -> bytes:
     if isinstance(value, bytes):
         return value
     if encoding is Encoding.BYTEWISE:
-        if _LAYOUTS.get(number, _FLOAT32).size > WIRE_SIZE:
+        if _LAYOUT.get(number, _FLOAT32).size > WIRE_SIZE:
             raise UsageError(
-                f"{type_name(number)} takes 8 bytes and PARAM_SET has 4; it cannot be written this way"
+                f"{ParamType(number).name} takes 8 bytes and PARAM_SET has 4; it cannot be written this way"
             )
         return bits_of(value, number).to_bytes(WIRE_SIZE, "little")
     value, kind = _number_of(value, number)
@@ -457,7 +428,7 @@ def from_bits(bits: int, number: int, *, is_raw: bool = False) -> WireValue:
         return _shortest_of_bits(bits)
     if number == _CUSTOM and not is_raw:
         return _text_or_bytes(bits)
-    layout = None if is_raw else _LAYOUTS.get(number)
+    layout = None if is_raw else _LAYOUT.get(number)
     if layout is None:
         return bits.to_bytes(max(WIRE_SIZE, byte_length(bits)), "little")
     value: int | float = layout.unpack(bits.to_bytes(layout.size, "little"))[0]
@@ -497,7 +468,7 @@ def bits_of(value: WireValue, number: int) -> int:
         return int.from_bytes(value.encode() if isinstance(value, str) else value, "little")
     if isinstance(value, bytes):
         check_value(value)
-        return int.from_bytes(value[: _LAYOUTS.get(number, _FLOAT32).size], "little")
+        return int.from_bytes(value[: _LAYOUT.get(number, _FLOAT32).size], "little")
     value, kind = _number_of(value, number)
     if kind is ParamType.REAL32:
         return int.from_bytes(_to_float32(value, kind), "little")
@@ -518,8 +489,8 @@ def _number_of(value: WireValue, number: int) -> tuple[int | float, ParamType]:
     """Return a number and its type; UsageError for a value or a type that is no number."""
     if isinstance(value, str | bytes):
         raise UsageError(f"{value!r} is text, and the parameter is a number")
-    if number not in _LAYOUTS:
-        raise UsageError(f"{type_name(number)} is not a type that MAVLink defines; give the 4 raw bytes")
+    if number not in _LAYOUT:
+        raise UsageError(f"{ParamType(number).name} is not a type that MAVLink defines; give the 4 raw bytes")
     return check_number(value), ParamType(number)
 
 

@@ -370,9 +370,9 @@ def _rows(table: Table) -> list[PackedParam]:
             "the list of parameters has a gap, a name twice, or one that no file can contain"
         )
     params = [table.params[name] for name in names]
-    if inexact := [each.name for each in params if each.is_raw or each.type_number not in PACKABLE]:
+    if inexact := [each.name for each in params if each.is_raw or each.type not in PACKABLE]:
         raise ChecksumUnavailable(f"the exact value of {inexact[0]} is not known")
-    return [PackedParam(each.name, ParamType(each.type_number), each.bits) for each in params]
+    return [PackedParam(each.name, ParamType(each.type), each.bits) for each in params]
 
 
 def may_be_rounded(row: PackedParam) -> bool:

@@ -14,7 +14,6 @@ from paramclient.model.values import (
     bits_of_wire,
     encode_value,
     from_bits,
-    known_type,
 )
 from paramclient.wire import messages
 from paramclient.wire.messages import Message
@@ -81,7 +80,7 @@ class Dialect:
 def _plain_param(name: str, raw: bytes, number: int, index: int | None, encoding: Encoding) -> Param:
     bits, is_raw = bits_of_wire(raw, number, encoding)
     value = from_bits(bits, number, is_raw=is_raw)
-    return Param(name, value, known_type(number), index, bits, is_raw=is_raw)
+    return Param(name, value, number, index, bits, is_raw=is_raw)
 
 
 PLAIN = Dialect(

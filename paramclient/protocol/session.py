@@ -189,7 +189,7 @@ class Session:
                 return
         if name in self.acknowledging and self.table.encoding is Encoding.BYTEWISE:
             known = self.table.params.get(name)
-            if known is not None and known.type_number != number:
+            if known is not None and known.type != number:
                 return
         self.table.store(self.typed(message), now)
 
@@ -203,7 +203,7 @@ class Session:
         is_ack = self.identification.is_ardupilot and message.param_index == NO_INDEX
         if known is None or not is_ack or known.is_raw or message.param_type != ParamType.REAL32:
             return message
-        return message._replace(param_type=known.type_number)
+        return message._replace(param_type=known.type)
 
     def spelled(self, name: str) -> str:
         """Return a name as the vehicle spells it.

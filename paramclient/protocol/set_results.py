@@ -62,7 +62,7 @@ class SetResult:
         return self.status == "adjusted"
 
     def __str__(self) -> str:
-        number = self.param.type_number
+        number = self.param.type
         actual = format_value(self.param.settable, number)
         if self.adjusted:
             return f"{self.name} = {actual} (adjusted from {format_value(self.requested, number)})"

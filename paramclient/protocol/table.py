@@ -167,7 +167,7 @@ class Table:
             new = self._placed(old, place)
         else:
             new = self.dialect.param(name, raw, number, place, self._encoding)
-            if new.type_number == old.type_number:
+            if new.type == old.type:
                 new = replace(new, default=old.default)
         if self._held is not None:
             self._wire[name] = (raw, number)
@@ -281,7 +281,7 @@ class Table:
 
     def _is_reported(self, known: Param, raw: bytes, number: int) -> bool:
         """Return whether these bytes are the component's form of a known value, which may be rounded."""
-        if known.type_number != number or self.dialect is not PLAIN:
+        if known.type != number or self.dialect is not PLAIN:
             return False
         if known.is_raw:
             return int.from_bytes(raw, "little") == known.bits
@@ -318,7 +318,7 @@ class Table:
     def with_default(self, param: Param) -> Param:
         """Return a parameter that was received earlier with the default that is known by now."""
         now = self.params.get(param.name, param)
-        is_new = param.default is None and now.default is not None and now.type_number == param.type_number
+        is_new = param.default is None and now.default is not None and now.type == param.type
         return replace(param, default=now.default) if is_new else param
 
     # trust
@@ -396,7 +396,7 @@ class Table:
             if old is None:
                 self.params[param.name] = param.with_trust(Trust.CACHED)
                 self.moments[param.name] = moments[param.name]
-            elif old.type_number == param.type_number:
+            elif old.type == param.type:
                 index = old.index if old.index is not None or not has_indices else param.index
                 default = old.default if old.default is not None else param.default
                 self.params[param.name] = replace(old, index=index, default=default)

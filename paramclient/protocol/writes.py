@@ -28,7 +28,7 @@ from paramclient.errors import (
 )
 from paramclient.model.identity import autopilot_name, reason_against_non_finite
 from paramclient.model.names import is_group_switch
-from paramclient.model.values import Param, ParamType, Trust, WireValue, format_value, type_name
+from paramclient.model.values import Param, ParamType, Trust, WireValue, format_value
 from paramclient.protocol.channel import Inbox, task_group
 from paramclient.protocol.reads import queue_time, read, read_param, refusal
 from paramclient.protocol.session import ReplacedValue, Session
@@ -267,7 +267,7 @@ class _Write:
             while True:
                 answer = await self._set(inbox)
                 await self._confirm()
-                if answer.type_number != self.before.type_number:
+                if answer.type != self.before.type:
                     self._retype(answer)
                 elif self._is_wanted(answer) or self._is_converted(answer):
                     return self._result(answer)
@@ -319,7 +319,7 @@ class _Write:
         refused = None
         if isinstance(answer, ParamExtAck) and answer.param_result not in EXT_TAKEN:
             refused = self._ext_refusal(answer.param_result)
-        elif isinstance(answer, Param) and answer.type_number == self.before.type_number:
+        elif isinstance(answer, Param) and answer.type == self.before.type:
             return answer
         if not channel.is_silent(self._began):
             with suppress(NoReply):  # only a read shows a changed type, or an extended parameter's value
@@ -345,7 +345,7 @@ class _Write:
         self.attempts += 1
         self._report(None)
         self.session.acknowledging.add(self.name)
-        dialect, number = self.session.dialect, self.before.type_number
+        dialect, number = self.session.dialect, self.before.type
         return dialect.request_set(self.channel.target, self.name, self._raw, number)
 
     def _accept(self, message: Message) -> Param | ParamExtAck | None:
@@ -361,11 +361,11 @@ class _Write:
             return None
         assert isinstance(message, session.dialect.value)
         _, raw, number, _, _ = message = session.typed(message)
-        if (number, raw) == (self.before.type_number, self._raw):
+        if (number, raw) == (self.before.type, self._raw):
             # this value, and not the rounded form of the one before
             session.table.store(message, anyio.current_time(), is_exact=True)
         param = session.dialect.param(self.name, raw, number, None, encoding)
-        if self._is_wanted(param) or number != self.before.type_number:
+        if self._is_wanted(param) or number != self.before.type:
             return param
         self._has_other_value = True
         return None
@@ -380,7 +380,7 @@ class _Write:
 
     def _encode(self) -> None:
         """Set the bytes to send, and the value that proves success."""
-        session, number = self.session, self.before.type_number
+        session, number = self.session, self.before.type
         encoding = session.table.encoding
         self._raw = session.dialect.encode(self.value, number, encoding)
         self.wanted = session.dialect.param(self.name, self._raw, number, None, encoding)
@@ -403,7 +403,7 @@ class _Write:
         if not actual.same_value(param):
             actual = replace(param, index=actual.index, default=actual.default)
         exact = self._is_wanted(param)
-        if exact and actual.type_number != ParamType.REAL32 and not isinstance(self.value, bytes):
+        if exact and actual.type != ParamType.REAL32 and not isinstance(self.value, bytes):
             exact = actual.settable == self.value
         return SetResult(self.name, "accepted" if exact else "adjusted", self.value, actual, self.attempts)
 
@@ -416,7 +416,7 @@ class _Write:
             self._has_new_type = True
             self._encode()
         except UsageError as error:
-            what = f"{self.name} of {self.channel} is {type_name(answer.type_number)} now: {error}"
+            what = f"{self.name} of {self.channel} is {answer.type.name} now: {error}"
             raise TypeMismatch(what, *self.channel.target, name=self.name) from None
 
     def _ext_refusal(self, result: int) -> ExtSetRefused:
@@ -426,7 +426,7 @@ class _Write:
 
     def _not_applied(self, actual: Param) -> ValueNotApplied:
         target, kept = self.channel.target, actual.settable
-        words, sent = (format_value(each, actual.type_number) for each in (kept, self.value))
+        words, sent = (format_value(each, actual.type) for each in (kept, self.value))
         what = f"{self.channel} keeps {self.name} at {words}; {sent} was sent {self.attempts} times"
         return ValueNotApplied(what, *target, name=self.name, requested=self.value, actual=kept)
 

@@ -249,9 +249,7 @@ def _in_no_hidden_group(table: Mapping[str, Param], wanted: Iterable[str]) -> fr
         table: the whole list.
         wanted: the wanted names.
     """
-    switches = [
-        name for name, param in table.items() if param.type_number is ParamType.INT8 and param.settable == 0
-    ]
+    switches = [name for name, param in table.items() if param.type is ParamType.INT8 and param.settable == 0]
     hidden = tuple({start for name in switches for start in _group_prefixes(name)})
     return frozenset(name for name in wanted if name not in table and not name.startswith(hidden))
 

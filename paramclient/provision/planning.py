@@ -25,7 +25,6 @@ from paramclient.model.values import (
     bits_of,
     format_value,
     same_bits,
-    type_name,
 )
 from paramclient.protocol.dialect import EXTENDED, PLAIN
 from paramclient.provision.apply_rules import CATEGORIES, OUT_OF_RANGE, READ_ONLY, Choice, rules_for
@@ -398,7 +397,7 @@ class _Planner:
         name = wanted.name
         current: Param | WrittenParam | None = self.current.get(name)
         before = None if current is None else current.settable
-        kind = wanted.type_number if current is None or current.type_number is None else current.type_number
+        kind = wanted.type if current is None or current.type is None else current.type
         info = self.described.get(name)
         vehicle_type = None if self.identity is None else self.identity.vehicle_type
         needs_reboot = self.rules.needs_reboot(name, vehicle_type)
@@ -525,7 +524,7 @@ class _Planner:
             except UsageError as error:
                 return WRONG, str(error)
             if isinstance(value, float) and kind < ParamType.REAL32 and not value.is_integer():
-                return WRONG, f"{value!r} is not a whole number, and the parameter is {type_name(kind)}"
+                return WRONG, f"{value!r} is not a whole number, and the parameter is {ParamType(kind).name}"
         if target.is_raw and not isinstance(before, bytes):
             return WRONG, f"{format_value(value)} are raw bytes, and the vehicle has a number"
         if isinstance(value, bytes | str):

@@ -41,8 +41,8 @@ NO_DEFAULTS: Final = (
 
 def component_set(component: Component, params: Iterable[Param], source: str) -> ParamSet:
     """Return parameters of a component as a set of this moment; `source` is their origin in words."""
-    return ParamSet.of(
-        params,
+    return ParamSet(
+        {param.name: param for param in params},
         component=component.component,
         system=component.system,
         identity=component.identity,
@@ -98,8 +98,8 @@ def cached_set(table: CachedComponent, *, extended: bool = False, partial: bool 
         source = f"{source}: {are}"
         if not partial:
             raise NotInCache(f"{table.system}/{table.component} is incomplete: {are}")
-    return ParamSet.of(
-        table.params.values(),
+    return ParamSet(
+        table.params,
         component=table.component,
         system=table.system,
         identity=table.identity,

@@ -288,7 +288,7 @@ class Target:
     def outcome(self, found: SetOutcome) -> JsonObject:
         """Return the outcome of a write as JSON."""
         known = self.component.params.get(found.name)
-        kind = ParamType.REAL64 if known is None else known.type_number
+        kind = ParamType.REAL64 if known is None else known.type
         return outcome_json(found, kind, self.info(found.name))
 
     async def values(self, given: Mapping[str, Scalar], *, force: bool = True) -> dict[str, WireValue]:
@@ -309,7 +309,7 @@ class Target:
             value: WireValue | None = each
             if isinstance(each, str) and component.is_extended:
                 known = component.params.get(name) or await component.get(name)
-                value = parse_ext_value(name, each, known.type_number)
+                value = parse_ext_value(name, each, known.type)
             elif isinstance(each, str):
                 value = number_of(each) if info is None else info.parse(each)
             if value is None:

@@ -73,14 +73,14 @@ def rows_of(session: Session) -> Rows | None:
     entries, has_defaults = [], True
     for _, name in sorted(table.names.items()):
         param = table.params[name]
-        if param.is_raw or param.type_number not in PACKABLE:
+        if param.is_raw or param.type not in PACKABLE:
             return None
         default = None
         if param.default is None:
             has_defaults = False
         elif param.is_changed:
-            default = bits_of(param.default, param.type_number)
-        entries.append(PackedParam(name, ParamType(param.type_number), param.bits, default))
+            default = bits_of(param.default, param.type)
+        entries.append(PackedParam(name, ParamType(param.type), param.bits, default))
     if table.hash is None and any(may_be_rounded(row) for row in entries):
         return None
     return Rows(entries, has_defaults)

@@ -108,8 +108,8 @@ def value_of(session: Session, param: Param, *, index: int | None = None) -> Rep
     elif param.is_raw:
         raw = param.bits.to_bytes(WIRE_SIZE, "little")
     else:
-        raw = as_reported(param.bits, param.type_number, session.table.encoding)
-    return session.dialect.value(param.name, raw, param.type_number, count, index)
+        raw = as_reported(param.bits, param.type, session.table.encoding)
+    return session.dialect.value(param.name, raw, param.type, count, index)
 
 
 def digest_of(session: Session) -> messages.ParamValue | None:
@@ -413,7 +413,7 @@ class KeptTable(Stream[Change]):
         askers, params = self._sets[name, raw, number], session.table.params
         if name not in params or params[name].trust is Trust.CACHED:
             await read(session, name)
-        known = params[name].type_number
+        known = params[name].type
         if number != known and (is_extended or session.table.encoding is not Encoding.C_CAST):
             system, component = self.source
             what = f"{name} of {system}/{component} has another type"

@@ -88,7 +88,7 @@ class Camera(Vehicle):
         for name in (*self.failing, *self.slow, *self.limits):
             self.ext_param(name)
         self._supported = {
-            name: {encode_ext_value(value, self.ext_param(name).type_number) for value in values}
+            name: {encode_ext_value(value, self.ext_param(name).type) for value in values}
             for name, values in self.supported.items()
         }
         self._at_work: dict[str, tuple[float, bytes]] = {}
@@ -129,7 +129,7 @@ class Camera(Vehicle):
             UsageError: the camera has no extended parameter with that name, or the value does not fit its
                 type.
         """
-        self._store(name, encode_ext_value(value, self.ext_param(name).type_number))
+        self._store(name, encode_ext_value(value, self.ext_param(name).type))
 
     def add_ext_param(self, name: str, entry: WireValue | tuple[ParamType | int, WireValue]) -> None:
         """Add an extended parameter behind the others; an entry is one of `ExtEntries`.
@@ -172,7 +172,7 @@ class Camera(Vehicle):
         is_change = wanted != ext_bytes(known)
         if name in self._at_work:
             self._send_ack(name, ExtAckResult.IN_PROGRESS)
-        elif request.param_type != known.type_number or name in self.failing:
+        elif request.param_type != known.type or name in self.failing:
             self._send_ack(name, ExtAckResult.FAILED)
         elif wanted not in self._supported.get(name, (wanted,)):
             self._send_ack(name, ExtAckResult.VALUE_UNSUPPORTED)
@@ -186,22 +186,22 @@ class Camera(Vehicle):
 
     def _send_ack(self, name: str, result: ExtAckResult) -> None:
         param = self._ext[name]
-        self.send(messages.ParamExtAck(name, ext_bytes(param), param.type_number, result))
+        self.send(messages.ParamExtAck(name, ext_bytes(param), param.type, result))
 
     def _store(self, name: str, raw: bytes) -> None:
         known = self._ext[name]
-        param = ext_param(name, raw, known.type_number, known.index)
+        param = ext_param(name, raw, known.type, known.index)
         if name in self.limits and isinstance(param.value, int | float):
             low, high = self.limits[name]
             value = type(param.value)(min(max(param.value, low), high))
-            raw = encode_ext_value(value, known.type_number)
-            param = ext_param(name, raw, known.type_number, known.index)
+            raw = encode_ext_value(value, known.type)
+            param = ext_param(name, raw, known.type, known.index)
         self._ext[name] = param
 
     def _send_ext(self, *params: Param | None) -> None:
         for each in filter(None, params):
             data, index = ext_bytes(each), each.index or 0
-            self.send(messages.ParamExtValue(each.name, data, each.type_number, len(self._ext), index))
+            self.send(messages.ParamExtValue(each.name, data, each.type, len(self._ext), index))
 
     def _switch_on(self, at: float) -> None:
         self._at_work.clear()

@@ -22,7 +22,6 @@ from paramclient.model.values import (
     bits_of,
     check_name,
     from_bits,
-    known_type,
 )
 from paramclient.protocol.param_pck import PACKABLE, PackedParam
 
@@ -70,7 +69,7 @@ class SimParam:
 
     def __post_init__(self) -> None:
         check_name(self.name)
-        object.__setattr__(self, "type", known_type(self.type))
+        object.__setattr__(self, "type", ParamType(self.type))
         object.__setattr__(self, "bits", bits_of(self.value, self.type))
 
 

@@ -113,14 +113,14 @@ def test_what_was_received_is_written_with_incomplete_and_the_file_names_the_oth
 def test_values_that_are_no_numbers_are_left_out_of_a_file_that_cannot_hold_them(
     command: Command, put: Put, tmp_path: Path, ending: str
 ) -> None:
-    raw = {"WIDE": (b"\1\0\0\0", ParamType.INT64), "ODD": (b"\2\0\0\0", ParamType.UNKNOWN)}
+    raw = {"WIDE": (b"\1\0\0\0", ParamType.INT64), "ODD": (b"\2\0\0\0", 0)}
     path = tmp_path / f"quad.{ending}"
     saved = command("save", put(Partial({**TABLE, **raw})), path, "--no-cache")
     assert saved.code == 0
     params = read_file(path).choose()
     if ending == "json":
         assert set(params) == {*TABLE, *raw}
-        assert (params["WIDE"].type_number, params["ODD"].type_number) == (ParamType.INT64, 0)
+        assert (params["WIDE"].type, params["ODD"].type) == (ParamType.INT64, 0)
     else:
         assert set(params) == set(TABLE)
         assert "1/1: left out, as only a .json file can hold them: WIDE, ODD" in saved.err

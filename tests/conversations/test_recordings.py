@@ -168,7 +168,7 @@ class Recorded:
 
 def bits(params: dict[str, Param]) -> dict[str, tuple[int, int]]:
     """Return type and bits of the parameters with an index."""
-    return {name: (each.type_number, each.bits) for name, each in params.items() if each.index is not None}
+    return {name: (each.type, each.bits) for name, each in params.items() if each.index is not None}
 
 
 PX4_TABLE = {row.name: (int(row.type), row.bits) for row in px4_table()}
@@ -310,6 +310,6 @@ def test_a_listener_takes_every_value_and_sends_nothing(name: str) -> None:
         assert encoding is (Encoding.BYTEWISE if name.startswith("px4") else Encoding.C_CAST)
         for param_id, raw in last.items():
             held = session.table.params[param_id]
-            assert held.bits == PLAIN.param(param_id, raw, held.type_number, None, encoding).bits
+            assert held.bits == PLAIN.param(param_id, raw, held.type, None, encoding).bits
 
     run(main)

@@ -559,7 +559,7 @@ async def test_a_signed_session_takes_no_forged_and_no_replayed_value(make: type
         result = await fetch_all(session)
         name = vehicle.listed[0].name
         assert not result.missing
-        conversation.hear(ParamValue(name, b"\x9a\x02\0\0", vehicle.listed[0].type_number, 903, 0))
+        conversation.hear(ParamValue(name, b"\x9a\x02\0\0", vehicle.listed[0].type, 903, 0))
         assert session.table.params[name].same_value(vehicle.listed[0])
         report = verifier.report()
         assert report.signed > 5

@@ -27,7 +27,7 @@ from paramclient.errors import (
     ValueNotApplied,
 )
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, type_name
+from paramclient.model.values import ParamType
 from paramclient.protocol.commands import SAVING_TIME
 from paramclient.provision import ApplyStatus, apply, restore
 from tests.live.choice import another_value
@@ -75,7 +75,7 @@ def checks(*, reboots: bool) -> Iterator[Check]:
     yield Check("get of an unknown name", get_unknown, "UnknownParameter")
     for number in (ParamType.INT8, ParamType.INT16, ParamType.INT32, ParamType.REAL32):
         yield Check(
-            f"set, {type_name(number)}",
+            f"set, {ParamType(number).name}",
             partial(set_one, number=number),
             "accepted, and read back",
             writes=True,
@@ -274,7 +274,7 @@ async def expect(error: type[ParamClientError], call: Callable[[], Awaitable[obj
 async def set_one(session: Session, *, number: ParamType) -> str:
     name = session.choice.by_type.get(number)
     if name is None:
-        raise Skip(f"no harmless parameter of type {type_name(number)}")
+        raise Skip(f"no harmless parameter of type {ParamType(number).name}")
     async with session.client() as vehicle:
         param = await vehicle.get(name)
         value = another_value(param)
@@ -420,9 +420,7 @@ async def restore_before(session: Session) -> str:
         raise Skip("no harmless parameters")
     async with session.client() as vehicle:
         await vehicle.fetch_all(timeout=SLOWEST_FETCH)
-        state = ParamSet.of(
-            session.journal.before.values(), component=vehicle.component, identity=vehicle.identity
-        )
+        state = ParamSet(session.journal.before, component=vehicle.component, identity=vehicle.identity)
         for name in names:
             await session.journal.set(vehicle, name, another_value(session.journal.before[name]))
         done = await restore(vehicle, state)

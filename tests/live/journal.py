@@ -63,8 +63,8 @@ class Journal:
         """Take the state before, and write it to the file."""
         self.kind = vehicle.autopilot
         self.before = dict(params)
-        state = ParamSet.of(
-            params.values(),
+        state = ParamSet(
+            params,
             system=vehicle.system,
             component=vehicle.component,
             identity=vehicle.identity,

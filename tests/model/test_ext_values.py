@@ -18,7 +18,7 @@ from paramclient.model.ext_values import (
     ext_bytes,
     ext_param,
 )
-from paramclient.model.values import Param, ParamType, Settable, Value, type_name
+from paramclient.model.values import Param, ParamType, Settable, Value
 
 KINDS = ParamType
 NAN = struct.pack("<f", math.nan)
@@ -52,10 +52,10 @@ def test_values_of_every_type(number: int, value: Value, raw: bytes) -> None:
     assert encode_ext_value(value, number) == raw
     in_message = raw.ljust(EXT_VALUE_SIZE, b"\0")
     param = ext_param("A", in_message, number, 3)
-    assert (param.name, param.type_number, param.index) == ("A", number, 3)
+    assert (param.name, param.type, param.index) == ("A", number, 3)
     assert ext_bytes(param) == encode_ext_value(param.settable, number) == raw
     assert type(param.settable) is type(value)
-    assert param.is_raw == (type_name(number) == f"TYPE_{number}")
+    assert param.is_raw == (ParamType(number).name == f"TYPE_{number}")
     assert param.is_raw or param.value == value
     assert ext_param("A", raw, number, 3) == param
 

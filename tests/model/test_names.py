@@ -38,7 +38,7 @@ def test_suggestions_are_a_sentence() -> None:
 
 def test_upper_and_lower_case_do_not_matter_in_a_selection() -> None:
     choice = NameChoice(["mc_yaw*", "Mpc_xy_p", "ringbuffer"])
-    assert choice.choose(NAMES) == ({"MC_YAWRATE_P", "MC_YAW_P", "MPC_XY_P", "ringBuffer"}, "")
+    assert choice.choose(NAMES) == {"MC_YAWRATE_P", "MC_YAW_P", "MPC_XY_P", "ringBuffer"}
     assert choice.has("mc_yaw_p")
     assert choice.has("MPC_XY_P")
     assert not choice.has("MC_ROLL_P")

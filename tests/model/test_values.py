@@ -32,7 +32,7 @@ from paramclient.model.values import (
 from paramclient.protocol.dialect import PLAIN
 
 BYTEWISE, C_CAST = Encoding.BYTEWISE, Encoding.C_CAST
-KNOWN = [kind for kind in ParamType if kind is not ParamType.UNKNOWN]
+KNOWN = list(ParamType)
 INTEGERS = [kind for kind in ParamType if kind.is_integer]
 SMALL = [kind for kind in INTEGERS if kind.size <= 4]
 UNDEFINED = [0, 77, 255]
@@ -77,19 +77,19 @@ def param(bits: int = 0x3F800000, value: WireValue = 1.0, kind: int = ParamType.
 @pytest.mark.parametrize("number", UNDEFINED)
 def test_a_param_of_an_unknown_type_has_a_number_and_is_raw(number: int) -> None:
     param = Param("X", b"\x01\x02\x03\x84", number, None, 0x84030201)
-    assert (param.type, param.type_number) == (ParamType.UNKNOWN, number)
+    assert (param.type, param.type.name) == (number, f"TYPE_{number}")
     assert (param.value, param.is_raw, param.settable) == (0x84030201, True, b"\x01\x02\x03\x84")
     assert str(param) == "X = 0x84030201"
     assert param == Param("X", 0x84030201, number, None, 0x84030201)
     assert param != Param("X", b"\x01\x02\x03\x84", 200, None, 0x84030201)
 
 
-def test_a_plain_param_of_the_type_custom_is_one_of_an_unknown_type() -> None:
+def test_a_plain_param_of_the_type_custom_is_raw() -> None:
     param = PLAIN.param("X", b"abc\n", 11, None, Encoding.BYTEWISE)
-    assert (param.type, param.type_number, param.is_raw) == (ParamType.UNKNOWN, 11, True)
+    assert (param.type, param.is_raw) == (11, True)
     assert (param.settable, str(param)) == (b"abc\n", "X = 0x0a636261")
     written = WrittenParam.of(param.with_trust(Trust.CACHED))
-    assert (written.type, written.is_raw, written.settable) == (ParamType.UNKNOWN, True, b"abc\n")
+    assert (written.type, written.is_raw, written.settable) == (11, True, b"abc\n")
     assert written.is_held_by(param)
 
 

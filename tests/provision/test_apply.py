@@ -441,7 +441,7 @@ async def test_the_state_of_another_vehicle_is_refused() -> None:
         component = await client.component()
         await component.fetch_all()
         await component.wait_until_identified(10.0)
-        state = ParamSet.of(component.params.values(), identity=component.identity)
+        state = ParamSet(component.params, identity=component.identity)
     async with a_client(ardupilot()) as client:
         component = await client.component()
         await component.fetch_all()

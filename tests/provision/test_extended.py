@@ -36,7 +36,7 @@ def wanted(camera: Camera, **values: Value) -> ParamSet:
     other = Camera({name: (param.type, param.value) for name, param in camera.ext_params.items()})
     for name, value in values.items():
         other.set_ext_param(name, value)
-    return ParamSet.of((other.ext_params[name] for name in values), is_extended=True)
+    return ParamSet({name: other.ext_params[name] for name in values}, is_extended=True)
 
 
 @in_simulated_time

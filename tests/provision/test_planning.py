@@ -351,7 +351,7 @@ def test_a_plan_for_the_saved_table_of_a_vehicle_has_no_steps() -> None:
     """The table saved from a vehicle needs no write."""
     for table, autopilot in ((px4_table(), "px4"), (ardupilot_table(), "ardupilot")):
         current = copy_of(table)
-        wanted = ParamSet.of(current.values())
+        wanted = ParamSet(current)
         made = plan_from(current, wanted, autopilot=autopilot)
         assert made.complete
         assert not made.to_write
@@ -363,7 +363,7 @@ def test_a_plan_for_the_saved_table_of_a_vehicle_has_no_steps() -> None:
 
 def test_a_file_of_another_component_is_refused() -> None:
     camera = ParamSet({"A": WrittenParam("A", 1)}, component=100, source="cam.params")
-    autopilot = ParamSet.of(held(A=2).values(), component=1)
+    autopilot = ParamSet(held(A=2), component=1)
     with pytest.raises(
         UsageError, match=r"parameters of cam.params are those of component 100, not of component 1"
     ):

@@ -561,7 +561,7 @@ async def test_rule_3_a_change_during_an_answer_is_in_it() -> None:
         await anyio.sleep(0.5)
         [*_, last] = [each for each in station.of(ParamValue) if each.param_id == name]
         param = component.params[name]
-        assert last.raw == encode_value(param.settable, param.type_number, component.encoding)
+        assert last.raw == encode_value(param.settable, param.type, component.encoding)
         assert {each.param_count for each in station.of(ParamValue)} == {component.count}
 
 
@@ -1183,7 +1183,7 @@ async def test_twenty_stations_and_ten_vehicles() -> None:
             for vehicle in vehicles:
                 known = {value.param_id: value.raw for value in each.of(ParamValue, system=vehicle.system)}
                 wanted = {
-                    param.name: encode_value(param.settable, param.type_number, Encoding.BYTEWISE)
+                    param.name: encode_value(param.settable, param.type, Encoding.BYTEWISE)
                     for param in vehicle.listed
                 }
                 assert {name: known[name] for name in wanted} == wanted

@@ -17,7 +17,6 @@ from paramclient.model.values import (
     decode_value,
     encode_value,
     from_bits,
-    known_type,
 )
 from paramclient.protocol import param_pck
 from paramclient.protocol.ftp import Opcode, Packet
@@ -53,7 +52,7 @@ def params(values: Iterable[messages.ParamValue], encoding: Encoding) -> list[Pa
     for value in values:
         if value.param_index != messages.NO_INDEX:
             number, bits = decode_value(value.raw, value.param_type, encoding)
-            found.append(Param(value.param_id, number, known_type(value.param_type), value.param_index, bits))
+            found.append(Param(value.param_id, number, value.param_type, value.param_index, bits))
     return found
 
 
