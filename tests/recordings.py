@@ -38,7 +38,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
-from paramclient.model.identity import Identity
+from paramclient.model.identity import Identity, commit_text, hardware_id
 from paramclient.model.values import WireValue
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.sim import Vehicle
@@ -102,15 +102,14 @@ def identity_in(name: str, autopilot: int) -> Identity:
     version = next(
         message for _, message in from_vehicle(name) if isinstance(message, messages.AutopilotVersion)
     )
-    return Identity.from_version(
+    return Identity(
         system=1,
         link="udpin:0.0.0.0:14550",
+        uid=hardware_id(version.uid, version.uid2),
         autopilot=autopilot,
         vehicle_type=2,
-        uid=version.uid,
-        uid2=version.uid2,
         firmware=version.flight_sw_version,
-        git_hash=version.git_hash,
+        git_hash=commit_text(version.git_hash),
         board=version.board_version,
         vendor_id=version.vendor_id,
         product_id=version.product_id,

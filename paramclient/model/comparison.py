@@ -6,7 +6,7 @@ Has no knowledge of vehicles, files or time: every source that gives a `ParamSet
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -79,13 +79,8 @@ class Difference:
     @property
     def types_differ(self) -> bool:
         """Whether both sides have a type and the types differ. `INT32 1` equals `REAL32 1.0`."""
-        left = self.left
-        return (
-            left is not None
-            and self.right is not None
-            and None not in (left.type, self.right.type)
-            and left.type != self.right.type
-        )
+        types = {each.type for each in (self.left, self.right) if each is not None and each.type is not None}
+        return len(types) == 2
 
     @property
     def is_rounding(self) -> bool:
@@ -96,17 +91,11 @@ class Difference:
         """
         if self.status is not DifferenceStatus.DIFFERENT or self.left is None or self.right is None:
             return False
-        if self.left.is_raw or self.right.is_raw:
+        values = self.left.settable, self.right.settable
+        if not all(isinstance(each, int) for each in values):
             return False
-        left, right = self.left.value, self.right.value
-        if not (isinstance(left, int) and isinstance(right, int)):
-            return False
-        rounded = _bits(left, ParamType.REAL32)
-        return (
-            rounded is not None
-            and rounded == _bits(right, ParamType.REAL32)
-            and from_bits(rounded, ParamType.REAL32) in (left, right)
-        )
+        rounded, other = (_bits(each, ParamType.REAL32) for each in values)
+        return rounded is not None and rounded == other and from_bits(rounded, ParamType.REAL32) in values
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,18 +158,19 @@ def compare(
     """
     chosen = left.keys() | right.keys()
     if names is not None:
-        chosen = _chosen(chosen, [names] if isinstance(names, str) else names)
-    entries = (_compared(name, left.get(name), right.get(name), base) for name in sorted(chosen))
+        given = [names] if isinstance(names, str) else names
+        chosen = NameChoice(given).choose(chosen, " of either side")
+    entries = []
+    for name in sorted(chosen):
+        ours, theirs, before = left.get(name), right.get(name), None if base is None else base.get(name)
+        entries.append(Difference(name, ours, theirs, before, *_judge(ours, theirs, before)))
     return Comparison(left, right, base, tuple(entries))
 
 
 def non_defaults(params: ParamSet) -> ParamSet:
     """Return the parameters that differ from the firmware's defaults, as far as these are known."""
-    differing = {
-        name: param
-        for name, param in params.items()
-        if param.default is not None and not same_value(param, WrittenParam(name, param.default, param.type))
-    }
+    defaults = {name: default for name, param in params.items() if (default := _default_of(param))}
+    differing = {name: params[name] for name in defaults if not same_value(params[name], defaults[name])}
     return replace(params, params=differing)
 
 
@@ -218,49 +208,31 @@ def defaults_of(*sets: ParamSet) -> ParamSet:
     disputed: set[str] = set()
     for each in sets:
         for name, param in each.items():
-            if param.default is not None:
-                default = WrittenParam(name, param.default, param.type)
-                if not same_value(known.setdefault(name, default), default):
-                    disputed.add(name)
+            default = _default_of(param)
+            if default is not None and not same_value(known.setdefault(name, default), default):
+                disputed.add(name)
     kept = {name: param for name, param in known.items() if name not in disputed}
     return ParamSet(kept, source="the firmware's defaults")
 
 
-def _chosen(known: Collection[str], patterns: Iterable[str]) -> set[str]:
-    chosen, useless = NameChoice(patterns).choose(known)
-    if useless:
-        raise UsageError(f"no parameter of either side is called {useless}")
-    return chosen
+def _default_of(param: WrittenParam) -> WrittenParam | None:
+    """Return a parameter with its default as the value; None if that is not known."""
+    return None if param.default is None else WrittenParam(param.name, param.default, param.type)
 
 
-def _compared(
-    name: str, left: WrittenParam | None, right: WrittenParam | None, base: ParamSet | None
-) -> Difference:
-    before = None if base is None else base.get(name)
-    status = _status(left, right)
-    return Difference(name, left, right, before, status, _changed_side(left, right, before, status))
-
-
-def _status(left: WrittenParam | None, right: WrittenParam | None) -> DifferenceStatus:
-    if right is None:
-        return DifferenceStatus.ONLY_LEFT
-    if left is None:
-        return DifferenceStatus.ONLY_RIGHT
-    return DifferenceStatus.SAME if same_value(left, right) else DifferenceStatus.DIFFERENT
-
-
-def _changed_side(
-    left: WrittenParam | None, right: WrittenParam | None, base: WrittenParam | None, status: DifferenceStatus
-) -> ChangedSide | None:
+def _judge(
+    left: WrittenParam | None, right: WrittenParam | None, base: WrittenParam | None
+) -> tuple[DifferenceStatus, ChangedSide | None]:
+    if left is None or right is None:
+        status = DifferenceStatus.ONLY_RIGHT if left is None else DifferenceStatus.ONLY_LEFT
+    else:
+        status = DifferenceStatus.SAME if same_value(left, right) else DifferenceStatus.DIFFERENT
     if base is None:
-        return None
-    is_left_changed = left is not None and not same_value(left, base)
-    is_right_changed = right is not None and not same_value(right, base)
-    if is_left_changed and is_right_changed:
-        return ChangedSide.BOTH if status is DifferenceStatus.SAME else ChangedSide.CONFLICT
-    if is_left_changed:
-        return ChangedSide.LEFT
-    return ChangedSide.RIGHT if is_right_changed else ChangedSide.NEITHER
+        return status, None
+    is_left, is_right = (each is not None and not same_value(each, base) for each in (left, right))
+    if is_left and is_right:
+        return status, ChangedSide.BOTH if status is DifferenceStatus.SAME else ChangedSide.CONFLICT
+    return status, ChangedSide.LEFT if is_left else ChangedSide.RIGHT if is_right else ChangedSide.NEITHER
 
 
 def _common_type(left: WrittenParam, right: WrittenParam) -> ParamType | int | None:

@@ -9,6 +9,7 @@ __all__ = [
     "PX4_SITL_UID",
     "Identity",
     "autopilot_name",
+    "commit_text",
     "hardware_id",
     "has_autopilot",
     "is_sitl_uid",
@@ -51,7 +52,7 @@ class Identity:
         autopilot: MAV_AUTOPILOT of the heartbeat.
         vehicle_type: MAV_TYPE of the heartbeat.
         firmware: flight_sw_version; 0 while unknown, like the following attributes.
-        git_hash: the commit of the firmware, as many digits as the vehicle sends; "" while unknown.
+        git_hash: the commit of the firmware (see `commit_text`); "" while unknown.
         board: board_version.
         vendor_id, product_id: of the board.
         capabilities: MAV_PROTOCOL_CAPABILITY bits.
@@ -68,49 +69,6 @@ class Identity:
     vendor_id: int = 0
     product_id: int = 0
     capabilities: int = 0
-
-    @classmethod
-    def from_version(
-        cls,
-        *,
-        system: int,
-        link: str,
-        autopilot: int,
-        vehicle_type: int,
-        uid: int = 0,
-        uid2: bytes = b"",
-        firmware: int = 0,
-        git_hash: bytes = b"",
-        board: int = 0,
-        vendor_id: int = 0,
-        product_id: int = 0,
-        capabilities: int = 0,
-    ) -> Identity:
-        """Build an identity from the fields of AUTOPILOT_VERSION.
-
-        Args:
-            uid: the older hardware id, 64 bits; used if `uid2` is all zero.
-            uid2: the hardware id, 18 bytes.
-            git_hash: flight_custom_version, 8 bytes: ArduPilot writes the hash as text, PX4 as a
-                little-endian number (both measured).
-        """
-        hardware = hardware_id(uid, uid2)
-        commit = git_hash.rstrip(b"\0")
-        if not _HEX_DIGITS.issuperset(commit):
-            commit = git_hash[::-1].hex().encode()
-        return cls(
-            system=system,
-            link=link,
-            uid=hardware,
-            autopilot=autopilot,
-            vehicle_type=vehicle_type,
-            firmware=firmware,
-            git_hash=commit.decode("ascii"),
-            board=board,
-            vendor_id=vendor_id,
-            product_id=product_id,
-            capabilities=capabilities,
-        )
 
     @property
     def key(self) -> str:
@@ -165,6 +123,15 @@ def hardware_id(uid: int, uid2: bytes) -> str | None:
         uid2: the hardware id, 18 bytes.
     """
     return uid2.hex() if any(uid2) else f"{uid:016x}" if uid else None
+
+
+def commit_text(git_hash: bytes) -> str:
+    """Return flight_custom_version as the commit, with as many digits as the vehicle sends.
+
+    ArduPilot writes the hash as text, PX4 as a little-endian number (both measured).
+    """
+    commit = git_hash.rstrip(b"\0")
+    return commit.decode("ascii") if _HEX_DIGITS.issuperset(commit) else git_hash[::-1].hex()
 
 
 def has_autopilot(autopilot: int) -> bool:

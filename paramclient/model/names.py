@@ -111,8 +111,13 @@ def nearest_names(name: str, names: Iterable[str]) -> tuple[str, ...]:
     head, tail = wanted[:AFFIX_LENGTH], wanted[-AFFIX_LENGTH:]
     others = {other.upper(): other for other in names if other not in (name, "")}
     near = [upper for upper in others if upper.startswith(head) or upper.endswith(tail)]
-    found = difflib.get_close_matches(wanted, near, SIMILAR_NAMES_MAX, SIMILARITY_MIN)
-    return tuple(others[upper] for upper in found)
+    matcher = difflib.SequenceMatcher(b=wanted)
+    scored = []
+    for upper in near:
+        matcher.set_seq1(upper)
+        if matcher.quick_ratio() >= SIMILARITY_MIN and (ratio := matcher.ratio()) >= SIMILARITY_MIN:
+            scored.append((-ratio, others[upper]))
+    return tuple(other for _, other in sorted(scored)[:SIMILAR_NAMES_MAX])
 
 
 def did_you_mean(nearest: Sequence[str]) -> str:
@@ -123,10 +128,10 @@ def did_you_mean(nearest: Sequence[str]) -> str:
     return f"; did you mean {', '.join(others)} or {last}?" if others else f"; did you mean {last}?"
 
 
-P = TypeVar("P")
+AnyHeld = TypeVar("AnyHeld")
 
 
-class ByName(Mapping[str, P]):
+class ByName(Mapping[str, AnyHeld]):
     """Base of the mappings of parameters by name. An iteration is over the names at its start.
 
     Attributes:
@@ -134,9 +139,9 @@ class ByName(Mapping[str, P]):
     """
 
     __slots__ = ()
-    params: Mapping[str, P]
+    params: Mapping[str, AnyHeld]
 
-    def __getitem__(self, name: str) -> P:
+    def __getitem__(self, name: str) -> AnyHeld:
         try:
             return self.params[name]
         except KeyError:

@@ -9,7 +9,7 @@ from typing import Final
 import anyio
 
 from paramclient.errors import CommandResult, NoReply
-from paramclient.model.identity import Identity
+from paramclient.model.identity import Identity, commit_text, hardware_id
 from paramclient.model.values import Encoding
 from paramclient.protocol.channel import Channel
 from paramclient.wire import messages
@@ -182,15 +182,11 @@ class Identification:
     def version(self, message: messages.AutopilotVersion) -> bool:
         """Take an AUTOPILOT_VERSION, and return whether it is another vehicle's than the last one."""
         before = self.identity
-        self.identity = Identity.from_version(
-            system=before.system,
-            link=before.link,
-            autopilot=self.autopilot or 0,
-            vehicle_type=self.vehicle_type or 0,
-            uid=message.uid,
-            uid2=message.uid2,
+        self.identity = replace(
+            before,
+            uid=hardware_id(message.uid, message.uid2),
             firmware=message.flight_sw_version,
-            git_hash=message.git_hash,
+            git_hash=commit_text(message.git_hash),
             board=message.board_version,
             vendor_id=message.vendor_id,
             product_id=message.product_id,

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from paramclient.model.identity import PX4_SITL_UID, Identity, is_sitl_uid
+from paramclient.model.identity import PX4_SITL_UID, Identity, hardware_id, is_sitl_uid
 from tests.recordings import identity_in
 
 
@@ -65,9 +65,7 @@ def test_a_hardware_id_of_px4_sitl_follows_the_system_id() -> None:
     def sitl(system: int) -> Identity:
         uid2 = bytes([system - 1, *bytes(17)])
         uid = int(PX4_SITL_UID, 16) + system - 1
-        return Identity.from_version(
-            system=system, link="udp", autopilot=12, vehicle_type=2, uid=uid, uid2=uid2
-        )
+        return Identity(system, "udp", hardware_id(uid, uid2), autopilot=12, vehicle_type=2)
 
     first, second = sitl(1), sitl(7)
     assert (first.uid, second.uid) == (PX4_SITL_UID, "06" + "00" * 17)
