@@ -105,6 +105,8 @@ class BaseLink(ABC):
         except BaseException as error:
             if opening == self._openings:
                 await self._end("closed")
+            elif isinstance(error, OSError):
+                self._check(opening)
             if isinstance(error, OSError) and not isinstance(error, LinkError):
                 raise self._error(self._refusal(error)) from error
             raise

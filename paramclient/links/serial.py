@@ -3,8 +3,8 @@
 The library serialx, which the extra `serial` installs, opens and configures the port: 8 data bits, no parity,
 one stop bit, no flow control. The default and the limits of the baud rate are in `names`. On POSIX systems,
 bytes then go through the port's non-blocking file descriptor, like through the sockets of other links, on
-every event loop that anyio supports. Windows has no such descriptors: there serialx's own transport moves the
-bytes, which only asyncio can run.
+every event loop that anyio supports. Windows has no such descriptors: there serialx's asyncio interface moves
+the bytes.
 
 An open port is exclusive: two programs on one port would each receive a part of the bytes. DTR and RTS are
 raised on opening, and lowered when the last program closes the port. Linux and pyserial do the same, and with
@@ -18,9 +18,8 @@ from __future__ import annotations
 import errno
 import os
 import sys
-import threading
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import anyio
 import anyio.lowlevel
@@ -39,7 +38,7 @@ if sys.platform != "win32":
 if TYPE_CHECKING:
     import serialx
 
-__all__ = ["SerialDevice", "SerialLink", "open_port"]
+__all__ = ["AsyncioPort", "SerialDevice", "SerialLink", "open_here"]
 
 READ_SIZE: Final = 65536
 """Bytes per read. Linux holds 4,095 for a reader, and bytes that arrive meanwhile in the driver."""
@@ -156,50 +155,78 @@ class _Port(Protocol):
 
 
 async def open_port(device: str, baud: int) -> _Port:
-    """Open a port, as this system does.
+    """Open a port.
 
     Raises:
         OSError, UsageError: it cannot be opened.
     """
-    if sys.platform == "win32":
-        from paramclient.links.serial_transport import Transport  # imported here because it imports asyncio
+    import serialx  # imported here: needs the extra, and takes long to load
 
-        return await Transport.opened(device, baud)
+    try:
+        return await open_here(device, baud)
+    except serialx.UnsupportedSetting as error:
+        raise UsageError(f"{device}: this system does not support {baud} baud") from error
+    except RuntimeError as error:  # of drivers that do not report the rate that they set
+        raise OSError(errno.EINVAL, os.strerror(errno.EINVAL)) from error
+
+
+async def open_here(device: str, baud: int) -> _Port:
+    """Open a port, as this system does."""
+    if sys.platform == "win32":
+        return await AsyncioPort.opened(device, baud)
     else:  # noqa: RET505 - with else, the type checker of each system skips the other branch
-        return await _Descriptor.opened(device, baud)
+        return await anyio.to_thread.run_sync(_Descriptor, device, baud)
+
+
+class AsyncioPort:
+    """A port of serialx's asyncio interface, for Windows."""
+
+    def __init__(self, port: serialx.AsyncSerial) -> None:
+        self._port = port
+
+    @classmethod
+    async def opened(cls, device: str, baud: int) -> AsyncioPort:
+        """Open a port. OSError if that fails."""
+        import serialx
+
+        options: Any = {"baudrate": baud}
+        port = serialx.async_serial_for_url(device, **options)
+        await port.open()
+        port.transport.set_write_buffer_limits(high=0)
+        return cls(port)
+
+    async def read(self) -> bytes:
+        """See `_Port`."""
+        return await self._port.read(READ_SIZE)
+
+    async def write(self, data: bytes) -> None:
+        """See `_Port`."""
+        await self._port.write(data)
+
+    async def close(self) -> None:
+        """See `_Port`."""
+        self._port.abort()
+        with anyio.move_on_after(CLOSE_TIMEOUT, shield=True):
+            await self._port.wait_closed()
 
 
 if sys.platform != "win32":
 
     class _Descriptor:
-        """A port as a non-blocking file descriptor."""
+        """A port as a non-blocking file descriptor. Opening and closing may block."""
 
-        def __init__(self, serial: serialx.BaseSerial) -> None:
-            self._serial = serial
-            self._file = serial.fileno()
+        def __init__(self, device: str, baud: int) -> None:
+            import serialx
 
-        @classmethod
-        async def opened(cls, device: str, baud: int) -> _Descriptor:
-            """Open a port in a thread. A port that opens after cancellation is closed again."""
-            ports: list[_Descriptor] = []
-            is_abandoned = threading.Event()
-
-            def release() -> None:
-                with suppress(IndexError):  # the thread and the caller may both come here
-                    ports.pop()._release()
-
-            def work() -> None:
-                ports.append(cls._open(device, baud))
-                if is_abandoned.is_set():
-                    release()
-
+            self._serial = serialx.serial_for_url(device, baud)
+            self._serial.open()
+            self._file = self._serial.fileno()
             try:
-                await anyio.to_thread.run_sync(work, abandon_on_cancel=True)
-            except BaseException:
-                is_abandoned.set()
-                release()
+                # serialx's lock is advisory; TIOCEXCL makes open fail for every other program.
+                fcntl.ioctl(self._file, termios.TIOCEXCL)
+            except OSError:
+                self._serial.close()
                 raise
-            return ports.pop()
 
         async def read(self) -> bytes:
             with suppress(anyio.ClosedResourceError):
@@ -222,25 +249,6 @@ if sys.platform != "win32":
             anyio.notify_closing(self._file)
             with anyio.move_on_after(CLOSE_TIMEOUT, shield=True):
                 await anyio.to_thread.run_sync(self._release, abandon_on_cancel=True)
-
-        @classmethod
-        def _open(cls, device: str, baud: int) -> _Descriptor:
-            import serialx  # imported here: needs the extra, and takes long to load
-
-            serial = serialx.serial_for_url(device, baud)
-            try:
-                serial.open()
-            except serialx.UnsupportedSetting as error:
-                raise UsageError(f"{device}: this system does not support {baud} baud") from error
-            except RuntimeError as error:  # of drivers that do not report the rate that they set
-                raise OSError(errno.EINVAL, os.strerror(errno.EINVAL)) from error
-            try:
-                # serialx's lock is advisory; TIOCEXCL makes open fail for every other program.
-                fcntl.ioctl(serial.fileno(), termios.TIOCEXCL)
-            except OSError:
-                serial.close()
-                raise
-            return cls(serial)
 
         def _release(self) -> None:
             with suppress(OSError, termios.error):  # the device may be unplugged

@@ -13,8 +13,9 @@ import anyio
 import anyio.abc
 import anyio.lowlevel
 
+from paramclient.errors import UsageError
 from paramclient.links.link import BaseLink, Link, Peer
-from paramclient.links.names import LinkSpec
+from paramclient.links.names import FAULT_OPTIONS, LinkSpec
 
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint, Vehicle
@@ -113,8 +114,10 @@ def simulated(spec: LinkSpec) -> SimLink:
 
     kinds: dict[str, Callable[..., Vehicle]]
     kinds = {"px4": sim.PX4Vehicle, "ardupilot": sim.ArduPilotVehicle, "camera": sim.Camera}
-    faults: dict[str, Any] = dict(spec.options)
-    options = {key: faults.pop(key) for key in ("system", "param_error", "metadata") if key in faults}
+    options: dict[str, Any] = dict(spec.options)
+    faults = {key: options.pop(key) for key in FAULT_OPTIONS if key in options}
+    if "metadata" in options and spec.host != "px4":
+        raise UsageError(f"{spec}: option metadata is for sim:px4; other vehicles describe no parameters")
     vehicle = kinds[spec.host](**options)
     return SimLink(sim.Air.symmetric([vehicle], **faults) if faults else vehicle, spec.name)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import selectors
 import socket
 import sys
 from collections.abc import Callable
@@ -14,7 +13,7 @@ from typing import Final, NamedTuple
 import anyio
 import anyio.lowlevel
 
-from paramclient.links.link import OPEN_TIMEOUT, Address, Peer, SocketLink, claim, close_socket
+from paramclient.links.link import Peer, SocketLink, claim, close_socket
 from paramclient.links.names import LinkSpec
 from paramclient.links.refusals import reason
 
@@ -81,20 +80,15 @@ class TcpOut(SocketLink):
                 await self._fail(opening, f"connection to {self._target} lost: {reason(error)}", error)
 
     async def _open(self, opening: int) -> None:
-        candidates = await self._resolve(socket.SOCK_STREAM)
-        for family, address in candidates:
-            sock = socket.socket(family, socket.SOCK_STREAM)
-            self._adopt(sock, opening)
-            _set_up(sock)
-            try:
-                with anyio.fail_after(OPEN_TIMEOUT / len(candidates)):
-                    await _connect(sock, address)
-            except OSError:
-                self._check(opening)
-                if address is candidates[-1][1]:
-                    raise
-            else:
-                break
+        family, address = (await self._resolve(socket.SOCK_STREAM))[0]
+        sock = socket.socket(family, socket.SOCK_STREAM)
+        self._adopt(sock, opening)
+        _set_up(sock)
+        with suppress(BlockingIOError):
+            sock.connect(address)
+        await _writable(sock)
+        if status := sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+            raise OSError(status, os.strerror(status))
         self._peer = self._peer._replace(number=self._peer.number + 1)
 
 
@@ -110,27 +104,28 @@ class TcpIn(SocketLink):
 
     def __init__(self, spec: LinkSpec) -> None:
         super().__init__(spec)
-        self._selector: selectors.BaseSelector | None = None
         self._clients: dict[Peer, socket.socket] = {}
         self.accepted: Callable[[Peer], object] = lambda peer: None
         self._accepted = 0
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`: up to `READ_SIZE` bytes from each readable connection."""
-        listener, selector, opening = self._socket, self._selector, self._openings
-        assert selector is not None
+        listener, opening = self._socket, self._openings
         batch: list[tuple[Peer, bytes]] = []
         while not batch:
-            if (file := _file_of(selector)) is not None:
-                await self._readable(file, opening)
-            else:
-                await self._any_readable([listener, *self._clients.values()])
-                self._check(opening)
-            for key, _ in selector.select(0):
-                if key.data is None:
-                    self._accept(listener, selector)
-                else:
-                    batch += self._read(key.data, selector)
+            async with anyio.create_task_group() as tasks:
+
+                async def wait(sock: socket.socket) -> None:
+                    with suppress(anyio.ClosedResourceError):
+                        await anyio.wait_readable(sock)
+                    tasks.cancel_scope.cancel()
+
+                for sock in (listener, *self._clients.values()):
+                    tasks.start_soon(wait, sock)
+            self._check(opening)
+            self._accept(listener)
+            for peer in tuple(self._clients):
+                batch += self._read(peer)
         return batch
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
@@ -140,7 +135,8 @@ class TcpIn(SocketLink):
         """
         await anyio.lowlevel.checkpoint()
         opening = self._opened()
-        for client in self._destinations(peer):
+        known = self._clients.values() if peer is None else filter(None, [self._clients.get(peer)])
+        for client in tuple(known):
             try:
                 await _send_all(client, data)
             except OSError:
@@ -159,42 +155,18 @@ class TcpIn(SocketLink):
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind(address)
         listener.listen()
-        self._selector = selectors.DefaultSelector()
-        self._selector.register(listener, selectors.EVENT_READ)
 
     async def _release(self) -> None:
         await super()._release()
-        if self._selector is not None:
-            if (file := _file_of(self._selector)) is not None:
-                anyio.notify_closing(file)
-            self._selector.close()
-            self._selector = None
         while self._clients:
-            _, client = self._clients.popitem()
-            close_socket(client)
+            close_socket(self._clients.popitem()[1])
 
-    async def _any_readable(self, sockets: list[socket.socket]) -> None:
-        """Wait for any of the sockets."""
-        async with anyio.create_task_group() as tasks:
-
-            async def wait(sock: socket.socket) -> None:
-                with suppress(anyio.ClosedResourceError):
-                    await anyio.wait_readable(sock)
-                tasks.cancel_scope.cancel()
-
-            for sock in sockets:
-                tasks.start_soon(wait, sock)
-
-    def _destinations(self, peer: Peer | None) -> list[socket.socket]:
-        if peer is None:
-            return list(self._clients.values())
-        return [self._clients[peer]] if peer in self._clients else []
-
-    def _accept(self, listener: socket.socket, selector: selectors.BaseSelector) -> None:
+    def _accept(self, listener: socket.socket) -> None:
+        """Accept a waiting connection, if there is one."""
         try:
             client, (host, port, *_) = listener.accept()
         except (BlockingIOError, ConnectionError):
-            return  # the client has already disconnected
+            return
         except OSError as error:
             raise self._error(f"cannot accept: {reason(error)}") from error
         if len(self._clients) >= CONNECTIONS_MAX:
@@ -204,28 +176,19 @@ class TcpIn(SocketLink):
         self._accepted += 1
         peer = TcpConnection(self._accepted, host, port)
         self._clients[peer] = client
-        selector.register(client, selectors.EVENT_READ, peer)
         self.accepted(peer)
 
-    def _read(self, peer: Peer, selector: selectors.BaseSelector) -> list[tuple[Peer, bytes]]:
-        client = self._clients[peer]
+    def _read(self, peer: Peer) -> list[tuple[Peer, bytes]]:
+        """Read what a connection has received; empty bytes are its end."""
         try:
-            data = client.recv(READ_SIZE)
+            data = self._clients[peer].recv(READ_SIZE)
         except BlockingIOError:
             return []
         except OSError:
             data = b""
         if not data:
-            selector.unregister(client)
-            del self._clients[peer]
-            close_socket(client)
+            close_socket(self._clients.pop(peer))
         return [(peer, data)]
-
-
-def _file_of(selector: selectors.BaseSelector) -> int | None:
-    """Return the selector's file descriptor, readable when any of its files is; None on Windows."""
-    number = getattr(selector, "fileno", None)
-    return None if number is None else int(number())
 
 
 def _set_up(sock: socket.socket) -> None:
@@ -233,26 +196,6 @@ def _set_up(sock: socket.socket) -> None:
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     if sys.platform == "linux":
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(SILENCE_TIMEOUT * 1000))
-
-
-async def _connect(sock: socket.socket, address: Address) -> None:
-    status = sock.connect_ex(address)
-    if status in _IN_PROGRESS:
-        await _writable(sock)
-        status = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-    if status:
-        raise OSError(status, _status_text(status))
-
-
-if sys.platform == "win32":
-    _IN_PROGRESS = (errno.WSAEWOULDBLOCK, errno.WSAEINPROGRESS)
-
-    def _status_text(status: int) -> str:
-        return socket.errorTab.get(status, os.strerror(status))
-
-else:
-    _IN_PROGRESS = (errno.EINPROGRESS,)
-    _status_text = os.strerror
 
 
 async def _send_all(sock: socket.socket, data: bytes) -> None:

@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import (
+    FORMS,
     Link,
     LinkKind,
     LinkSpec,
@@ -252,7 +253,7 @@ KINDS = ["udpin", "udpout", "tcp", "tcpin", "serial", "sim"]
         ("sim:px4?jitter=-0&rate=1e3&queue=0", "sim:px4?jitter=0.0&queue=0&rate=1000.0"),
         (
             "sim:ardupilot?duplicate=1&reorder=0.5&bit_errors=1e-05&system=255&param_error=1",
-            "sim:ardupilot?bit_errors=1e-05&duplicate=1.0&param_error=1&reorder=0.5&system=255",
+            "sim:ardupilot?bit_errors=1e-05&duplicate=1&param_error=1&reorder=0.5&system=255",
         ),
     ],
 )
@@ -311,25 +312,17 @@ def test_a_spec_has_the_parts_of_the_name() -> None:
         ("sim:", "px4, ardupilot and camera"),
         ("sim:ardupilot4", "px4, ardupilot and camera"),
         ("sim:px4?loss", "NAME=VALUE"),
-        ("sim:ardupilot?metadata=1", "option metadata is for sim:px4"),
         ("sim:px4?colour=red", "'colour' is not an option"),
         ("sim:px4?loss=0.1&loss=0.2", "given twice"),
-        ("sim:px4?loss=", "a number from 0 to 1, not ''"),
-        ("sim:px4?loss=1.1", "from 0 to 1"),
-        ("sim:px4?loss=nan", "from 0 to 1"),
-        ("sim:px4?delay=-1", "from 0 to 3600"),
-        ("sim:px4?rate=0", "from 1 to"),
-        ("sim:px4?queue=100", "needs a rate"),
-        ("sim:px4?seed=1.5", "whole number"),
-        ("sim:px4?system=0", "from 1 to 255"),
-        ("sim:px4?param_error=yes", "from 0 to 1"),
+        ("sim:px4?loss=", "a number, not ''"),
+        ("sim:px4?loss=nan", "a number, not 'nan'"),
+        ("sim:px4?param_error=yes", "a number, not 'yes'"),
     ],
 )
 def test_an_invalid_name_gives_the_problem_and_the_accepted_forms(text: str, problem: str) -> None:
     with pytest.raises(UsageError, match=problem) as caught:
         parse_link(text)
-    for form in ("udpin:HOST:PORT", "udpout:", "tcp:", "tcpin:", "serial:", "sim:px4", "sim:ardupilot"):
-        assert form in str(caught.value)
+    assert FORMS in str(caught.value)
 
 
 SCHEMES = "udp udpin udpout tcp tcpin tcpout serial sim http"
@@ -351,6 +344,22 @@ def test_any_text_is_a_link_or_a_usage_error(text: str) -> None:
 
 
 # Making links
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        ("px4?loss=1.1", "loss must be 0 to 1, not 1.1"),
+        ("px4?delay=-1", "delay must be 0 or more"),
+        ("px4?rate=0", "rate must be a number of bytes per second above 0"),
+        ("px4?queue=100", "queue needs a rate"),
+        ("px4?system=0", "system must be 1 to 255"),
+        ("ardupilot?metadata=1", "option metadata is for sim:px4"),
+    ],
+)
+def test_an_option_out_of_its_range_is_a_usage_error(options: str, problem: str) -> None:
+    with pytest.raises(UsageError, match=problem):
+        create_link(f"sim:{options}")
 
 
 def test_create_link_returns_links_unchanged() -> None:
@@ -476,7 +485,7 @@ async def test_udpin_and_udpout_communicate(host: str) -> None:
         far: Any
         [(peer, data)] = await collect(station, 1)
         assert data == HEARTBEAT
-        assert peer[:2] == vehicle.address
+        assert peer[:2] == (host, vehicle.address[1])
         await station.send(frame(1), peer)
         [(far, data)] = await collect(vehicle, 1)
         assert data == frame(1)
@@ -587,15 +596,16 @@ async def test_listening_needs_an_address_of_this_computer(kind: str) -> None:
 async def test_udpout_receives_only_from_its_target_and_keeps_its_port() -> None:
     with udp_socket() as vehicle:
         async with opened(f"udpout:127.0.0.1:{vehicle.getsockname()[1]}") as link:
-            with udp_socket(link.address) as stranger:
+            address = ("127.0.0.1", link.address[1])
+            with udp_socket(address) as stranger:
                 await link.send(frame(1), None)
-                assert vehicle.recvfrom(1000) == (frame(1), link.address)
+                assert vehicle.recvfrom(1000) == (frame(1), address)
                 stranger.send(frame(2))
-                vehicle.sendto(frame(3), link.address)
+                vehicle.sendto(frame(3), address)
                 assert await collect(link, 1) == [(vehicle.getsockname(), frame(3))]
                 await link.send(frame(4), stranger.getsockname())
                 await link.send(frame(5), None)
-                assert vehicle.recvfrom(1000) == (frame(5), link.address)
+                assert vehicle.recvfrom(1000) == (frame(5), address)
 
 
 @pytest.mark.asyncio

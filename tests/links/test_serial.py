@@ -8,7 +8,6 @@ import fcntl
 import os
 import struct
 import sys
-import threading
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from functools import partial
@@ -22,8 +21,8 @@ import serialx
 
 from paramclient.client import link_task
 from paramclient.errors import LinkError, UsageError
-from paramclient.links import Link, Peer, create_link, link, serial
-from paramclient.links.serial_transport import UNREAD_BYTES_MAX, Transport
+from paramclient.links import Link, Peer, create_link, serial
+from paramclient.links.serial import AsyncioPort
 from paramclient.wire import messages
 from tests.cable import TIMEOUT, Cable
 from tests.shell import a_client, bits, generic, small_px4, until
@@ -41,11 +40,11 @@ def cable(tmp_path: Path) -> Iterator[Cable]:
         yield cable
 
 
-@pytest.fixture(params=["descriptor", "transport"])
+@pytest.fixture(params=["descriptor", "asyncio"])
 def port(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Both implementations; the second is that of Windows, which also works here."""
-    if request.param == "transport":
-        monkeypatch.setattr(serial, "open_port", Transport.opened)
+    if request.param == "asyncio":
+        monkeypatch.setattr(serial, "open_here", AsyncioPort.opened)
     return str(request.param)
 
 
@@ -180,27 +179,6 @@ async def test_a_stalled_device_is_lost_and_its_data_dropped(
         assert cable.recv(100_000) == HEARTBEAT
 
 
-@pytest.mark.asyncio
-async def test_a_transport_pauses_at_its_limit(cable: Cable) -> None:
-    port = await Transport.opened(str(cable.device), 115200)
-    try:
-        sent = 0
-        with anyio.fail_after(TIMEOUT):
-            while port.unread < UNREAD_BYTES_MAX:
-                sent += cable.offer(bytes(500))
-                await anyio.sleep(0.0001)
-            unread = port.unread
-            for _ in range(100):
-                sent += cable.offer(bytes(500))
-                await anyio.sleep(0.0001)
-            assert port.unread == unread
-            read = 0
-            while read < sent:
-                read += len(await port.read())
-    finally:
-        await port.close()
-
-
 # Ports that cannot be opened
 
 
@@ -245,62 +223,6 @@ async def test_an_unsupported_baud_rate(cable: Cable, port: str, monkeypatch: py
     monkeypatch.setattr(serialx.Serial, "_reconfigure_port", refuse)
     with pytest.raises(UsageError, match="this system does not support 115200 baud"):
         await create_link(cable.link).open()
-
-
-class Stuck:
-    """A driver that delays opening or closing of the next port."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, call: str) -> None:
-        self.is_in_it = threading.Event()
-        self.may_go_on = threading.Event()
-        self.is_closed = threading.Event()
-        self._port: int | None = None  # its id: keeping the port itself would keep it open
-        self._slow = call
-        self._real = {name: getattr(serialx.Serial, name) for name in ("open", "close")}
-        monkeypatch.setattr(serialx.Serial, "open", lambda port: self._call("open", port))
-        monkeypatch.setattr(serialx.Serial, "close", lambda port: self._call("close", port))
-
-    def _call(self, name: str, port: object) -> None:
-        if name == "open" and self._port is None:
-            self._port = id(port)
-        is_it = id(port) == self._port  # the garbage collector closes ports of earlier tests
-        if is_it and name == self._slow:
-            self.is_in_it.set()
-            assert self.may_go_on.wait(TIMEOUT)
-        self._real[name](port)
-        if is_it and name == "close":
-            self.is_closed.set()
-
-
-@pytest.mark.asyncio
-async def test_opening_a_stalled_driver_times_out(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The event loop keeps running, the call times out, and a port that opens later is closed again."""
-    monkeypatch.setattr(link, "OPEN_TIMEOUT", 0.01)
-    monkeypatch.setattr(serial, "CLOSE_TIMEOUT", 0.01)
-    stuck = Stuck(monkeypatch, "open")
-    is_in_it = False
-    while not is_in_it:  # a busy computer may not even have begun to open the port
-        error = await refusal(create_link(cable.link))
-        assert f"{cable.link}: {cable.device} did not open within " in str(error)
-        is_in_it = await anyio.to_thread.run_sync(stuck.is_in_it.wait, 1.0)
-    assert not stuck.is_closed.is_set()
-    stuck.may_go_on.set()
-    assert await anyio.to_thread.run_sync(stuck.is_closed.wait, TIMEOUT)
-    monkeypatch.undo()
-    await until(lambda: "paramclient link" not in {thread.name for thread in threading.enumerate()})
-    async with opened(cable):
-        pass
-
-
-@pytest.mark.asyncio
-async def test_closing_a_stalled_driver_times_out(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serial, "CLOSE_TIMEOUT", 0.01)
-    stuck = Stuck(monkeypatch, "close")
-    async with opened(cable) as link:
-        await link.close()
-        assert stuck.is_in_it.is_set()
-        stuck.may_go_on.set()
-        await until(lambda: "paramclient link" not in {thread.name for thread in threading.enumerate()})
 
 
 # The extra
