@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Final, Generic, TypeAlias, TypeVar, Unpack
+from dataclasses import fields
+from typing import Any, Final, Generic, TypeAlias, TypeVar
 
 from paramclient.errors import UsageError
-from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
-from paramclient.sim.air import Faults
+from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
 
 __all__ = ["MakeArduPilot", "MakePX4", "SimVehicle", "sim_ardupilot", "sim_px4"]
 
@@ -41,7 +41,7 @@ class SimVehicle(Generic[V]):
         UsageError: a fault is out of range.
     """
 
-    def __init__(self, vehicle: V, *, seed: int = 0, **faults: Unpack[Faults]) -> None:
+    def __init__(self, vehicle: V, *, seed: int = 0, **faults: Any) -> None:
         self.vehicle = vehicle
         self.air = Air.symmetric([vehicle], seed=seed, **faults)
 
@@ -95,7 +95,7 @@ MakeArduPilot: TypeAlias = Callable[..., SimVehicle[ArduPilotVehicle]]
 
 
 def _make(kind: Callable[..., V], pace: float | None, seed: int, options: dict[str, Any]) -> SimVehicle[V]:
-    faults: Faults = {name: options.pop(name) for name in Faults.__annotations__ if name in options}  # type: ignore[assignment]  # exactly the keys of Faults
+    faults = {each.name: options.pop(each.name) for each in fields(FaultyLink) if each.name in options}
     if pace is not None:
         if not (math.isfinite(pace) and pace > 0.0):
             raise UsageError(f"pace must be a number of values per second above 0, not {pace}")

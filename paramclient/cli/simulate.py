@@ -19,7 +19,7 @@ from paramclient.links.tcp import TcpIn
 from paramclient.links.udp import UdpIn
 
 if TYPE_CHECKING:
-    from paramclient.sim import OtherStation, Vehicle
+    from paramclient.sim import Vehicle
 
 __all__ = ["FaultOptions", "VehicleFaults", "sim"]
 
@@ -69,7 +69,7 @@ class VehicleFaults:
     """Index or name of a parameter that is never listed, and whose reads are never answered. May be given
     several times."""
 
-    list_stops_at: int | None = None
+    list_stops_at: Positive = None
     """Number of values after which the list stops, once. Default: never."""
 
     boot_time: float = 0.0
@@ -84,35 +84,22 @@ class VehicleFaults:
     armed: bool = False
     """Report that the vehicle is armed; it then refuses to reboot."""
 
-    other_list_every: float | None = None
-    """Interval in seconds at which another ground station requests the list. Default: never."""
-
     @property
     def options(self) -> dict[str, Any]:
         """The arguments for the simulated vehicle."""
         return {
             "dead": [int(each) if each.isdecimal() else each for each in self.dead],
-            "list_stops_at": self.list_stops_at,
             "boot_time": self.boot_time,
             "armed": self.armed,
             "reboot_down": self.reboot_down,
         }
 
-    def apply_to(self, vehicle: Vehicle) -> list[OtherStation]:
-        """Apply the faults that are no arguments; return the other stations on the channel."""
-        from paramclient.sim import OtherStation
-
+    def apply_to(self, vehicle: Vehicle) -> None:
+        """Apply the faults that are no arguments."""
         if self.reboot_at is not None:
             vehicle.when_listed(self.reboot_at, partial(vehicle.reboot, down=self.reboot_down))
-        if self.other_list_every is None:
-            return []
-        return [
-            OtherStation(
-                target_system=vehicle.system,
-                target_component=vehicle.component,
-                list_every=self.other_list_every,
-            )
-        ]
+        if self.list_stops_at is not None:
+            vehicle.when_listed(self.list_stops_at, vehicle.stop_list)
 
 
 _NO_FAULTS: Final = FaultOptions()
@@ -171,7 +158,8 @@ async def sim(
     chosen = (100 if autopilot == "camera" else 1) if component is None else component
     make = partial(PX4Vehicle, metadata=True) if metadata else kinds[autopilot]
     vehicle = make(system=system, component=chosen, **options)
-    air = Air.symmetric([vehicle], others=vehicle_faults.apply_to(vehicle), **asdict(faults))
+    vehicle_faults.apply_to(vehicle)
+    air = Air.symmetric([vehicle], **asdict(faults))
     announcement = _Announcement(f"{autopilot} {system}/{chosen}", spec)
     await serve_endpoint(air, real, task_status=announcement)
 

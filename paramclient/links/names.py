@@ -32,12 +32,13 @@ FORMS: Final = """\
 
 SIMULATED: Final = ("px4", "ardupilot", "camera")
 """What a `sim:` link simulates."""
-FAULT_OPTIONS: Final = (
+VEHICLE_OPTIONS: Final = ("system", "param_error", "metadata")
+"""Options of a `sim:` link that are arguments of the vehicle."""
+SIM_OPTIONS: Final = (
     *("loss", "loss_burst", "delay", "jitter", "duplicate", "reorder", "bit_errors", "rate", "queue", "seed"),
+    *VEHICLE_OPTIONS,
 )
-"""Options of `sim:` links that are faults of the link; see `paramclient.sim.FaultyLink` for their ranges."""
-SIM_OPTIONS: Final = (*FAULT_OPTIONS, "system", "param_error", "metadata")
-"""The options of `sim:` links."""
+"""The options of `sim:` links. `paramclient.sim.FaultyLink` has the ranges of those for the link."""
 
 DEFAULT_BAUD: Final = 57600
 """Baud rate of a serial device without one: that of telemetry radios, and MAVSDK's and MAVProxy's default. A

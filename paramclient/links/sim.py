@@ -15,7 +15,7 @@ import anyio.lowlevel
 
 from paramclient.errors import UsageError
 from paramclient.links.link import BaseLink, Link, Peer
-from paramclient.links.names import FAULT_OPTIONS, LinkSpec
+from paramclient.links.names import VEHICLE_OPTIONS, LinkSpec
 
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint, Vehicle
@@ -114,8 +114,8 @@ def simulated(spec: LinkSpec) -> SimLink:
 
     kinds: dict[str, Callable[..., Vehicle]]
     kinds = {"px4": sim.PX4Vehicle, "ardupilot": sim.ArduPilotVehicle, "camera": sim.Camera}
-    options: dict[str, Any] = dict(spec.options)
-    faults = {key: options.pop(key) for key in FAULT_OPTIONS if key in options}
+    faults: dict[str, Any] = dict(spec.options)
+    options = {key: faults.pop(key) for key in VEHICLE_OPTIONS if key in faults}
     if "metadata" in options and spec.host != "px4":
         raise UsageError(f"{spec}: option metadata is for sim:px4; other vehicles describe no parameters")
     vehicle = kinds[spec.host](**options)

@@ -21,15 +21,14 @@ The vehicles behave as measured on real ones, with the real timing. The docstrin
 - `px4`, `ardupilot`: the autopilots. `camera`: a camera with extended parameters.
 - `vehicle`, `device`: their base classes, and the vehicle of the standard.
 - `param_table`, `ftp`, `metadata`: parameter tables, the MAVFTP server, metadata files.
-- `air`, `other_station`: the faulty link, a second ground station.
+- `air`: the faulty link.
 """
 
 from __future__ import annotations
 
-from paramclient.sim.air import Air, Endpoint, Faults, FaultyLink
+from paramclient.sim.air import Air, Endpoint, FaultyLink
 from paramclient.sim.ardupilot import ArduPilotVehicle
 from paramclient.sim.camera import Camera, ExtEntries, camera_table
-from paramclient.sim.other_station import OtherStation
 from paramclient.sim.param_table import SimParam, Table, ardupilot_table, px4_table
 from paramclient.sim.px4 import PX4Vehicle
 from paramclient.sim.vehicle import GenericVehicle, Vehicle
@@ -40,10 +39,8 @@ __all__ = [
     "Camera",
     "Endpoint",
     "ExtEntries",
-    "Faults",
     "FaultyLink",
     "GenericVehicle",
-    "OtherStation",
     "PX4Vehicle",
     "SimParam",
     "Table",

@@ -7,7 +7,7 @@ import random
 from collections.abc import Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
-from typing import Protocol, TypedDict, Unpack
+from typing import Any, Protocol
 
 from paramclient.errors import UsageError
 from paramclient.sim.device import OUT_LIMIT
@@ -40,20 +40,6 @@ class Endpoint(Protocol):
         """Return the data to send, and clear it. Each item is one frame, to be sent as one datagram."""
 
 
-class Faults(TypedDict, total=False):
-    """Faults of a link; see `FaultyLink`."""
-
-    loss: float
-    loss_burst: float
-    delay: float
-    jitter: float
-    duplicate: float
-    reorder: float
-    bit_errors: float
-    rate: float | None
-    queue: int | None
-
-
 @dataclass(kw_only=True, eq=False)
 class FaultyLink:
     """One direction of a link with faults, reproducible by its seed.
@@ -79,7 +65,6 @@ class FaultyLink:
     Attributes:
         sent: datagrams given to `send`.
         lost: the number of them that do not arrive, because of `loss` or a full queue.
-        duplicated: the number of them that arrive twice.
         free_at: when a new datagram would leave without waiting, or earlier.
 
     Raises:
@@ -110,7 +95,7 @@ class FaultyLink:
         self._random = random.Random(self.seed)
         self._flying: list[tuple[float, int, bytes]] = []
         self._last_arrival = self.free_at = -math.inf
-        self.sent = self.lost = self.duplicated = 0
+        self.sent = self.lost = 0
 
     def send(self, data: bytes, now: float) -> None:
         """Send one datagram."""
@@ -136,7 +121,6 @@ class FaultyLink:
         else:
             self._last_arrival = arrives_at
         is_doubled = self.duplicate and chance() < self.duplicate
-        self.duplicated += bool(is_doubled)
         for copy in range(2 if is_doubled else 1):
             heappush(self._flying, (arrives_at, 2 * self.sent + copy, self._damaged(data)))
 
@@ -188,8 +172,6 @@ class Air:
         vehicles: any endpoints.
         uplink: from the program to the vehicles; None for a link without faults.
         downlink: from the vehicles to the program; None for a link without faults.
-        others: further ground stations on the channel (see `OtherStation`). Their data goes through both
-            links, to the vehicles and to the program.
 
     Attributes:
         vehicles: as given.
@@ -203,50 +185,40 @@ class Air:
         *,
         uplink: FaultyLink | None = None,
         downlink: FaultyLink | None = None,
-        others: Sequence[Endpoint] = (),
     ) -> None:
         self.uplink = uplink or FaultyLink()
         self.downlink = downlink or FaultyLink()
         self.vehicles = tuple(vehicles)
-        self._senders = (*others, *vehicles)
-        self._others = len(others)
         counts = [getattr(each, "vehicle_count", None) for each in vehicles]
         self.vehicle_count: int | None = None if None in counts else sum(map(int, filter(None, counts)))
         self._out: list[bytes] = []
 
     @classmethod
-    def symmetric(
-        cls,
-        vehicles: Sequence[Endpoint],
-        *,
-        others: Sequence[Endpoint] = (),
-        seed: int = 0,
-        **faults: Unpack[Faults],
-    ) -> Air:
+    def symmetric(cls, vehicles: Sequence[Endpoint], *, seed: int = 0, **faults: Any) -> Air:
         """Make an `Air` with the same faults in both directions; `delay` is one-way.
 
         See `FaultyLink` for the faults. The two directions use different random numbers, both derived from
         the seed.
         """
         uplink, downlink = FaultyLink(seed=2 * seed, **faults), FaultyLink(seed=2 * seed + 1, **faults)
-        return cls(vehicles, uplink=uplink, downlink=downlink, others=others)
+        return cls(vehicles, uplink=uplink, downlink=downlink)
 
     def receive(self, data: bytes, now: float) -> None:
         """Take one datagram for all vehicles."""
         self.tick(now)
         self.uplink.send(data, now)
-        self._step(now, [*map(_at, self._senders)])
+        self._step(now, [*map(_at, self.vehicles)])
 
     def tick(self, now: float) -> None:
         """Do all work that is due by `now`, in the order of its deadlines."""
-        due = [*map(_at, self._senders)]
+        due = [*map(_at, self.vehicles)]
         while (first := min(*due, _at(self.uplink), _at(self.downlink), now)) < now:
             self._step(first, due)
         self._step(now, [now] * len(due))
 
     def next_deadline(self) -> float | None:
-        """Return the earliest deadline of the vehicles, stations and links."""
-        first = min(*map(_at, self._senders), _at(self.uplink), _at(self.downlink))
+        """Return the earliest deadline of the vehicles and links."""
+        first = min(*map(_at, self.vehicles), _at(self.uplink), _at(self.downlink))
         return None if first == math.inf else first
 
     def data_to_send(self) -> list[bytes]:
@@ -256,20 +228,15 @@ class Air:
 
     def _step(self, now: float, due: list[float]) -> None:
         """Advance to `now`; skips vehicles without due work and received data."""
-        up: list[bytes] = []
-        for place, sender in enumerate(self._senders):
-            if place == self._others:
-                up = self.uplink.deliver(now)
+        up = self.uplink.deliver(now)
+        for place, vehicle in enumerate(self.vehicles):
             if up or due[place] <= now:
-                sender.tick(now)
+                vehicle.tick(now)
                 for data in up:
-                    sender.receive(data, now)
-                for data in sender.data_to_send():
+                    vehicle.receive(data, now)
+                for data in vehicle.data_to_send():
                     self.downlink.send(data, now)
-                    if place < self._others:
-                        self.uplink.send(data, now)
-                due[place] = _at(sender)
-        self.uplink.deliver(now)  # without vehicles, nothing has taken it
+                due[place] = _at(vehicle)
         arrived = self.downlink.deliver(now)
         self._out += arrived[: OUT_LIMIT - len(self._out)]
 

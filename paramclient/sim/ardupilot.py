@@ -8,11 +8,11 @@ import struct
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
-from paramclient.errors import CommandResult, ParamErrorCode, UsageError
-from paramclient.model.values import Encoding, ParamType, WireValue, bits_of
+from paramclient.errors import CommandResult, ParamErrorCode
+from paramclient.model.values import Encoding, ParamType, bits_of
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.param_pck import PARAM_FILE
 from paramclient.sim.ftp import Address, FileServer
@@ -22,10 +22,7 @@ from paramclient.sim.param_table import (
     Table,
     ardupilot_table,
     as_table,
-    check_names,
-    check_range,
     ek2_group,
-    with_system_id,
 )
 from paramclient.sim.vehicle import SIMULATED_COMMIT, Vehicle
 from paramclient.wire import frames, messages
@@ -117,15 +114,14 @@ class ArduPilotVehicle(Vehicle):
     ftp_rate: float = 48_500.0
 
     def __post_init__(self) -> None:
-        if self.kind not in _KINDS:
-            raise UsageError(f"kind must be one of {', '.join(_KINDS)}, not {self.kind!r}")
         is_built_in = self.table is None
         table = ardupilot_table() if self.table is None else as_table(self.table)
         groups = self.groups
         if groups is None:
             groups = {"EK2_ENABLE": ek2_group()} if is_built_in else {}
         members = {switch: as_table(group) for switch, group in groups.items()}
-        rows = tuple(_with_groups(with_system_id(table, _SYSTEM_ID, self.system), dict(members)))
+        table = tuple(replace(row, value=self.system) if row.name == _SYSTEM_ID else row for row in table)
+        rows = tuple(_with_groups(table, dict(members)))
         self._in_groups = (
             frozenset(row.name for row in table[_NOT_IN_GROUPS:]) if is_built_in else frozenset()
         )
@@ -139,13 +135,8 @@ class ArduPilotVehicle(Vehicle):
             else self.read_only
         )
         self._live = frozenset(self.live)
-        check_names(rows, members, () if self.read_only is None else self.read_only)
-        if others := self._late_switches - self._switches:
-            raise UsageError(f"reboot_groups that are not switches in groups: {', '.join(sorted(others))}")
         uid2 = (int.from_bytes(_UID2, "little") + self.system - 1).to_bytes(18, "little")
         uid2 = uid2 if self.uid2 is None else self.uid2.ljust(18, b"\0")
-        check_range(0, 18, **{"the length of uid2": len(uid2)})
-        check_range(0.0, live_period=self.live_period)
         self._stored: set[Entry] = set()
         """Parameters that have had another value than at the first start."""
         self._list_fills_loop = self.burst > _BUSY_RATE * self.period
@@ -163,16 +154,6 @@ class ArduPilotVehicle(Vehicle):
             ),
             FileServer(self._packed_params, self.ftp_rate) if self.ftp else None,
         )
-
-    def load(self, values: Mapping[str, WireValue]) -> None:
-        """Change values as code on board does that announces nothing.
-
-        Raises:
-            UsageError: the vehicle has no parameter with such a name, or a value does not fit its type.
-        """
-        for name, value in values.items():
-            entry = self._entry(name)
-            self._store(entry, bits_of(value, entry.type))
 
     # Time
 
@@ -290,14 +271,14 @@ class ArduPilotVehicle(Vehicle):
         return has_default and entry.name in self._in_groups and entry not in self._stored
 
     def _write(self, entry: Entry, bits: int) -> None:
-        self._store(entry, bits)
+        super()._write(entry, bits)
         self._answers.setdefault(entry, None)
         self._sooner(self._answer_sets, self._next(_LOOP))
 
     def _store(self, entry: Entry, bits: int) -> None:
         if bits != entry.bits:
             self._stored.add(entry)
-        entry.store(bits)
+        super()._store(entry, bits)
         if entry.name in self._switches:
             self._relist()
         if entry.name == _SYSTEM_ID and self.kind != "copter":

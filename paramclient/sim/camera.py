@@ -85,8 +85,6 @@ class Camera(Vehicle):
         self._ext: dict[str, Param] = {}
         for name, entry in (camera_table() if self.table is None else self.table).items():
             self.add_ext_param(name, entry)
-        for name in (*self.failing, *self.slow, *self.limits):
-            self.ext_param(name)
         self._supported = {
             name: {encode_ext_value(value, self.ext_param(name).type) for value in values}
             for name, values in self.supported.items()
@@ -129,7 +127,7 @@ class Camera(Vehicle):
             UsageError: the camera has no extended parameter with that name, or the value does not fit its
                 type.
         """
-        self._store(name, encode_ext_value(value, self.ext_param(name).type))
+        self._change(name, encode_ext_value(value, self.ext_param(name).type))
 
     def add_ext_param(self, name: str, entry: WireValue | tuple[ParamType | int, WireValue]) -> None:
         """Add an extended parameter behind the others; an entry is one of `ExtEntries`.
@@ -181,14 +179,14 @@ class Camera(Vehicle):
             self._sooner(self._end_work, self._now + self.slow[name])
             self._send_ack(name, ExtAckResult.IN_PROGRESS)
         else:
-            self._store(name, wanted)
+            self._change(name, wanted)
             self._send_ack(name, ExtAckResult.ACCEPTED)
 
     def _send_ack(self, name: str, result: ExtAckResult) -> None:
         param = self._ext[name]
         self.send(messages.ParamExtAck(name, ext_bytes(param), param.type, result))
 
-    def _store(self, name: str, raw: bytes) -> None:
+    def _change(self, name: str, raw: bytes) -> None:
         known = self._ext[name]
         param = ext_param(name, raw, known.type, known.index)
         if name in self.limits and isinstance(param.value, int | float):
@@ -215,7 +213,7 @@ class Camera(Vehicle):
         for name, (ends_at, raw) in list(self._at_work.items()):
             if ends_at <= at:
                 del self._at_work[name]
-                self._store(name, raw)
+                self._change(name, raw)
                 self._send_ack(name, ExtAckResult.ACCEPTED)
         self._due[self._end_work] = min((ends_at for ends_at, _ in self._at_work.values()), default=math.inf)
 

@@ -56,10 +56,6 @@ class Device:
     def _set_up(self, heartbeat: messages.Heartbeat, version: messages.AutopilotVersion) -> None:
         """Check the arguments, and prepare the first start."""
         check_range(1, 255, system=self.system, component=self.component)
-        check_range(1, 2, mavlink_version=self.mavlink_version)
-        check_range(0.0, boot_time=self.boot_time)
-        check_range(0.0, 10_000.0, telemetry=self.telemetry)
-        check_range(0.0, math.inf, reboot_down=self.reboot_down)
         self._heartbeat = heartbeat
         self.version = version
         self.requests: Counter[str] = Counter()

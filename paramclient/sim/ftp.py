@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple, TypeAlias
 
-from paramclient.errors import FileErrorCode, UsageError
+from paramclient.errors import FileErrorCode
 from paramclient.model.px4_hash import crc32_px4
 from paramclient.protocol import param_pck
 from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
@@ -22,8 +22,6 @@ PX4_IDLE_LIMIT: Final = 11.0
 """Seconds without a request after which PX4 closes a session (measured: between 10.5 and 12)."""
 PX4_BURST_BLOCKS: Final = 168
 """Blocks after which PX4 ends a burst with burst_complete: 40,152 bytes."""
-PX4_STEP: Final = 0.010
-"""Period of PX4's MAVLink loop in seconds; bursts start and continue with it."""
 EINVAL: Final = 22
 """Linux' error number for invalid arguments, as in NAKs."""
 QUEUE: Final = 5
@@ -76,15 +74,13 @@ class _Session:
 
 @dataclass(slots=True)
 class _Burst:
-    """A burst in progress; for PX4 with the time of its next step and the bytes that it may send then."""
+    """A burst in progress, with the blocks until its end."""
 
     request: Packet
     sender: Address
     offset: int
     sequence: int
-    left: float = math.inf
-    at: float = 0.0
-    budget: float = 0.0
+    left: float
 
 
 @dataclass(slots=True)
@@ -104,9 +100,8 @@ class FileServer:
     - The checksum of a param.pck is that of the file as it is read 64 bytes at a time.
     - A burst of ArduPilot sends a block whenever a third of the link is free again, to the end of the file.
     - PX4 has one session for each link, closes it after 11 s without a request, and a reset from any sender
-      closes it. A burst starts up to 10 ms after its request, has blocks of 239 bytes independent of the
-      requested size, and ends after 168 blocks with burst_complete; other requests are answered meanwhile,
-      and another burst replaces it.
+      closes it. A burst has blocks of 239 bytes independent of the requested size, and ends after 168 blocks
+      with burst_complete; other requests are answered meanwhile, and another burst replaces it.
 
     Attributes:
         files: contents by path; a path's directories exist implicitly.
@@ -131,10 +126,6 @@ class FileServer:
     _last: tuple[Address, Packet] | None = None
     _packed: tuple[object, bytes] | None = None
 
-    def __post_init__(self) -> None:
-        if not 0.0 < self.rate < math.inf:
-            raise UsageError(f"ftp_rate must be a number of bytes per second above 0, not {self.rate}")
-
     @property
     def open_files(self) -> list[str]:
         """The paths of the open files that are in the way of other stations."""
@@ -156,9 +147,7 @@ class FileServer:
     def next_deadline(self) -> float:
         """Return the time of the next work, or infinity."""
         request_at = max(self._waiting[0].at, self._free_at) if self._waiting else math.inf
-        if self._burst is None:
-            return request_at
-        return min(request_at, self._burst.at) if self.is_px4 else self._free_at
+        return request_at if self._burst is None else self._free_at
 
     def work(self, now: float, packets_max: float = math.inf) -> list[tuple[Packet, Address]]:
         """Do the due work, limited to `packets_max` responses; return the responses with their receivers."""
@@ -168,15 +157,13 @@ class FileServer:
             if len(out) >= packets_max:
                 self._free_at = now
                 break
-            rate = 3 * self.rate
             answer: Packet | None
             burst = self._burst
-            if burst is None or (self.is_px4 and due < burst.at):
+            if burst is None or (self.is_px4 and self._waiting and self._waiting[0].at <= due):
                 _, request, sender = self._waiting.popleft()
-                answer = self._answer(request, sender, due)
+                answer, rate = self._answer(request, sender, due), 3 * self.rate
             else:
-                answer, sender = self._next_block(burst, due), burst.sender
-                rate = math.inf if self.is_px4 else self.rate
+                answer, sender, rate = self._next_block(burst, due), burst.sender, self.rate
             if answer is not None:
                 self._free_at = max(self._free_at, due + (OVERHEAD + len(answer.data)) / rate)
                 self._answered_at = due
@@ -212,7 +199,10 @@ class FileServer:
                 case Opcode.LIST_DIRECTORY:
                     return answer._replace(data=self._list(_text(request.data), request.offset))
                 case Opcode.CALC_FILE_CRC32:
-                    content = self._checked(_text(request.data))
+                    path = _text(request.data)
+                    content = self.files.get(path)
+                    if content is None:  # ArduPilot reads param.pck 64 bytes at a time
+                        content = self._param_file(self._query(path)[0], CHECKSUM_READ)
                     return answer._replace(data=crc32_px4(content).to_bytes(4, "little"))
                 case _:
                     raise _Refusal(FileErrorCode.UNKNOWN_COMMAND)
@@ -319,15 +309,11 @@ class FileServer:
         return self._read(burst.request.session, burst.offset, size, now)
 
     def _begin_burst(self, request: Packet, sender: Address, now: float) -> None:
-        burst = _Burst(request, sender, request.offset, request.sequence + 1)
+        blocks = PX4_BURST_BLOCKS if self.is_px4 else math.inf
+        burst = _Burst(request, sender, request.offset, request.sequence + 1, blocks)
         self._read_block(burst, now)
         self._burst = burst
-        if self.is_px4:
-            burst.left = PX4_BURST_BLOCKS
-            burst.at = (math.floor(now / PX4_STEP) + 1) * PX4_STEP
-            burst.budget = PX4_STEP * self.rate
-        else:
-            self._free_at = max(self._free_at, now)
+        self._free_at = max(self._free_at, now)
 
     def _next_block(self, burst: _Burst, now: float) -> Packet:
         request = burst.request
@@ -342,16 +328,7 @@ class FileServer:
         burst.offset += len(block.data)
         if block.burst_complete or block.opcode == Opcode.NAK:
             self._burst = None
-        burst.budget -= OVERHEAD + len(block.data)
-        while self.is_px4 and burst.budget <= 0.0:
-            burst.at += PX4_STEP
-            burst.budget += PX4_STEP * self.rate
         return block
-
-    def _checked(self, path: str) -> bytes:
-        """Return the content of which the checksum is; ArduPilot reads param.pck 64 bytes at a time."""
-        content = self.files.get(path)
-        return self._param_file(self._query(path)[0], CHECKSUM_READ) if content is None else content
 
     def _list(self, path: str, skip: int) -> bytes:
         prefix = path.rstrip("/") + "/" if path else ""

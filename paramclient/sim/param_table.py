@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import csv
-import math
 import struct
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 from typing import SupportsIndex, TypeAlias
@@ -31,13 +30,10 @@ __all__ = [
     "Table",
     "ardupilot_table",
     "as_table",
-    "check_names",
     "check_range",
-    "distance",
     "ek2_group",
     "px4_table",
     "typed",
-    "with_system_id",
 ]
 
 FLT_EPSILON = 2.0**-23
@@ -114,11 +110,19 @@ class Entry:
         """The entry in param.pck, with its default if that differs; None for a type that param.pck lacks."""
         if self._packed is None and self.type in PACKABLE:
             kind, default, other = ParamType(self.type), self.row.default, None
-            if default is not None and not distance(self.value, default) < FLT_EPSILON:
+            if default is not None and not self._is_near(default):
                 whole = int(default) & (1 << 8 * kind.size) - 1
                 other = whole if kind.is_integer else bits_of(default, kind)
             self._packed = PackedParam(self.name, kind, self.bits, other)
         return self._packed
+
+    def _is_near(self, number: float) -> bool:
+        """Return whether the value is this number, as near as ArduPilot compares two float32."""
+        value = self.value
+        if isinstance(value, bytes | str):
+            return False
+        (one,), (two,) = (struct.unpack("<f", struct.pack("<f", each)) for each in (value, number))
+        return bool(abs(one - two) < FLT_EPSILON)
 
     def store(self, bits: int) -> None:
         """Set another value."""
@@ -147,31 +151,22 @@ def typed(entry: WireValue | tuple[ParamType | int, WireValue]) -> tuple[ParamTy
     return ParamType.INT32 if isinstance(entry, SupportsIndex) else ParamType.REAL32, entry
 
 
-def with_system_id(rows: Iterable[SimParam], name: str, system: int) -> tuple[SimParam, ...]:
-    """Return a table in which the parameter with this name is set to the system id."""
-    return tuple(replace(row, value=system) if row.name == name else row for row in rows)
-
-
 @cache
 def px4_table() -> tuple[SimParam, ...]:
     """Return the 903 parameters of a PX4 1.17 quad, read from a real one; 58 of them are volatile."""
-    kinds = ((row, ParamType[row["type"]]) for row in _read("px4.csv"))
-    return tuple(
-        SimParam(row["name"], kind, from_bits(int(row["bits"], 16), kind), row["volatile"] == "1")
-        for row, kind in kinds
-    )
+    return _read("px4.csv")
 
 
 @cache
 def ardupilot_table() -> tuple[SimParam, ...]:
     """Return the 1382 parameters of an ArduCopter 4.6 quad, read from a real one."""
-    return tuple(map(_plain, _read("ardupilot.csv")))
+    return _read("ardupilot.csv")
 
 
 @cache
 def ek2_group() -> tuple[SimParam, ...]:
     """Return the 52 parameters that EK2_ENABLE shows on that quad. Only their number is measured."""
-    return tuple(map(_plain, _read("ardupilot_ek2.csv")))
+    return _read("ardupilot_ek2.csv")
 
 
 def check_range(low: float, high: float = sys.float_info.max, /, **numbers: float) -> None:
@@ -182,27 +177,12 @@ def check_range(low: float, high: float = sys.float_info.max, /, **numbers: floa
             raise UsageError(f"{name} must be {limits}, not {number}")
 
 
-def check_names(known: Iterable[SimParam], *names: Iterable[str]) -> None:
-    """Raise UsageError unless all these names are in the table."""
-    if unknown := set().union(*names).difference(row.name for row in known):
-        raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
-
-
-def distance(value: WireValue, other: WireValue) -> float:
-    """Return how far two numbers are apart as float32; infinite for values that are no numbers."""
-    if isinstance(value, bytes | str) or isinstance(other, bytes | str):
-        return math.inf
-    one, two = struct.unpack("<ff", struct.pack("<ff", value, other))
-    return abs(float(one) - float(two))
-
-
-def _plain(row: dict[str, str]) -> SimParam:
-    kind = ParamType[row["type"]]
-    value = int(row["value"]) if kind.is_integer else float(row["value"])
-    default = float(row["default"]) if "default" in row else None
-    return SimParam(row["name"], kind, value, default=default)
-
-
-def _read(name: str) -> Iterable[dict[str, str]]:
+def _read(name: str) -> tuple[SimParam, ...]:
     text = resources.files(__package__).joinpath("tables", name).read_text(encoding="ascii")
-    return csv.DictReader(text.splitlines())
+    rows = []
+    for row in csv.DictReader(text.splitlines()):
+        kind = ParamType[row["type"]]
+        value = int(row["value"]) if kind.is_integer else float(row["value"])
+        default = float(row["default"]) if "default" in row else None
+        rows.append(SimParam(row["name"], kind, value, row.get("volatile") == "1", default))
+    return tuple(rows)

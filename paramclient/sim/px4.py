@@ -5,25 +5,20 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Final
 
 from paramclient.errors import CommandResult, ParamErrorCode
 from paramclient.model.px4_hash import crc32_px4, hash_params
-from paramclient.model.values import ParamType, WireValue, bits_of, from_bits
+from paramclient.model.values import ParamType, bits_of
 from paramclient.sim.ftp import FileServer
 from paramclient.sim.metadata import GENERAL_FILE, metadata_files
 from paramclient.sim.param_table import (
-    FLT_EPSILON,
     Entry,
     SimParam,
     Table,
     as_table,
-    check_names,
-    check_range,
-    distance,
     px4_table,
-    with_system_id,
 )
 from paramclient.sim.vehicle import SIMULATED_COMMIT, Vehicle
 from paramclient.wire import frames, messages
@@ -69,9 +64,6 @@ class PX4Vehicle(Vehicle):
     - The position controller checks its parameters 0.4 s after one of them has changed, and sets those beyond
       their limit to the limit (see `LIMITS`); a real one takes 10 ms to 1.1 s. These changes are sent
       like any other.
-    - A change of a float by at most 1.19e-7 does not count as a change: the value is neither sent again nor
-      saved on its own. After a reboot the earlier value is back, unless another change caused a save. A value
-      that close to the default is never saved.
     - A wrong type, an unknown name and an unknown index are not answered.
     - A parameter that is not in use can be read and set by name (index 65535) and is neither in the list
       nor in the hash.
@@ -135,7 +127,7 @@ class PX4Vehicle(Vehicle):
     def __post_init__(self) -> None:
         is_built_in = self.table is None
         table = px4_table() if self.table is None else as_table(self.table)
-        rows = with_system_id(table, _SYSTEM_ID, self.system)
+        rows = tuple(replace(row, value=self.system) if row.name == _SYSTEM_ID else row for row in table)
         commit = SIMULATED_COMMIT + (SIMULATED_COMMIT if is_built_in else _checksum(rows))
         late_use = self.late_use or {}
         if is_built_in and self.late_use is None:
@@ -145,11 +137,8 @@ class PX4Vehicle(Vehicle):
         self._late_use = {name: frozenset(more) for name, more in late_use.items()}
         self._never_used = frozenset(self.not_in_use).union(*self._late_use.values())
         self._used_once = _FIRST_START_ONLY if is_built_in else frozenset()
-        check_names(rows, self._never_used, self._late_use)
-        check_range(0.0, autosave=self.autosave, clamp_delay=self.clamp_delay or 0.0)
         files = FileServer(self._packed_params if self.ftp else lambda: None, self.ftp_rate, is_px4=True)
         if self.metadata:
-            check_range(2, mavlink_version=self.mavlink_version)
             files.files |= metadata_files(rows)
         self._hash: int | None = None
         self._set_up_table(
@@ -189,19 +178,9 @@ class PX4Vehicle(Vehicle):
         self._unused.difference_update([self._entry(name).name for name in names])
         self._relist()
 
-    def load(self, values: Mapping[str, WireValue]) -> None:
-        """Change values as `param load`, `param reset` and `param set-default` do: nothing is sent.
-
-        Raises:
-            UsageError: the vehicle has no parameter with such a name, or a value does not fit its type.
-        """
-        entries = [self._entry(name) for name in values]
-        self._load({entry: bits_of(values[entry.name], entry.type) for entry in entries})
-
-    def _load(self, bits: Mapping[Entry, int]) -> None:
-        for entry, each in bits.items():
-            entry.store(each)
-            self._unsaved.pop(entry, None)
+    def _store(self, entry: Entry, bits: int) -> None:
+        super()._store(entry, bits)
+        self._unsaved.discard(entry)
         self._hash = None
 
     # Requests
@@ -218,7 +197,8 @@ class PX4Vehicle(Vehicle):
     def _on_command(self, request: messages.CommandLong, sender: frames.Frame) -> None:
         is_message = request.command == messages.MAV_CMD_REQUEST_MESSAGE
         if request.command == messages.MAV_CMD_PREFLIGHT_STORAGE and request.param1 == _RESET_ALL:
-            self._load({entry: entry.row.bits for entry in self.entries})
+            for entry in self.entries:
+                self._store(entry, entry.row.bits)
             self._acknowledge(request, sender)
         elif is_message and self.metadata and request.param1 == _METADATA:
             crc = crc32_px4(self.files[GENERAL_FILE])
@@ -251,16 +231,10 @@ class PX4Vehicle(Vehicle):
     # Changes
 
     def _write(self, entry: Entry, bits: int) -> None:
-        before = entry.bits
-        if bits == before:
+        if bits == entry.bits:
             return
-        entry.store(bits)
-        self._hash = None
-        if _is_near(entry, before):
-            kept = self._unsaved.get(entry)
-            self._unsaved[entry] = before if kept is None else kept
-            return
-        self._unsaved[entry] = None
+        self._store(entry, bits)
+        self._unsaved.add(entry)
         if late := self._late_use.get(entry.name):
             self._waking |= late
             self._sooner(self._wake, self._now + _PUSH_DELAY)
@@ -280,12 +254,6 @@ class PX4Vehicle(Vehicle):
     def _end_all(self) -> None:
         super()._end_all()
         self._never_used |= self._used_once  # the sensors of the first start are stored
-        for entry in self.entries:
-            default, kept = entry.row.default, self._unsaved.get(entry)
-            if kept is not None:
-                entry.store(kept)
-            if default is not None and _is_near(entry, bits_of(default, entry.type)):
-                entry.store(bits_of(default, entry.type))
         autoconfig = self._find("SYS_AUTOCONFIG")
         if autoconfig is not None and autoconfig.bits != 0:
             for entry in self.entries:
@@ -298,8 +266,7 @@ class PX4Vehicle(Vehicle):
 
     def _switch_on(self, at: float) -> None:
         self._unused = set(self._never_used)
-        self._unsaved: dict[Entry, int | None] = dict.fromkeys(map(self._entry, self.unsaved))
-        """With the saved bits of floats that have since changed by at most FLT_EPSILON."""
+        self._unsaved = set(map(self._entry, self.unsaved))
         self._waking: frozenset[str] = frozenset()
         self._hash_next = False
         self._push_from: int | None = None
@@ -367,13 +334,6 @@ class PX4Vehicle(Vehicle):
         if value is not None:
             raw, place = value.to_bytes(4, "little"), (len(self._listed), messages.NO_INDEX)
             self.send(messages.ParamValue(messages.HASH_CHECK, raw, ParamType.UINT32, *place))
-
-
-def _is_near(entry: Entry, bits: int) -> bool:
-    """Return whether the entry is a float that PX4 considers equal to another one."""
-    if entry.type != ParamType.REAL32 or entry.bits == bits:
-        return False
-    return distance(entry.value, from_bits(bits, entry.type)) <= FLT_EPSILON
 
 
 _LIMITED = frozenset(name for limit in LIMITS for name in limit if isinstance(name, str))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
@@ -12,7 +12,7 @@ from paramclient.model.values import Encoding, Param, ParamType, WireValue, bits
 from paramclient.protocol.param_pck import PackedParam
 from paramclient.sim.device import Device
 from paramclient.sim.ftp import FileServer
-from paramclient.sim.param_table import Entry, SimParam, Table, as_table, check_range
+from paramclient.sim.param_table import Entry, SimParam, Table, as_table
 from paramclient.wire import frames, messages
 
 __all__ = ["SIMULATED_COMMIT", "GenericVehicle", "Vehicle"]
@@ -22,8 +22,6 @@ SIMULATED_COMMIT: Final = "5eed5eed"
 digits. Their tables and versions are those of a real firmware, but their descriptions are not: with its
 commit, the stored descriptions of one would be used for the other. A real commit has these first 8 digits
 with a probability of 1 in 4 billion, and all 16 practically never."""
-TABLE_SIZE_MAX: Final = 65535
-"""Parameters of a table: param_count has 16 bits, and index 65535 means none."""
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -54,8 +52,6 @@ class Vehicle(Device):
             calls; datagrams are never joined.
         dead: indices and names that the list leaves out, and whose reads are not answered. They still count,
             and a set of them is answered. Can be replaced at any time.
-        list_stops_at: number of values after which a list stops, once; None for never. The list has then
-            ended: a new request starts at the beginning.
         reboot_down: seconds for which the vehicle is off during a reboot.
         signing_key: the key that signs sent frames; only frames signed with it, and RADIO_STATUS, are then
             accepted. None: no signing, until SETUP_SIGNING sets a key. A sender's timestamps must rise, and
@@ -71,7 +67,6 @@ class Vehicle(Device):
     period: float = 0.01
     param_error: bool = False
     dead: Collection[int | str] = ()
-    list_stops_at: int | None = None
 
     def _set_up_table(
         self,
@@ -85,22 +80,12 @@ class Vehicle(Device):
         self._by_name = {self._key(entry.name): entry for entry in reversed(self.entries)}
         if len({entry.name for entry in self.entries}) < len(self.entries):
             raise UsageError("the table contains a parameter name twice")
-        check_range(0, TABLE_SIZE_MAX, **{"the size of a table": len(self.entries)})
-        if self.param_error and self.mavlink_version == 1:
-            raise UsageError("PARAM_ERROR does not exist in MAVLink 1")
-        check_range(1, burst=self.burst, list_stops_at=(self.list_stops_at or 0) + 1)
-        if not 0.0 < self.period < math.inf:
-            raise UsageError(f"period must be a number of seconds above 0, not {self.period}")
         for each in self.dead:
             if isinstance(each, str):
                 self._entry(each)
-            else:
-                check_range(0, TABLE_SIZE_MAX - 1, **{"an index in dead": each})
         self.file_server = file_server
         self._listed: list[Entry] = []
         self._when_listed: dict[int, list[Callable[[], object]]] = {}
-        if self.list_stops_at is not None:
-            self.when_listed(self.list_stops_at, self._stop_list)
         self._set_up(heartbeat, version)
 
     # Public interface
@@ -133,13 +118,9 @@ class Vehicle(Device):
         """Call a function once, when a list has sent this many values since its start.
 
         For events during a list: `px4.when_listed(300, lambda: px4.use("WV_EN"))` changes the count,
-        `px4.when_listed(300, px4.reboot)` ends the list. The function may change the vehicle in any way;
-        several functions for one count are called in the given order.
-
-        Raises:
-            UsageError: the count is below 0.
+        `px4.when_listed(300, px4.stop_list)` and `px4.reboot` end the list. The function may change the
+        vehicle in any way; several functions for one count are called in the given order.
         """
-        check_range(0, count=count)
         self._when_listed.setdefault(count, []).append(do)
 
     @property
@@ -166,6 +147,16 @@ class Vehicle(Device):
         """
         entry = self._entry(name)
         self._write(entry, bits_of(value, entry.type))
+
+    def load(self, values: Mapping[str, WireValue]) -> None:
+        """Change values as code on board does that announces nothing, such as PX4's `param load`.
+
+        Raises:
+            UsageError: the vehicle has no parameter with such a name, or a value does not fit its type.
+        """
+        for name, value in values.items():
+            entry = self._entry(name)
+            self._store(entry, bits_of(value, entry.type))
 
     def respond(self, message: messages.Message, sender: frames.Frame) -> None:
         """See `Device.respond`."""
@@ -212,6 +203,10 @@ class Vehicle(Device):
 
     def _write(self, entry: Entry, bits: int) -> None:
         """Set another value, from any source, and start what follows from the change."""
+        self._store(entry, bits)
+
+    def _store(self, entry: Entry, bits: int) -> None:
+        """Set another value, without announcing it."""
         entry.store(bits)
 
     def _is_listed(self, entry: Entry) -> bool:
@@ -251,7 +246,8 @@ class Vehicle(Device):
         self._list_sent = 0
         self._due[self._send_list] = max(at, self._on_at + self.boot_time)
 
-    def _stop_list(self) -> None:
+    def stop_list(self) -> None:
+        """End the list without its remaining values; a new request starts at the beginning."""
         self._position = None
 
     def _send_list(self, at: float) -> None:

@@ -705,9 +705,8 @@ def test_show_lists_several_vehicles_and_prints_one(command: Command, warm: Path
         (["sim", "px4", "--link", "sim:px4"], "itself a simulated vehicle"),
         (["sim", "px4", "--loss", "2", "--link", "tcp:127.0.0.1:1"], "loss"),
         (["sim", "px4", "--dead", "NOPE", "--link", "tcp:127.0.0.1:1"], "NOPE"),
-        (["sim", "px4", "--list-stops-at", "-1", "--link", "tcp:127.0.0.1:1"], "list_stops_at"),
+        (["sim", "px4", "--list-stops-at", "-1", "--link", "tcp:127.0.0.1:1"], "--list-stops-at"),
         (["sim", "px4", "--reboot-at", "0", "--link", "tcp:127.0.0.1:1"], "--reboot-at"),
-        (["sim", "px4", "--other-list-every", "0", "--link", "tcp:127.0.0.1:1"], "list_every"),
         (["history"], "VEHICLE"),
     ],
 )

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from paramclient.sim import Air, GenericVehicle, PX4Vehicle
-from paramclient.sim.other_station import OtherStation
+from paramclient.sim import GenericVehicle, PX4Vehicle
+from paramclient.wire.messages import Heartbeat, Message
 from tests.commands import Command, Put
 
 URL = "sim:custom"
@@ -25,6 +25,14 @@ class Deaf(PX4Vehicle):
 
     def receive(self, data: bytes, now: float) -> None:
         """Lose what is sent to the vehicle."""
+
+
+class Station(GenericVehicle):
+    """A ground station, which sends heartbeats."""
+
+    def send(self, message: Message) -> None:
+        if isinstance(message, Heartbeat):
+            super().send(Heartbeat(6, 8))
 
 
 SPEAKS = "1/1 sends messages (the last one "
@@ -48,7 +56,7 @@ def test_one_cause_of_many_writes_is_explained_once(command: Command, put: Put) 
 
 
 def test_only_another_station_is_received(command: Command, put: Put) -> None:
-    done = command("get", put(Air([], others=[OtherStation(system=252)])), "A", "--timeout", 3)
+    done = command("get", put(Station({}, system=252, component=190)), "A", "--timeout", 3)
     assert done.code == 3
     assert done.err == (
         "paramclient: no reply: an autopilot in 3.0 s. Heard on sim:custom so far: only 252/190 ground "
@@ -87,7 +95,7 @@ def test_a_terminal_shows_what_is_awaited(
     command: Command, put: Put, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     use_terminal(monkeypatch)
-    done = command("get", put(Air([], others=[OtherStation(system=252)])), "A", "--timeout", 3.2)
+    done = command("get", put(Station({}, system=252, component=190)), "A", "--timeout", 3.2)
     texts = drawn(done.err)
     received = "Heard on sim:custom so far: only 252/190 ground station, an"
     assert texts[0] == "waiting for an autopilot on sim:custom (0 s). " + received[: 99 - 46]

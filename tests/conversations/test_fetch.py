@@ -268,7 +268,8 @@ def test_dead_indices_are_missing() -> None:
 
 def test_a_list_that_stops_is_completed() -> None:
     async def main() -> None:
-        for vehicle in (PX4Vehicle(list_stops_at=500), ArduPilotVehicle(ftp=False, list_stops_at=700)):
+        for vehicle, count in ((PX4Vehicle(), 500), (ArduPilotVehicle(ftp=False), 700)):
+            vehicle.when_listed(count, vehicle.stop_list)
             async with converse(vehicle) as conversation:
                 node = await conversation.node()
                 node.plain.serves_file = False

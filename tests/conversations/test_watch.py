@@ -12,8 +12,8 @@ from paramclient.protocol.fetch import Policy, fetch_all
 from paramclient.protocol.node import Node
 from paramclient.protocol.session import Session
 from paramclient.protocol.watch import SyncState, Watch
-from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, OtherStation, PX4Vehicle
-from paramclient.wire.messages import ParamRequestList, ParamRequestRead, ParamSet, ParamValue
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
+from paramclient.wire.messages import ParamRequestList, ParamRequestRead, ParamSet, ParamValue, encode
 from tests.conversations.virtual import Conversation, Silence, Tap, converse, virtual, virtual_on_both
 
 REQUESTS = (ParamRequestList, ParamRequestRead, ParamSet)
@@ -196,10 +196,11 @@ async def test_a_check_that_fails_is_repeated_and_none_runs_beside_a_hold() -> N
 @virtual
 async def test_a_list_for_another_station_is_taken_and_restarts_nothing() -> None:
     vehicle = PX4Vehicle()
-    air = Air([vehicle], others=[OtherStation(list_every=7.0)])
-    async with watched(air, interval=0.0) as found:
+    async with watched(vehicle, interval=0.0) as found:
         vehicle.load({"MC_ROLL_P": 3.25})
         before = found.requests
+        request = encode(ParamRequestList(1, 1), system=254, component=190, sequence=0)
+        vehicle.receive(request, anyio.current_time())
         await anyio.sleep(9.0)
         assert found.requests == before
         assert found.session.table.params["MC_ROLL_P"].value == 3.25

@@ -28,7 +28,7 @@ from paramclient.protocol.reads import read, read_many, read_param
 from paramclient.protocol.session import Session
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetStatus
 from paramclient.protocol.writes import write, write_many
-from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, OtherStation, PX4Vehicle, SimParam
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
 from paramclient.wire.messages import (
     NO_INDEX,
     AutopilotVersion,
@@ -38,6 +38,7 @@ from paramclient.wire.messages import (
     ParamRequestRead,
     ParamSet,
     ParamValue,
+    encode,
 )
 from tests.conversations.virtual import Puppet, Silence, Tap, converse, run, virtual, virtual_on_both
 
@@ -561,12 +562,14 @@ async def test_another_vehicle_behind_a_value_ends_a_write_and_no_read() -> None
 
 @virtual
 async def test_a_change_has_the_author_whose_set_was_seen() -> None:
-    sets = [(2.0, SimParam("MC_ROLL_P", ParamType.REAL32, 3.0))]
     vehicle = PX4Vehicle()
-    air = Air([vehicle], others=[OtherStation(system=254, sets=sets)])
-    async with converse(air) as conversation:
+    async with converse(vehicle) as conversation:
         session = (await conversation.node()).plain
         await read(session, "MC_ROLL_P")
+        theirs = ParamSet(1, 1, "MC_ROLL_P", struct.pack("<f", 3.0), ParamType.REAL32)
+        conversation.hear(theirs, system=254, component=190)
+        data = encode(theirs, system=254, component=190, sequence=0)
+        vehicle.receive(data, anyio.current_time())
         await anyio.sleep(3.0)
         await write(session, "MC_ROLL_P", 5.0)
         await write(session, "MC_ROLL_P", 6.0, author="us for pilot")

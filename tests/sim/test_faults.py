@@ -9,15 +9,12 @@ from typing import Literal
 
 import pytest
 
-from paramclient.errors import CommandResult, UsageError
+from paramclient.errors import CommandResult
 from paramclient.model.values import Encoding, ParamType
 from paramclient.sim import (
-    Air,
     ArduPilotVehicle,
     GenericVehicle,
-    OtherStation,
     PX4Vehicle,
-    SimParam,
     Vehicle,
 )
 from paramclient.wire import frames, messages
@@ -34,23 +31,6 @@ EVERY_KIND = pytest.mark.parametrize("kind", [GenericVehicle, PX4Vehicle, ArduPi
 def listed(station: Station, seconds: float = 0.5) -> list[int]:
     """Return the indices that a list sends."""
     return [index for index in indices(station.ask(LIST, seconds=seconds)) if index != NO_INDEX]
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: GenericVehicle(TEN, dead=["NO_SUCH"]),
-        lambda: GenericVehicle(TEN, dead=[-1]),
-        lambda: GenericVehicle(TEN, list_stops_at=-1),
-        lambda: GenericVehicle(TEN).when_listed(-1, list),
-        lambda: OtherStation(system=0),
-        lambda: OtherStation(list_every=0.0),
-        lambda: OtherStation(sets=[(-1.0, SimParam("A", ParamType.INT32, 1))]),
-    ],
-)
-def test_invalid_arguments_are_rejected(make: Callable[[], object]) -> None:
-    with pytest.raises(UsageError):
-        make()
 
 
 @EVERY_KIND
@@ -77,17 +57,14 @@ class TestDead:
 
 
 @EVERY_KIND
-class TestListStops:
-    def test_a_list_stops_once(self, kind: Callable[..., Vehicle]) -> None:
-        station = Station(kind(table=TEN, list_stops_at=4))
-        assert listed(station) == [0, 1, 2, 3]
-        assert indices(station.ask(read(index=8))) == [8]
-        assert listed(station) == list(range(10))
-
-    def test_a_list_stops_at_its_start(self, kind: Callable[..., Vehicle]) -> None:
-        station = Station(kind(table=TEN, list_stops_at=0))
-        assert listed(station) == []
-        assert len(listed(station)) == 10
+@pytest.mark.parametrize("count", [0, 4])
+def test_a_list_stops_once(kind: Callable[..., Vehicle], count: int) -> None:
+    vehicle = kind(table=TEN)
+    vehicle.when_listed(count, vehicle.stop_list)
+    station = Station(vehicle)
+    assert listed(station) == list(range(count))
+    assert indices(station.ask(read(index=8))) == [8]
+    assert listed(station) == list(range(10))
 
 
 class TestWhenListed:
@@ -220,12 +197,3 @@ class TestClock:
         assert states[0] == first
         assert states[-1] == then
         assert states == sorted(states, key=[first, then].index)
-
-
-class TestOtherStation:
-    def test_another_station_restarts_the_list(self) -> None:
-        vehicle = PX4Vehicle()
-        air = Air([vehicle], others=[OtherStation(list_every=0.3)])
-        values = Station(air).ask(LIST, seconds=1.0)
-        assert indices(values).count(0) == 4
-        assert vehicle.requests["PARAM_REQUEST_LIST"] == 4
