@@ -259,9 +259,9 @@ def test_the_commands_for_users_of_other_programs_run(tmp_path: Path) -> None:
 
 
 @contextmanager
-def simulating(autopilot: str, port: int, cwd: Path, *options: str) -> Iterator[None]:
+def simulating(vehicle: str, port: int, cwd: Path) -> Iterator[None]:
     """Run a simulated vehicle in a process of its own, which sends to a port of this computer."""
-    words = ["-m", "paramclient", "sim", autopilot, "--link", f"udpout:127.0.0.1:{port}", *options]
+    words = ["-m", "paramclient", "sim", vehicle, "--link", f"udpout:127.0.0.1:{port}"]
     with subprocess.Popen(
         [sys.executable, *words],
         cwd=cwd,
@@ -312,11 +312,11 @@ def test_the_commands_for_sitl_print_what_the_page_shows(
 def test_the_first_steps_print_what_the_page_shows(port: int, tmp_path: Path) -> None:
     """With the four simulated vehicles of the page, on another port."""
     page = (DOCS / "first-steps.md").read_text(encoding="utf-8")
-    assert "sim px4 --metadata --link udpout:127.0.0.1:14550 --system $number" in page
+    assert 'sim "px4?metadata=1&system=$number" --link udpout:127.0.0.1:14550' in page
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     with ExitStack() as vehicles:
         for number in "1234":
-            vehicles.enter_context(simulating("px4", port, tmp_path, "--metadata", "--system", number))
+            vehicles.enter_context(simulating(f"px4?metadata=1&system={number}", port, tmp_path))
         for command in blocks(DOCS / "first-steps.md", "sh")[0].splitlines():
             done = run_command(command.replace("14550", str(port)), tmp_path)
             assert (done.returncode, "1/1" in done.stdout) == (0, True), command + done.stderr

@@ -244,7 +244,7 @@ _add(_app, "logs:import_", "FILE [FILE...]", "flight.tlog")
 _add(_app, "serve:serve", "LINK [LINK...]", "serial:/dev/ttyACM0:57600 --listen 127.0.0.1:0")
 _add(_app, "serve:token", None, "anna --file tokens", "wall-display --file tokens --read")
 _add(_app, "ports:ports")
-_add(_app, "simulate:sim", None, "px4 --link udpout:127.0.0.1:14550 --loss 0.05 --seed 1")
+_add(_app, "simulate:sim", None, "px4 --link udpout:127.0.0.1:14550", "'ardupilot?loss=0.05&seed=1'")
 for _group in (_cache, _metadata, _signing):
     _app.command(_group)
 _add(_signing, "signing:setup", None, "udpin:0.0.0.0:14550 --signing-key vehicle.key")

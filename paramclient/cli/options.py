@@ -12,7 +12,6 @@ from typing import Annotated, Final, TypeAlias
 from cyclopts import Group, Parameter
 from cyclopts.validators import Number
 
-from paramclient.client.component import SETTLE_MAX
 from paramclient.client.signing import Signing, key_from_environment, read_key
 from paramclient.errors import UsageError
 from paramclient.model.values import Encoding
@@ -21,14 +20,11 @@ from paramclient.wire.signing import SigningKey
 __all__ = [
     "CONNECTION",
     "ApplyFlags",
-    "IN_ID_RANGE",
     "CacheOptions",
-    "Id",
     "KeyOptions",
     "Positive",
     "LinkOptions",
     "Seconds",
-    "Settle",
     "TrafficOptions",
     "Verbose",
 ]
@@ -39,11 +35,6 @@ SOURCE_SYSTEM: Final = 255
 CONNECTION: Final = Parameter(group=Group("Connection", sort_key=9))
 """Options of the link, which stand at the end of the help."""
 
-IN_ID_RANGE: Final = Parameter(validator=Number(gte=1, lte=255))
-"""Of a system or component id."""
-Id: TypeAlias = Annotated[int | None, IN_ID_RANGE]
-"""A system or component id, or none."""
-
 
 def _check_seconds(_: object, seconds: float | None) -> None:
     if seconds is not None and not 0 < seconds < math.inf:
@@ -52,8 +43,6 @@ def _check_seconds(_: object, seconds: float | None) -> None:
 
 Seconds: TypeAlias = Annotated[float | None, Parameter(validator=_check_seconds)]
 """A timeout in seconds."""
-Settle: TypeAlias = Annotated[float, Parameter(validator=Number(gte=0, lte=SETTLE_MAX))]
-"""Seconds to watch a value after a write."""
 Positive: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1))]
 """A whole number from 1 up, or none."""
 Verbose: TypeAlias = Annotated[bool, Parameter(name=("--verbose", "-v"))]
@@ -80,7 +69,7 @@ class KeyOptions:
     signing_key: Annotated[Path | None, CONNECTION] = None
     """A file with the key. Default: that of the environment."""
 
-    source_system: Annotated[int, IN_ID_RANGE, CONNECTION] = SOURCE_SYSTEM
+    source_system: Annotated[int, CONNECTION, Parameter(validator=Number(gte=1, lte=255))] = SOURCE_SYSTEM
     """System id of this computer. Default: 255."""
 
     @property

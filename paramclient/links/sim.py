@@ -108,14 +108,19 @@ async def serve_endpoint(
         await link.close()
 
 
-def simulated(spec: LinkSpec) -> SimLink:
-    """Return the vehicle of a `sim:` name, behind a faulty link with the faults of its options."""
+def simulated(spec: LinkSpec, **options: Any) -> SimLink:
+    """Return the vehicle of a `sim:` name, behind a faulty link with the faults of its options.
+
+    Args:
+        spec: the parsed name.
+        options: further options of the vehicle.
+    """
     from paramclient import sim  # imported here: loads parameter tables
 
     kinds: dict[str, Callable[..., Vehicle]]
     kinds = {"px4": sim.PX4Vehicle, "ardupilot": sim.ArduPilotVehicle, "camera": sim.Camera}
     faults: dict[str, Any] = dict(spec.options)
-    options = {key: faults.pop(key) for key in VEHICLE_OPTIONS if key in faults}
+    options |= {key: faults.pop(key) for key in VEHICLE_OPTIONS if key in faults}
     if "metadata" in options and spec.host != "px4":
         raise UsageError(f"{spec}: option metadata is for sim:px4; other vehicles describe no parameters")
     vehicle = kinds[spec.host](**options)
