@@ -6,7 +6,7 @@ All links implement `Link`; a program can provide its own implementation.
 - `link`, `names`: the interface of links, and their names.
 - `udp`, `tcp`, `serial`, `sim`, `replay`: one module for each kind of link.
 - `refusals`: the reason why a link cannot be opened.
-- `ports`, `serial_transport`, `tlog`: serial ports, serialx on Windows, logs.
+- `ports`, `tlog`: the list of serial ports, logs.
 """
 
 from __future__ import annotations

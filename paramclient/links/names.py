@@ -122,8 +122,9 @@ _LISTENING = frozenset({LinkKind.UDPIN, LinkKind.TCPIN})
 
 _SERVICE = re.compile(r"https?://", re.IGNORECASE)
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*):(.*)")
-_HOST_PORT = re.compile(r"(?:\[([^\[\]]*)\]|([^:\[\]]*)):([^:]*)")
-_HOST_LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
+_HOST_PORT = re.compile(r"(?:(?:\[([^\[\]]+)\]|([^:\[\]]*)):)?([0-9]{1,5})")
+_LABEL = "[A-Za-z0-9_](?:[A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?"
+_HOST = re.compile(rf"(?=.{{1,253}}$){_LABEL}(?:\.{_LABEL})*\.?")
 _DEVICE = re.compile(r"(/[!-~]+?|COM[0-9]{1,3})(?:[:,]([0-9]{1,8}))?", re.IGNORECASE)
 _BARE_DEVICE = re.compile(r"/dev/|COM[0-9]", re.IGNORECASE)
 
@@ -139,56 +140,32 @@ def _parse(name: str) -> LinkSpec:
     scheme = _SCHEME.fullmatch(name)
     kind = _SCHEMES.get(scheme[1].lower()) if scheme else None
     if scheme is None or kind is None:
-        if "/" in name or not _HOST_PORT.fullmatch(name):
+        if "/" in name or ":" not in name or not _HOST_PORT.fullmatch(name):
             _fail(f"{scheme[1]!r} is not a kind of link" if scheme else "the kind of link is missing")
         return _network(LinkKind.UDPIN, name)
     rest = scheme[2].removeprefix("//")
     if kind in _PARSERS:
         return _PARSERS[kind](rest)
-    if kind in _LISTENING and rest.isdecimal():
-        rest = f":{rest}"
     return _network(kind, rest)
 
 
 def _network(kind: LinkKind, rest: str) -> LinkSpec:
+    is_listening = kind in _LISTENING
     parts = _HOST_PORT.fullmatch(rest)
-    if parts is None:
-        if rest.count(":") > 1:
-            _fail("write an IPv6 address in brackets, as in udpin:[::1]:14550")
-        _fail("the host is missing" if rest.isdecimal() else "the port is missing")
-    bracketed, host, digits = parts.groups()
-    listening = kind in _LISTENING
-    if bracketed is not None:
-        try:
+    bracketed, host, port = parts.groups() if parts else (None, None, "-1")
+    host = host or ("0.0.0.0" if is_listening else "")
+    if not (0 if is_listening else 1) <= int(port) <= 65535 or not (bracketed or host):
+        _fail("expected HOST:PORT, with an IPv6 address in brackets, and a port up to 65535")
+    try:
+        if bracketed:
             host = str(IPv6Address(bracketed))
-        except AddressValueError:
-            _fail(f"{bracketed!r} is not an IPv6 address")
-    elif host:
-        host = _host(host)
-    elif listening:
-        host = "0.0.0.0"
-    else:
-        _fail("the host is missing")
-    return LinkSpec(kind, host, _port(digits, smallest=0 if listening else 1))
-
-
-def _host(host: str) -> str:
-    if re.fullmatch(r"[0-9.]+", host):
-        try:
-            return str(IPv4Address(host))
-        except AddressValueError:
-            _fail(f"{host!r} is not an IPv4 address")
-    if len(host) > 253 or not all(map(_HOST_LABEL.fullmatch, host.removesuffix(".").split("."))):
-        _fail(f"{host!r} is not a host name")
-    return host.lower()
-
-
-def _port(digits: str, *, smallest: int) -> int:
-    if not digits:
-        _fail("the port is missing")
-    if not re.fullmatch("[0-9]{1,5}", digits) or not smallest <= int(digits) <= 65535:
-        _fail(f"{digits!r} is not a port; ports are {smallest} to 65535")
-    return int(digits)
+        elif re.fullmatch(r"[0-9.]+", host):
+            host = str(IPv4Address(host))
+        elif not _HOST.fullmatch(host):
+            raise AddressValueError
+    except AddressValueError:
+        _fail(f"{bracketed or host!r} is not a host name or an address")
+    return LinkSpec(kind, host.lower(), int(port))
 
 
 def _serial(rest: str) -> LinkSpec:

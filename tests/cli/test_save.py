@@ -113,7 +113,7 @@ def test_what_was_received_is_written_with_incomplete_and_the_file_names_the_oth
 def test_values_that_are_no_numbers_are_left_out_of_a_file_that_cannot_hold_them(
     command: Command, put: Put, tmp_path: Path, ending: str
 ) -> None:
-    raw = {"WIDE": (b"\1\0\0\0", ParamType.INT64), "ODD": (b"\2\0\0\0", 0)}
+    raw = {"WIDE": (b"\1\0\0\0", ParamType.INT64), "ODD": (b"\2\0\0\0", ParamType(0))}
     path = tmp_path / f"quad.{ending}"
     saved = command("save", put(Partial({**TABLE, **raw})), path, "--no-cache")
     assert saved.code == 0

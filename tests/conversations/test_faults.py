@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable, Coroutine, Iterable
 from contextlib import suppress
 from random import Random
+from typing import Any, TypeAlias
 
 import anyio
 import pytest
@@ -18,7 +19,7 @@ from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read
 from paramclient.protocol.station import Station
 from paramclient.protocol.writes import write
-from paramclient.sim import Air, ArduPilotVehicle, Faults, GenericVehicle, PX4Vehicle, Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire.messages import (
     NO_INDEX,
     AutopilotVersion,
@@ -39,6 +40,8 @@ from paramclient.wire.messages import (
     encode,
 )
 from tests.conversations.virtual import Puppet, converse, jump, run, virtual, virtual_on_both
+
+Faults: TypeAlias = dict[str, Any]
 
 KINDS = {
     "loss in bursts": Faults(loss=0.2, loss_burst=5.0, delay=0.05),

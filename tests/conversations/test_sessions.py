@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import anyio
 import pytest
@@ -19,8 +19,10 @@ from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
 from paramclient.protocol.writes import write
-from paramclient.sim import Air, ArduPilotVehicle, Faults, GenericVehicle, PX4Vehicle, SimParam, Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
 from tests.conversations.virtual import Silence, converse, run
+
+Faults: TypeAlias = dict[str, Any]
 
 TABLE = [
     SimParam(f"P{number:02}", ParamType.INT32 if number % 3 else ParamType.REAL32, number)
