@@ -18,14 +18,14 @@ from paramclient.protocol.channel import (
 )
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.session import Session
-from paramclient.wire.messages import HASH_CHECK, PARAMETERS_MAX, Message, ParamError
+from paramclient.wire.messages import HASH_CHECK, Message, ParamError
 
 __all__ = ["ListResult", "download_list"]
 
 LIST_REQUESTS_MAX: Final = 12
 """Requests for a list that does not begin: an ArduPilot ignores them early after its start."""
 LIST_REQUESTS_ALONE: Final = 3
-"""The first of them; reads of a value take turns with the others, for firmware without a list."""
+"""The first of them; reads of the index 0 and 1 take turns with the others, for firmware without a list."""
 LIST_TIMEOUT_MIN: Final = 0.2
 """Seconds to wait for the first value of a list, at least: a second request makes the list begin again."""
 PAUSE_PX4: Final = 0.12
@@ -34,8 +34,12 @@ PAUSE_OTHERS: Final = 0.6
 """The same for other components: ArduPilot's list pauses for up to 0.5 s while it serves reads."""
 PAUSE_TAIL: Final = 0.06
 """The same at the last values of a list, where a pause is rare."""
+PAUSE_END: Final = 0.03
+"""The same behind the last value by its count, which is false where others follow."""
+INTERVALS_END: Final = 2
+"""The same in mean intervals between two values, on a slow link."""
 PAUSE_GROWING: Final = 2.0
-"""The same for a component that counts what it has sent: only the pause tells the end of its list."""
+"""The same for a component whose count grows or is false: only the pause tells the end of its list."""
 PAUSE_INTERVALS: Final = 8
 """Mean intervals between two values after which a slow list has ended: PX4 sends 8 values a second in its
 low-bandwidth mode."""
@@ -110,28 +114,27 @@ class _Download:
         self._count: int | None = None
         self._began = self._last = 0.0
         self._reached = -1  # the highest index
-        self._listed = 0  # values of this pass
+        self._listed = 0  # values of this pass that no read had asked for
+        self._listed_at = 0.0  # when the last of them arrived
         self._rate_before = 0.0  # values per second of the quickest pass before it
-        self._listed_at = 0.0  # when the last value arrived that no read had asked for
+        self._lost: set[int] = set()  # indices of values of the list
         self._skipped: set[int] = set()  # missing indices below the highest one
         self._reading: set[int] = set()  # indices whose reads are in flight
         self._tried: dict[int, int] = {}  # attempts in vain by index that was ever read
         self._gained_at = 0.0  # when the last value arrived that was missing
-        self._has_answer = False  # to a read
 
     async def begin(self) -> None:
         """Request the list until its first value arrives; later a value too, where no list is served."""
-        channel = self.channel
+        channel, dialect, target = self.channel, self.session.dialect, self.channel.reads_from
         self._began = anyio.current_time()
 
-        is_read = False
-
         def request(attempt: int) -> Message:
-            nonlocal is_read
             self.session.report(0, self.table.count)
-            is_read = attempt >= LIST_REQUESTS_ALONE and bool(attempt % 2)
-            dialect, target = self.session.dialect, channel.reads_from
-            return dialect.request_read(target, 0) if is_read else dialect.request_list(target)
+            if attempt < LIST_REQUESTS_ALONE or attempt % 2 == 0:
+                return dialect.request_list(target)
+            which = attempt // 2 % 2 ^ 1
+            self._reading.add(which)
+            return dialect.request_read(target, which)
 
         first: Message = await channel.exchange(
             request,
@@ -142,47 +145,55 @@ class _Download:
             timeout_min=LIST_TIMEOUT_MIN,
         )
         channel.is_streaming = True
-        if is_read:
+        if self._reading:
             self._began = anyio.current_time()  # of the list, if there is one
+        self._listed_at = self._began
         self._take(first)
+        self._reading.clear()
 
     def _first(self, message: Message) -> Message | None:
         """Return the first value of the list; PX4's hash comes before it, and says nothing of its end."""
         assert isinstance(message, self.session.dialect.value)
-        if message.param_index <= message.param_count:
+        if message.param_index in self.table.names:
             return message
         self._take(message)
         return None
 
     async def run(self) -> None:
         """Receive the list and read its gaps."""
-        if self.reads_beside:
-            await self._read_gaps()
-        else:
-            while not self._is_over():
-                await self._take_for(GAPS_INTERVAL)
-            fruitless = 0
-            while (missing := self._missing()) and not self.channel.is_silent(self._began):
-                seconds_left = len(self.table.names) / self._rate() + PASS_OVERHEAD
-                is_slower = len(missing) / READS_PER_SECOND_ARDUPILOT > seconds_left
-                has_begun = len(self._received) > self.channel.window_size  # others may answer earlier reads
-                if (
-                    (has_begun and not is_slower)
-                    or len(missing) < self.channel.window_size
-                    or fruitless >= FRUITLESS_PASSES_MAX
-                ):
-                    await self._read_gaps()
-                    is_short = self._missing() and self._count != 1  # a count of one may be right
-                    if is_short and not self._has_answer and not self.channel.is_silent(self._began):
-                        await self._next_pass()  # some firmware serves no reads
-                    break
-                self.result.lost += len(missing)
+        if not self.reads_beside:
+            await self._take_passes()
+        await self._read_gaps()
+        serves_reads, count = self.session.serves_reads.get(int), self._count
+        has_loss = not serves_reads and any(0 < index < self._reached for index in self._lost)
+        for _ in range(1 + (self.table.is_growing and has_loss)):  # also its end may have been lost twice
+            gaps = self._skipped if self.reads_beside else self._gaps()
+            if gaps and count != 1 and not serves_reads and not self.channel.is_silent(self._began):
                 await self._next_pass()
-                fruitless = fruitless + 1 if self._missing() == missing else 0
+        if not has_loss and not self.channel.is_silent(self._began):
+            self.table.end_list()
         self.result.missing = missing = self._missing()
         self.result.has_gap = any(min(self._received) < each < self._reached for each in missing)
-        if self.table.is_growing and not self.channel.is_silent(self._began):
-            missing.pop()  # it has no more
+        self.result.lost = len(self._lost & {*self._received, *missing})
+
+    async def _take_passes(self) -> None:
+        """Receive the list until it is over, and once more while that is quicker than to read its gaps."""
+        while not self._is_over():
+            await self._take_for(GAPS_INTERVAL)
+        fruitless = 0
+        while (missing := self._missing()) and self._is_served and not self.channel.is_silent(self._began):
+            seconds_left = len(self.table.names) / self._rate() + PASS_OVERHEAD
+            is_slower = len(missing) / READS_PER_SECOND_ARDUPILOT > seconds_left
+            has_begun = len(self._received) > self.channel.window_size  # others may answer earlier reads
+            if (
+                (has_begun and not is_slower)
+                or len(missing) < self.channel.window_size
+                or fruitless >= FRUITLESS_PASSES_MAX
+            ):
+                return
+            self._lost.update(missing)
+            await self._next_pass()
+            fruitless = fruitless + 1 if self._missing() == missing else 0
 
     async def _next_pass(self) -> None:
         """Request the list once more, where that is quicker than reads, and receive it."""
@@ -192,7 +203,7 @@ class _Download:
         self._skipped.clear()
         self._rate_before, self._listed = self._rate(), 0
         self._began = self._listed_at = anyio.current_time()
-        while self._missing() and not self._is_over():
+        while (self.table.is_growing or self._missing()) and not self._is_over():
             await self._take_for(GAPS_INTERVAL)
         self._reached = max(self._reached, before)
 
@@ -211,7 +222,8 @@ class _Download:
                     if index not in self._reading and not self._is_given_up(index):
                         self._reading.add(index)
                         self._tried.setdefault(index, 0)
-                        self.result.lost += 1
+                        if self._is_served:
+                            self._lost.add(index)
                         tasks.start_soon(self._read, index)
                 await self.channel.gate.wait()
                 await self._take_for(GAPS_INTERVAL)
@@ -222,7 +234,7 @@ class _Download:
         now = anyio.current_time()
         if not self._is_over() or (self.table.is_growing and now - self._listed_at < PAUSE_GROWING):
             return False
-        missing = self._missing()
+        missing = self._gaps()
         if missing and now - self._gained_at < QUEUE_TIME:
             return False
         given_up = sum(map(self._is_given_up, missing))
@@ -254,45 +266,50 @@ class _Download:
                 await channel.exchange(
                     request, inbox, accept, what=what, attempts=self._attempts_max, copies=copies
                 )
-                self._has_answer = True
+                self.session.serves_reads[int] = True
             except NoReply as error:
                 attempts = error.attempts
         await self._take_received()
         self._reading.discard(index)
-        if not self._has(index):
+        if index not in self._received:
             self._tried[index] = attempts
 
     def _missing(self) -> list[int]:
-        """Return the indices that are missing. They begin at 1 if the count itself is one, and 0 is none;
-        where the count grows with the index, the vehicle may have one more."""
-        count = self._count or 0
-        first = int(count in self._received and 0 not in self._received)
-        indices = range(first, first + count + self.table.is_growing)
-        return [index for index in indices if not self._has(index)]
-
-    def _has(self, index: int) -> bool:
-        """Return whether an index was received, and is not forgotten with the encoding of its value.
-
-        The table has no indices where the count is beyond them.
-        """
-        return index in self._received and (index in self.table.names or self._count == PARAMETERS_MAX)
+        """Return the indices that were not received, or whose values were forgotten with their encoding."""
+        return self.table.missing(self._received & self.table.names.keys())
 
     def _gaps(self) -> list[int]:
-        """Return the indices that are missing, below the end of the list so far."""
-        if self._is_over():
-            return self._missing()
-        return sorted(index for index in self._skipped if index <= self._reached - TAIL)
+        """Return the indices to read: below the end of the list so far, or all that are missing.
+
+        The one behind the last is read too where the count may be false, or where they may begin at 1.
+        """
+        if not self._is_over():
+            return sorted(index for index in self._skipped if index <= self._reached - TAIL)
+        gaps, count = set(self._missing()), self._count or 0
+        if self.table.is_growing or not self._is_served:
+            gaps |= {0, count, count + (0 not in self._received)}
+        elif 0 in gaps and self._is_given_up(0):
+            gaps.add(count)
+        return sorted(gaps - self._received)
 
     def _is_over(self) -> bool:
         """Return whether the list has ended: by its last index, or by a pause."""
         count = None if self.table.is_growing else self._count
+        interval, pause = 1 / self._rate() if self._listed else 0.0, PAUSE_OTHERS
         if count is not None and self._reached >= count - 1:
-            return True
-        pause = PAUSE_PX4 if self.reads_beside else PAUSE_OTHERS
-        if count is not None and self._reached >= count - TAIL:
-            pause = PAUSE_TAIL
-        pause = max(pause, PAUSE_INTERVALS / self._rate() if self._listed else self.channel.timing.timeout(0))
-        return anyio.current_time() - self._listed_at > pause or self.channel.is_silent(self._began)
+            pause = 0.0 if self.result.digest else max(PAUSE_END, INTERVALS_END * interval)
+        else:
+            if count is not None and self._reached >= count - TAIL:
+                pause = PAUSE_TAIL
+            elif self.reads_beside:
+                pause = PAUSE_PX4
+            pause = max(pause, PAUSE_INTERVALS * interval or self.channel.timing.timeout(0))
+        return anyio.current_time() - self._listed_at >= pause or self.channel.is_silent(self._began)
+
+    @property
+    def _is_served(self) -> bool:
+        """Whether values of a list arrived, beside those that were read."""
+        return bool(self._listed or self._rate_before)
 
     def _rate(self) -> float:
         """Return the values per second of this list so far, or of an earlier pass."""
@@ -315,21 +332,20 @@ class _Download:
     def _take(self, message: Message) -> None:
         """Take one value."""
         assert isinstance(message, self.session.dialect.value)
-        count, index = min(message.param_count, PARAMETERS_MAX), message.param_index
+        index = message.param_index
         self._last = anyio.current_time()
         if message.param_id == HASH_CHECK:
             self.result.digest = Digest.of(message)
-        if index > count:
+        if index not in self.table.names:
             return
-        if self.table.is_growing:
+        if self._count != self.table.count:
             self._count = self.table.count
-        elif count != self._count:
-            self._count = count
-            self._received = {each for each in self._received if each in self.table.names}
-            self._skipped.clear()
-            self._tried.clear()
-            self._reached = -1
-        if index > self._reached or index not in self._tried:
+            if not self.table.is_growing:
+                self._received &= self.table.names.keys()
+                self._skipped.clear()
+                self._tried.clear()
+                self._reached = -1
+        if index not in self._reading and (index > self._reached or index not in self._tried):
             self._listed_at = self._last
             self._listed += 1
         if index in self._received:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import replace
 from typing import Final
 
@@ -21,7 +21,7 @@ from paramclient.model.values import (
 from paramclient.protocol.dialect import PLAIN, Dialect, Digest, ReportedValue
 from paramclient.protocol.events import Change
 from paramclient.protocol.param_pck import PackedParam
-from paramclient.wire.messages import HASH_CHECK, NO_INDEX, PARAMETERS_MAX
+from paramclient.wire.messages import HASH_CHECK, PARAMETERS_MAX
 
 __all__ = ["Table"]
 
@@ -29,6 +29,9 @@ NAMES_MAX: Final = 65_535
 """Names in one table: as many as there are indices, and as many again without an index (parameters not in
 use). No real component has more."""
 
+BEYOND_MAX: Final = 64
+"""Indices by which a value may be beyond the count, so that the count is false: more than are lost in a row.
+Values further beyond are stored without their index."""
 LEFT_OUT_MAX: Final = 10
 """Names that are not stored, of which the notes tell; so that they stay readable."""
 
@@ -49,8 +52,9 @@ class Table:
         author_of: returns the author of a change of a name.
         left_out: received names that no parameter file can contain, and that are not stored.
         evidence: for each encoding, a value that shows it: name, bytes and type.
-        is_growing: whether each value so far was the last one by its own param_count: a component that counts
-            what it has sent, and whose list ends by a pause.
+        is_growing: whether each value so far was the last one by its own param_count, or some were beyond it:
+            the count grows with the values that arrive, and only a pause tells the end of the list.
+        begins_at_1: whether the component has no index 0, as far as known.
         changed: called with each change, after it is stored.
         recounted: called when the count of a complete table changes, or may have changed.
     """
@@ -65,6 +69,7 @@ class Table:
         self.volatile_is_known = False
         self.left_out: set[str] = set()
         self.is_growing = True
+        self.begins_at_1 = False
         self.author_of: Callable[[str], str] = lambda name: "vehicle"
         self.changed: Callable[[Change], None] = lambda change: None
         self.recounted: Callable[[], None] = lambda: None
@@ -73,6 +78,7 @@ class Table:
         self._wire: dict[str, tuple[bytes, int]] = {}  # as received, until the encoding is certain
         self.evidence: dict[Encoding, tuple[str, bytes, int]] = {}
         self._was_complete = False
+        self._false_count: int | None = None  # a param_count that values exceeded
         self._outdated: set[str] = set()  # names whose index belongs to an earlier count
         self._hash: int | None = None
         self._hash_is_stale = False
@@ -82,17 +88,15 @@ class Table:
     @property
     def is_complete(self) -> bool:
         """Whether every index below the count has a parameter."""
-        if self.count is None:
-            return False
-        has_both_ends = self.count in self.names and 0 in self.names
-        return len(self.names) - has_both_ends >= self.count
+        return self.count is not None and len(self.names) >= self.count and not self.missing()
 
-    def missing(self) -> list[int]:
-        """Return the indices without a parameter. They begin at 1 if the count itself is one, and 0 is
-        none."""
-        count, names = self.count or 0, self.names
-        first = int(count in names and 0 not in names)
-        return [index for index in range(first, first + count) if index not in names]
+    def missing(self, received: Container[int] | None = None) -> list[int]:
+        """Return the indices without a parameter, or those that were not received. They begin at 1 if the
+        count itself is one, and 0 is none."""
+        present, count = self.names if received is None else received, self.count or 0
+        has_last = count in present and not self.is_growing
+        first = int(0 not in present and (self.begins_at_1 or has_last))
+        return [index for index in range(first, first + count) if index not in present]
 
     @property
     def encoding(self) -> Encoding:
@@ -140,20 +144,13 @@ class Table:
         name, raw, number, count, index = message
         if name == HASH_CHECK:
             return None
-        is_last = index == count - 1
-        if count != self.count and 0 < count <= PARAMETERS_MAX:
-            if self.is_growing and is_last:
-                self.count = max(count, self.count or 0)
-            else:
-                self.recount(count)
-        self.is_growing = is_last and (self.is_growing or not self.names)
-        place = index if index <= count <= PARAMETERS_MAX else None
+        place = self._take_count(name, count, index)
         if not self._may_store(name):
             if place is not None:
                 self.names[place] = name
             return None
         old = self.params.get(name)
-        if place is None and old is not None and index == NO_INDEX:
+        if place is None and old is not None:
             place = old.index
         elif place is not None:
             self._take_place(name, place)
@@ -172,6 +169,35 @@ class Table:
         if self._held is not None:
             self._wire[name] = (raw, number)
         return self._put(name, old, new)
+
+    def _take_count(self, name: str, count: int, index: int) -> int | None:
+        """Take the count of a value, unless it is false. Return the index; None for a value without one."""
+        if index >= PARAMETERS_MAX:
+            if 0 < count <= PARAMETERS_MAX and count != self._false_count:
+                self.recount(count)
+            return None
+        count, before = min(count, PARAMETERS_MAX), self.count or 0
+        if index > count or (index == count and (0 in self.names or index == 0)):
+            known = self.params.get(name)
+            if index > before + BEYOND_MAX or (known is not None and known.index not in (None, index)):
+                return None  # some firmware answers reads by name with such an index
+            if not self.is_growing and self.is_complete:
+                self.recounted()
+            self.is_growing, self._false_count = True, count
+        if count == self._false_count:
+            self.count = max(before, index + (not self.begins_at_1))
+        elif self.is_growing and index >= count - 1:
+            self.count = max(before, count)
+        else:
+            self.recount(count)
+            self.is_growing = index >= count - 1 and not self.names
+        return index
+
+    def end_list(self) -> None:
+        """Take note that a list has ended, and that its first and last index are certain."""
+        self.begins_at_1 = 0 not in self.names
+        if self.is_growing and self.names:
+            self.count = max(self.names) + (0 in self.names)
 
     def _take_evidence(self, name: str, raw: bytes, number: int) -> None:
         if self.dialect is PLAIN and len(self.evidence) < len(Encoding):
@@ -263,13 +289,14 @@ class Table:
 
     def recount(self, count: int) -> None:
         """Take a count; another one invalidates all indices."""
+        was_growing, self.is_growing = self.is_growing, False
         if count == self.count:
             return
         was_complete = self.is_complete
-        if self.count is not None:
+        if not was_growing:
             self._outdated |= set(self.names.values())
             self.names.clear()
-        self.count = count
+        self.count, self._false_count, self.begins_at_1 = count, None, False
         self.unconfirm()
         if was_complete:
             self.recounted()
@@ -357,7 +384,8 @@ class Table:
         for each in (self.params, self.names, self.moments, self._wire, self._outdated, self.left_out):
             each.clear()
         self.evidence.clear()
-        self.count = None
+        self.count = self._false_count = None
+        self.is_growing, self.begins_at_1 = True, False
         self.volatile, self.volatile_is_known = frozenset(), False
         self._was_complete = False
         self.unconfirm()

@@ -108,30 +108,40 @@ async def test_an_acknowledgement_in_another_type_changes_neither_the_type_nor_t
             ]
 
 
+COUNTS = {
+    "right": lambda index: 40,
+    "growing": lambda index: index + 1,
+    "its index": lambda index: index,
+    "0": lambda index: 0,
+    "5": lambda index: 5,
+    "39": lambda index: 39,
+}
+
+
+@pytest.mark.parametrize("heartbeat", [QUIET, PX4], ids=["generic", "PX4"])
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize(
-    "options",
-    [
-        {"first": 1},
-        {"first": 1, "serves": ("list",)},
-        {"count": lambda index: index + 1},
-        {"count": lambda index: index + 1, "serves": ("list",)},
-    ],
-    ids=["from 1", "from 1, list only", "growing", "growing, list only"],
+    ("serves", "loss"),
+    [(EVERYTHING, 0.0), (EVERYTHING, 0.1), (("list",), 0.0), (("indices",), 0.0)],
+    ids=["all", "all, loss", "list only", "reads by index only"],
 )
-@pytest.mark.parametrize("loss", [0.0, 0.1])
 @virtual
-async def test_odd_indices_and_counts_make_a_complete_table(options: dict[str, Any], loss: float) -> None:
-    vehicle = Partial({f"P{number:02}": (number, ParamType.INT32) for number in range(40)}, **options)
+async def test_odd_indices_and_counts_make_a_complete_table(
+    serves: tuple[str, ...], loss: float, count: str, first: int, heartbeat: Heartbeat
+) -> None:
+    table = {f"P{number:02}": (number, ParamType.INT32) for number in range(40)}
+    vehicle = Partial(table, serves=serves, count=COUNTS[count], first=first, heartbeat=heartbeat)
     async with converse(Air.symmetric([vehicle], loss=loss, seed=5)) as conversation:
         session = (await conversation.node()).plain
-        for _ in range(4):
-            result = await fetch_all(session)
-            if len(result.params) == 40:
-                break
-        assert (result.complete, len(result.params), result.count) == (True, 40, 40)
-        assert {name: each.value for name, each in result.params.items()} == {
-            f"P{number:02}": number for number in range(40)
+        result = await fetch_all(session)
+        assert (result.complete, len(result.params), result.count, result.missing) == (True, 40, 40, ())
+        assert {name: (each.value, each.index) for name, each in result.params.items()} == {
+            f"P{number:02}": (number, number + first) for number in range(40)
         }
+        assert bool(result.lost) <= bool(loss)
+        conversation.hear(ParamValue("P02", bytes(4), ParamType.INT32, COUNTS[count](2 + first), 2 + first))
+        assert session.table.is_complete
 
 
 @pytest.mark.parametrize("serves", [EVERYTHING, ("list",)], ids=["reads", "list only"])
