@@ -2,8 +2,9 @@
 
 - `app`: all subcommands, the main function, signals and errors.
 - Subcommands: `read_commands` (fetch, get), `set_command`, `reset_command`, `writes` of both, `watch`,
-  `show`, `cached` (cache, history), `search` (search, info), `logs` (import), `apply`, `restore`, `save`,
-  `diff`, `metadata`, `link`, `check`, `ports`, `signing`, `serve` (serve, token) and `simulate` (sim).
+  `show`, `cached` (cache, history), `search` (search, info), `logs` (import), `apply` (apply, restore),
+  `save`, `diff`, `metadata`, `link`, `check`, `ports`, `signing`, `serve` (serve, token) and `simulate`
+  (sim).
 - `session`: open links with the vehicles of --vehicle, on which a subcommand works. `options`: options.
 - `sources`: the parameters that an argument names: of a file, a link or the cache. `time_arguments`: times.
 - `param_names`: names and patterns of parameters, and suggestions.

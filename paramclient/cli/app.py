@@ -42,7 +42,8 @@ def run(arguments: Sequence[str]) -> int:
             given = bound.arguments
             if given.get("verbose", getattr(given.get("options"), "verbose", False)):
                 printer.show_steps()
-            call = partial(command, *bound.args, **bound.kwargs)
+            words = ["-" if word == STDIN else word for word in bound.args]
+            call = partial(command, *words, **bound.kwargs)
             code = anyio.run(_until_signal, call) if inspect.iscoroutinefunction(command) else call()
         except CycloptsError as error:
             report(_usage_text(error))
@@ -237,9 +238,9 @@ _add(
     "apply:apply",
     "URL FILE",
     "udpin:0.0.0.0:14550 quad.params --dry-run",
-    "udpin:0.0.0.0:14550 fleet.param --vehicle all --overlay 'own/{system}.param'",
+    "udpin:0.0.0.0:14550 'own/{system}.param' --vehicle all",
 )
-_add(_app, "restore:restore", "URL [WHEN|FILE]", "sim:px4 --dry-run", "udpin:0.0.0.0:14550 '2h ago'")
+_add(_app, "apply:restore", "URL [WHEN|FILE]", "sim:px4 --dry-run", "udpin:0.0.0.0:14550 '2h ago'")
 _add(_app, "logs:import_", "FILE [FILE...]", "flight.tlog")
 _add(_app, "serve:serve", "LINK [LINK...]", "serial:/dev/ttyACM0:57600 --listen 127.0.0.1:0")
 _add(_app, "serve:token", None, "anna --file tokens", "wall-display --file tokens --read")

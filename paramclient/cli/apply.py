@@ -1,66 +1,62 @@
-"""The subcommand apply, and what it shares with restore: the plan, the confirmation, the writes."""
+"""The subcommands apply and restore: write the values of a file, or an earlier state, to vehicles."""
 
 from __future__ import annotations
 
+import shlex
+import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import anyio
-from cyclopts import Parameter
+import anyio.to_thread
 
 from paramclient.cli.exit_codes import ExitCode, code_of
+from paramclient.cli.file_output import described
 from paramclient.cli.json_apply import apply_json, plan_json, rows_json
 from paramclient.cli.json_output import JsonObject
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
 from paramclient.cli.options import ApplyFlags
-from paramclient.cli.output import Coloured, Status, can_ask, confirm, report, say
-from paramclient.cli.session import CommandSession, Done, Sessions, sessions
-from paramclient.cli.sources import (
-    check_new,
-    check_pattern,
-    choose,
-    fill_pattern,
-    is_file,
-    open_file,
-    resolve,
+from paramclient.cli.output import Coloured, Status, can_ask, confirm, local_time, report, say
+from paramclient.cli.session import ChosenVehicle, CommandSession, Done, Sessions, sessions
+from paramclient.cli.sources import check_pattern, fill_pattern, is_pattern_name, resolve_all
+from paramclient.cli.time_arguments import parse_when
+from paramclient.errors import (
+    AlreadyRestored,
+    CacheError,
+    FileError,
+    NoReply,
+    NotInCache,
+    UnknownVehicle,
+    UsageError,
 )
-from paramclient.errors import FileError, NoReply, UsageError
+from paramclient.files import ParamFile
 from paramclient.model.notation import typed
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import WireValue, format_value
-from paramclient.model.wording import counted, first_of
+from paramclient.model.wording import age_in_words, counted, first_of
 from paramclient.protocol.fetch import Progress
-from paramclient.provision import (
-    CATEGORIES,
-    ApplyOptions,
-    ApplyProgress,
-    ApplyResult,
-    ApplyRow,
-    ApplyStatus,
-    Plan,
-    plan,
-)
+from paramclient.provision import CATEGORIES, ApplyProgress, ApplyResult, ApplyRow, ApplyStatus, Plan, plan
 from paramclient.provision import apply as apply_to_vehicle
-from paramclient.provision.planning import Rows, check_component
+from paramclient.provision import restore as restore_state
+from paramclient.provision.apply_restore import restore_categories
+from paramclient.provision.inspection import wait_for_identity
+from paramclient.provision.planning import Rows
+from paramclient.provision.restore_point import load_restore_point
+from paramclient.provision.sources import choose, is_file, read_source
 
-__all__ = ["ApplyJob", "apply", "run_jobs"]
+__all__ = ["apply", "restore"]
 
 APPLY_NAMES_MAX: Final = 10
 """Parameters that a line names, so that it stays short; it gives the number of further ones."""
 _STYLES: Final = {
-    ApplyStatus.SET: "green",
-    ApplyStatus.LATER: "yellow",
-    ApplyStatus.INVALID: "bold red",
-    ApplyStatus.SKIPPED: "dim",
-    ApplyStatus.ACCEPTED: "green",
-    ApplyStatus.ADJUSTED: "yellow",
+    **dict.fromkeys((ApplyStatus.SET, ApplyStatus.ACCEPTED), "green"),
+    **dict.fromkeys((ApplyStatus.LATER, ApplyStatus.ADJUSTED, ApplyStatus.UNPROVEN), "yellow"),
+    **dict.fromkeys((ApplyStatus.INVALID, ApplyStatus.UNKNOWN), "bold red"),
+    **dict.fromkeys((ApplyStatus.SKIPPED, ApplyStatus.NOT_TRIED), "dim"),
     ApplyStatus.REFUSED: "red",
-    ApplyStatus.UNPROVEN: "yellow",
-    ApplyStatus.UNKNOWN: "bold red",
-    ApplyStatus.NOT_TRIED: "dim",
 }
 """Styles of each status."""
 _WORDS: Final = {ApplyStatus.SET: "to set", ApplyStatus.LATER: "that may be revealed"}
@@ -74,8 +70,6 @@ async def apply(
     /,
     *,
     partial: bool = False,
-    durable: bool = False,
-    over: Annotated[str | None, Parameter(name="--overlay")] = None,
     metadata: MetadataChoice = None,
     options: ApplyFlags = _OPTIONS,
 ) -> int:
@@ -92,125 +86,297 @@ async def apply(
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, or sim:ardupilot for a simulated vehicle.
-        file: A parameter file; or a vehicle in the cache, as cache:VEHICLE.
+        file: A parameter file, also with {uid} or {system} in its name for the vehicle's ids; or a vehicle in
+            the cache, as cache:VEHICLE.
         partial: Skip invalid values and names that the vehicle does not have, and write the remaining values.
-        durable: End only when the values and their history are on the disk and survive a power loss.
-        over: A file whose parameters replace and extend those of FILE, with {uid} or {system} in its name
-            for the vehicle's ids.
         metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for the
             ranges of values, and for parameters that take effect only after a reboot.
     """
-    check_pattern("the file of --overlay", over, options)
-    check_pattern("the file of --backup", options.backup, options)
-    given = from_file(metadata)
-    opened = open_file(file, partial=partial) if is_file(file) else None
-    params = None
-    if opened is None:
-        params = await resolve(file, options, writes=True, extended=options.extended)
-    extended = options.extended or (opened is not None and opened.is_extended)
-    async with sessions(url, options, writes=True, extended=extended) as found:
+    source = _Files.open(file)
+    if source is None:
+        (params,) = await resolve_all([file], options, writes=True, extended=options.extended)
 
-        async def job(session: CommandSession) -> ApplyJob:
-            base = params
-            if opened is not None:
-                base = choose(opened, session.choice.component, session.component.system)
-            assert base is not None
-            wanted = base if over is None else await _with_overlay(base, over, session)
+    async def load(session: CommandSession) -> _State:
+        return _State(params) if source is None else await source.state_of(session)
+
+    return await _run(url, options, load, source, metadata, {"partial": partial})
+
+
+async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags = _OPTIONS) -> int:
+    """Restore an earlier state of a vehicle, with its own identity and calibration.
+
+    Parameters that the state does not have are not changed. Identity and calibration are written if the state
+    is that of this very vehicle: a snapshot, a backup that has its hardware id (as .json files do), or one
+    whose name has it; or if --vehicle names the hardware id. On a terminal, the changes are shown and must be
+    confirmed. The exit codes are those of apply.
+
+    A time without a time zone is in the time zone of this computer, in which times are printed too, with its
+    offset: 2026-11-20T14:00:00.000+01:00. A time in UTC ends with Z: 2026-11-20T13:00Z.
+
+    Args:
+        url: The link.
+        when: A time, such as '2h ago' or '2026-11-20 14:00'; the number of a snapshot, from `history VEHICLE
+            --snapshots`; or a backup file. Default: the state before the last apply, unless a restore ran
+            since then. With --vehicle all, a time, or a backup file with {uid} or {system} in its name.
+    """
+    source = None if when is None else _Files.open(when)
+    moment = None
+    if source is not None:
+        check_pattern("the backup file", when, options)
+    else:
+        moment = None if when is None else parse_when(when, time.time())
+        if isinstance(moment, int) and ChosenVehicle.parse(options.vehicle).is_all:
+            raise UsageError(
+                f"snapshot {when} is of one vehicle; with --vehicle all, give a time such as '2h ago'"
+            )
+        if options.place is False:
+            raise UsageError(
+                "earlier states are in the cache, which --no-cache excludes; leave out --no-cache, or name a "
+                "backup file"
+            )
+
+    async def load(session: CommandSession) -> _State:
+        state = await (source.state_of(session) if source else _earlier_state(session, url, moment))
+        prefix = session.prefix
+        say(f"{prefix}the state: {described(state.params)}")
+        if state.point:
+            say(f"{prefix}the state is that {state.point}; {state.changes}")
+        return state
+
+    return await _run(url, options, load, source, None, {})
+
+
+# The values to write
+
+
+@dataclass(frozen=True, slots=True)
+class _State:
+    """The values to write to one vehicle.
+
+    Attributes:
+        params: the values.
+        point: the restore point in words, such as `before the last apply, 9 min ago (snapshot 4)`; "" for a
+            state that the user chose.
+        changes: the changes since then in words; "" for a state that the user chose.
+        again: the command that continues after an error; "" for the given one. A restore without a time is
+            refused the second time, and an age is another time later.
+    """
+
+    params: ParamSet
+    point: str = ""
+    changes: str = ""
+    again: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Files:
+    """A file for every vehicle, or one each if the name has a placeholder; then `file` is None."""
+
+    name: str
+    file: ParamFile | None
+
+    @classmethod
+    def open(cls, name: str) -> _Files | None:
+        """Return the files of an argument; None if it names none."""
+        if is_file(name):
+            return cls(name, read_source(name))
+        return cls(name, None) if is_pattern_name(name) else None
+
+    async def state_of(self, session: CommandSession) -> _State:
+        """Return the values for a vehicle; as its own, if its hardware id is named and the file has none.
+
+        The id is named by --vehicle, or in the name of the file.
+
+        Raises:
+            FileError: the file does not exist, or has no parameters for the vehicle.
+        """
+        file = self.file
+        if file is None:
+            path = await fill_pattern(self.name, session)
+            file = read_source(path) if is_file(path) else None
+            if file is None:
+                raise FileError("no such file", source=path)
+        params = choose(file, session.choice.component, session.component.system)
+        await wait_for_identity(session.component)
+        own, origin = session.component.identity, params.identity
+        is_named = session.choice.uid is not None or (own.uid is not None and own.uid in params.source)
+        if is_named and own.uid is not None and (origin is None or origin.uid is None):
+            params = replace(params, identity=own if origin is None else replace(origin, uid=own.uid))
+        return _State(params)
+
+
+async def _earlier_state(session: CommandSession, url: str, moment: float | int | None) -> _State:
+    """Return the state at a time, of a snapshot, or without either before the last apply.
+
+    Raises:
+        ParamClientError: there is none.
+    """
+    cache, vehicle = session.client.cache, session.component
+    if cache is None:
+        raise NotInCache("earlier states are in the cache, which cannot be used")
+    await wait_for_identity(vehicle)
+    await vehicle.core.cache_writer.write_all()
+    key, component, extended = vehicle.identity.key, vehicle.component, vehicle.is_extended
+    if moment is not None:
+        try:
+            state = await anyio.to_thread.run_sync(
+                lambda: cache.state_at(key, component, moment, extended=extended)
+            )
+        except UnknownVehicle:  # the vehicle was heard on the link; the user named none of the cache
+            message = f"the cache {cache.place} has no earlier state of {key}, component {component}"
+            raise NotInCache(message) from None
+        is_number = isinstance(moment, int)
+        return _State(state, again="" if is_number else _command(url, local_time(moment), session))
+    try:
+        point = await anyio.to_thread.run_sync(
+            lambda: load_restore_point(cache, key, component, extended=extended)
+        )
+    except NotInCache as error:
+        raise NotInCache(f"{error}, such as '2h ago', or a backup file") from None
+    except AlreadyRestored as error:
+        raise UsageError(_choices(error, url, session)) from None
+    except CacheError as error:
+        raise CacheError(
+            f"nothing was sent, as the state before the last apply cannot be read: {error}. A backup file"
+            " can be restored without the cache (--no-cache)"
+        ) from error
+    now = time.time()
+    changes = [f"{name} {age_in_words(now - at)} ago" for name, at in point.changes.items()]
+    return _State(
+        point.state,
+        f"before the last apply, {age_in_words(now - point.at)} ago (snapshot {point.snapshot})",
+        f"changed since then: {first_of(changes, APPLY_NAMES_MAX)}"
+        if changes
+        else "nothing is known to have changed since then",
+        _command(url, point.snapshot, session),
+    )
+
+
+def _choices(error: AlreadyRestored, url: str, session: CommandSession) -> str:
+    """Return the error with the commands that choose a state."""
+
+    def command(when: object) -> str:
+        return f"`{_command(url, when, session)}`"
+
+    more = ["--extended"] if session.component.is_extended else []
+    listing = shlex.join(["paramclient", "history", str(session.component.system), *more, "--snapshots"])
+    seconds = max(1, int(time.time() - error.restored_at) + 1)
+    return (
+        f"{error.summary}; choose the state: {command(error.before_apply)} for the state before that apply, "
+        f"also to continue that restore; {command(error.before_restore)} for the state before that restore; "
+        f"or a time, as in {command(f'{seconds}s ago')}; `{listing}` lists the snapshots"
+    )
+
+
+def _command(url: str, when: object, session: CommandSession) -> str:
+    """Return the command that restores a state of a vehicle, for messages."""
+    vehicle = str(session.component.system) if session.choice.is_all else session.options.vehicle
+    chosen = [] if vehicle is None else ["--vehicle", vehicle]
+    more = ["--extended"] if session.component.is_extended else []
+    return shlex.join(["paramclient", "restore", url, str(when), *chosen, *more])
+
+
+# Plans and writes
+
+
+async def _run(
+    url: str,
+    flags: ApplyFlags,
+    load: Callable[[CommandSession], Awaitable[_State]],
+    source: _Files | None,
+    metadata: str | None,
+    more: dict[str, Any],
+) -> int:
+    """Plan, ask, and write; print the plans or the results, also those so far after an interruption.
+
+    Args:
+        url: the link.
+        flags: the options of the subcommand.
+        load: returns the values for a vehicle.
+        source: the files that they are from, or None.
+        metadata: the value of --metadata.
+        more: further options of `apply`; none for `restore`.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        UsageError: --backup gives several vehicles one file.
+        FileError: a file of --backup exists, or a file of a vehicle does not.
+    """
+    check_pattern("the file of --backup", flags.backup, flags)
+    given, file = from_file(metadata), None if source is None else source.file
+    extended = flags.extended or (file is not None and file.is_extended)
+    async with sessions(url, flags, writes=True, extended=extended) as found:
+
+        async def job(session: CommandSession) -> _Job:
+            state = await load(session)
             info = given or await known_of_session(session, metadata)
-            more: ApplyOptions = {"info": info, "partial": partial, "durable": durable}
-            return ApplyJob(session, wanted, options, more)
+            return _Job(session, state, flags, {"info": info, **more}, is_restore=not more)
 
-        jobs = [Done(each, result=await job(each)) for each in found]
-        if not options.dry_run and options.no_cache and options.backup is None and not url.startswith("sim:"):
+        loaded = await found.work(job)
+        failed = [each for each in loaded if each.error is not None]
+        for each in failed:
+            if isinstance(each.error, FileError):  # before anything is sent to another vehicle
+                raise each.error
+        jobs = {each.session: each.result for each in loaded if each.result is not None}
+        ready = Sessions(jobs)
+        backups = {each: await fill_pattern(flags.backup, each) for each in jobs} if flags.backup else {}
+        if len(set(backups.values())) < len(backups):
+            raise UsageError(f"--backup {flags.backup} names one file for several vehicles")
+        files = {each: _new(name) for each, name in backups.items()}
+        if flags.dry_run or (not flags.yes and not flags.json and can_ask()):
+            made = await ready.work(lambda session: jobs[session].planned()) if ready else []
+            plans = [each.result for each in made if each.result is not None]
+            if flags.dry_run or any(each.has_work for each in plans):
+                made += [Done(each.session, error=each.error) for each in failed]
+                code = found.show(made)
+                for planned in [] if flags.json else plans:
+                    planned.say_summary()
+            if flags.dry_run:
+                return max([code, *(each.check() for each in plans)])
+            if any(each.has_work for each in plans) and not await confirm("go on?"):
+                return ExitCode.INCOMPLETE
+        if flags.no_cache and flags.backup is None and not url.startswith("sim:"):
             say("the state before is not stored: --no-cache is given, and --backup is not")
-        code = await run_jobs(found, jobs)
-        return max(code, ExitCode.INCOMPLETE) if opened is not None and opened.left_out else code
+        try:
+            done = await ready.work(lambda session: jobs[session].run(files.get(session))) if ready else []
+        except anyio.get_cancelled_exc_class():
+            found.show([Done(session, job) for session, job in jobs.items()])
+            rows = [row for job in jobs.values() for row in job.arrived.values()]
+            unproven = sum(row.status is ApplyStatus.ACCEPTED for row in rows)
+            say(
+                f"interrupted: {counted(unproven, 'value')} acknowledged, not proven, and others may be in "
+                f"flight; {'; '.join(dict.fromkeys(job.to_continue for job in jobs.values()))}"
+            )
+            raise
+        code = found.show([*done, *failed])
+        code = max([code, *(each.result.say_summary() for each in done if each.result is not None)])
+        return max(code, ExitCode.INCOMPLETE) if file is not None and file.left_out else code
 
 
-async def _with_overlay(base: ParamSet, pattern: str, session: CommandSession) -> ParamSet:
-    path = await fill_pattern(pattern, session)
-    if not is_file(path):
-        raise FileError(f"no such file, which --overlay names for {session.label}", source=path)
-    own = choose(open_file(path), session.choice.component, session.component.system)
-    check_component(own, base.component, is_extended=base.is_extended)
-    params = {**base.params, **own.params}
-    return replace(base, params=params, identity=own.identity or base.identity)
+def _new(path: str) -> Path:
+    """Return the path of a new file. An existing file may be the only copy of an earlier state.
 
-
-# Shared with restore
-
-
-@dataclass(kw_only=True)
-class _Planned:
-    """The plan for one vehicle, as it is printed."""
-
-    columns: ClassVar[Sequence[str]] = ("stage", "name", "before", "wanted", "status", "reason")
-
-    job: ApplyJob
-    plan: Plan
-
-    def as_json(self) -> JsonObject:
-        return plan_json(self.plan, self.job.session.component, full=self.job.flags.full)
-
-    def rows(self) -> Iterator[Sequence[object]]:
-        has_started = False
-        restart = (None, None, None, Coloured("reboot", "yellow"), "the vehicle reboots")
-        for number, stage in enumerate(self.plan.stages, start=1):
-            for row in stage.rows:
-                purpose = stage.purpose + (", takes effect after a reboot" if row.needs_reboot else "")
-                yield number, *_cells(row, row.reason or purpose)
-            if self.job.flags.reboot and stage.reboot_first:
-                has_started = True
-                yield number, *restart
-        if self.job.flags.reboot and not has_started and (self.plan.reboot_for or self.plan.awaiting_reboot):
-            yield None, *restart
-        for row in self.plan.rows.values():
-            if row.status is not ApplyStatus.SET and (self.job.flags.full or row.is_shown):
-                yield None, *_cells(row, row.why)
-
-    def say_summary(self) -> None:
-        session, made = self.job.session, self.plan
-        if made.firmware_note:
-            say(f"{session.label}: {made.firmware_note}")
-        say(f"{session.receiver}: {_counted(made)}; nothing was sent")
-        self.job.say_notes(made, made)
-        if made.reboot_for and not self.job.flags.reboot:
-            names = first_of(made.reboot_for, APPLY_NAMES_MAX)
-            say(f"{session.label}: would take effect after a reboot: {names}")
-
-    @property
-    def has_work(self) -> bool:
-        """Whether something is written."""
-        is_refused = bool(self.plan.problems) and not self.job.partial
-        waits = self.job.flags.reboot and bool(self.plan.awaiting_reboot)
-        return not is_refused and (bool(self.plan.to_write) or waits)
-
-    def check(self) -> int:
-        """Report that the vehicle is armed; return the exit code that the command is expected to have."""
-        session, code = self.job.session, ExitCode.DONE
-        if self.plan.problems and not self.job.partial:
-            code = ExitCode.USAGE
-        elif any(not row.is_as_wanted for row in self.plan.of(ApplyStatus.SKIPPED, ApplyStatus.INVALID)):
-            code = ExitCode.INCOMPLETE
-        if session.component.is_armed and not self.job.flags.allow_armed:
-            report(f"{session.label} is armed; nothing would be set now without --allow-armed")
-            code = max(code, ExitCode.INCOMPLETE)
-        return code
+    Raises:
+        FileError: the file exists.
+    """
+    if Path(path).exists():
+        message = "exists already, and may be the backup of an earlier run; choose another name"
+        raise FileError(message, source=path)
+    return Path(path)
 
 
 @dataclass(eq=False)
-class ApplyJob:
+class _Job:
     """What apply or restore does with one vehicle, and what became of it.
 
     Attributes:
         session: the vehicle.
-        wanted: the wanted parameters, or the state to restore.
+        state: the values to write.
         flags: the options of the subcommand.
         more: further options of `apply`.
-        call: `apply` or `restore`.
-        own: categories that `call` includes by itself.
-        again: the command that continues after an error, if it is not the given command.
-        done: a sentence on a complete result; "" for none.
+        is_restore: whether the values are an earlier state of the vehicle.
         arrived: the outcomes so far.
         result: the result at the end.
     """
@@ -218,20 +384,12 @@ class ApplyJob:
     columns: ClassVar[Sequence[str]] = ("name", "before", "wanted", "now", "status", "reason")
 
     session: CommandSession
-    wanted: ParamSet
+    state: _State
     flags: ApplyFlags
-    more: ApplyOptions
-    call: Callable[..., Awaitable[ApplyResult]] = apply_to_vehicle
-    own: tuple[str, ...] = ()
-    again: str = ""
-    done: str = ""
+    more: dict[str, Any]
+    is_restore: bool
     arrived: dict[str, ApplyRow] = field(default_factory=dict)
     result: ApplyResult | None = None
-
-    @property
-    def partial(self) -> bool:
-        """Whether invalid values are skipped."""
-        return self.call is not apply_to_vehicle or self.more.get("partial", False)
 
     async def planned(self) -> _Planned:
         """Return the plan, if it is known before the deadline of the command.
@@ -239,19 +397,14 @@ class ApplyJob:
         Raises:
             NoReply: the deadline has passed.
         """
-        left = self.session.deadline.left()
+        component, params, left = self.session.component, self.state.params, self.session.deadline.left()
+        own = await restore_categories(component, params) if self.is_restore else ()
         with anyio.move_on_after(left):
-            made = await plan(
-                self.session.component,
-                self.wanted,
-                include=(*self.own, *self.flags.include),
-                info=self.more.get("info"),
-                force=self.flags.force,
-            )
-            return _Planned(job=self, plan=made)
+            include = (*own, *self.flags.include)
+            return _Planned(self, await plan(component, params, include=include, info=self.more["info"]))
         raise NoReply(f"the parameters of {self.session.label}", attempts=0, waited=left or 0.0)
 
-    async def run(self, backup: Path | None) -> ApplyJob:
+    async def run(self, backup: Path | None) -> _Job:
         """Write, and return the job with its result; `backup` is the file for the state before."""
         session, flags = self.session, self.flags
         began: float | None = None
@@ -268,13 +421,12 @@ class ApplyJob:
             await session.check_only()
             session.announce_write()
 
-        title = f"{'setting' if self.call is apply_to_vehicle else 'restoring'} {session.label}"
+        title = f"{'restoring' if self.is_restore else 'setting'} {session.label}"
         with Status(f"{title}: waiting for the first response", title) as status:
-            self.result = await self.call(
+            self.result = await (restore_state if self.is_restore else apply_to_vehicle)(
                 session.component,
-                self.wanted,
+                self.state.params,
                 include=flags.include,
-                force=flags.force,
                 reboot=flags.reboot,
                 allow_armed=flags.allow_armed,
                 backup=backup,
@@ -290,25 +442,21 @@ class ApplyJob:
         if self.result is None:
             rows = rows_json(self._so_far)
             return {**self.session.ids, "complete": False, "params": rows, "error": "interrupted"}
-        return apply_json(self.result, self.session.component, full=self.flags.full)
+        return apply_json(self.result, self.session.component)
 
     def rows(self) -> Iterator[Sequence[object]]:
-        """Yield the cells of `APPLIED_COLUMNS`."""
-        rows: Iterable[ApplyRow] = self._so_far
-        if self.result is not None:
-            rows = self.result.rows.values() if self.flags.full else self.result.shown_rows
-        for row in rows:
+        """Yield the cells of each row."""
+        for row in self._so_far if self.result is None else self.result.shown_rows:
             name, before, wanted, *more = _cells(row, row.why)
             yield name, before, wanted, _text(row.actual, row), *more
 
     @property
-    def _so_far(self) -> list[ApplyRow]:
+    def _so_far(self) -> Iterable[ApplyRow]:
         """The outcomes before an interruption: no value was read back."""
         unproven, reason = ApplyStatus.UNPROVEN, "acknowledged, and not read back"
-        return [
-            replace(row, status=unproven, reason=reason) if row.status is ApplyStatus.ACCEPTED else row
-            for row in self.arrived.values()
-        ]
+        for row in self.arrived.values():
+            is_proven = row.status is not ApplyStatus.ACCEPTED
+            yield row if is_proven else replace(row, status=unproven, reason=reason)
 
     def say_summary(self) -> int:
         """Print what became of the vehicle; return the exit code."""
@@ -324,8 +472,8 @@ class ApplyJob:
         if result.error is not None:
             report(f"{session.label}: {result.error}; {self.to_continue}")
             return max(code_of(result.error), ExitCode.INCOMPLETE)
-        if self.done:
-            say(f"{session.label}: {self.done}")
+        if self.state.point:
+            say(f"{session.label}: restored the state {self.state.point}")
         return ExitCode.DONE if result.complete else ExitCode.INCOMPLETE
 
     def say_notes(self, shown: Rows, made: Plan) -> None:
@@ -344,66 +492,75 @@ class ApplyJob:
     @property
     def to_continue(self) -> str:
         """How to continue after an error, in words."""
-        return f"to continue: `{self.again}`" if self.again else "run it again to continue"
+        again = self.state.again
+        return f"to continue: `{again}`" if again else "run it again to continue"
 
 
-async def run_jobs(found: Sessions, loaded: Sequence[Done[ApplyJob]]) -> int:
-    """Print the plans, or write and print the results, also those so far after an interruption.
+@dataclass(frozen=True, slots=True)
+class _Planned:
+    """The plan for one vehicle, as it is printed."""
 
-    Args:
-        found: the vehicles.
-        loaded: the job of each vehicle, or the error why there is none.
+    columns: ClassVar[Sequence[str]] = ("name", "before", "wanted", "status", "reason")
 
-    Returns:
-        The exit code.
+    job: _Job
+    plan: Plan
 
-    Raises:
-        UsageError: --backup gives several vehicles one file.
-        FileError: a file of --backup exists.
-    """
-    failed = [each for each in loaded if each.error is not None]
-    jobs = {each.session: each.result for each in loaded if each.result is not None}
-    ready, flags = Sessions(jobs), next((job.flags for job in jobs.values()), ApplyFlags())
-    backups = {each: await fill_pattern(flags.backup, each) for each in jobs} if flags.backup else {}
-    if len(set(backups.values())) < len(backups):
-        raise UsageError(f"--backup {flags.backup} names one file for several vehicles")
-    files = {each: check_new(name) for each, name in backups.items()}
-    if flags.dry_run or (not flags.yes and not flags.json and can_ask()):
-        made = await ready.work(lambda session: jobs[session].planned()) if ready else []
-        plans = [each.result for each in made if each.result is not None]
-        if flags.dry_run or any(each.has_work for each in plans):
-            made += [Done(each.session, error=each.error) for each in failed]
-            code = found.show(made)
-            if not flags.json:
-                for each in plans:
-                    each.say_summary()
-        if flags.dry_run:
-            return max([code, *(each.check() for each in plans)])
-        if any(each.has_work for each in plans) and not await confirm("go on?"):
-            return ExitCode.INCOMPLETE
-    try:
-        done = await ready.work(lambda session: jobs[session].run(files.get(session))) if ready else []
-    except anyio.get_cancelled_exc_class():
-        found.show([Done(session, result=job) for session, job in jobs.items()])
-        rows = [row for job in jobs.values() for row in job.arrived.values()]
-        unproven = sum(row.status is ApplyStatus.ACCEPTED for row in rows)
-        say(
-            f"interrupted: {counted(unproven, 'value')} acknowledged, not proven, and others may be in "
-            f"flight; {'; '.join(dict.fromkeys(job.to_continue for job in jobs.values()))}"
-        )
-        raise
-    code = found.show([*done, *failed])
-    return max([code, *(each.result.say_summary() for each in done if each.result is not None)])
+    def as_json(self) -> JsonObject:
+        return plan_json(self.plan, self.job.session.component)
+
+    def rows(self) -> Iterator[Sequence[object]]:
+        """Yield the cells of each row, in the order of writing."""
+        reboots = self.job.flags.reboot and bool(self.plan.reboot_for or self.plan.awaiting_reboot)
+        restart = (None, None, None, Coloured("reboot", "yellow"), "the vehicle reboots")
+        for stage in self.plan.stages:
+            for row in stage.rows:
+                purpose = stage.purpose + (", takes effect after a reboot" if row.needs_reboot else "")
+                yield _cells(row, row.reason or purpose)
+            if reboots and stage.reboot_first:
+                reboots = False
+                yield restart
+        if reboots:
+            yield restart
+        for row in self.plan.rows.values():
+            if row.status is not ApplyStatus.SET and row.is_shown:
+                yield _cells(row, row.why)
+
+    def say_summary(self) -> None:
+        session, made = self.job.session, self.plan
+        if made.firmware_note:
+            say(f"{session.label}: {made.firmware_note}")
+        say(f"{session.receiver}: {_counted(made)}; nothing was sent")
+        self.job.say_notes(made, made)
+        if made.reboot_for and not self.job.flags.reboot:
+            names = first_of(made.reboot_for, APPLY_NAMES_MAX)
+            say(f"{session.label}: would take effect after a reboot: {names}")
+
+    @property
+    def _is_refused(self) -> bool:
+        return bool(self.plan.problems) and not (self.job.is_restore or self.job.more["partial"])
+
+    @property
+    def has_work(self) -> bool:
+        """Whether something is written."""
+        waits = self.job.flags.reboot and bool(self.plan.awaiting_reboot)
+        return not self._is_refused and (bool(self.plan.to_write) or waits)
+
+    def check(self) -> int:
+        """Report that the vehicle is armed; return the exit code that the command is expected to have."""
+        session, code = self.job.session, ExitCode.DONE
+        if self._is_refused:
+            code = ExitCode.USAGE
+        elif any(not row.is_as_wanted for row in self.plan.of(ApplyStatus.SKIPPED, ApplyStatus.INVALID)):
+            code = ExitCode.INCOMPLETE
+        if session.component.is_armed and not self.job.flags.allow_armed:
+            report(f"{session.label} is armed; nothing would be set now without --allow-armed")
+            code = max(code, ExitCode.INCOMPLETE)
+        return code
 
 
 def _cells(row: ApplyRow, reason: str) -> list[object]:
-    return [
-        row.name,
-        _text(row.before, row),
-        _text(row.wanted.settable, row),
-        Coloured(row.status, _STYLES.get(row.status, "")),
-        reason,
-    ]
+    status = Coloured(row.status, _STYLES.get(row.status, ""))
+    return [row.name, _text(row.before, row), _text(row.wanted.settable, row), status, reason]
 
 
 def _text(value: WireValue | None, row: ApplyRow) -> str | None:

@@ -12,7 +12,6 @@ from paramclient.cli.json_output import history_json, snapshot_json
 from paramclient.cli.options import CacheOptions, Positive
 from paramclient.cli.output import local_time, print_json, print_line, say, show
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
-from paramclient.cli.sources import component_of, tables_in
 from paramclient.cli.time_arguments import parse_time
 from paramclient.errors import UsageError
 from paramclient.model.identity import autopilot_name
@@ -20,6 +19,7 @@ from paramclient.model.names import NameChoice
 from paramclient.model.notation import hash_text, time_or_none
 from paramclient.model.values import Param, format_value
 from paramclient.model.wording import counted
+from paramclient.provision.sources import component_of, tables_in
 
 __all__ = [
     "cache_list",
@@ -29,7 +29,6 @@ __all__ = [
     "history",
     "load_tables",
     "show_summaries",
-    "tables_of",
 ]
 
 _DEFAULTS: Final = CacheOptions()
@@ -132,21 +131,6 @@ def load_tables(
     """Load tables; another process may have removed one."""
     loaded = (cache.load(each.key, each.component, extended=extended) for each in summaries)
     return [table for table in loaded if table is not None]
-
-
-def tables_of(
-    cache: str | None, vehicle: str, component: int | None, *, extended: bool
-) -> list[CachedComponent]:
-    """Return the cached tables of a vehicle, or that of one of its components.
-
-    Raises:
-        NotInCache, UnknownVehicle, AmbiguousVehicle: as `tables_in`.
-        CacheError: the cache cannot be read.
-    """
-    with ParamCache(cache) as opened:
-        return load_tables(
-            opened, tables_in(opened, vehicle, component, extended=extended), extended=extended
-        )
 
 
 # history

@@ -83,6 +83,6 @@ def say_sources(label: str, defaults: Iterable[Default | None]) -> None:
 
 def report_no_defaults(hint: str = DEFAULTS_HINT) -> None:
     """Print that the defaults are not known, and what to do."""
-    from paramclient.provision.vehicle_params import NO_DEFAULTS  # only here: loads provision
+    from paramclient.provision.sources import NO_DEFAULTS  # only here: loads provision
 
     report(f"{NO_DEFAULTS}; {hint}")

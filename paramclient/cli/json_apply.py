@@ -39,7 +39,6 @@ def diff_json(
     right: Metadata | None = None,
     base: Metadata | None = None,
     *,
-    everything: bool = False,
     has_defaults: bool = False,
 ) -> JsonObject:
     """Return a comparison.
@@ -47,7 +46,6 @@ def diff_json(
     Args:
         outcome: the comparison.
         left, right, base: the metadata of each side, or None.
-        everything: include names that do not differ.
         has_defaults: whether the base are the firmware's defaults.
     """
 
@@ -80,7 +78,7 @@ def diff_json(
         "base": None if outcome.base is None else origin_json(outcome.base),
         "counts": {status: outcome.counts[status] for status in DifferenceStatus},
         "changed_sides": {side: outcome.changed_sides[side] for side in ChangedSide} if has_base else None,
-        "params": {each.name: entry_json(each) for each in outcome.entries if everything or each.is_shown},
+        "params": {each.name: entry_json(each) for each in outcome.entries if each.is_shown},
     }
 
 
@@ -108,8 +106,8 @@ def rows_json(rows: Iterable[ApplyRow]) -> JsonObject:
     return {row.name: row_json(row) for row in rows}
 
 
-def plan_json(plan: Plan, component: Component, *, full: bool = False) -> JsonObject:
-    """Return the plan for a vehicle, with unchanged parameters only if `full`."""
+def plan_json(plan: Plan, component: Component) -> JsonObject:
+    """Return the plan for a vehicle, without unchanged parameters."""
 
     def step_json(row: ApplyRow) -> JsonObject:
         value, kind = typed(row.wanted.settable, row.type)
@@ -122,7 +120,7 @@ def plan_json(plan: Plan, component: Component, *, full: bool = False) -> JsonOb
             "needs_reboot": row.needs_reboot,
         }
 
-    rows = [row for row in plan.rows.values() if full or row.status is not ApplyStatus.UNCHANGED]
+    rows = [row for row in plan.rows.values() if row.status is not ApplyStatus.UNCHANGED]
     found: JsonObject = {
         "system": component.system,
         "component": component.component,
@@ -147,10 +145,10 @@ def plan_json(plan: Plan, component: Component, *, full: bool = False) -> JsonOb
     return found
 
 
-def apply_json(result: ApplyResult, component: Component, *, full: bool = False) -> JsonObject:
+def apply_json(result: ApplyResult, component: Component) -> JsonObject:
     """Return the result for a vehicle; its first address is that at the start, `now` the one at the end.
 
-    Unchanged parameters, and left-out ones that do not differ, are included only if `full`.
+    Unchanged parameters, and left-out ones that do not differ, are not included.
     """
     return {
         "system": component.system,
@@ -159,7 +157,7 @@ def apply_json(result: ApplyResult, component: Component, *, full: bool = False)
         "now": {"system": result.system, "component": result.component},
         "complete": result.complete,
         "counts": _counts(result),
-        "params": rows_json(result.rows.values() if full else result.shown_rows),
+        "params": rows_json(result.shown_rows),
         "extra": len(result.extra),
         "unchecked": len(result.plan.unchecked),
         "reboots": result.reboots,

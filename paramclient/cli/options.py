@@ -152,17 +152,11 @@ class ApplyFlags(LinkOptions):
     allow_armed: bool = False
     """Continue if the vehicle is armed."""
 
-    force: bool = False
-    """Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot."""
-
     backup: str | None = None
     """A new file for the state before the first write; {uid} and {system} become the ids of the vehicle."""
 
     dry_run: bool = False
     """Print the values that would be sent, and send none of them."""
-
-    full: bool = False
-    """Also print parameters that are unchanged or left out."""
 
     extended: bool = False
     """Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them."""

@@ -19,7 +19,6 @@ from paramclient.cli.metadata import (
 from paramclient.cli.options import CacheOptions, Positive
 from paramclient.cli.output import local_time, print_json, print_line, print_table, report, say
 from paramclient.cli.param_names import unmatched_text
-from paramclient.cli.sources import tables_in
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata, ParamInfo
 from paramclient.model.defaults import DefaultSource, default_of
@@ -27,6 +26,7 @@ from paramclient.model.identity import autopilot_name, has_autopilot
 from paramclient.model.notation import time_text
 from paramclient.model.values import Param, check_name, format_value
 from paramclient.model.wording import counted
+from paramclient.provision.sources import tables_in
 
 __all__ = ["info", "search"]
 

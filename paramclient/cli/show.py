@@ -22,7 +22,6 @@ from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import by_index, local_time, print_json, print_table, say
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
 from paramclient.cli.param_table import RIGHT, ParamTable
-from paramclient.cli.sources import is_file, open_file, source_of, tables_in
 from paramclient.errors import UnknownVehicle, UsageError
 from paramclient.files import ParamFile
 from paramclient.files.formats import address
@@ -34,6 +33,7 @@ from paramclient.model.names import NameChoice
 from paramclient.model.notation import hash_text, time_or_none, typed
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import format_value
+from paramclient.provision.sources import is_file, read_source, source_of, tables_in
 
 __all__ = ["show"]
 
@@ -72,7 +72,8 @@ def show(
                 "names, and --metadata without --changed, go with a vehicle in the cache, not with a "
                 "parameter file"
             )
-        file = open_file(vehicle, partial=True)
+        file = read_source(vehicle)
+        assert file is not None, "it is no link"
         return _show_file(file, from_file(metadata, offline=True), options, changed=changed)
     chosen, given = check_given(names), from_file(metadata, offline=True)
     is_log = vehicle is not None and vehicle.lower().startswith("replay:")

@@ -7,7 +7,7 @@ several vehicles.
 - `inspection`: read what a vehicle has; `plan`.
 - `apply_restore`: `apply` and `restore`; `execution` runs them, and stores the state before the first write.
 - `fleet`: `for_each`.
-- `vehicle_params`: parameters of a vehicle or of the cache as a set.
+- `sources`: `resolve`, the parameters of a file, a log, a vehicle of the cache, or a link.
 - `restore_point`: reads the snapshot that the last `apply` stored, and what has changed since.
 - `apply_rules`: parameters that `apply` leaves out, writes first or last, or reboots for; the list is
   `apply_rules.toml`.
@@ -31,6 +31,7 @@ from paramclient.provision.planning import (
     Stage,
     plan_from,
 )
+from paramclient.provision.sources import resolve
 
 __all__ = [
     "ApplyOptions",
@@ -50,5 +51,6 @@ __all__ = [
     "for_each",
     "plan",
     "plan_from",
+    "resolve",
     "restore",
 ]

@@ -14,7 +14,7 @@ from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Param, ParamType, Settable, Trust
 from paramclient.provision.planning import Plan, PlanOptions, check_component, plan_from
-from paramclient.provision.vehicle_params import component_set
+from paramclient.provision.sources import component_set
 
 __all__ = [
     "POLL_INTERVAL",

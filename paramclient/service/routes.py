@@ -45,7 +45,7 @@ from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision import ApplyProgress, apply, restore
 from paramclient.provision import plan as plan_of
 from paramclient.provision.restore_point import load_restore_point
-from paramclient.provision.vehicle_params import component_set, fetched_set, select_non_defaults
+from paramclient.provision.sources import component_set, fetched_set, select_non_defaults
 from paramclient.service.hub import Hub, Target
 from paramclient.service.problems import ServiceError
 from paramclient.version import __version__

@@ -95,14 +95,12 @@ def test_apply_sets_and_verifies_values_that_differ(
     assert vehicle.requests["PARAM_SET"] == 2
 
 
-def test_a_name_that_no_vehicle_can_have_is_invalid_too(
+def test_a_name_that_no_vehicle_can_have_is_skipped_and_named(
     command: Command, put: Put, file: Callable[..., Path]
 ) -> None:
     vehicle = copter()
     wrong = file("RTL_ALT,2500\nSIM_GPS1_BYTELOSS,0\n")
-    assert command("apply", put(vehicle), wrong).code == 2
-    assert vehicle.requests["PARAM_SET"] == 0
-    outcome = command("apply", put(vehicle), wrong, "--partial")
+    outcome = command("apply", put(vehicle), wrong)
     assert (outcome.code, vehicle.values["RTL_ALT"]) == (1, 2500)
     assert "line 2: " in outcome.err
 
@@ -177,7 +175,7 @@ def test_a_user_at_a_terminal_must_confirm(
     outcome = command("apply", put(vehicle), file())
     assert outcome.code == (0 if sets else 1)
     assert "go on? [y/N]" in outcome.err
-    assert ["1", "RTL_ALT", "1500", "2500", "set", "all other parameters"] in outcome.rows
+    assert ["RTL_ALT", "1500", "2500", "set", "all other parameters"] in outcome.rows
     assert vehicle.requests["PARAM_SET"] == sets
     _, _, after = outcome.err.partition("go on? [y/N]")
     assert outcome.err.count("writing to 1/1") == after.count("writing to 1/1") == (1 if sets else 0)
@@ -195,12 +193,12 @@ def test_dry_run_prints_the_stages_in_order(
     outcome = command("apply", put(vehicle), wanted, "--dry-run", "--reboot", "--backup", backup)
     assert outcome.code == 0
     assert outcome.rows[1:3] == [
-        ["1", "EK2_ENABLE", "0", "1", "set", "switches that reveal parameters, takes effect after a reboot"],
-        ["1", "reboot", "the vehicle reboots"],
+        ["EK2_ENABLE", "0", "1", "set", "switches that reveal parameters, takes effect after a reboot"],
+        ["reboot", "the vehicle reboots"],
     ]
-    assert [row[:5] for row in outcome.rows[3:5]] == [
-        ["2", "RTL_ALT", "1500", "2500", "set"],
-        ["2", "WPNAV_SPEED", "500.0", "750.5", "set"],
+    assert [row[:4] for row in outcome.rows[3:5]] == [
+        ["RTL_ALT", "1500", "2500", "set"],
+        ["WPNAV_SPEED", "500.0", "750.5", "set"],
     ]
     assert [row[0] for row in outcome.rows[5:]] == ["COMPASS_OFS_X", "EK2_NO_SUCH"]
     assert "; nothing was sent\n" in outcome.err
@@ -265,7 +263,7 @@ def test_restore_reverts_the_last_apply(command: Command, put: Put, file: Callab
     assert vehicle.values["COMPASS_OFS_X"] == 12.5
     would = command("restore", put(vehicle), "--dry-run")
     assert would.code == 0
-    assert [row[1:4] for row in would.rows[1:]] == [
+    assert [row[:3] for row in would.rows[1:]] == [
         ["RTL_ALT", "2500", "1500"],
         ["WPNAV_SPEED", "750.5", "500.0"],
         ["COMPASS_OFS_X", "12.5", "5.0"],
@@ -297,7 +295,7 @@ def test_restore_says_what_it_undoes(
     ), would.err
     vehicle = restarted(vehicle)
     later = time.time() + 9 * 60 + 5
-    monkeypatch.setattr("paramclient.cli.restore.time.time", lambda: later)
+    monkeypatch.setattr("paramclient.cli.apply.time.time", lambda: later)
     reported = command("restore", put(vehicle), "--json")
     assert reported.json["complete"]
     assert "the state is that before the last apply, 9 min ago (snapshot 1)" in reported.err
@@ -361,12 +359,11 @@ def test_all_vehicles_are_set_concurrently(
     command: Command, put: Put, file: Callable[..., Path], tmp_path: Path
 ) -> None:
     air, vehicles = fleet()
+    file(FILE, "fleet.param")
     for system in (1, 2, 3):
-        file(f"WPNAV_SPEED,{system}00\nWPNAV_ACCEL,{system}0.5\n", f"own/{system}.param")
-    over = tmp_path / "own/{system}.param"
-    backup = tmp_path / "{system}.json"
-    options = ("--vehicle", "all", "--overlay", over, "--backup", backup)
-    outcome = command("apply", put(air), file(), *options)
+        file(f"@include ../fleet.param\nWPNAV_SPEED,{system}00\n", f"own/{system}.param")
+    own, backup = tmp_path / "own/{system}.param", tmp_path / "{system}.json"
+    outcome = command("apply", put(air), own, "--vehicle", "all", "--backup", backup)
     assert outcome.code == 0
     assert [row[:5] for row in outcome.rows if row[1] == "WPNAV_SPEED"] == [
         [f"{system}/1", "WPNAV_SPEED", "500.0", f"{system}00.0", f"{system}00.0"] for system in (1, 2, 3)
@@ -375,8 +372,10 @@ def test_all_vehicles_are_set_concurrently(
     assert [vehicle.values["RTL_ALT"] for vehicle in vehicles] == [2500, 2500, 2500]
     receivers = [f"{system}/1 ArduPilot quadrotor, firmware 4.6.0-dev" for system in (1, 2, 3)]
     lines = outcome.err.splitlines()
-    assert lines[:3] == [f"writing to {each} on udpin:0.0.0.0:14550" for each in receivers]
-    assert [line.split(":")[0] for line in lines[3:] if " accepted" in line] == receivers
+    assert [line for line in lines if line.startswith("writing")] == [
+        f"writing to {each} on udpin:0.0.0.0:14550" for each in receivers
+    ]
+    assert [line.split(":")[0] for line in lines if " accepted" in line] == receivers
     assert sorted(path.name for path in tmp_path.glob("?.json")) == ["1.json", "2.json", "3.json"]
 
 
@@ -398,14 +397,13 @@ def test_file_names_for_all_vehicles_need_a_placeholder(
     command: Command, put: Put, file: Callable[..., Path], tmp_path: Path
 ) -> None:
     air, vehicles = fleet()
-    for option in ("--overlay", "--backup"):
-        outcome = command("apply", put(air), file(), "--vehicle", "all", option, "same.param")
-        assert outcome.code == 2
-        assert "{uid} or {system}" in outcome.err
-    file("RTL_ALT,3\n", "1.param")
-    outcome = command("apply", put(air), file(), "--vehicle", "all", "--overlay", tmp_path / "{system}.param")
+    outcome = command("apply", put(air), file(), "--vehicle", "all", "--backup", "same.param")
     assert outcome.code == 2
-    assert "which --overlay names for 2/1 ardupilot" in outcome.err
+    assert "{uid} or {system}" in outcome.err
+    file("RTL_ALT,3\n", "1.param")
+    outcome = command("apply", put(air), tmp_path / "{system}.param", "--vehicle", "all")
+    assert outcome.code == 2
+    assert "2.param: no such file" in outcome.err
     assert not any(vehicle.requests["PARAM_SET"] for vehicle in vehicles)
     assert command("apply", put(air), file(), "--vehicle", "all", "--vehicle", 2).code == 2
     assert command("apply", put(air), file()).code == 2
@@ -464,7 +462,7 @@ def test_one_state_is_not_restored_to_all_vehicles(
     assert command("restore", put(air), "--vehicle", "all", "--no-cache").code == 2
     assert command("restore", put(air), "--vehicle", "all", "--extended").code == 2
     missing = command("restore", put(air), file().parent / "none-{system}.param", "--vehicle", "all")
-    assert (missing.code, missing.err.count("no such file")) == (2, 3)
+    assert (missing.code, "no such file" in missing.err) == (2, True)
     assert not any(vehicle.requests["PARAM_SET"] for vehicle in vehicles)
 
 
@@ -560,7 +558,7 @@ def test_a_restore_that_fails_prints_the_command_that_continues(
     assert command("apply", put(GenericVehicle(dict.fromkeys(names, 1))), wanted).code == 0
     with ParamCache(cache) as kept:
         [before] = kept.snapshots(kept.vehicles()[0].key)
-    monkeypatch.setattr("paramclient.cli.restore.time.time", lambda: before.at + 600)
+    monkeypatch.setattr("paramclient.cli.apply.time.time", lambda: before.at + 600)
     told = command("restore", put(Dying(dict.fromkeys(names, 2))), "10min ago")
     assert told.code == 3
     found = re.search(

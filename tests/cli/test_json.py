@@ -134,7 +134,7 @@ CASES: Final = {
         (
             FETCH,
             "diff 1 DATA/json/quad.params --json",
-            "diff DATA/json/quad.params DATA/json/quad.param --all --json",
+            "diff DATA/json/quad.params DATA/json/quad.param --json",
             "diff DATA/json/quad.params DATA/json/quad.param --base 1 --json",
         ),
     ),
@@ -188,7 +188,6 @@ CASES: Final = {
         (
             "apply URL DATA/json/copter.param --partial --dry-run --json",
             "apply URL DATA/json/copter.param --partial --json",
-            "apply URL DATA/json/copter.param --partial --full --json",
         ),
     ),
     "apply_all": Case(both, ("apply URL DATA/json/copter.param --partial --vehicle all --json",)),

@@ -58,7 +58,6 @@ def test_save_needs_no_link_for_a_vehicle_in_the_cache(command: Command, cache: 
     ("options", "problem"),
     [
         (["--no-cache"], "'1' is a vehicle in the cache, which --no-cache excludes"),
-        (["--refresh"], "--refresh needs a link"),
         (["--format", "exe"], "exe"),
     ],
 )

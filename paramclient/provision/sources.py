@@ -1,0 +1,344 @@
+"""Parameters as a `ParamSet`: `resolve` reads a file, a log, a vehicle of the cache or a link."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path, PurePath
+from typing import Final
+
+from paramclient.cache import CachedComponent, CachedSummary, ParamCache
+from paramclient.cache.lookup import address_of, is_vehicle_name
+from paramclient.client.client import ParamClient
+from paramclient.client.component import Component
+from paramclient.errors import NotInCache, UnknownVehicle, UsageError, VehicleError
+from paramclient.files import LARGEST_FILE, FileFormat, ParamFile, loads, read_file
+from paramclient.files.formats import AUTOPILOT
+from paramclient.logs.onboard import is_onboard_log, read_onboard_log
+from paramclient.model.comparison import defaults_of, non_defaults
+from paramclient.model.defaults import add_defaults
+from paramclient.model.paramset import ParamSet
+from paramclient.model.values import Param
+from paramclient.model.wording import first_of
+from paramclient.protocol.fetch import FetchResult
+
+__all__ = [
+    "NAMES_SHOWN_MAX",
+    "NO_DEFAULTS",
+    "STANDARD_INPUT",
+    "choose",
+    "collect_defaults",
+    "component_of",
+    "component_set",
+    "fetched_set",
+    "is_file",
+    "is_offline",
+    "read_source",
+    "resolve",
+    "select_non_defaults",
+    "source_of",
+    "tables_in",
+]
+
+STANDARD_INPUT: Final = "-"
+"""The word for the standard input."""
+NAMES_SHOWN_MAX: Final = 20
+"""Parameters that a message names, so that it stays readable; it gives the number of further ones."""
+NO_DEFAULTS: Final = (
+    "the firmware's defaults are not known, so the parameters that differ from them cannot be found: they "
+    "come with the parameter file over MAVFTP, which ArduPilot and PX4 from 1.18 on serve, or with the "
+    "metadata of the firmware"
+)
+"""The message for a request that needs the firmware's defaults when no parameter has one."""
+_CACHED: Final = "cache:"
+"""The prefix of a vehicle in the cache."""
+
+logger = logging.getLogger(__name__)
+
+
+async def resolve(
+    text: str,
+    *,
+    system: int | None = None,
+    component: int | None = None,
+    extended: bool = False,
+    cache: ParamCache | str | bool | None = None,
+    fetch: Callable[[str], Awaitable[ParamSet]] | None = None,
+) -> ParamSet:
+    """Return the parameters that a text names.
+
+    1. A file that exists, whatever its name, or `-` for the standard input: a parameter file, or a log.
+    2. `cache:VEHICLE`, or a text that can only name a vehicle in the cache (see `paramclient.cache.lookup`).
+    3. Any other text: a link. The whole table is fetched, from the cache if the vehicle confirms it.
+
+    `./1` is a file, `cache:1` the vehicle. Names that no vehicle can have are left out of a file, with a
+    warning that names their lines.
+
+    Args:
+        text: the file, the vehicle or the link.
+        system, component: select a set of a file, a table of the cache, or a vehicle of the link.
+        extended: extended parameters of a vehicle; a file with them needs no mention.
+        cache: as in `ParamClient`; False excludes vehicles of the cache.
+        fetch: returns the parameters of a link; by default, a new client fetches them.
+
+    Raises:
+        UsageError: the text names none of the three; a file cannot be read (FileError).
+        UnknownVehicle, AmbiguousVehicle, CacheError: as `tables_in`.
+        VehicleError: some parameters were not received; the message names them, or counts those in the cache.
+        NoReply, LinkError: as from `ParamClient.component` and `Component.fetch_all`.
+    """
+    found = read_source(text, component=component, extended=extended, cache=cache)
+    if found is not None:
+        return choose(found, component, system)
+    link = source_of(text)
+    if fetch is not None:
+        return await fetch(link)
+    async with ParamClient(link if link == text else f"{link}?speed=0", cache=cache) as client:
+        vehicle = await client.component(system, component)
+        vehicle = vehicle.ext if extended else vehicle
+        return fetched_set(vehicle, await vehicle.fetch_all(), source=f"link {client.link.name}")
+
+
+def read_source(
+    text: str,
+    *,
+    component: int | None = None,
+    every: bool = False,
+    extended: bool = False,
+    incomplete: bool = False,
+    cache: ParamCache | str | bool | None = None,
+) -> ParamFile | None:
+    """Return the sets of a file, of a log, or of a vehicle of the cache; None if the text names a link.
+
+    Args:
+        text, component, extended, cache: as in `resolve`; `component` selects only a table of the cache.
+        every: all tables of a vehicle of the cache, instead of that of its autopilot.
+        incomplete: also an incomplete table of the cache, whose source says so.
+
+    Raises:
+        ParamClientError: as in `resolve`.
+    """
+    if is_file(source_of(text)):
+        return _read(text)
+    if not is_offline(text):
+        return None
+    if cache is False:
+        raise UsageError(f"{text!r} is a vehicle in the cache, which --no-cache excludes")
+    place = cache if isinstance(cache, str) else None
+    with cache if isinstance(cache, ParamCache) else ParamCache(place) as opened:
+        tables = tables_in(opened, text, component, extended=extended)
+        pilots = [each for each in tables if each.component == AUTOPILOT]
+        if not every and len(tables) > 1:
+            if not pilots:
+                known = ", ".join(f"{each.system}/{each.component}" for each in tables)
+                raise UsageError(f"no autopilot is among {known}; name one of them instead of {text}")
+            tables = pilots
+        loaded = [opened.load(each.key, each.component, extended=extended) for each in tables]
+    sets = [_cached_set(each, extended=extended, partial=incomplete) for each in loaded if each is not None]
+    if not sets:  # removed meanwhile
+        raise NotInCache(f"the cache has no table of {text}")
+    return ParamFile(tuple(sets), FileFormat.JSON, sets[0].source)
+
+
+def _read(path: str) -> ParamFile:
+    """Read a parameter file, or the values at the end of an on-board log; its notes become warnings."""
+    if path == STANDARD_INPUT:
+        file = loads(sys.stdin.buffer.read(LARGEST_FILE + 1), source="standard input", partial=True)
+    elif is_onboard_log(path):
+        log = read_onboard_log(path)
+        file = ParamFile((log.at_end(),), log.file_format, path, notes=log.notes)
+    else:
+        file = read_file(path, partial=True)
+    for note in file.notes:
+        logger.warning("%s: %s", file.source, note)
+    return file
+
+
+def is_file(text: str) -> bool:
+    """Return whether a text names an existing file or the standard input.
+
+    A device is not a file: it may be a link.
+    """
+    if text == STANDARD_INPUT:
+        return True
+    with suppress(OSError, ValueError):  # a text that is too long or has a NUL is not a file name
+        path = Path(text)
+        return path.is_file() or path.is_fifo()
+    return False
+
+
+def is_offline(text: str) -> bool:
+    """Return whether a text names a file or a vehicle in the cache, and no link."""
+    return is_file(source_of(text)) or text.startswith(_CACHED) or is_vehicle_name(text)
+
+
+def source_of(text: str) -> str:
+    """Return the link `replay:FILE` for a telemetry log, else the text."""
+    is_telemetry = PurePath(text).suffix.lower() == ".tlog" and is_file(text)
+    return f"replay:{text}" if is_telemetry else text
+
+
+def choose(file: ParamFile, component: int | None, system: int | None) -> ParamSet:
+    """Return a file's parameters for a component; `system` selects only in a file of several systems.
+
+    Raises:
+        FileError: the file has no parameters for it.
+    """
+    is_of_several = len({each.system for each in file.sets}) > 1
+    return file.choose(component, system=system if is_of_several else None)
+
+
+def tables_in(
+    cache: ParamCache, vehicle: str | None, component: int | None = None, *, extended: bool = False
+) -> list[CachedSummary]:
+    """Return the tables in the cache that an argument names. All subcommands use this function.
+
+    Args:
+        cache: the cache.
+        vehicle: the name of the vehicle, also with the prefix `cache:`; None for all vehicles.
+        component: return only the table of this component, unless the name has one.
+        extended: only components with extended parameters. A system id is then enough, also if a camera of
+            the system has a hardware id of its own.
+
+    Raises:
+        NotInCache: no component of the vehicle has extended parameters in the cache.
+        UsageError: the name is empty, such as an unset variable of a script.
+        UnknownVehicle: no vehicle in the cache has this name, or none of its tables is of this component.
+        AmbiguousVehicle: several vehicles have this name.
+    """
+    name = None if vehicle is None else vehicle.removeprefix(_CACHED)
+    if name == "":
+        raise UsageError("a vehicle in the cache needs a name: its system id, its hardware id, or its key")
+    is_system = extended and name is not None and name.isdecimal()
+    known = cache.components(None if is_system else name, extended=extended)
+    known = [each for each in known if not is_system or str(each.system) == name]
+    component = component if name is None or component_of(name) is None else component_of(name)
+    chosen = [each for each in known if component in (None, each.component)]
+    if not chosen and extended:
+        raise NotInCache("there are no extended parameters of that vehicle in the cache")
+    if not chosen and (known or vehicle is not None):
+        addresses = [f"{each.system}/{each.component} ({each.key})" for each in known]
+        raise UnknownVehicle(
+            f"component {component} is not in the cache {cache.place}, which has {', '.join(addresses)}",
+            vehicles=addresses,
+        )
+    return chosen
+
+
+def component_of(vehicle: str) -> int | None:
+    """Return the component id in the name of a vehicle in the cache, such as `4/1`; None without one."""
+    address = address_of(vehicle.removeprefix(_CACHED))
+    return None if address is None else address[1]
+
+
+def component_set(component: Component, params: Iterable[Param], source: str) -> ParamSet:
+    """Return parameters of a component as a set of this moment; `source` is their origin in words."""
+    return ParamSet(
+        {param.name: param for param in params},
+        component=component.component,
+        system=component.system,
+        identity=component.identity,
+        at=time.time(),
+        source=source,
+        is_extended=component.is_extended,
+    )
+
+
+def fetched_set(component: Component, result: FetchResult, *, source: str, partial: bool = False) -> ParamSet:
+    """Return a fetched table as a set, without values that are only cached.
+
+    Args:
+        component: the component.
+        result: the result of its fetch.
+        source: the origin of the set, in words; a doubt of the encoding, and with `partial` the missing
+            parameters, are added.
+        partial: whether some parameters may be missing.
+
+    Raises:
+        VehicleError: some parameters were not received; the message names them.
+    """
+    if doubt := component.session.encoding_doubt:
+        source = f"{source} ({doubt})"
+    cached = {result.params[name].index: name for name in result.cached}
+    indices = sorted({*result.missing, *(index for index in cached if index is not None)})
+    missing = [cached.get(index, f"index {index}") for index in indices]
+    if missing and not partial:
+        vehicle = f"{component.system}/{component.component} {component.autopilot}"
+        was = f"{first_of(missing, NAMES_SHOWN_MAX)} {'was' if len(missing) == 1 else 'were'} not received"
+        raise VehicleError(
+            f"{vehicle} on {component.identity.link} is incomplete: {was}",
+            system=component.system,
+            component=component.component,
+        )
+    left_out = [*missing, *map(repr, sorted(component.session.table.left_out))]
+    if left_out:
+        source = f"{source}, without {first_of(left_out, NAMES_SHOWN_MAX)}"
+    known = result.params.keys() - set(result.cached)
+    return component_set(component, (each for name, each in result.params.items() if name in known), source)
+
+
+def _cached_set(table: CachedComponent, *, extended: bool, partial: bool) -> ParamSet:
+    """Return a component's cached parameters as a set.
+
+    Raises:
+        VehicleError: the cache has not all of them, and `partial` is false.
+    """
+    source = f"cache {table.key}"
+    if not table.complete:
+        of = "" if table.count is None else f" of {table.count}"
+        are = f"{table.size}{of} parameters are in the cache"
+        source = f"{source}: {are}"
+        if not partial:
+            message = f"{table.system}/{table.component} is incomplete: {are}"
+            raise VehicleError(message, system=table.system, component=table.component)
+    return ParamSet(
+        table.params,
+        component=table.component,
+        system=table.system,
+        identity=table.identity,
+        at=table.updated_at if table.synced_at is None else table.synced_at,
+        source=source,
+        is_extended=extended,
+    )
+
+
+def select_non_defaults(whole: ParamSet, described: Mapping[str, int | float]) -> ParamSet:
+    """Return the parameters of a set that differ from the firmware's defaults.
+
+    Args:
+        whole: the set.
+        described: defaults in the metadata by name, for parameters of the set without a default.
+
+    Raises:
+        UsageError: the defaults are not known, or no parameter differs.
+    """
+    known = add_defaults(whole, described)
+    if not any(param.default is not None for param in known.values()):
+        raise UsageError(NO_DEFAULTS)
+    found = {name: whole[name] for name in non_defaults(known)}
+    if not found:
+        raise UsageError("no parameter differs from its default")
+    return replace(whole, params=found)
+
+
+def collect_defaults(sets: Sequence[ParamSet], described: Sequence[Mapping[str, int | float]]) -> ParamSet:
+    """Return the firmware's defaults of the parameters of sets: a base for `compare`.
+
+    Args:
+        sets: the sets.
+        described: defaults in the metadata of each set by name, for parameters without a default in the set.
+
+    Raises:
+        UsageError: the defaults are not known.
+    """
+    base = defaults_of(*(add_defaults(each, more) for each, more in zip(sets, described, strict=True)))
+    if not base:
+        raise UsageError(NO_DEFAULTS)
+    given = {name for each in sets for name, param in each.items() if param.default is not None}
+    if count := len(base.keys() - given):
+        base = replace(base, source=f"{base.source}, {count} of {len(base)} from the metadata")
+    return base
