@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Awaitable, Callable
-from contextlib import suppress
+from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import asdict
-from importlib.metadata import version
 from statistics import median
 from typing import Annotated, Any, Final
 
@@ -14,38 +12,23 @@ import anyio
 from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.json_output import JsonObject
 from paramclient.cli.options import Seconds, TrafficOptions
 from paramclient.cli.output import Coloured, Status, milliseconds, print_json, print_line, print_table
 from paramclient.cli.session import VEHICLE_TIMEOUT, ChosenVehicle, Deadline, listen, wait_for_vehicle
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
-from paramclient.errors import (
-    FileTransferError,
-    LinkError,
-    NoReply,
-    PackError,
-    ParamClientError,
-    UsageError,
-    VehicleError,
-)
+from paramclient.errors import LinkError, NoReply, ParamClientError, UsageError
 from paramclient.model.identity import version_text
 from paramclient.model.notation import hash_text, rounded
 from paramclient.protocol import param_pck
+from paramclient.protocol.commands import request_message
 from paramclient.protocol.file_download import WITH_DEFAULTS
-from paramclient.protocol.list_download import ListResult, download_list
+from paramclient.protocol.list_download import download_list
 from paramclient.protocol.param_pck import PARAM_FILE
 from paramclient.version import __version__
 from paramclient.wire.frames import enum_word
-from paramclient.wire.messages import (
-    HASH_CHECK,
-    MAV_AUTOPILOT_INVALID,
-    MAV_CMD_REQUEST_MESSAGE,
-    MAV_TYPE_GCS,
-    AutopilotVersion,
-    CommandAck,
-    CommandLong,
-    message_id,
-)
+from paramclient.wire.messages import HASH_CHECK, AutopilotVersion
 
 __all__ = ["check"]
 
@@ -53,16 +36,10 @@ CHECK_TIMEOUT: Final = 60.0
 """Seconds for the whole measurement without --timeout: a list at 57600 baud takes 35."""
 CHECK_LISTENING_TIME: Final = 2.2
 """Seconds in which every component is heard twice, as each sends a heartbeat once a second."""
-VERSION_TIMEOUT: Final = 3.0
-"""Seconds for AUTOPILOT_VERSION: four attempts at the initial timeout."""
 MEASURE_TIMEOUT: Final = 3.0
 """Seconds for one small request: longer than any measured round trip with repeats."""
 ROUND_TRIP_COUNT: Final = 10
 """Number of round trips that are measured: enough for a median and a maximum."""
-SINGLE_READ_COUNT: Final = 5
-"""Number of sequential reads that are measured: enough for a median."""
-CONCURRENT_READ_COUNT: Final = 30
-"""Number of concurrent reads: ArduPilot serves five in 100 ms, so 30 show its rate within 0.6 s."""
 STEADY_SHARE: Final = 0.9
 """Share of the list up to which its rate is measured: after it come the repeats of lost values."""
 NOTABLE_LOSS: Final = 0.005
@@ -74,6 +51,18 @@ ROUND_TRIP_LONG: Final = 0.5
 LIST_RATE_SLOW: Final = 200.0
 """Values per second below which a list is reported as slow. ArduPilot sends 1,680 and PX4 1,000 over UDP or
 USB (measured); a 57600 baud radio carries 40."""
+FASTER_PORT: Final = "Raise the port's baud rate or data rate (PX4: MAV_n_RATE, ArduPilot: SERIALn_BAUD)."
+"""What to do about a slow list."""
+ENABLE_FTP: Final = "Check that BRD_OPTIONS leaves MAVFTP on (bit 1), and that the firmware is 4.1 or newer."
+"""What to do about an ArduPilot that serves no parameter file."""
+LESS_LOSS: Final = "Check antenna, distance and baud rate, or send less telemetry on this link."
+"""What to do about lost frames."""
+NO_ACKNOWLEDGEMENT: Final = (
+    "No command was acknowledged: frames to the vehicle are lost, another station was first on a port that "
+    "answers only one (PX4 over UDP), or the vehicle expects signed frames. Close other ground stations and "
+    "restart the vehicle's link; with signing, give --signing-key."
+)
+"""The finding about a vehicle that acknowledges no command, and what to do about it."""
 _DEFAULTS: Final = TrafficOptions()
 _STYLES: Final = {"problem": "red", "slow": "yellow"}
 """Styles of each severity."""
@@ -103,354 +92,245 @@ async def check(
         if client.listens_only:
             raise UsageError(f"{client.link.name} is a log: check needs a link to a vehicle")
         heartbeat_timeout = VEHICLE_TIMEOUT if timeout is None else deadline.left()
-        found = await wait_for_vehicle(client, choice, timeout=heartbeat_timeout)
-        report = _Report(client, found, deadline)
-        await report.measure()
+        component = await wait_for_vehicle(client, choice, timeout=heartbeat_timeout)
+        found = await _measure(client, component, deadline)
+    findings = [*_findings(found)]
     if options.json:
-        versions = {
-            "paramclient": __version__,
-            "pymavlink": version("pymavlink"),
-            "python": platform.python_version(),
-            "system": platform.platform(),
-        }
-        print_json({**report.json, "findings": report.findings, "versions": versions})
+        members = [{"severity": severity, "text": text} for severity, text in findings]
+        versions = {"paramclient": __version__, "python": platform.python_version()}
+        print_json({**found, "findings": members, "versions": versions | {"system": platform.platform()}})
     else:
-        print_table(("what", "measured"), report.rows.items())
+        print_table(("what", "measured"), _rows(found))
         print_line("")
-        if report.findings:
-            rows = [
-                (Coloured(each["severity"], _STYLES[each["severity"]]), f"{each['text']} {each['advice']}")
-                for each in report.findings
-            ]
+        if findings:
+            rows = [(Coloured(severity, _STYLES[severity]), text) for severity, text in findings]
             print_table(("severity", "slow or unusual"), rows)
         else:
             print_line("Nothing slow or unusual.")
-    listed = report.json["list"]
+    listed = found["list"]
     is_whole = listed is not None and listed["error"] is None and not listed["missing"]
     return ExitCode.DONE if is_whole else ExitCode.INCOMPLETE
 
 
-class _Report:
-    """The measurements of one vehicle, each as JSON, as a row of the table, and with its findings.
+# Measurements
+
+
+async def _measure(client: ParamClient, component: Component, deadline: Deadline) -> JsonObject:
+    """Return all measurements; those for which no time is left are None.
 
     Sends no PARAM_SET, no command except MAV_CMD_REQUEST_MESSAGE, and writes no file.
 
-    Args:
-        client: an open client that counts traffic, without a cache.
-        component: the vehicle.
-        deadline: a measurement after it is left out, and a list download that takes longer is cut short.
+    Raises:
+        LinkError: the link failed.
     """
+    began, identification = anyio.current_time(), component.node.identification
 
-    def __init__(self, client: ParamClient, component: Component, deadline: Deadline) -> None:
-        self._client, self._component, self._deadline = client, component, deadline
-        self._identification = component.node.identification
-        self._proof = "checksum" if self._identification.is_ardupilot else "hash"
-        self.json: dict[str, Any] = {}
-        self.rows: dict[str, str] = {}
-        self.findings: list[dict[str, str]] = []
-
-    async def measure(self) -> None:
-        """Take all measurements.
-
-        Raises:
-            LinkError: the link failed.
-        """
-        began, listened = anyio.current_time(), self._client.traffic_report().seconds
-        await self._step("listening", lambda: anyio.sleep(max(0.0, CHECK_LISTENING_TIME - listened)))
-        await self._step("identification", self._wait_for_identity)
-        self._describe()
-        self.json |= dict.fromkeys(("link", "reads", "list", "files", "hash"))
-        self.rows["round trip"] = "no command was acknowledged"
-        self.rows["loss"] = ""
-        titles = ("single reads", "list", "parameter file", self._proof)
-        self.rows |= dict.fromkeys(titles, "not measured: no time left")
-        trips = await self._step("round trip", self._measure_round_trips)
-        await self._step("hash", self._read_hash)
-        await self._step("single reads", self._measure_reads)
-        await self._step("list download", self._measure_list)
-        await self._step("MAVFTP", self._check_files)
-        self._describe_link(trips or [])
-        self.json["elapsed_s"] = round(anyio.current_time() - began, 3)
-        self.rows["measured in"] = f"{self.json['elapsed_s']:.1f} s"
-
-    def _find(self, severity: str, text: str, advice: str = "") -> None:
-        self.findings.append({"severity": severity, "text": text, "advice": advice})
-
-    def _left(self) -> float:
-        """Return the timeout of one request in seconds."""
-        return self._deadline.left(MEASURE_TIMEOUT) or 0.0
-
-    async def _step(self, name: str, measure: Callable[[], Awaitable[Any]]) -> Any:
+    async def step(name: str, measure: Callable[[], Awaitable[Any]]) -> Any:
         """Return the result of a measurement; None if no time is left for it."""
-        if not self._left():
+        if not deadline.left():
             return None
         with Status(f"measuring: {name}"):
             return await measure()
 
-    async def _wait_for_identity(self) -> None:
-        """Wait until AUTOPILOT_VERSION was received or finally refused, at most `VERSION_TIMEOUT`."""
-        await self._component.wait_until_identified(self._deadline.left(VERSION_TIMEOUT) or 0.0)
+    listened = client.traffic_report().seconds
+    await step("listening", lambda: anyio.sleep(max(0.0, CHECK_LISTENING_TIME - listened)))
+    await step(
+        "identification", lambda: component.wait_until_identified(deadline.left(MEASURE_TIMEOUT) or 0.0)
+    )
+    kind = identification.vehicle_type
+    found: JsonObject = {
+        "system": component.system,
+        "component": component.component,
+        "autopilot": component.autopilot,
+        "vehicle_type": None if kind is None else enum_word("MAV_TYPE", kind),
+        "identity": asdict(component.identity),
+        "has_version": identification.capabilities is not None,
+        "encoding": component.encoding.value,
+        "encoding_reason": component.encoding_reason,
+        "is_armed": component.is_armed,
+    }
+    trips = await step("round trip", lambda: _round_trips(component, deadline))
+    crc = await step("hash", lambda: _hash(client, component, deadline))
+    listed = await step("list download", lambda: _list(component, deadline))
+    files = await step("MAVFTP", lambda: _files(component, deadline))
+    found |= {"link": _link(client, component, trips or []), "list": listed}
+    return found | {"files": files, "hash": crc, "elapsed_s": round(anyio.current_time() - began, 3)}
 
-    def _describe(self) -> None:
-        component, identity, kind = (
-            self._component,
-            self._component.identity,
-            self._identification.vehicle_type,
-        )
-        has_version = self._identification.capabilities is not None
-        vehicle_type = None if kind is None else enum_word("MAV_TYPE", kind)
-        self.json |= {
-            "system": component.system,
-            "component": component.component,
-            "autopilot": component.autopilot,
-            "vehicle_type": vehicle_type,
-            "identity": asdict(identity),
-            "has_version": has_version,
-            "encoding": component.encoding.value,
-            "encoding_reason": component.encoding_reason,
-            "is_armed": component.is_armed,
-        }
-        words = " ".join(dict.fromkeys(filter(None, (component.autopilot, vehicle_type))))
-        armed = {True: ", armed", False: ", disarmed", None: ""}[component.is_armed]
-        self.rows["vehicle"] = f"{component.system}/{component.component} {words}{armed}"
-        if has_version:
-            self.rows["firmware"] = version_text(identity.firmware)
-            self.rows["hardware id"] = identity.uid or "none"
+
+async def _round_trips(component: Component, deadline: Deadline) -> list[float]:
+    """Measure the time from command to acknowledgement; stop if the vehicle acknowledges none."""
+    found: list[float] = []
+    for _ in range(ROUND_TRIP_COUNT):
+        began = anyio.current_time()
+        try:
+            with anyio.fail_after(deadline.left(MEASURE_TIMEOUT)):
+                await request_message(component.node.channel, AutopilotVersion)
+        except (NoReply, TimeoutError):
+            return found
+        found.append(anyio.current_time() - began)
+    return found
+
+
+async def _hash(client: ParamClient, component: Component, deadline: Deadline) -> JsonObject:
+    """Read PX4's hash or ArduPilot's checksum, with its time and its bytes of both directions."""
+    began, before = anyio.current_time(), client.bytes_sent + client.bytes_received
+    timeout = deadline.left(MEASURE_TIMEOUT)
+    try:
+        if component.node.identification.is_ardupilot:
+            crc = await component.file_checksum(PARAM_FILE, timeout=timeout)
         else:
-            self.rows["firmware"] = "unknown: no AUTOPILOT_VERSION received"
-            self._find(
-                "problem",
-                "The vehicle did not answer the request for AUTOPILOT_VERSION: another vehicle with this "
-                "system id would be taken for it.",
-            )
-        self.rows["encoding"] = f"{component.encoding.value}: {component.encoding_reason}"
+            crc = (await component.get(HASH_CHECK, timeout=timeout)).bits
+    except LinkError:
+        raise
+    except ParamClientError as error:
+        return {"before": None, "elapsed_s": None, "bytes": None, "error": str(error)}
+    count = client.bytes_sent + client.bytes_received - before
+    elapsed = rounded(anyio.current_time() - began)
+    return {"before": hash_text(crc), "elapsed_s": elapsed, "bytes": count, "error": None}
 
-    async def _measure_round_trips(self) -> list[float]:
-        """Measure the time from command to acknowledgement, of commands that were sent once."""
-        channel, what = self._component.node.channel, f"COMMAND_ACK of {self._component.node.channel}"
-        command = CommandLong(*channel.target, MAV_CMD_REQUEST_MESSAGE, float(message_id(AutopilotVersion)))
-        found: list[float] = []
-        for _ in range(ROUND_TRIP_COUNT):
-            began = anyio.current_time()
-            sent: list[int] = []
 
-            def request(attempt: int, sent: list[int] = sent) -> CommandLong:
-                sent.append(attempt)
-                return command
+async def _list(component: Component, deadline: Deadline) -> JsonObject:
+    """Measure one list download, also if a file download would be faster."""
+    session, began, arrivals = component.session, anyio.current_time(), list[tuple[float, int]]()
+    result, problem = None, None
 
-            with (
-                anyio.move_on_after(self._left()) as scope,
-                channel.inbox((CommandAck, MAV_CMD_REQUEST_MESSAGE)) as inbox,
-                suppress(NoReply),
-            ):
-                await channel.exchange(request, inbox, lambda ack: ack, what=what)
-                if len(sent) == 1:
-                    found.append(anyio.current_time() - began)
-                continue
-            if scope.cancelled_caught and not found:
-                break  # the vehicle acknowledges no commands
-        return found
+    def progress(received: int, _: int | None) -> None:
+        if received and (not arrivals or received > arrivals[-1][1]):
+            arrivals.append((anyio.current_time() - began, received))
 
-    async def _read_hash(self) -> None:
-        """Read PX4's hash or ArduPilot's checksum, with its time and its bytes of both directions."""
-        client, began = self._client, anyio.current_time()
-        before = client.bytes_sent + client.bytes_received
-        found = dict.fromkeys(("before", "elapsed_s", "bytes", "error"))
-        self.json["hash"] = found
-        try:
-            if self._identification.is_ardupilot:
-                crc = await self._component.file_checksum(PARAM_FILE, timeout=self._left())
-            else:
-                crc = (await self._component.get(HASH_CHECK, timeout=self._left())).bits
-        except (FileTransferError, NoReply, VehicleError) as error:
-            found["error"] = str(error)
-            self.rows[self._proof] = f"none: {error}"
-            if self._component.autopilot == "px4":
-                text = f"{error}: each session downloads the table anew."
-                self._find("slow", text, "Set MAV_HASH_CHK_EN to 1.")
-            return
-        elapsed, count = anyio.current_time() - began, client.bytes_sent + client.bytes_received - before
-        found |= {"before": hash_text(crc), "elapsed_s": round(elapsed, 4), "bytes": count}
-        self.rows[self._proof] = f"{hash_text(crc)}, {count} bytes in {milliseconds(elapsed)}"
+    session.observers.add(progress)
+    try:
+        # the vehicle sends the whole list even if later measurements have begun
+        with anyio.move_on_after(max(0.0, (deadline.left() or 0.0) - MEASURE_TIMEOUT)):
+            result = await download_list(session)
+    except LinkError:
+        raise
+    except ParamClientError as error:
+        problem, arrivals = str(error), []
+    finally:
+        session.observers.discard(progress)
+    received = arrivals[-1][1] if arrivals else 0
+    steady = [each for each in arrivals if each[1] >= STEADY_SHARE * received and each[0] > arrivals[0][0]]
+    count = None if problem else component.count
+    return {
+        "count": count,
+        "received": received,
+        "elapsed_s": rounded(anyio.current_time() - began),
+        "per_s": rounded(steady[0][1] / (steady[0][0] - arrivals[0][0])) if steady else None,
+        "lost": result.lost if result else 0,
+        "missing": len(result.missing) if result else (count or 0) - received,
+        "is_cut_short": result is None and problem is None,
+        "error": problem,
+    }
 
-    async def _measure_reads(self) -> None:
-        """Measure reads of single parameters: one after the other, and many at once."""
-        single: list[float] = []
-        self.json["reads"], self.rows["single reads"] = {"in_flight": 0, "answered": 0}, "no response"
-        for index in range(SINGLE_READ_COUNT):
-            began = anyio.current_time()
-            if await self._is_answered(index):
-                single.append(anyio.current_time() - began)
-            elif not single:
-                return
-        count = self._component.count or 0
-        # indices spread over the table, without those that were just read
-        step = max((count - SINGLE_READ_COUNT) // CONCURRENT_READ_COUNT, 1)
-        indices = range(SINGLE_READ_COUNT, count, step)[:CONCURRENT_READ_COUNT]
-        began = anyio.current_time()
-        answered_at: list[float] = []
 
-        async def read(index: int) -> None:
-            if await self._is_answered(index):
-                answered_at.append(anyio.current_time())
+async def _files(component: Component, deadline: Deadline) -> JsonObject:
+    """Download the packed parameter file over MAVFTP."""
+    began = anyio.current_time()
+    try:
+        data = await component.read_file(PARAM_FILE + WITH_DEFAULTS, timeout=deadline.left())
+        elapsed, content = anyio.current_time() - began, param_pck.decode(data)
+    except LinkError:
+        raise
+    except ParamClientError as error:
+        missing = dict.fromkeys(("size", "elapsed_s", "parameters", "defaults"))
+        return {"is_serving": not isinstance(error, NoReply), **missing, "error": str(error)}
+    count = len(content.entries)
+    return {
+        "is_serving": True,
+        "size": len(data),
+        "elapsed_s": rounded(elapsed),
+        "parameters": count,
+        "defaults": count if content.with_defaults else 0,
+        "error": None,
+    }
 
-        async with anyio.create_task_group() as tasks:
-            for index in indices:
-                tasks.start_soon(read, index)
-        rate = len(answered_at) / (max(answered_at) - began) if answered_at else None
-        speed = {"single_s": rounded(median(single))} | ({"per_s": rounded(rate)} if rate else {})
-        self.json["reads"] = speed | {"in_flight": len(indices), "answered": len(answered_at)}
-        rates = f", {rate:.0f} per second with {len(indices)} at once" if rate else ""
-        self.rows["single reads"] = f"{milliseconds(median(single))} each{rates}"
 
-    async def _is_answered(self, index: int) -> bool:
-        try:
-            await self._component.get(index, timeout=self._left())
-        except (NoReply, VehicleError):
-            return False
-        return True
+def _link(client: ParamClient, component: Component, trips: list[float]) -> JsonObject:
+    """Return the round trips, and the loss of the vehicle's frames since the link was opened."""
+    report, trip = client.traffic_report(), None
+    (own,) = (each for each in report.components if (each.system, each.component) == component.address)
+    lost = max(own.totals["lost"], 0)
+    sent = own.totals["frames"] - own.totals["repeated"] + lost
+    if trips:
+        trip = {"count": len(trips), "median_s": rounded(median(trips)), "max_s": rounded(max(trips))}
+    others = [each.address for each in client.autopilots if each.node is not component.node]
+    return {
+        "name": client.link.name,
+        "seconds": round(report.seconds, 3),
+        "round_trip": trip,
+        "loss": rounded(lost / sent) if sent else None,
+        "lost": lost,
+        "autopilots": [f"{system}/{number}" for system, number in others],
+    }
 
-    async def _measure_list(self) -> None:
-        """Measure one list download, also if a file download would be faster."""
-        session, began = self._component.session, anyio.current_time()
-        arrivals: list[tuple[float, int]] = []
-        result: ListResult | None = None
-        error: ParamClientError | None = None
 
-        def progress(received: int, total: int | None) -> None:
-            if received and (not arrivals or received > arrivals[-1][1]):
-                arrivals.append((anyio.current_time(), received))
+# Output
 
-        session.observers.add(progress)
-        try:
-            # the vehicle sends the whole list even if later measurements have begun
-            with anyio.move_on_after(max(0.0, (self._deadline.left() or 0.0) - MEASURE_TIMEOUT)):
-                result = await download_list(session)
-        except LinkError:
-            raise
-        except ParamClientError as failure:
-            error = failure
-        finally:
-            session.observers.discard(progress)
-        elapsed, count = anyio.current_time() - began, None if error else self._component.count
-        received = arrivals[-1][1] if arrivals and not error else 0
-        steady = [(at, number) for at, number in arrivals if number >= STEADY_SHARE * received]
-        rates = [number / (at - arrivals[0][0]) for at, number in steady if at > arrivals[0][0]]
-        rate = rates[0] if rates and not error else None
-        lost = 0 if result is None else result.lost
-        missing = (count or 0) - received if result is None else len(result.missing)
-        is_cut_short = result is None and error is None
-        self.json["list"] = {
-            "count": count,
-            "received": received,
-            "elapsed_s": round(elapsed, 4),
-            "per_s": rounded(rate),
-            "lost": lost,
-            "missing": missing,
-            "is_cut_short": is_cut_short,
-            "error": None if error is None else str(error),
-        }
-        parts = [f"{received} of {count} in {elapsed:.2f} s"]
-        parts += [f"{rate:,.0f} per second"] if rate else []
-        parts += [f"{lost} requested again"] if lost else []
-        parts += [f"{missing} missing"] if missing else []
-        self.rows["list"] = ", ".join(parts) if error is None else str(error)
-        if error is not None:
-            self._find("problem", f"The list could not be downloaded: {error}.")
-        elif is_cut_short:
-            self._find("slow", f"The list was cut short after {elapsed:.0f} s by the time limit.")
-        elif missing:
-            self._find(
-                "problem",
-                f"{missing} of {count} parameters stayed missing: the vehicle counts parameters that it does "
-                "not send.",
-            )
-        if rate is not None and rate < LIST_RATE_SLOW:
-            self._find(
-                "slow",
-                f"The list is received at {rate:.0f} values per second: a slow port, a radio, or a "
-                "low-bandwidth mode.",
-                "Raise the port's baud rate or data rate (PX4: MAV_n_RATE, ArduPilot: SERIALn_BAUD).",
-            )
 
-    async def _check_files(self) -> None:
-        """Download the packed parameter file over MAVFTP."""
-        began = anyio.current_time()
-        found: dict[str, Any] = {"is_serving": True}
-        found |= dict.fromkeys(("size", "elapsed_s", "parameters", "defaults", "error"))
-        self.json["files"] = found
-        try:
-            data = await self._component.read_file(PARAM_FILE + WITH_DEFAULTS, timeout=self._deadline.left())
-            elapsed = anyio.current_time() - began
-            content = param_pck.decode(data)
-        except (FileTransferError, NoReply, PackError) as error:
-            found |= {"is_serving": not isinstance(error, NoReply), "error": str(error)}
-            self.rows["parameter file"] = str(error) or "none"
-            if self._identification.is_ardupilot:
-                self._find(
-                    "slow",
-                    f"The packed parameter file cannot be read ({error}), so tables are downloaded as lists, "
-                    "without defaults.",
-                    "Check that BRD_OPTIONS does not turn MAVFTP off (bit 1), and that the firmware is 4.1 "
-                    "or newer.",
-                )
-            return
-        count = len(content.entries)
-        defaults = count if content.with_defaults else 0
-        found |= {"size": len(data), "elapsed_s": rounded(elapsed), "parameters": count, "defaults": defaults}
-        what = f"{count} parameters, {len(data):,} bytes in {elapsed:.2f} s"
-        self.rows["parameter file"] = f"{what}, {'with' if defaults else 'without'} defaults"
+def _rows(found: JsonObject) -> Iterator[tuple[str, str]]:
+    """Yield the measurements in words."""
+    link, listed, files, crc = (found[name] for name in ("link", "list", "files", "hash"))
+    proof, no_time = "checksum" if found["autopilot"] == "ardupilot" else "hash", "not measured: no time left"
+    words = " ".join(dict.fromkeys(filter(None, (found["autopilot"], found["vehicle_type"]))))
+    armed = {True: ", armed", False: ", disarmed", None: ""}[found["is_armed"]]
+    yield "vehicle", f"{found['system']}/{found['component']} {words}{armed}"
+    if found["has_version"]:
+        yield "firmware", version_text(found["identity"]["firmware"])
+        yield "hardware id", found["identity"]["uid"] or "none"
+    else:
+        yield "firmware", "unknown: no AUTOPILOT_VERSION received"
+    yield "encoding", f"{found['encoding']}: {found['encoding_reason']}"
+    if trip := link["round_trip"]:
+        most = f"at most {milliseconds(trip['max_s'])}, {trip['count']} commands"
+        yield "round trip", f"{milliseconds(trip['median_s'])} ({most})"
+    else:
+        yield "round trip", "no command was acknowledged"
+    share = "unknown" if link["loss"] is None else f"{link['loss']:.1%}"
+    yield "loss", f"{share} ({link['lost']:,} of the vehicle's frames in {link['seconds']:.1f} s)"
+    yield "list", no_time if listed is None else listed["error"] or ", ".join(_list_in_words(listed))
+    if files is None or files["error"]:
+        yield "parameter file", no_time if files is None else files["error"]
+    else:
+        what = f"{files['parameters']} parameters, {files['size']:,} bytes in {files['elapsed_s']:.2f} s"
+        yield "parameter file", f"{what}, {'with' if files['defaults'] else 'without'} defaults"
+    if crc is None or crc["error"]:
+        yield proof, no_time if crc is None else f"none: {crc['error']}"
+    else:
+        yield proof, f"{crc['before']}, {crc['bytes']} bytes in {milliseconds(crc['elapsed_s'])}"
+    yield "other autopilots", ", ".join(link["autopilots"]) or "none"
+    yield "measured in", f"{found['elapsed_s']:.1f} s"
 
-    def _describe_link(self, trips: list[float]) -> None:
-        """Add the round trips, and the loss of the vehicle's frames since the link was opened."""
-        report, own = self._client.traffic_report(), self._component.address
-        mine = next((each for each in report.components if (each.system, each.component) == own), None)
-        lost = 0 if mine is None else max(mine.totals["lost"], 0)
-        sent = 0 if mine is None else mine.totals["frames"] - mine.totals["repeated"] + lost
-        loss = lost / sent if sent else None
-        others = [
-            f"{each.system}/{each.component}"
-            for each in report.components
-            if each.heartbeat is not None
-            and (each.system, each.component) != own
-            and each.heartbeat.type != MAV_TYPE_GCS
-            and each.heartbeat.autopilot != MAV_AUTOPILOT_INVALID
-        ]
-        trip: dict[str, Any] | None = None
-        if trips:
-            least, middle, most = min(trips), median(trips), max(trips)
-            trip = {"count": len(trips), "min_s": round(least, 4)}
-            trip |= {"median_s": round(middle, 4), "max_s": round(most, 4)}
-            spread = f"{milliseconds(least)} to {milliseconds(most)}"
-            self.rows["round trip"] = f"{milliseconds(middle)} ({spread}, {len(trips)} commands)"
-        self.json["link"] = {
-            "name": self._client.link.name,
-            "seconds": round(report.seconds, 3),
-            "round_trip": trip,
-            "loss": rounded(loss),
-            "lost": lost,
-            "autopilots": others,
-        }
-        share = "unknown" if loss is None else f"{loss:.1%}"
-        self.rows["loss"] = f"{share} ({lost:,} of the vehicle's frames in {report.seconds:.1f} s)"
-        self.rows["other autopilots"] = ", ".join(others) or "none"
-        if loss is not None and loss >= NOTABLE_LOSS:
-            self._find(
-                "problem" if loss >= SEVERE_LOSS else "slow",
-                f"{loss:.1%} of the vehicle's frames were lost ({lost:,}).",
-                "Check antenna, distance and baud rate, or send less telemetry on this link.",
-            )
-        if not trips:
-            self._find(
-                "problem",
-                "No command was acknowledged: frames to the vehicle are lost, another station was first on a "
-                "port that answers only one (PX4 over UDP), or the vehicle expects signed frames.",
-                "Close other ground stations and restart the vehicle's link; with signing, give "
-                "--signing-key.",
-            )
-        elif median(trips) >= ROUND_TRIP_LONG:
-            self._find(
-                "slow",
-                f"The round trip is {median(trips):.2f} s. Each repeat of a lost request takes at least as "
-                "long.",
-            )
+
+def _list_in_words(listed: JsonObject) -> Iterator[str]:
+    yield f"{listed['received']} of {listed['count']} in {listed['elapsed_s']:.2f} s"
+    if listed["per_s"]:
+        yield f"{listed['per_s']:,.0f} per second"
+    if listed["lost"]:
+        yield f"{listed['lost']} requested again"
+    if listed["missing"]:
+        yield f"{listed['missing']} missing"
+
+
+def _findings(found: JsonObject) -> Iterator[tuple[str, str]]:
+    """Yield what is slow or unusual: its severity, and sentences that end with what to do."""
+    link, listed, files, crc = (found[name] for name in ("link", "list", "files", "hash"))
+    if listed is not None and (listed["error"] or listed["missing"]):
+        text = f"{listed['missing']} of {listed['count']} parameters stayed missing"
+        yield "problem", f"The list could not be downloaded: {listed['error'] or text}."
+    if listed is not None and listed["per_s"] and listed["per_s"] < LIST_RATE_SLOW:
+        text = f"The list is received at {listed['per_s']:.0f} values per second"
+        yield "slow", f"{text}: a slow port, a radio, or a low-bandwidth mode. {FASTER_PORT}"
+    if crc is not None and crc["error"] and found["autopilot"] == "px4":
+        yield "slow", f"{crc['error']}: each session downloads the table anew. Set MAV_HASH_CHK_EN to 1."
+    if files is not None and files["error"] and found["autopilot"] == "ardupilot":
+        text = f"The packed parameter file cannot be read ({files['error']})"
+        yield "slow", f"{text}, so tables are downloaded as lists, without defaults. {ENABLE_FTP}"
+    if link["loss"] is not None and link["loss"] >= NOTABLE_LOSS:
+        text = f"{link['loss']:.1%} of the vehicle's frames were lost ({link['lost']:,}). {LESS_LOSS}"
+        yield "problem" if link["loss"] >= SEVERE_LOSS else "slow", text
+    if link["round_trip"] is None:
+        yield "problem", NO_ACKNOWLEDGEMENT
+    elif link["round_trip"]["median_s"] >= ROUND_TRIP_LONG:
+        text = f"The round trip is {link['round_trip']['median_s']:.2f} s."
+        yield "slow", f"{text} Each repeat of a lost request takes at least as long."

@@ -11,6 +11,7 @@ from typing import Final
 import anyio
 
 from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.json_output import JsonObject
 from paramclient.cli.options import Seconds, TrafficOptions
 from paramclient.cli.output import LiveView, milliseconds, print_json, print_line, print_table
 from paramclient.cli.session import Deadline, listen, received_in_words
@@ -22,8 +23,6 @@ from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import rounded
 from paramclient.protocol.channel import task_group
 from paramclient.wire.frames import enum_word, message_name
-from paramclient.wire.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS
-from paramclient.wire.signing import SigningReport
 
 __all__ = ["link"]
 
@@ -39,8 +38,6 @@ MEASURE_INTERVAL: Final = 4.0
 """Seconds between two reads that measure the round trip: request and response together take less of the link
 than the heartbeats of this client."""
 _DEFAULTS: Final = TrafficOptions()
-NO_AUTOPILOT: Final = ("unknown", autopilot_name(MAV_AUTOPILOT_INVALID))
-"""Autopilot names of components that have no parameters to read."""
 
 
 async def link(
@@ -65,138 +62,49 @@ async def link(
     limit = seconds if is_live or seconds is not None else LINK_LISTENING_TIME
     async with listen(url, options, listen_only=listen_only) as client, task_group() as tasks:
         tasks.start_soon(_measure_round_trips, client)
-        view, deadline = LiveView() if is_live else None, Deadline(limit)
+        view, deadline = LiveView(), Deadline(limit)
         while True:
             report = client.traffic_report()  # raises if the link has failed
-            if view is not None:
-                nothing = ["", f"nothing received yet: {_pace(client, report)}"]
-                lines = _lines(client, report) if report.totals["frames"] else nothing
-                view.draw(_COLUMNS, _rows(client, report), lines)
+            found = _json(client, report)
+            if is_live:
+                view.draw(_COLUMNS, map(_row, found["components"]), _lines(found))
             if not (left := deadline.left(REFRESH_INTERVAL)):
                 break
             await anyio.sleep(left)
         tasks.cancel_scope.cancel()
-        if not report.totals["frames"]:
-            hint = received_in_words(client)
-            raise NoReply(
-                f"a MAVLink frame on {client.link.name}", attempts=0, waited=report.seconds, hint=hint
-            )
+        if not found["frames"]:
+            what, hint = f"a MAVLink frame on {client.link.name}", received_in_words(client)
+            raise NoReply(what, attempts=0, waited=report.seconds, hint=hint)
     if options.json:
-        print_json(_json(client, report))
+        print_json(found)
     elif not is_live:
-        print_table(_COLUMNS, _rows(client, report), right=" ".join(_COLUMNS[2:]))
-        for line in _lines(client, report):
+        print_table(_COLUMNS, map(_row, found["components"]), right=" ".join(_COLUMNS[2:]))
+        for line in _lines(found):
             print_line(line)
     return ExitCode.DONE
 
 
 async def _measure_round_trips(client: ParamClient) -> None:
     """Read a value of each component with an autopilot every `MEASURE_INTERVAL`, until cancelled."""
+
+    async def read(component: Component) -> None:
+        with suppress(ParamClientError):
+            await component.get(0, timeout=MEASURE_INTERVAL)
+
     await anyio.sleep(MEASURE_DELAY)
     async with anyio.create_task_group() as tasks:
         while True:
-            for component in client.components.values():
-                if component.autopilot not in NO_AUTOPILOT:
-                    tasks.start_soon(_read_a_value, component)
+            for component in client.autopilots:
+                tasks.start_soon(read, component)
             await anyio.sleep(MEASURE_INTERVAL)
-
-
-async def _read_a_value(component: Component) -> None:
-    with suppress(ParamClientError):
-        await component.get(0, timeout=MEASURE_INTERVAL)
-
-
-# Tables
-
-_COLUMNS: Final = ("from", "what", "v", "frames/s", "bytes/s", "loss", "round trip", "heartbeat")
-"""Columns of the table of components."""
-
-
-def _rows(client: ParamClient, report: TrafficReport) -> Iterator[tuple[object, ...]]:
-    for each in report.components:
-        trip = _round_trip(client, each)
-        yield (
-            f"{each.system}/{each.component}",
-            _what(each),
-            each.version,
-            f"{each.recent['frames']:.1f}",
-            f"{each.recent['bytes']:,.0f}",
-            None if each.loss is None else f"{each.loss:.1%}",
-            None if trip is None else milliseconds(trip),
-            None if each.heartbeat_at is None else f"{report.at - each.heartbeat_at:.1f} s",
-        )
-
-
-def _lines(client: ParamClient, report: TrafficReport) -> Iterator[str]:
-    yield ""
-    for each in report.components:
-        state = "" if each.heartbeat is None else f" {_state(each.heartbeat.system_status)}"
-        current = [message for message in each.messages if each.recent[message]]
-        shown = [
-            f"{message_name(message)} {each.recent[message]:.1f}/s"
-            for message in current[:MESSAGES_SHOWN_MAX]
-        ]
-        more = len(current) - len(shown)
-        kinds = f"{', '.join(shown)}{f' and {more} more' if more else ''}" if shown else "silent"
-        yield f"{each.system}/{each.component}{state}: {kinds}"
-        if each.radio is not None:
-            yield (
-                f"  signal {each.radio.rssi} here, {each.radio.remote_rssi} there; "
-                f"noise {each.radio.noise} and {each.radio.remote_noise}; buffer {each.radio.free} % free; "
-                f"{each.radio.errors} packets with errors, {each.radio.fixed} corrected"
-            )
-    yield ""
-    yield _pace(client, report)
-    signed = sum(each.totals["signed"] for each in report.components)
-    lost = sum(each.totals["lost"] for each in report.components)
-    yield (
-        f"{report.totals['frames']:,} frames, {lost:,} lost, {report.damaged:,} with a wrong checksum, "
-        f"{report.totals['unknown']:,} of unknown ids, {signed:,} signed; {report.other_bytes:,} other bytes"
-    )
-    signing = client.signing_report()
-    if signing is not None:
-        unproven, refused = (
-            "".join(f", {count:,} {what}: {reason}" for reason, count in counts.items())
-            for counts, what in ((signing.unproven, "accepted"), (signing.refused, "refused"))
-        )
-        yield f"key {signing.fingerprint}: {signing.signed:,} frames proven{unproven}{refused}"
-
-
-def _pace(client: ParamClient, report: TrafficReport) -> str:
-    return (
-        f"{client.link.name}, {report.seconds:.1f} s: "
-        f"{report.recent['received']:,.0f} bytes/s received, {report.recent['sent']:,.0f} sent"
-    )
-
-
-def _what(each: ComponentTraffic) -> str:
-    beat = each.heartbeat
-    if beat is None:
-        return "radio" if each.radio is not None else ""
-    words = [_type(beat.type)]
-    if beat.autopilot != MAV_AUTOPILOT_INVALID:
-        words.insert(0, autopilot_name(beat.autopilot))
-    return " ".join(dict.fromkeys(words))
-
-
-def _type(number: int) -> str:
-    return "ground station" if number == MAV_TYPE_GCS else enum_word("MAV_TYPE", number)
-
-
-def _state(number: int) -> str:
-    return enum_word("MAV_STATE", number)
-
-
-def _round_trip(client: ParamClient, each: ComponentTraffic) -> float | None:
-    component = client.components.get((each.system, each.component))
-    return None if component is None else component.round_trip
 
 
 # JSON
 
 
-def _json(client: ParamClient, report: TrafficReport) -> dict[str, object]:
+def _json(client: ParamClient, report: TrafficReport) -> JsonObject:
     signing = client.signing_report()
+    names = ("fingerprint", "policy", "link_id", "signed", "unsigned", "unproven", "refused")
     return {
         "link": client.link.name,
         "seconds": round(report.seconds, 3),
@@ -208,34 +116,20 @@ def _json(client: ParamClient, report: TrafficReport) -> dict[str, object]:
         "unknown": report.totals["unknown"],
         "damaged": report.damaged,
         "other_bytes": report.other_bytes,
-        "signing": None if signing is None else _signing_json(signing),
-        "components": [
-            _component_json(report.at, each, _round_trip(client, each)) for each in report.components
-        ],
+        "signing": None if signing is None else {name: getattr(signing, name) for name in names},
+        "components": [_component_json(client, report.at, each) for each in report.components],
     }
 
 
-def _signing_json(signing: SigningReport) -> dict[str, object]:
-    return {
-        "fingerprint": signing.fingerprint,
-        "policy": signing.policy,
-        "link_id": signing.link_id,
-        "signed": signing.signed,
-        "unsigned": signing.unsigned,
-        "unproven": {str(why): count for why, count in signing.unproven.items()},
-        "refused": {str(why): count for why, count in signing.refused.items()},
-    }
-
-
-def _component_json(now: float, each: ComponentTraffic, round_trip: float | None) -> dict[str, object]:
-    beat = each.heartbeat
+def _component_json(client: ParamClient, now: float, each: ComponentTraffic) -> JsonObject:
+    beat, component = each.heartbeat, client.components.get((each.system, each.component))
     return {
         "system": each.system,
         "component": each.component,
         "mavlink": each.version,
         "autopilot": None if beat is None else autopilot_name(beat.autopilot),
-        "type": None if beat is None else _type(beat.type),
-        "state": None if beat is None else _state(beat.system_status),
+        "type": None if beat is None else enum_word("MAV_TYPE", beat.type),
+        "state": None if beat is None else enum_word("MAV_STATE", beat.system_status),
         "heartbeat_age_s": None if each.heartbeat_at is None else rounded(now - each.heartbeat_at),
         "age_s": round(now - each.received_at, 4),
         "frames": each.totals["frames"],
@@ -247,7 +141,7 @@ def _component_json(now: float, each: ComponentTraffic, round_trip: float | None
         "repeated": each.totals["repeated"],
         "late": each.totals["late"],
         "signed": each.totals["signed"],
-        "round_trip_s": rounded(round_trip),
+        "round_trip_s": None if component is None else rounded(component.round_trip),
         "messages": {
             message_name(message): {
                 "id": message,
@@ -258,3 +152,57 @@ def _component_json(now: float, each: ComponentTraffic, round_trip: float | None
         },
         "radio": None if each.radio is None else asdict(each.radio),
     }
+
+
+# Tables
+
+_COLUMNS: Final = ("from", "what", "v", "frames/s", "bytes/s", "loss", "round trip", "heartbeat")
+"""Columns of the table of components."""
+
+
+def _row(each: JsonObject) -> tuple[object, ...]:
+    names = [each["autopilot"], each["type"]] if each["autopilot"] != "no autopilot" else [each["type"]]
+    trip, age = each["round_trip_s"], each["heartbeat_age_s"]
+    return (
+        f"{each['system']}/{each['component']}",
+        " ".join(dict.fromkeys(filter(None, names))) or ("radio" if each["radio"] else ""),
+        each["mavlink"],
+        f"{each['frames_per_s']:.1f}",
+        f"{each['bytes_per_s']:,.0f}",
+        None if each["loss"] is None else f"{each['loss']:.1%}",
+        None if trip is None else milliseconds(trip),
+        None if age is None else f"{age:.1f} s",
+    )
+
+
+def _lines(found: JsonObject) -> Iterator[str]:
+    yield ""
+    for each in found["components"]:
+        rates = {name: count["per_s"] for name, count in each["messages"].items() if count["per_s"]}
+        shown = [f"{name} {rate:.1f}/s" for name, rate in [*rates.items()][:MESSAGES_SHOWN_MAX]]
+        more = f" and {len(rates) - len(shown)} more" if len(rates) > len(shown) else ""
+        state = f" {each['state']}" if each["state"] else ""
+        yield f"{each['system']}/{each['component']}{state}: {', '.join(shown) or 'silent'}{more}"
+        if radio := each["radio"]:
+            yield (
+                f"  signal {radio['rssi']} here, {radio['remote_rssi']} there; noise {radio['noise']} and "
+                f"{radio['remote_noise']}; buffer {radio['free']} % free; {radio['errors']} packets with "
+                f"errors, {radio['fixed']} corrected"
+            )
+    yield ""
+    yield (
+        f"{found['link']}, {found['seconds']:.1f} s: {found['received_per_s']:,.0f} bytes/s received, "
+        f"{found['sent_per_s']:,.0f} sent"
+    )
+    lost, signed = (sum(each[name] for each in found["components"]) for name in ("lost", "signed"))
+    yield (
+        f"{found['frames']:,} frames, {lost:,} lost, {found['damaged']:,} with a wrong checksum, "
+        f"{found['unknown']:,} of unknown ids, {signed:,} signed; {found['other_bytes']:,} other bytes"
+    )
+    if signing := found["signing"]:
+        others = [
+            f", {count:,} {what}: {reason}"
+            for name, what in (("unproven", "accepted"), ("refused", "refused"))
+            for reason, count in signing[name].items()
+        ]
+        yield f"key {signing['fingerprint']}: {signing['signed']:,} frames proven{''.join(others)}"

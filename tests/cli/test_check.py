@@ -20,7 +20,6 @@ def test_a_vehicle_on_a_good_link_has_no_findings(command: Command, put: Put) ->
         assert done.json["list"]["received"] == done.json["list"]["count"]
         assert 0 <= done.json["link"]["round_trip"]["median_s"] < 0.1
     assert (done.json["files"]["parameters"], done.json["files"]["is_serving"]) == (1382, True)
-    assert 45 < done.json["reads"]["per_s"] < 55
 
 
 def test_the_cost_of_proving_a_cached_table_is_measured(command: Command, put: Put) -> None:
