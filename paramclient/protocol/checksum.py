@@ -76,9 +76,11 @@ PART_TIME: Final = 0.008
 many parts take the fewest round trips."""
 SLOW_ROUND_TRIP: Final = 0.05
 """Seconds of round trip from which on values that move are compared at once."""
-GUESS_BITS: Final = 29
+GUESS_BITS: Final = 26
 """Bits of a value, and of the number of rows in which it may be, up to which a guess is hardly chance: in
 each wrong row, any of 2**32 values would explain the difference."""
+GUESS_BITS_SHORT: Final = 29
+"""The same in a short range, where hardly two values differ."""
 
 
 class ChecksumUnavailable(Exception):
@@ -175,6 +177,7 @@ class _Proof:
                 suspects = {at for at in whole if MEASURED.fullmatch(rows[at].name) and rows[at].bits}
             guesses: dict[int, int] = {}
             numbers: set[int] = set()
+            divided: list[range] = []
             for place, difference in places.items():
                 if ends := self._ends_of(moving, place) or self._ends_of(rare, place):
                     numbers |= ends
@@ -185,12 +188,13 @@ class _Proof:
                 elif guess := self._guess(place, difference):
                     guesses |= guess
                 elif len(place) > 1:
-                    numbers |= self._parts(place)
+                    numbers |= self._divide(place)
+                    divided.append(place)
                 elif len(places) == len(self._found):
                     raise TableDiffers(OTHER)
                 else:
                     return False
-            self._weigh(len(guesses), len(numbers))
+            self._weigh(len(guesses), len(numbers), divided)
             if numbers:
                 await self._request(numbers)
             else:
@@ -210,9 +214,12 @@ class _Proof:
         known."""
         return {end for at in indices if at in place for end in (at, at + 1)} - {0, *self._found}
 
-    def _parts(self, place: range) -> set[int]:
-        parts = min(max(PARTS_MIN, int(self._round_trip / PART_TIME)), PARTS_MAX)
-        size = -(-len(place) // parts)
+    @property
+    def _parts(self) -> int:
+        return min(max(PARTS_MIN, int(self._round_trip / PART_TIME)), PARTS_MAX)
+
+    def _divide(self, place: range) -> set[int]:
+        size = -(-len(place) // self._parts)
         return set(range(place.start + size, place.stop, size))
 
     def _places(self) -> dict[range, int]:
@@ -236,7 +243,8 @@ class _Proof:
             TableDiffers: the number of parameters in the header explains it.
         """
         guess: dict[int, int] = {}
-        bits_max = GUESS_BITS - math.log2(len(place)) if len(place) > 1 else math.inf
+        bits = GUESS_BITS_SHORT if len(place) <= PARTS_MAX else GUESS_BITS
+        bits_max = bits - math.log2(len(place)) if len(place) > 1 else math.inf
         for at in reversed(place):
             row = self._rows[at]
             change = crc32_px4_before(difference, row.type.size)
@@ -250,14 +258,23 @@ class _Proof:
             raise TableDiffers(OTHER)
         return guess
 
-    def _weigh(self, reads: int, requests: int) -> None:
-        """Compare the time of the next step with that of a download.
+    def _weigh(self, reads: int, requests: int, divided: list[range]) -> None:
+        """Compare the time of the whole search with that of a download.
+
+        Where most values are not simple, each part is divided until one row is left. Before the first
+        division, that is not known.
 
         Raises:
             TableDiffers: the download is quicker.
         """
-        trip = self._round_trip
-        search = 2 * trip + INTERVAL * requests + SLOT_ARDUPILOT * (0.5 + reads // READS_PER_SLOT_ARDUPILOT)
+        trip, parts = self._round_trip, self._parts
+        largest = max((len(each) for each in divided), default=0)
+        is_narrow = 2 * largest < len(self._rows) and 2 * len(divided) > reads
+        depths = [math.ceil(math.log(len(each), parts)) if is_narrow else 1 for each in divided]
+        rounds = max(depths, default=bool(requests))
+        requests += (parts - 1) * (sum(depths) - len(depths))
+        slots = 0.5 + reads // READS_PER_SLOT_ARDUPILOT
+        search = (rounds + 1) * trip + requests * INTERVAL + slots * SLOT_ARDUPILOT
         byte_time = max(1 / FILE_RATE, self._byte_time)
         if search > FILE_ROUND_TRIPS * trip + byte_time * len(self._content):
             raise TableDiffers(TOO_MANY)

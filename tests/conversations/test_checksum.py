@@ -209,6 +209,23 @@ async def test_changed_values_are_found_in_less_time_than_the_file_takes() -> No
     assert max(elapsed[1:]) < elapsed[0]
 
 
+@pytest.mark.parametrize("delay", [0.002, 0.05, 0.3])
+@pytest.mark.parametrize("is_simple", [True, False], ids=["simple", "odd"])
+@virtual
+async def test_a_search_ends_where_the_file_is_quicker(delay: float, is_simple: bool) -> None:
+    floats = [each.name for each in ArduPilotVehicle().listed if each.type is ParamType.REAL32]
+    for number in (5, 12, 20):
+        vehicle = ArduPilotVehicle(live_period=0.0)
+        cached = vehicle.params
+        names = [name for name in floats if name[:3] not in ("INS", "BAR")][number :: 400 // number][:number]
+        vehicle.load({name: at + (2.5 if is_simple else 1 / 7) for at, name in enumerate(names)})
+        async with converse(Air.symmetric([vehicle], delay=delay)) as conversation:
+            node = await with_cached_table(conversation, cached)
+            result = await fetch_all(node.plain)
+            check(vehicle, node, result)
+            assert result.elapsed < 0.45 + 6 * 2 * delay  # the file takes 0.37 s and 3 round trips
+
+
 @virtual
 async def test_a_changed_count_costs_one_round_trip() -> None:
     elapsed = []
@@ -292,7 +309,7 @@ async def test_where_it_does_not_work_the_table_is_downloaded(kind: str) -> None
     elif kind == "many":
         vehicle.load(dict.fromkeys(list(cached)[300:700:20], 3))
     elif kind == "renamed":
-        cached["STAT_BOOTS"] = replace(cached.pop("STAT_BOOTCNT"), name="STAT_BOOTS")
+        cached["STAT_BOOTCNX"] = replace(cached.pop("STAT_BOOTCNT"), name="STAT_BOOTCNX")
         vehicle.load({"STAT_RUNTIME": 5})
     elif kind == "rounded":
         vehicle.load({"BARO_PROBE_EXT": 0x7654321})
