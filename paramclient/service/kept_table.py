@@ -31,8 +31,6 @@ PROOF_AGE_MAX: Final = 5.0
 background."""
 SILENT_AFTER: Final = 60.0
 """Seconds of silence after which a component without heartbeats counts as lost."""
-UNSERVED_TIME: Final = 30.0
-"""Seconds for which requests pass to a component that did not answer the gateway's own fetch."""
 PROGRESS_INTERVAL: Final = 0.05
 """Seconds between two looks for values that a running fetch has brought."""
 FIRST_VALUE_TIME: Final = 1.0
@@ -50,8 +48,9 @@ TAKE_OVER_TIME: Final = 10.0
 """Seconds in which a list that was passed to a vehicle may still be in progress."""
 PENDING_MAX: Final = 1_000
 """Reads, and sets, that wait for one component, at most; further ones are dropped, as on a full link."""
-UNKNOWN_TIME: Final = 30.0
-"""Seconds for which a name that the vehicle does not have is remembered."""
+REMEMBERED_TIME: Final = 30.0
+"""Seconds for which a name that the vehicle does not have is remembered, and for which requests pass to a
+component that did not answer the gateway's own fetch."""
 UNKNOWN_NAMES_MAX: Final = 4_096
 """Names that are remembered as unknown, at most."""
 
@@ -195,10 +194,9 @@ class KeptTable(Stream[Change]):
     def is_kept(self) -> bool:
         """Whether the gateway answers for the component; otherwise requests pass to it."""
         node, now = self.component.node, anyio.current_time()
-        is_doubtful = node.identification.is_encoding_certain and not is_decoded(self.session)
-        is_usable = not (self.session.table.left_out or node.has_rival(now))
-        if is_doubtful and not self.is_loading:
-            return False
+        is_decoding = is_decoded(self.session) or self.is_loading
+        is_doubtful = node.identification.is_encoding_certain and not is_decoding
+        is_usable = not (is_doubtful or self.session.table.left_out or node.has_rival(now))
         return is_usable and node.identification.has_parameters and now >= self._unserved_until
 
     @property
@@ -244,7 +242,7 @@ class KeptTable(Stream[Change]):
         values = self.list_if_current
         if values is not None:
             self.check()
-            station.stream((self, "list"), self.source, self._current(values))
+            self._stream(station, values, set())
         else:
             self._listing.setdefault(station, set())
             self.load()
@@ -255,26 +253,36 @@ class KeptTable(Stream[Change]):
             station.list_passed_at = -math.inf
             self.send_list(station)
 
-    def _current(self, values: Iterable[ReportedValue]) -> Iterator[Message]:
-        """Yield the values of one list, each as it is by then, until the component is lost or restarts."""
-        node, before = self.component.node, self.changes
-        generation = node.generation
+    def _stream(self, station: GroundStation, values: Iterable[ReportedValue], sent: set[int]) -> None:
+        now = (self.changes, self.component.node.generation)
+        station.stream((self, "list"), self.source, self._current(values, sent, *now))
+
+    def _current(
+        self, values: Iterable[ReportedValue], sent: set[int], changes: int, generation: int
+    ) -> Iterator[Message]:
+        """Yield the values of one list, each as it is by then, until the component is lost or restarts.
+
+        Args:
+            values: of the list, as they were after so many changes.
+            sent: takes the index of each yielded value.
+            changes, generation: of the table and the component when the list was made.
+        """
         for value in values:
-            if self.is_lost or node.generation != generation:
+            if self.is_lost or self.component.node.generation != generation:
                 return
             param = self.session.table.params.get(value.param_id)
-            if self.changes != before and param is not None:
+            if self.changes != changes and param is not None:
                 now = value_of(self.session, param, index=value.param_index)
                 value = now._replace(param_count=value.param_count)
+            sent.add(value.param_index)
             yield value
 
     def load(self) -> anyio.Event:
         """Fetch the table, unless that is in progress; return the event of its end."""
-        loaded = self._loaded
-        if loaded is None:
-            loaded = self._loaded = anyio.Event()
-            self.component.core.spawn(self._load, loaded)
-        return loaded
+        if self._loaded is None:
+            self._loaded = anyio.Event()
+            self.component.core.spawn(self._load, self._loaded)
+        return self._loaded
 
     async def _load(self, loaded: anyio.Event) -> None:
         try:
@@ -284,7 +292,7 @@ class KeptTable(Stream[Change]):
                     await self.component.fetch_all()
                 except ParamClientError:
                     if not self.is_lost:
-                        self._unserved_until = anyio.current_time() + UNSERVED_TIME
+                        self._unserved_until = anyio.current_time() + REMEMBERED_TIME
                 tasks.cancel_scope.cancel()
             self._send_known()
         finally:
@@ -308,16 +316,9 @@ class KeptTable(Stream[Change]):
             self._listing_count = self.session.table.count
             for sent in self._listing.values():
                 sent.clear()
-        whole = self.list_if_current
-        values = (whole or listed(self.session)) if self._listing else []
+        values = (self.list_if_current or listed(self.session)) if self._listing else []
         for station, sent in self._listing.items():
-            new = [value for value in values if value.param_index not in sent]
-            sent.update(value.param_index for value in new)
-            if whole is not None:
-                station.stream((self, "list"), self.source, self._current(new))
-            else:
-                for value in new:
-                    station.say(value, self.source)
+            self._stream(station, [value for value in values if value.param_index not in sent], sent)
 
     # single values
 
@@ -355,7 +356,7 @@ class KeptTable(Stream[Change]):
         except (errors.UnknownParameter, errors.Refused) as error:
             if len(self._unknown) >= UNKNOWN_NAMES_MAX:
                 self._unknown.clear()
-            self._unknown[which] = anyio.current_time() + UNKNOWN_TIME
+            self._unknown[which] = anyio.current_time() + REMEMBERED_TIME
             self._refuse(self._reads[which], which, _code_of(error))
         finally:
             del self._reads[which]
@@ -391,8 +392,7 @@ class KeptTable(Stream[Change]):
         askers, code = self._sets[key], int(NO_ANSWER)
         try:
             with anyio.move_on_after(SET_TIMEOUT):
-                await self._write(*key, author)
-                code = ParamErrorCode.NO_ERROR
+                code = await self._write(*key, author)
         except ParamClientError as error:
             code = _code_of(error)
         finally:
@@ -400,11 +400,12 @@ class KeptTable(Stream[Change]):
         if code:
             self._reject(askers, key, code)
 
-    async def _write(self, name: str, raw: bytes, number: int, author: str) -> None:
+    async def _write(self, name: str, raw: bytes, number: int, author: str) -> ParamErrorCode:
         """Write a value, and acknowledge it to the askers.
 
+        A component that takes values byte by byte takes those of its own type only.
+
         Raises:
-            TypeMismatch: the component takes values byte by byte, and the type is another one.
             ParamClientError: as from `Component.set`.
         """
         session, is_extended = self.session, self.session.dialect.has_ack
@@ -415,9 +416,7 @@ class KeptTable(Stream[Change]):
             await read(session, name)
         known = params[name].type
         if number != known and (is_extended or session.table.encoding is not Encoding.C_CAST):
-            system, component = self.source
-            what = f"{name} of {system}/{component} has another type"
-            raise errors.TypeMismatch(what, system=system, component=component, name=name)
+            return ParamErrorCode.TYPE_MISMATCH
         value = session.dialect.param(name, raw, known, None, session.table.encoding).settable
         result = await self.component.set(name, value, author=author)
         done = value_of(session, result.param)
@@ -425,6 +424,7 @@ class KeptTable(Stream[Change]):
             self._say(askers, messages.ParamExtAck(name, done.raw, number, ExtAckResult.ACCEPTED))
         else:
             self._announce(self, done)
+        return ParamErrorCode.NO_ERROR
 
     def _say(self, askers: Iterable[Asker], message: Message) -> None:
         for asker in askers:

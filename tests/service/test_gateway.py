@@ -565,6 +565,20 @@ async def test_rule_3_a_change_during_an_answer_is_in_it() -> None:
         assert {each.param_count for each in station.of(ParamValue)} == {component.count}
 
 
+@in_simulated_time
+async def test_rule_3_a_change_before_the_first_value_of_an_answer_is_in_it() -> None:
+    async with in_sync(small_px4()) as (served, _, station):
+        component = await served.clients[0].component()
+        served.link.is_stuck = True
+        await station.ask(GCS, seconds=1.5)  # a heartbeat of the vehicle holds the sender up
+        await station.ask(LIST)
+        await component.set("PARAM_01", 77)
+        served.link.is_stuck = False
+        await anyio.sleep(0.5)
+        values = [each for each in station.of(ParamValue) if each.param_id == "PARAM_01"]
+        assert (len(values), values[-1].raw) == (2, struct.pack("<i", 77))
+
+
 # 4: sets
 
 
