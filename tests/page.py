@@ -17,7 +17,7 @@ import anyio.from_thread
 
 from paramclient.links import SimLink
 from paramclient.model.values import ParamType, WireValue
-from paramclient.service import Hub, Listening, Tokens, serve
+from paramclient.service import Hub, Tokens, serve
 from paramclient.sim import ArduPilotVehicle, Camera, PX4Vehicle, Vehicle
 from paramclient.wire.frames import Frame
 from paramclient.wire.messages import Message
@@ -132,8 +132,7 @@ def at_work(folder: Path, *, tokens: Tokens | None = None, port: int = 0) -> Ite
                 url, endpoint = where, hub.gateway.endpoints[0].address
                 listens.set()
 
-            listening = Listening(port=port)
-            await serve(hub, listening=listening, tokens=tokens, stop=stop, listens=reported)
+            await serve(hub, f"127.0.0.1:{port}", tokens=tokens, stop=stop, listens=reported)
 
         running, stop = portal.start_task(run)
         try:

@@ -85,8 +85,8 @@ async def serve(
     with on_end_signal(lambda _: stop.set()):
         await service.serve(
             hub,
-            listening=service.Listening.at(listen),
-            tokens=None if tokens is None else service.Tokens.read(tokens),
+            listen,
+            tokens=None if tokens is None else service.read_tokens(tokens),
             stop=stop,
             listens=started,
         )

@@ -11,6 +11,6 @@
 from __future__ import annotations
 
 from paramclient.service.hub import Hub
-from paramclient.service.server import Listening, Tokens, add_token, create_app, serve
+from paramclient.service.server import Tokens, add_token, create_app, read_tokens, serve
 
-__all__ = ["Hub", "Listening", "Tokens", "add_token", "create_app", "serve"]
+__all__ = ["Hub", "Tokens", "add_token", "create_app", "read_tokens", "serve"]

@@ -198,9 +198,7 @@ class Target:
             "params": len(component.params),
             "hash": hash_text(component.hash),
             "state": component.state,
-            "sync_state": component.sync_state.value,
             "is_armed": component.is_armed,
-            "is_lost": component.sync_state == "lost",
             "silence_s": round(component.silence, 3),
             "round_trip_s": rounded(component.round_trip),
             "fetch": None if now is None else {**asdict(now), "rate": round(now.rate, 1)},
@@ -330,15 +328,13 @@ class Target:
         """Call a function of the cache, in a thread, with the place of these parameters in it.
 
         Raises:
-            ServiceError: the service has no cache, or ends.
+            ServiceError: the service has no cache.
             ParamClientError: the cache cannot be read, or does not have what is requested.
         """
         component, cache = self.component, self.hub.cache
         if cache is None:
             detail = "The service runs without a cache and has no earlier states."
             raise ServiceError(409, "no-cache", detail)
-        if not self.hub.is_open:
-            raise ServiceError(503, "closing", "The service is shutting down.")
         await wait_for_identity(component)
         place = component.identity.key, component.component
         work = partial(call, cache, *place, *more, extended=component.is_extended)
@@ -387,7 +383,6 @@ class Hub:
         cache_thread: limits the work on the cache to one thread.
         feed: the event feed.
         gateway: the ground stations.
-        is_open: whether the hub is open.
         links: the links, by name.
         metadata_store: the metadata files beside the cache; None without a cache.
         started: `time.monotonic()` of the start.
@@ -415,7 +410,6 @@ class Hub:
         self.metadata_store = None if self.cache is None else MetadataStore.beside(self.cache.path)
         self.started = time.monotonic()
         self.links: dict[str, ServiceLink] = {}
-        self.is_open = False
         self.cache_thread = anyio.CapacityLimiter(1)
         for link in links:
             name = create_link(link).name
@@ -439,11 +433,9 @@ class Hub:
             self._tasks.start_soon(self._run_link, link)
         self._tasks.start_soon(self.gateway.run)
         self._tasks.start_soon(self._check_regularly)
-        self.is_open = True
         return self
 
     async def __aexit__(self, *error: Any) -> None:
-        self.is_open = False
         self.feed.end()
         self._tasks.cancel_scope.cancel()
         await self._tasks.__aexit__(None, None, None)

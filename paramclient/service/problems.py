@@ -93,12 +93,9 @@ def problem_response(error: Exception) -> Response:
         members = to_jsonable_python(public, inf_nan_mode="strings", bytes_mode="hex", fallback=str)
         members["error"] = name
     elif isinstance(error, RequestValidationError):
-        faults = [
-            {"where": ".".join(str(part)[:100] for part in fault["loc"]), "what": fault["msg"]}
-            for fault in error.errors()[:FAULTS_MAX]
-        ]
-        status, kind, members = 422, "invalid-request", {"faults": faults}
-        detail = "; ".join(f"{fault['where']}: {fault['what']}" for fault in faults)
+        first = error.errors()[:FAULTS_MAX]
+        faults = [f"{'.'.join(str(part)[:100] for part in each['loc'])}: {each['msg']}" for each in first]
+        status, kind, detail = 422, "invalid-request", "; ".join(faults)
     elif isinstance(error, HTTPException):
         status, detail, headers = error.status_code, error.detail, error.headers
         kind = HTTPStatus(status).phrase.lower().replace(" ", "-")

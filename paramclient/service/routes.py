@@ -5,11 +5,12 @@ With `?ext=true`, the routes of parameters are about the extended parameters of 
 
 from __future__ import annotations
 
-import math
+import json
 import re
 import time
 from base64 import b64decode
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from datetime import datetime
 from functools import partial
 from typing import Annotated, Any, ClassVar, Final, Self, TypeAlias
 
@@ -22,22 +23,14 @@ from pydantic import AwareDatetime, BaseModel, BeforeValidator, Field, model_val
 from pydantic import StrictFloat as Real
 from pydantic import StrictInt as Whole
 
-from paramclient.cache import ParamCache, SnapshotSummary
+from paramclient.cache import ParamCache
+from paramclient.cli import json_output
 from paramclient.cli.json_apply import apply_json, plan_json
-from paramclient.cli.json_output import (
-    JsonObject,
-    fetch_json,
-    history_json,
-    set_json,
-    snapshot_json,
-    vehicle_json,
-    written_json,
-)
+from paramclient.cli.json_output import JsonObject
 from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.files import FileFormat, ParamFile, dumps, loads, writable
 from paramclient.files.formats import ENDINGS
-from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import check_name
@@ -45,7 +38,7 @@ from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision import ApplyProgress, apply, restore
 from paramclient.provision import plan as plan_of
 from paramclient.provision.restore_point import load_restore_point
-from paramclient.provision.sources import component_set, fetched_set, select_non_defaults
+from paramclient.provision.sources import fetched_set, select_non_defaults
 from paramclient.service.hub import Hub, Target
 from paramclient.service.problems import ServiceError
 from paramclient.version import __version__
@@ -61,16 +54,8 @@ FILE_BYTES_MAX: Final = 2 * 2**20
 """Maximum size of a parameter file in bytes; a table of 10,000 parameters takes 1 MB."""
 VALUES_MAX: Final = 10_000
 """Maximum number of values of a request: more than a vehicle has."""
-METRICS_MEDIA_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
-"""Media type of the metrics."""
-STATION_SUMS: Final = {
-    "relayed": "Frames of vehicles.",
-    "answered": "Answers from the tables.",
-    "saved": "Bytes of answers that were not sent over the link of a vehicle.",
-    "dropped": "Frames dropped because a station did not read.",
-}
-"""Help texts of the sums over the connected stations of an endpoint, by attribute of `GroundStation`."""
-_ESCAPES: Final = str.maketrans({"\\": r"\\", "\n": r"\n", '"': r"\""})
+STATION_SUMS: Final = ("relayed", "answered", "saved", "dropped")
+"""Attributes of `GroundStation` whose sums over the connected stations of an endpoint are metrics."""
 _PAGE_NAME: Final = re.compile(r"[A-Za-z0-9._ -]{1,64}")
 
 Sample: TypeAlias = tuple[Mapping[str, object], float]
@@ -96,18 +81,13 @@ class Body(BaseModel, extra="forbid"):
         return self
 
 
-def _parse_number(given: object) -> object:
-    return int(given) if isinstance(given, str) and given.isdecimal() else given
-
-
 def _decode(given: object) -> object:
     return b64decode(given, validate=True) if isinstance(given, str) else given
 
 
-def _check_text(given: object) -> object:
-    if not isinstance(given, str):
-        raise ValueError("a time is text in ISO 8601, as 2026-11-20T14:00:00Z")
-    return given
+def _parse_moment(given: object) -> object:
+    text = str(given)
+    return int(text) if text.isdecimal() else datetime.fromisoformat(text)
 
 
 Name = Annotated[str, Field(min_length=1, max_length=16)]
@@ -120,17 +100,14 @@ Value = Annotated[
 ]
 Values = Annotated[dict[Name, Value], Field(min_length=1, max_length=VALUES_MAX)]
 Seconds = Annotated[float | None, Field(gt=0, le=86_400, description="Timeout in seconds.")]
-Patterns = Annotated[
-    tuple[Annotated[str, Field(min_length=1, max_length=64)], ...], Field(max_length=VALUES_MAX)
-]
+Pattern = Annotated[str, Field(min_length=1, max_length=64)]
+Patterns = Annotated[tuple[Pattern, ...], Field(max_length=VALUES_MAX)]
 Moment = Annotated[
-    Annotated[Whole, Field(ge=1, lt=1 << 62)] | Annotated[AwareDatetime, BeforeValidator(_check_text)],
-    BeforeValidator(_parse_number),
+    Annotated[Whole, Field(ge=1, lt=1 << 62)] | Annotated[AwareDatetime, Field(strict=True)],
+    BeforeValidator(_parse_moment),
     Field(description="The number of a snapshot, or a time with its zone."),
 ]
-Force = Annotated[
-    bool, Field(description="Write values outside the range in the metadata, NaN and infinities.")
-]
+Force = Annotated[bool, Field(description="Write values out of range, NaN and infinities.")]
 Durable = Annotated[bool, Field(description="Respond after value and history are on the disk.")]
 
 
@@ -265,9 +242,7 @@ Author = Annotated[str, Depends(author_of)]
 HubArgument = Annotated[Hub, Depends(_hub_of)]
 System = Annotated[int, Path(ge=1, le=255)]
 ComponentId = Annotated[int, Path(ge=0, le=255)]
-LinkName = Annotated[
-    str | None, Query(max_length=200, description="Name of the link, if several have the ids.")
-]
+LinkName = Annotated[str | None, Query(max_length=200, description="The link, if several have the ids.")]
 At = Annotated[Moment | None, Query(description="An earlier state: a snapshot's number, or a time.")]
 Names = Annotated[list[str] | None, Query(max_length=64, description="Names, or patterns such as MC_*.")]
 Ext = Annotated[bool, Query(description="The extended parameters (PARAM_EXT_*).")]
@@ -333,7 +308,7 @@ async def params(
     choice = NameChoice(names or ["*"])
     if at is not None:
         state = await target.state_at(at)
-        earlier = {name: written_json(each) for name, each in state.items() if choice.has(name)}
+        earlier = {name: json_output.written_json(each) for name, each in state.items() if choice.has(name)}
         return {**position, "params": earlier}
     known = [each for name, each in target.component.params.items() if choice.has(name)]
 
@@ -375,7 +350,7 @@ async def set_params(author: Author, target: TargetArgument, body: WriteManyRequ
     result = await target.component.set_many(values, **options, author=author)
     results = [target.outcome(each) for each in result.outcomes]
     error = {} if result.error is None else {"error": str(result.error)}
-    return {"vehicle": vehicle_json(target.component), "results": results, **error}
+    return {"vehicle": json_output.vehicle_json(target.component), "results": results, **error}
 
 
 @reading.post(f"{VEHICLE}/fetch")
@@ -386,7 +361,7 @@ async def fetch(target: TargetArgument, body: FetchRequest) -> JsonObject:
     if body.metadata:
         await target.load_metadata(timeout=body.timeout_s)
     known = dict(component.params)
-    return fetch_json(component, result, known.values(), target.defaults_of(known))
+    return json_output.fetch_json(component, result, known.values(), target.defaults_of(known))
 
 
 # files
@@ -396,7 +371,7 @@ async def fetch(target: TargetArgument, body: FetchRequest) -> JsonObject:
 async def read_file(body: UploadedFile) -> dict[str, Any]:
     """Parse a parameter file of any format, without names that no vehicle can have. It is not stored."""
     file = await anyio.to_thread.run_sync(partial(body.read, partial=True))
-    sets = [set_json(each) for each in file.sets]
+    sets = [json_output.set_json(each) for each in file.sets]
     return {"file": file.source, "format": file.file_format, "notes": file.notes, "components": sets}
 
 
@@ -415,20 +390,19 @@ async def file(
         found = fetched_set(target.component, fetched, source=f"link {target.link.name}")
     if changed:
         found = select_non_defaults(found, target.defaults_of(found) if at is None else {})
-    name = _file_name(found, file_format)
+    name = _file_name(target.component, found.at, file_format)
     found, _ = writable(found, file_format)
     data = await anyio.to_thread.run_sync(lambda: dumps(found, file_format=file_format, target=name))
     headers = {"content-disposition": f'attachment; filename="{name}"'}
     return Response(data, media_type="application/octet-stream", headers=headers)
 
 
-def _file_name(params: ParamSet, file_format: FileFormat) -> str:
+def _file_name(component: Component, at: float | None, file_format: FileFormat) -> str:
     """Return a name with firmware, ids and time, in characters that are safe in headers and files."""
-    autopilot = "params" if params.identity is None else autopilot_name(params.identity.autopilot)
-    at = time.strftime("%Y%m%d-%H%M%S", time.gmtime(time.time() if params.at is None else params.at))
-    parts = [str(each) for each in (autopilot, params.system, params.component, at) if each is not None]
-    ending = next((ending for ending, each in ENDINGS.items() if each is file_format), ".txt")
-    return re.sub(r"[^A-Za-z0-9._-]", "_", "-".join(parts))[:100] + ending
+    written = time.strftime("%Y%m%d-%H%M%S", time.gmtime(at))
+    ending = next(ending for ending, each in ENDINGS.items() if each is file_format)
+    name = f"{component.autopilot}-{component.system}-{component.component}-{written}"
+    return re.sub(r"[^A-Za-z0-9._-]", "_", name) + ending
 
 
 # apply and restore
@@ -482,10 +456,8 @@ async def _wanted(target: Target, body: PlanRequest) -> ParamSet:
         found = await target.state_at(body.at)
     else:
         values = await target.values(body.values or {})
-        found = ParamSet(
-            {check_name(name): value for name, value in values.items()},
-            is_extended=target.component.is_extended,
-        )
+        checked = {check_name(name): value for name, value in values.items()}
+        found = ParamSet(checked, is_extended=target.component.is_extended)
     return found if body.only is None else found.only(body.only)
 
 
@@ -511,26 +483,20 @@ def _context(author: str, target: Target) -> dict[str, Any]:
 @reading.get(f"{VEHICLE}/snapshots")
 async def snapshots(target: TargetArgument) -> JsonObject:
     """Return the snapshots, the newest last."""
-    return {"snapshots": [snapshot_json(each) for each in await target.cached(ParamCache.snapshots)]}
+    return {
+        "snapshots": [json_output.snapshot_json(each) for each in await target.cached(ParamCache.snapshots)]
+    }
 
 
 @writing.post(f"{VEHICLE}/snapshots", status_code=201)
 async def create_snapshot(target: TargetArgument, body: SnapshotRequest) -> JsonObject:
     """Store a snapshot of the known table."""
-    component = target.component
-    known = list(component.params.values())
-    if not known:
+    if not target.component.params:
         raise UsageError("no parameter of the vehicle is known")
-    table = component_set(component, known, f"link {target.link.name}")
-    is_whole, crc = len(known) >= (component.count or math.inf), component.hash
-
-    def store(cache: ParamCache, _: str, number: int, **which: bool) -> SnapshotSummary:
-        vehicle, reason = component.identity, body.reason
-        return cache.store_snapshot(
-            vehicle, number, table, reason=reason, hash=crc, complete=is_whole, **which
-        )
-
-    return snapshot_json(await target.cached(store))
+    await target.component.core.cache_writer.write_all()
+    return json_output.snapshot_json(
+        await target.cached(partial(ParamCache.store_snapshot, reason=body.reason))
+    )
 
 
 @reading.get(f"{VEHICLE}/history")
@@ -543,7 +509,7 @@ async def history(
     """Return the newest changes of values, the newest last."""
     begin = None if since is None else since.timestamp()
     entries = await target.cached(ParamCache.history, name, limit, begin)
-    return {"history": [history_json(each) for each in entries]}
+    return {"history": [json_output.history_json(each) for each in entries]}
 
 
 # metrics
@@ -553,39 +519,35 @@ async def history(
 async def metrics(hub: HubArgument) -> PlainTextResponse:
     """Return the metrics for Prometheus in text format."""
     lines = []
-    for name, text, samples in _metrics(hub):
-        kind = "counter" if name.endswith("_total") else "gauge"
-        lines += [f"# HELP paramclient_{name} {text}", f"# TYPE paramclient_{name} {kind}"]
+    for name, samples in _metrics(hub):
+        lines.append(f"# TYPE paramclient_{name} {'counter' if name.endswith('_total') else 'gauge'}")
         for labels, value in samples:
-            pairs = [f'{label}="{str(each).translate(_ESCAPES)}"' for label, each in labels.items()]
+            pairs = [f"{label}={json.dumps(str(each), ensure_ascii=False)}" for label, each in labels.items()]
             lines.append(f"paramclient_{name}{{{','.join(pairs)}}} {float(value)}")
-    return PlainTextResponse("\n".join([*lines, ""]), media_type=METRICS_MEDIA_TYPE)
+    return PlainTextResponse("\n".join([*lines, ""]))
 
 
-def _metrics(hub: Hub) -> Iterator[tuple[str, str, Sequence[Sample]]]:
-    """Yield name, help text and samples of each metric. The name of a counter ends with `_total`."""
-    yield "info", "Version of paramclient.", [({"version": __version__}, 1)]
-    yield "uptime_seconds", "Seconds since the start.", [({}, time.monotonic() - hub.started)]
-    yield "events_total", "Published events.", [({}, hub.feed.seq)]
+def _metrics(hub: Hub) -> Iterator[tuple[str, Sequence[Sample]]]:
+    """Yield name and samples of each metric. The name of a counter ends with `_total`."""
+    yield "info", [({"version": __version__}, 1)]
+    yield "uptime_seconds", [({}, time.monotonic() - hub.started)]
+    yield "events_total", [({}, hub.feed.seq)]
 
     links = [({"link": link.name}, link) for link in hub.links.values()]
-    yield "link_open", "1 if the link is open.", [(at, link.state == "open") for at, link in links]
-    opened = [(at, link.client) for at, link in links if link.client is not None]
-    yield "link_bytes_received_total", "Received bytes.", [(at, each.bytes_received) for at, each in opened]
-    yield "link_bytes_sent_total", "Sent bytes.", [(at, each.bytes_sent) for at, each in opened]
+    yield "link_open", [(at, link.state == "open") for at, link in links]
+    clients = [(at, link.client) for at, link in links if link.client is not None]
+    yield "link_bytes_received_total", [(at, each.bytes_received) for at, each in clients]
+    yield "link_bytes_sent_total", [(at, each.bytes_sent) for at, each in clients]
 
     tables = [(target.address, target.component) for target in hub.targets]
-    is_up = [(at, each.sync_state != "lost") for at, each in tables]
-    yield "component_up", "1 if the vehicle is not lost.", is_up
-    is_synced = [(at, each.sync_state == "synced") for at, each in tables]
-    yield "component_synced", "1 if the table matches that of the vehicle.", is_synced
-    sizes = [(at, len(each.params)) for at, each in tables]
-    yield "component_parameters", "Parameters in the table.", sizes
-    times = [(at, each.round_trip) for at, each in tables if each.round_trip is not None]
-    yield "component_round_trip_seconds", "Smoothed round-trip time in seconds.", times
+    yield "component_up", [(at, each.sync_state != "lost") for at, each in tables]
+    yield "component_synced", [(at, each.sync_state == "synced") for at, each in tables]
+    yield "component_parameters", [(at, len(each.params)) for at, each in tables]
+    trips = [(at, each.round_trip) for at, each in tables if each.round_trip is not None]
+    yield "component_round_trip_seconds", trips
 
     endpoints = [({"endpoint": each.name}, each.stations.values()) for each in hub.gateway.endpoints]
-    yield "stations", "Connected ground stations.", [(at, len(stations)) for at, stations in endpoints]
-    for name, text in STATION_SUMS.items():
+    yield "stations", [(at, len(stations)) for at, stations in endpoints]
+    for name in STATION_SUMS:
         sums = [(at, sum(getattr(each, name) for each in stations)) for at, stations in endpoints]
-        yield f"stations_{name}", text, sums
+        yield f"stations_{name}", sums

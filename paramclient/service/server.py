@@ -15,11 +15,10 @@ import re
 import secrets
 import socket
 from collections.abc import Callable, Generator, Mapping
-from dataclasses import dataclass
 from importlib import resources
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Final, Literal, NamedTuple, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import anyio
 import uvicorn
@@ -37,7 +36,7 @@ from paramclient.service.hub import Hub
 from paramclient.service.problems import ERRORS, RESPONSES, ServiceError, problem_response, respond
 from paramclient.version import __version__
 
-__all__ = ["Listening", "Tokens", "add_token", "create_app", "serve"]
+__all__ = ["Tokens", "add_token", "create_app", "read_tokens", "serve"]
 
 BODY_BYTES_MAX: Final = 4 * 2**20
 """Maximum size of a request body in bytes: a parameter file of 2 MB in base64, and some."""
@@ -50,8 +49,6 @@ IDLE_TIMEOUT: Final = 30
 """Seconds after which an idle connection is closed."""
 PORT_MAX: Final = 65_535
 """The highest TCP port."""
-HEADER_BYTES_MAX: Final = 32_768
-"""Maximum size of the headers of a request in bytes."""
 SHUTDOWN_TIMEOUT: Final = 1
 """Seconds for responses in progress at shutdown; their requests are then cancelled."""
 
@@ -59,13 +56,10 @@ SHUTDOWN_TIMEOUT: Final = 1
 # tokens
 
 
-Role: TypeAlias = Literal["read", "write"]
-"""Permission of a token: read, or read and write."""
-
 TOKEN_BYTES: Final = 32
 """Number of random bytes of a token: it cannot be guessed, so wrong tokens need no delay."""
 TOKEN_FILE_BYTES_MAX: Final = 100_000
-"""Maximum size of a token file in bytes."""
+"""Maximum size of a token file in bytes: a line that is cut off there is invalid."""
 _LINE: Final = re.compile(r"([A-Za-z0-9._-]{1,32})\s+(read|write)\s+sha256:([0-9a-f]{64})")
 
 
@@ -74,90 +68,81 @@ class TokenHolder(NamedTuple):
 
     Attributes:
         name: its name in the history.
-        role: permission of the token.
+        role: "read", or "write" for both.
     """
 
     name: str
-    role: Role
+    role: str
 
 
-@dataclass(frozen=True, slots=True)
-class Tokens:
-    """The valid tokens, by the SHA-256 of each: the time of a look-up tells nothing of a token."""
-
-    holders: Mapping[bytes, TokenHolder]
-
-    def holder(self, token: str) -> TokenHolder | None:
-        """Return the holder of a token, or None."""
-        return self.holders.get(_digest(token))
-
-    @classmethod
-    def of_text(cls, text: str, source: str) -> Tokens:
-        """Parse lines of `NAME ROLE sha256:DIGEST` of a file; `#` starts a comment.
-
-        Raises:
-            UsageError: a line is invalid, two have the same name or token, or there is none. The message
-                contains no part of a line.
-        """
-        holders: dict[bytes, TokenHolder] = {}
-        for number, line in enumerate(text.splitlines(), 1):
-            if not line.strip() or line.lstrip().startswith("#"):
-                continue
-            found = _LINE.fullmatch(line.strip())
-            if found is None:
-                what = "is not NAME read|write sha256:DIGEST; use `paramclient token`"
-                raise UsageError(f"{source}: line {number} {what}")
-            holder = TokenHolder(found[1], "write" if found[2] == "write" else "read")
-            digest = bytes.fromhex(found[3])
-            if digest in holders or holder.name in {each.name for each in holders.values()}:
-                raise UsageError(f"{source}: line {number} repeats a name or a token")
-            holders[digest] = holder
-        if not holders:
-            raise UsageError(f"{source}: the file has no token; create one with `paramclient token`")
-        return cls(holders)
-
-    @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> Tokens:
-        """Read a token file, which only its owner may access.
-
-        Raises:
-            UsageError: the file cannot be read, other users can access it, or it is invalid.
-        """
-        return cls.of_text(_read(path), os.fspath(path))
+Tokens: TypeAlias = Mapping[str, TokenHolder]
+"""The holders of the valid tokens, by the SHA-256 of each: the time of a look-up tells nothing of a token."""
 
 
-def add_token(path: str | os.PathLike[str], name: str, role: Role) -> str:
+def read_tokens(path: str | os.PathLike[str]) -> Tokens:
+    """Read a token file, which only its owner may access.
+
+    A line is `NAME ROLE sha256:DIGEST`; `#` starts a comment.
+
+    Raises:
+        UsageError: the file cannot be read, other users can access it, a line is invalid, two have the same
+            name or token, or there is none. The message contains no part of a line.
+    """
+    return _parse_tokens(_read(path), os.fspath(path))
+
+
+def add_token(path: str | os.PathLike[str], name: str, role: str) -> str:
     """Create a token, append the line with its digest to a file, and return it. A new file has the mode 0600.
+
+    Args:
+        path: the file.
+        name: of the holder.
+        role: "read" or "write".
 
     Raises:
         UsageError: the file cannot be written, is accessible by other users, is not a token file, or contains
             the name; or the name is not valid.
     """
     token = secrets.token_urlsafe(TOKEN_BYTES)
-    line = f"{name} {role} sha256:{_digest(token).hex()}\n"
+    line = f"{name} {role} sha256:{_digest(token)}\n"
     if _LINE.fullmatch(line.strip()) is None:
         raise UsageError("a name must have 1 to 32 letters, digits, dots, hyphens and underscores")
     try:
         os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0), 0o600))
         before = _read(path)
-        gap = "" if before.endswith("\n") or not before else "\n"
-        Tokens.of_text(f"{before}{gap}{line}", os.fspath(path))
+        added = line if before.endswith("\n") or not before else f"\n{line}"
+        _parse_tokens(before + added, os.fspath(path))
         with Path(path).open("a", encoding="ascii") as file:
-            file.write(gap + line)
+            file.write(added)
     except OSError as error:
         raise UsageError(f"{os.fspath(path)}: the token cannot be written: {error.strerror}") from error
     return token
 
 
 def _read(path: str | os.PathLike[str]) -> str:
-    data = read_private(path, "file of tokens", TOKEN_FILE_BYTES_MAX + 1)
-    if len(data) > TOKEN_FILE_BYTES_MAX:
-        raise UsageError(f"{os.fspath(path)}: a file of tokens may have at most {TOKEN_FILE_BYTES_MAX} bytes")
-    return data.decode("utf-8", "replace")
+    return read_private(path, "file of tokens", TOKEN_FILE_BYTES_MAX).decode("utf-8", "replace")
 
 
-def _digest(token: str) -> bytes:
-    return hashlib.sha256(token.encode("utf-8", "surrogatepass")).digest()
+def _parse_tokens(text: str, source: str) -> Tokens:
+    holders: dict[str, TokenHolder] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        found = _LINE.fullmatch(line.strip())
+        if found is None:
+            what = "is not NAME read|write sha256:DIGEST; use `paramclient token`"
+            raise UsageError(f"{source}: line {number} {what}")
+        holder = TokenHolder(found[1], found[2])
+        if found[3] in holders or holder.name in {each.name for each in holders.values()}:
+            raise UsageError(f"{source}: line {number} repeats a name or a token")
+        holders[found[3]] = holder
+    if not holders:
+        raise UsageError(f"{source}: the file has no token; create one with `paramclient token`")
+    return holders
+
+
+def _digest(token: str) -> str:
+    return hashlib.sha256(token.encode("utf-8", "surrogatepass")).hexdigest()
 
 
 # requests
@@ -216,7 +201,7 @@ def _holder_of(scope: Scope, tokens: Tokens | None) -> TokenHolder | None:
         return LOCAL
     if given is not None:
         scheme, _, token = given.partition(" ")
-        holder = tokens.holder(token.strip()) if scheme.lower() == "bearer" else None
+        holder = tokens.get(_digest(token.strip())) if scheme.lower() == "bearer" else None
         if holder is None:
             raise ServiceError(401, "unauthorized", "The token is not valid for this service.")
         return holder
@@ -278,55 +263,6 @@ def create_app(hub: Hub, *, tokens: Tokens | None = None) -> FastAPI:
     return app
 
 
-class Listening(NamedTuple):
-    """Listening address of the service.
-
-    Attributes:
-        host: host name or IP address.
-        port: TCP port; 0 for any free port.
-    """
-
-    host: str = "127.0.0.1"
-    port: int = 8765
-
-    @classmethod
-    def at(cls, text: str) -> Listening:
-        """Parse `HOST:PORT`; an IPv6 address is in brackets.
-
-        Raises:
-            UsageError: the text has another format.
-        """
-        found = re.fullmatch(r"(?:\[([0-9a-fA-F:.]+)\]|([^:\s]+)):([0-9]{1,5})", text)
-        if found is None or int(found[3]) > PORT_MAX:
-            what = "is not a listening address HOST:PORT such as 127.0.0.1:8765 or [::1]:0"
-            raise UsageError(f"{text!r} {what}")
-        return cls(found[1] or found[2], int(found[3]))
-
-    @property
-    def is_loopback(self) -> bool:
-        """Whether only programs of this computer can connect."""
-        try:
-            return ip_address(self.host).is_loopback
-        except ValueError:
-            return self.host == "localhost"
-
-    def open(self) -> tuple[socket.socket, str]:
-        """Return a listening socket and its URL.
-
-        Raises:
-            LinkError: the address cannot be listened on.
-        """
-        is_v6 = ":" in self.host
-        name = f"[{self.host}]" if is_v6 else self.host
-        try:
-            family = socket.AF_INET6 if is_v6 else socket.AF_INET
-            opened = socket.create_server((self.host, self.port), family=family)
-        except OSError as error:
-            where = f"{name}:{self.port}"
-            raise LinkError(f"cannot listen on {where}: {error.strerror}", link=where) from error
-        return opened, f"http://{name}:{opened.getsockname()[1]}"
-
-
 class _Server(uvicorn.Server):
     """uvicorn without its signal handlers: the command has its own."""
 
@@ -335,32 +271,60 @@ class _Server(uvicorn.Server):
         yield
 
 
+def listen_at(address: str, *, is_protected: bool) -> tuple[socket.socket, str]:
+    """Return a listening socket and its URL.
+
+    Args:
+        address: `HOST:PORT`; an IPv6 address is in brackets, and port 0 is any free port.
+        is_protected: whether other computers may connect.
+
+    Raises:
+        UsageError: the address has another format, or other computers could connect.
+        LinkError: the address cannot be listened on.
+    """
+    found = re.fullmatch(r"(?:\[([0-9a-fA-F:.]+)\]|([^:\s]+)):([0-9]{1,5})", address)
+    if found is None or int(found[3]) > PORT_MAX:
+        what = "is not a listening address HOST:PORT such as 127.0.0.1:8765 or [::1]:0"
+        raise UsageError(f"{address!r} {what}")
+    host, family = (found[1], socket.AF_INET6) if found[1] else (found[2], socket.AF_INET)
+    if not (is_protected or _is_loopback(host)):
+        what = "is not a loopback address: a service for other computers needs --tokens FILE"
+        raise UsageError(f"{host} {what}")
+    try:
+        opened = socket.create_server((host, int(found[3])), family=family)
+    except OSError as error:
+        raise LinkError(f"cannot listen on {address}: {error.strerror}", link=address) from error
+    return opened, f"http://{address.rpartition(':')[0]}:{opened.getsockname()[1]}"
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
 async def serve(
     hub: Hub,
+    address: str,
     *,
-    listening: Listening | None = None,
     tokens: Tokens | None = None,
-    stop: anyio.Event | None = None,
-    listens: Callable[[str], None] | None = None,
+    stop: anyio.Event,
+    listens: Callable[[str], None],
 ) -> None:
     """Open a hub and serve it until `stop` is set. At the end, the cache is written.
 
     Args:
         hub: links and cache, not yet open.
-        listening: listening address.
+        address: `HOST:PORT` to listen on.
         tokens: the valid tokens; None only for a loopback address.
-        stop: ends the call when set; None for no end but cancellation.
+        stop: ends the call when set.
         listens: called with the URL as soon as the service accepts connections.
 
     Raises:
         LinkError: the address cannot be listened on.
-        UsageError: other computers could connect without tokens.
+        UsageError: the address is invalid, or other computers could connect without tokens.
     """
-    listening = Listening() if listening is None else listening
-    stop = anyio.Event() if stop is None else stop
-    if tokens is None and not listening.is_loopback:
-        what = "is not a loopback address: a service for other computers needs --tokens FILE"
-        raise UsageError(f"{listening.host} {what}")
     config = uvicorn.Config(
         create_app(hub, tokens=tokens),
         lifespan="off",
@@ -372,10 +336,9 @@ async def serve(
         limit_concurrency=CONNECTIONS_MAX,
         timeout_keep_alive=IDLE_TIMEOUT,
         timeout_graceful_shutdown=SHUTDOWN_TIMEOUT,
-        h11_max_incomplete_event_size=HEADER_BYTES_MAX,
     )
     server = _Server(config)
-    opened, url = listening.open()
+    opened, url = listen_at(address, is_protected=tokens is not None)
     with opened:
         async with anyio.create_task_group() as tasks:
             try:
@@ -383,8 +346,7 @@ async def serve(
                     tasks.start_soon(server.serve, [opened])
                     while not server.started:  # noqa: ASYNC110 - uvicorn has no event for it
                         await anyio.sleep(0.01)
-                    if listens is not None:
-                        listens(url)
+                    listens(url)
                     await stop.wait()
             finally:
                 server.should_exit = True

@@ -143,7 +143,6 @@ class GroundStation:
         """The state of the station, as JSON. `saved_bytes` did not have to come over the vehicle's link."""
         return {
             "name": self.name,
-            "endpoint": self.endpoint.name,
             "ids": sorted(f"{system}/{component}" for system, component in self.sources),
             "mavlink": self.version,
             "silence_s": round(self.silence, 3),
@@ -337,22 +336,21 @@ class MavlinkEndpoint:
                     self.link.accepted = lambda peer: self._station(peer, tasks)
                 elif not self._listens:
                     self._station(None, tasks)
-                await self._read(take, tasks)
+                while True:
+                    try:
+                        await self._read(take, tasks)
+                    except LinkError as error:
+                        logger.warning("%s; reopening", error)
+                        await self._reopen()
         finally:
             with anyio.CancelScope(shield=True):
                 await self.link.close()
 
     async def _read(self, take: Take, tasks: anyio.abc.TaskGroup) -> None:
+        """Receive frames until the link fails."""
         cutter = FrameCutter(stream=self.link.is_stream)
         while True:
-            try:
-                chunks = await self.link.receive()
-            except LinkError as error:
-                logger.warning("%s; reopening", error)
-                cutter = FrameCutter(stream=self.link.is_stream)
-                await self._reopen()
-                continue
-            for peer, data in chunks:
+            for peer, data in await self.link.receive():
                 frames = [each for each in cutter.cut(data, peer) if each.is_proven or not each.is_known]
                 if self._verifier is not None:
                     frames = [each for each in frames if self._verifier.accepts(each.data)]
@@ -372,8 +370,7 @@ class MavlinkEndpoint:
         while True:
             await anyio.sleep(ENDPOINT_BACKOFF)
             with suppress(LinkError):
-                await self.link.open()
-                return
+                return await self.link.open()
 
     def _station(self, peer: Peer | None, tasks: anyio.abc.TaskGroup) -> GroundStation:
         station = self.stations.get(peer)

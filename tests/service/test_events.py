@@ -70,10 +70,10 @@ async def test_a_vehicle_is_told_when_it_appears_is_fetched_lost_found_and_armed
         while (await stream.next("vehicle"))["vehicle"]["state"] != "synced":
             pass
         tap.is_mute = True
-        while not (await stream.next("vehicle"))["vehicle"]["is_lost"]:
+        while (await stream.next("vehicle"))["vehicle"]["state"] != "lost":
             pass
         tap.is_mute = False
-        while (await stream.next("vehicle"))["vehicle"]["is_lost"]:
+        while (await stream.next("vehicle"))["vehicle"]["state"] == "lost":
             pass
 
 

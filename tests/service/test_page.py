@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
 from pymavlink import mavutil
 
 from paramclient.files import read_file
-from paramclient.service import Tokens, add_token
+from paramclient.service import add_token, read_tokens
 from tests.page import BROWSER, BROWSER_OPTIONS, HIGHEST, HOSTILE, Bench, at_work
 
 DESKTOP = {"width": 1280, "height": 800}
@@ -317,7 +317,7 @@ def test_before_a_token_the_page_only_asks_to_sign_in(
 ) -> None:
     file = tmp_path / "tokens"
     reads, writes = add_token(file, "eye", "read"), add_token(file, "hand", "write")
-    with at_work(tmp_path, tokens=Tokens.read(file)) as bench:
+    with at_work(tmp_path, tokens=read_tokens(file)) as bench:
         bench.token = reads
         until(bench.is_ready)
         sight = visit(bench.url, is_open=False)

@@ -180,7 +180,7 @@ async def test_a_vehicle_that_is_lost_answers_no_request_with_a_problem() -> Non
         await synced(browser)
         tap.is_mute = tap.is_deaf = True
         problem(await browser.get(f"{V}/params/PARAM_04?live=true"), 504, "no-reply")
-        await until(browser, V, lambda found: bool(found["is_lost"]))
+        await until(browser, V, lambda found: found["state"] == "lost")
         assert value(await browser.get(f"{V}/params/PARAM_04")) == VALUES["PARAM_04"]
         tap.is_mute = tap.is_deaf = False
         await synced(browser)

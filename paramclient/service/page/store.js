@@ -347,7 +347,7 @@ class Store {
 const NO_TABLE = new Table();
 
 /** A selected component that the service has removed: only the user changes the selection. */
-const asLost = (component) => ({ ...component, is_lost: true, is_armed: null, state: "lost", silence_s: 0, fetch: null });
+const asLost = (component) => ({ ...component, is_armed: null, state: "lost", silence_s: 0, fetch: null });
 
 /** Names the source of a change. */
 export function authorOf(by) {
