@@ -33,7 +33,7 @@ MAY_IMPORT = {
     "files": PROTOCOL,
     "metadata": SHELL | {"files"},
     "client": SHELL | {"sim"},
-    "provision": SHELL | {"files", "logs"},
+    "provision": SHELL | {"files", "metadata", "logs"},
     "logs": SHELL | {"files", "metadata"},
     "sync": SHELL | {"sim", "metadata", "provision"},
     "testing": {"errors", "sim"},

@@ -41,10 +41,9 @@ from paramclient.protocol.fetch import Progress
 from paramclient.provision import CATEGORIES, ApplyProgress, ApplyResult, ApplyRow, ApplyStatus, Plan, plan
 from paramclient.provision import apply as apply_to_vehicle
 from paramclient.provision import restore as restore_state
-from paramclient.provision.apply_restore import restore_categories
+from paramclient.provision.apply_restore import load_restore_point, restore_categories
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.planning import Rows
-from paramclient.provision.restore_point import load_restore_point
 from paramclient.provision.sources import choose, is_file, read_source
 
 __all__ = ["apply", "restore"]
@@ -81,7 +80,7 @@ async def apply(
     file. Exit code 1: some values differ. After an interruption, run the same command again to continue. If
     several vehicles are heard, --vehicle must choose one, or all.
 
-    Left out by default are the categories identity, hardware, calibration, measured, counter, action,
+    Left out are actions, and by default the categories identity, hardware, calibration, measured, counter,
     read-only and out-of-range.
 
     Args:

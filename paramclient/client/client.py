@@ -359,7 +359,7 @@ class ParamClient:
 
         Raises:
             AnotherVehicle: another vehicle has this system id.
-            NoReply: no message with this id arrived in time.
+            NoReply: no message with this id arrived in time, or no hardware id to recognize it by.
             LinkError: the link failed, or the client was closed.
         """
         before, began = component.identity, anyio.current_time()
@@ -371,6 +371,9 @@ class ParamClient:
         found = await self._wait_for(choose, selection.address_in_words(system, component.component), timeout)
         with anyio.move_on_after(timeout), self.core.station.gate.until_closed():
             await found.node.identification.settled()
+        if before.uid is not None and found.identity.uid is None:
+            subject = f"the hardware id of {found.node.channel}"
+            raise NoReply(subject, attempts=0, waited=anyio.current_time() - began)
         if not before.is_same_vehicle(found.identity):
             raise AnotherVehicle(system, found.component, str(before), str(found.identity))
         return found

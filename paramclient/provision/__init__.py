@@ -5,27 +5,24 @@ several vehicles.
 
 - `planning`: the values to write, their order, and the reason for each parameter that is not written.
 - `inspection`: read what a vehicle has; `plan`.
-- `apply_restore`: `apply` and `restore`; `execution` runs them, and stores the state before the first write.
-- `fleet`: `for_each`.
+- `apply_restore`: `apply`, `restore`, and the state before the last `apply`; `for_each`.
+- `execution`: one run of them, which stores the state before the first write.
 - `sources`: `resolve`, the parameters of a file, a log, a vehicle of the cache, or a link.
-- `restore_point`: reads the snapshot that the last `apply` stored, and what has changed since.
 - `apply_rules`: parameters that `apply` leaves out, writes first or last, or reboots for; the list is
   `apply_rules.toml`.
 """
 
 from __future__ import annotations
 
-from paramclient.provision.apply_restore import apply, restore
+from paramclient.provision.apply_restore import FleetResult, apply, for_each, restore
 from paramclient.provision.apply_rules import CATEGORIES
 from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult
-from paramclient.provision.fleet import FleetResult, for_each
 from paramclient.provision.inspection import plan
 from paramclient.provision.planning import (
     MISSING,
     WRONG,
     ApplyRow,
     ApplyStatus,
-    ParamInfo,
     Plan,
     PlanOptions,
     Stage,
@@ -42,7 +39,6 @@ __all__ = [
     "CATEGORIES",
     "FleetResult",
     "MISSING",
-    "ParamInfo",
     "Plan",
     "PlanOptions",
     "Stage",

@@ -1,17 +1,36 @@
-"""`apply` and `restore`: write wanted values to a vehicle, or an earlier state of that vehicle."""
+"""`apply` and `restore`: write wanted values to a vehicle, or an earlier state of it; `for_each` vehicle."""
 
 from __future__ import annotations
 
-from typing import Final, Unpack
+import time
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final, Generic, TypeVar, Unpack
 
+import anyio
+
+from paramclient.cache import ParamCache
 from paramclient.client.component import Component
-from paramclient.errors import UsageError
-from paramclient.model.paramset import ParamSet
+from paramclient.errors import AlreadyRestored, NotInCache, ParamClientError, UnknownVehicle, UsageError
+from paramclient.model.paramset import ParamSet, RestorePoint
+from paramclient.model.wording import age_in_words
 from paramclient.provision.apply_rules import OUT_OF_RANGE
 from paramclient.provision.execution import ApplyOptions, ApplyResult, run
 from paramclient.provision.inspection import Wanted, wait_for_identity, wanted_set
+from paramclient.provision.planning import Rows
 
-__all__ = ["BEFORE_APPLY", "BEFORE_RESTORE", "apply", "restore", "restore_categories"]
+__all__ = [
+    "BEFORE_APPLY",
+    "BEFORE_RESTORE",
+    "FleetResult",
+    "apply",
+    "for_each",
+    "load_restore_point",
+    "restore",
+    "restore_categories",
+]
+
+Outcome = TypeVar("Outcome", bound=Rows)
 
 BEFORE_APPLY: Final = "before apply"
 """The reason of the snapshot that `apply` stores before its first write."""
@@ -48,8 +67,7 @@ async def apply(component: Component, wanted: Wanted, **options: Unpack[ApplyOpt
 
     Raises:
         InvalidParameters: some values are invalid, or names are not on the vehicle, and `partial` is false.
-        UsageError: as from `plan_from`; SYS_AUTOCONFIG, which resets other parameters at the next start, is
-            included without `reboot`; or `durable` without a cache.
+        UsageError: as from `plan_from`; or `durable` without a cache.
         VehicleArmed: the vehicle is armed, and `allow_armed` is false.
         FileError, CacheError: the state before the first write could not be stored.
         NoReply: the vehicle did not answer before the first write.
@@ -96,3 +114,101 @@ async def restore_categories(component: Component, state: ParamSet) -> tuple[str
     if origin is not None and not is_own and None not in (origin.uid, own.uid) and origin.uid != own.uid:
         raise UsageError(f"the state is that of another vehicle: {origin}; this vehicle is {own}")
     return OWN_STATE_CATEGORIES if is_own else (OUT_OF_RANGE,)
+
+
+def load_restore_point(
+    cache: ParamCache, key: str, component: int, *, extended: bool = False
+) -> RestorePoint:
+    """Return the state that the cache stored before the latest `apply`, and what happened after it.
+
+    A restore stores a snapshot before its first write. If there is one after the `apply`, even of a restore
+    that did not end, the state must be named: another restore would also undo later changes.
+
+    Args:
+        cache: the cache.
+        key: `Identity.key` of the vehicle.
+        component: component id.
+        extended: that of extended parameters.
+
+    Raises:
+        AlreadyRestored: a restore ran since that `apply`.
+        NotInCache: there is no snapshot from before an `apply`.
+        CacheError: the cache cannot be read.
+    """
+    missing = NotInCache(
+        f"the cache has no snapshot from before an apply to {key}; name the time of the state to restore"
+    )
+    try:
+        snapshots = cache.snapshots(key, component, extended=extended)
+        points = [each for each in snapshots if each.reason == BEFORE_APPLY]
+        if not points:
+            raise missing
+        point, now = points[-1], time.time()
+        restores = [each for each in snapshots if each.reason == BEFORE_RESTORE and each.id > point.id]
+        if restores:
+            ago = age_in_words(now - restores[-1].at)
+            raise AlreadyRestored(
+                f"a restore ran {ago} ago, after the last apply ({age_in_words(now - point.at)} ago)",
+                before_apply=point.id,
+                before_restore=restores[-1].id,
+                restored_at=restores[-1].at,
+            )
+        state = cache.state_at(key, component, point.id, extended=extended)
+        table = cache.load(key, component, extended=extended)
+        entries = cache.history(key, component, extended=extended)
+    except UnknownVehicle:
+        raise missing from None
+    held = {} if table is None else table.params
+    latest = {entry.name: entry.at for entry in entries}  # of several entries of a name, the last one
+    changes = {
+        name: at
+        for name, at in sorted(latest.items(), key=lambda change: change[1])[::-1]
+        if name in held and name in state and held[name].settable != state[name].settable
+    }
+    return RestorePoint(point.id, point.at, state, changes)
+
+
+# Several vehicles
+
+
+@dataclass(frozen=True, slots=True)
+class FleetResult(Generic[Outcome]):
+    """The results of one call for each vehicle.
+
+    Attributes:
+        results: by (system, component), the result for each vehicle.
+        errors: by (system, component), the error that the call raised for a vehicle.
+    """
+
+    results: Mapping[tuple[int, int], Outcome]
+    errors: Mapping[tuple[int, int], ParamClientError]
+
+    @property
+    def complete(self) -> bool:
+        """Whether every call has a result, and every result is complete."""
+        return not self.errors and all(result.complete for result in self.results.values())
+
+
+async def for_each(
+    components: Iterable[Component], call: Callable[[Component], Awaitable[Outcome]]
+) -> FleetResult[Outcome]:
+    """Make a call for each vehicle, concurrently; a failure of one does not stop the others.
+
+    The call is `plan`, `apply` or `restore`::
+
+        fleet = await for_each(vehicles, lambda vehicle: apply(vehicle, {"RTL_ALT": 2500}, reboot=True))
+    """
+    results: dict[tuple[int, int], Outcome] = {}
+    errors: dict[tuple[int, int], ParamClientError] = {}
+
+    async def run(component: Component) -> None:
+        address = component.system, component.component
+        try:
+            results[address] = await call(component)
+        except ParamClientError as error:
+            errors[address] = error
+
+    async with anyio.create_task_group() as running:
+        for component in components:
+            running.start_soon(run, component)
+    return FleetResult(dict(sorted(results.items())), dict(sorted(errors.items())))

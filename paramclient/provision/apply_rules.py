@@ -14,16 +14,25 @@ from typing import Any, Final
 from paramclient.errors import UsageError
 from paramclient.model.names import NameChoice, is_group_switch
 
-__all__ = ["CATEGORIES", "OUT_OF_RANGE", "READ_ONLY", "ApplyRule", "ApplyRules", "Choice", "rules_for"]
+__all__ = [
+    "ACTION",
+    "CATEGORIES",
+    "OUT_OF_RANGE",
+    "READ_ONLY",
+    "ApplyRule",
+    "ApplyRules",
+    "Choice",
+    "rules_for",
+]
 
 READ_ONLY: Final = "read-only"
 """The category of parameters that the vehicle lets no client write."""
 OUT_OF_RANGE: Final = "out-of-range"
 """The category of values outside of the range in the metadata."""
-CATEGORIES: Final = (
-    *("identity", "hardware", "calibration", "measured", "counter", "action"),
-    *(READ_ONLY, OUT_OF_RANGE),
-)
+ACTION: Final = "action"
+"""The category of parameters that make the vehicle do something, such as to reset all others. None is
+included: `set` writes them."""
+CATEGORIES: Final = ("identity", "hardware", "calibration", "measured", "counter", READ_ONLY, OUT_OF_RANGE)
 """The categories that `include` accepts besides globs. The last two are also assigned from metadata."""
 
 
@@ -36,7 +45,7 @@ class ApplyRule:
         names: globs, in the case of param_id.
         reason: the predicate of a sentence whose subject is the parameter, such as "is counted by the
             vehicle".
-        category: one of `CATEGORIES` for a parameter that is left out; else "".
+        category: `ACTION` or one of `CATEGORIES` for a parameter that is left out; else "".
         unless: values of other parameters; the entry does not apply while one of them has its value.
         elsewhere: by glob, the vehicles or settings that have the parameter, for globs that match nothing in
             the tables of the simulated vehicles.
@@ -89,16 +98,11 @@ class ApplyRules:
     def has(self, section: str, name: str) -> bool:
         """Return whether a section has a parameter.
 
-        Sections are `frame` (selects the airframe), `resets` (resets other parameters at the next reboot),
+        Sections are `frame` (selects the airframe), `resets` (gives others new values at the next start),
         `brings_any` (may reveal parameters with any name), `last` (may end the connection, and is written
         last), and `system_id`.
         """
         return any(rule.fits(name) for rule in self.sections[section])
-
-    def is_action(self, name: str) -> bool:
-        """Return whether the parameter makes the vehicle do something, and is no setting."""
-        rule = self.left_out(name)
-        return rule is not None and rule.category == "action"
 
     def reveals(self, name: str) -> bool:
         """Return whether a change of the parameter may show or hide other parameters."""

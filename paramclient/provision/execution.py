@@ -8,7 +8,8 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Final, cast
+from functools import partial
+from typing import Final, Unpack, cast
 
 import anyio
 
@@ -29,7 +30,7 @@ from paramclient.files import write_file
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param
 from paramclient.protocol.set_results import SetOutcome, SetStatus
-from paramclient.provision.apply_rules import READ_ONLY, rules_for
+from paramclient.provision.apply_rules import READ_ONLY, ApplyRules, rules_for
 from paramclient.provision.inspection import (
     POLL_INTERVAL,
     Inspection,
@@ -53,19 +54,14 @@ __all__ = ["ApplyOptions", "ApplyProgress", "ApplyResult", "run"]
 WRITE_ATTEMPTS_MAX: Final = 2
 """Times that a value is written if the vehicle acknowledges it and later holds another value: a write of
 another parameter may have changed it."""
-DEFAULT_SYSTEM_ID: Final = 1
-"""The system id of a PX4 after SYS_AUTOCONFIG: its start script does not keep MAV_SYS_ID."""
 VERIFY_DELAY: Final = 1.2
 """Seconds between the last write and the read that verifies it: modules of PX4 clamp the value, or set other
 parameters, up to 1.1 s after the acknowledgement (measured)."""
 ARMED_STATE_TIMEOUT: Final = 3.0
 """Seconds to wait for a heartbeat with the armed flag: heartbeats arrive once a second, and some are lost."""
 SYSTEM_CHANGE_TIMEOUT: Final = 5.0
-"""Seconds to wait for the vehicle under its new system id; ArduPilot sends its next heartbeat under it."""
-SYSTEM_CHANGE_DELAY: Final = 2.5
-"""Seconds after the acknowledgement of SYSID_THISMAV: a vehicle whose heartbeats still have the old id then
-changes it after a reboot, as ArduCopter does. ArduPlane and Rover change it within a second (measured with
-4.6-dev)."""
+"""Seconds to wait for the acknowledgement of a system id, and for the vehicle under it: ArduPlane and Rover
+change it within a second (measured with 4.6-dev), and send their next heartbeat under it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,22 +158,20 @@ async def run(
     reason: str,
     *,
     skips_read_only: bool = False,
-    timeout: float | None = None,
-    **options: Any,
+    **options: Unpack[ApplyOptions],
 ) -> ApplyResult:
     """Apply wanted parameters to a vehicle; see `apply`.
 
     Args:
-        component, wanted, timeout, options: as in `apply`.
+        component, wanted, options: as in `apply`.
         reason: the reason of the snapshot of the state before the first write.
         skips_read_only: skip a parameter that the vehicle refuses as read-only, rather than report it as
             refused.
     """
     began = anyio.current_time()
     error: ParamClientError | None = None
-    planned = {name: options.pop(name) for name in PlanOptions.__annotations__ if name in options}
-    one = _Run(component, wanted, reason, skips_read_only, cast(PlanOptions, planned), **options)
-    with anyio.move_on_after(timeout) as scope:
+    one = _Run(component, wanted, reason, options, skips_read_only=skips_read_only)
+    with anyio.move_on_after(options.get("timeout")) as scope:
         await one.begin()
         try:
             with component.watch.held():  # a changed count starts no download besides those of the run
@@ -196,72 +190,66 @@ async def run(
     return one.result(error, waited)
 
 
-@dataclass(eq=False)
 class _Run:
-    """One run of `apply` or `restore`; the arguments are theirs.
+    """One run of `apply` or `restore`; the arguments are those of `run`.
 
     Attributes:
         component: the vehicle under its present system id.
         sent: parameters for which a PARAM_SET may have been sent, as the vehicle names them.
     """
 
-    component: Component
-    wanted: ParamSet
-    reason: str
-    skips_read_only: bool
-    planned: PlanOptions
-    partial: bool = False
-    reboot: bool = False
-    allow_armed: bool = False
-    durable: bool = False
-    backup: str | os.PathLike[str] | None = None
-    author: str | None = None
-    progress: Callable[[ApplyProgress], None] | None = None
-    before_writing: Callable[[], object] | None = None
-
-    def __post_init__(self) -> None:
-        check_author(self.author)
+    def __init__(
+        self,
+        component: Component,
+        wanted: ParamSet,
+        reason: str,
+        options: ApplyOptions,
+        *,
+        skips_read_only: bool,
+    ) -> None:
+        check_author(options.get("author"))
+        self.component, self.wanted, self.reason, self.options = component, wanted, reason, options
+        self.skips_read_only, self._reboots_allowed = skips_read_only, options.get("reboot", False)
+        self._planned = cast(
+            PlanOptions, {name: each for name, each in options.items() if name in PlanOptions.__annotations__}
+        )
         self.sent: set[str] = set()
-        self._rules = rules_for(self.component.autopilot, is_extended=self.component.is_extended)
         self._before: ParamSet | None = None  # the state before the first write
         self._snapshot: int | None = None  # its number in the cache
-        self._settled: dict[str, ApplyRow] = {}  # outcomes before the last read, by the vehicle's names
+        self._settled: dict[str, ApplyRow] = {}  # outcomes before the last read
         self._written: Counter[str] = Counter()  # acknowledged writes
         self._notes: dict[str, str] = {}  # of the acknowledged writes
         self._written_at = self._inspected_at = -math.inf  # end of the last write, begin of the last read
         self._reboot_for: dict[str, None] = {}
         self._reboots = 0
-        self._next_system_id: int | None = None  # the vehicle's system id after the next reboot
+
+    @property
+    def _rules(self) -> ApplyRules:
+        return rules_for(self.component.autopilot, is_extended=self.component.is_extended)
 
     async def begin(self) -> None:
         """Inspect the vehicle, and plan."""
         component = self.component
-        if self.durable and component.core.cache is None:
+        if self.options.get("durable") and component.core.cache is None:
             raise UsageError("durable needs a cache, and the client keeps none")
         self._replan({})  # its errors are raised before the vehicle is read
         await wait_for_identity(component)
-        self._rules = rules_for(component.autopilot, is_extended=component.is_extended)
         self._identity = component.identity
         with component.watch.held():
             await self._check_armed()
             await self._inspect()
         self._first_plan = self._plan
-        if self._plan.problems and not self.partial:
+        if self._plan.problems and not self.options.get("partial"):
             raise InvalidParameters(self._plan.problems)
-        for row in self._plan.to_write:
-            if self._rules.is_action(row.name) and self._resets(row) and not self.reboot:
-                raise UsageError(
-                    f"{row.name} resets other parameters to their defaults at the next start of the "
-                    "vehicle; it can only be set with reboot=True"
-                )
-        if self.before_writing is not None and (self._plan.to_write or self._must_reboot([])):
-            result = self.before_writing()
+        before_writing = self.options.get("before_writing")
+        if before_writing is not None and (self._plan.to_write or self._must_reboot([])):
+            result = before_writing()
             if isinstance(result, Awaitable):
                 await result
 
     async def store_state(self) -> None:
         """Store the vehicle's state in the backup file, and in the cache if the plan has values to write."""
-        component, inspection, path = self.component, self._inspection, self.backup
+        component, inspection, path = self.component, self._inspection, self.options.get("backup")
         writer, cache = component.core.cache_writer, component.core.cache
         if path is not None:
             await writer.run_in_thread(lambda: write_file(path, inspection.table))
@@ -317,23 +305,16 @@ class _Run:
                 await self._verify()
             else:
                 break
-        if self.durable and self.sent:
+        if self.options.get("durable") and self.sent:
             await self.component.core.cache_writer.write_durably(self.component.node)
 
     def result(self, error: ParamClientError | None, elapsed: float) -> ApplyResult:
         """Return the result of the run."""
         assert self._before is not None
+        rows = {name: self._final_row(row) for name, row in self._plan.rows.items()}
+        address, extra, reboot_for = self.component.address, self._plan.extra, tuple(self._reboot_for)
         return ApplyResult(
-            {name: self._final_row(row) for name, row in self._plan.rows.items()},
-            self.component.system,
-            self.component.component,
-            self._first_plan,
-            self._before,
-            self._plan.extra,
-            self._reboots,
-            tuple(self._reboot_for),
-            error,
-            elapsed,
+            rows, *address, self._first_plan, self._before, extra, self._reboots, reboot_for, error, elapsed
         )
 
     # Next stages
@@ -345,18 +326,17 @@ class _Run:
         for stage in self._plan.stages:
             if rows := tuple(row for row in stage.rows if self._may_write(row.name)):
                 stages.append(replace(stage, rows=rows))
-                if (stage.reveals and may_appear) or (stage.reboot_first and self.reboot):
+                if (stage.reveals and may_appear) or (stage.reboot_first and self._reboots_allowed):
                     break
         return stages
 
     def _may_write(self, name: str) -> bool:
         """Return whether a parameter whose value differs is written, or written again."""
-        attempts_max = 1 if self._rules.is_action(name) else WRITE_ATTEMPTS_MAX
-        return name not in self._settled and self._written[name] < attempts_max
+        return name not in self._settled and self._written[name] < WRITE_ATTEMPTS_MAX
 
     def _must_reboot(self, done: Sequence[Stage]) -> bool:
         """Return whether the vehicle must reboot after the stages that are done."""
-        if not self.reboot:
+        if not self._reboots_allowed:
             return False
         if done:
             return done[-1].reboot_first and bool(self._reboot_for)
@@ -369,9 +349,6 @@ class _Run:
             if self._rules.has("system_id", row.name) and row.before != self.component.system:
                 return row.before if isinstance(row.before, int) else None
         return None
-
-    def _resets(self, row: ApplyRow) -> bool:
-        return self._rules.has("resets", row.name)
 
     # Reads
 
@@ -414,7 +391,7 @@ class _Run:
             self.wanted,
             autopilot=self.component.autopilot,
             encoding=self.component.encoding,
-            **self.planned,
+            **self._planned,
         )
 
     def _check_same_vehicle(self) -> None:
@@ -450,8 +427,8 @@ class _Run:
         try:
             done = await self.component.set_many(
                 [(name, row.wanted.settable) for name, row in by_name.items()],
-                force=self.planned.get("force", False),
-                author=self.author,
+                force=self.options.get("force", False),
+                author=self.options.get("author"),
                 progress=lambda outcome: self._take(by_name[outcome.name], outcome),
             )
         except ParamClientError:
@@ -470,8 +447,6 @@ class _Run:
         """Record the outcome of a write."""
         done, error = outcome.result, outcome.error
         if done is not None:
-            if self._rules.is_action(outcome.name) and self._resets(row):
-                self._next_system_id = DEFAULT_SYSTEM_ID
             if done.adjusted:
                 self._count_write(row)
                 self._settle(row, ApplyStatus.ADJUSTED, "the vehicle changed the value")
@@ -496,17 +471,17 @@ class _Run:
                 reason = f"another vehicle on this link has system id {system}"
                 self._settle(row, ApplyStatus.SKIPPED, reason, WRONG)
                 return
-        if self._rules.needs_reboot(name):
+        if row.needs_reboot:
             await self._write([row])
-            self._next_system_id = system if self._written[name] else None
             return
         self.sent.add(name)
-        self._written_at = math.inf
-        is_kept, acknowledged_at = False, math.inf
+        self._written_at, is_acknowledged = math.inf, False
         try:
             with suppress(NoReply):  # it may have its new id before it acknowledges
-                await component.set(name, system, timeout=SYSTEM_CHANGE_DELAY, author=self.author)
-                acknowledged_at = anyio.current_time()
+                await component.set(
+                    name, system, timeout=SYSTEM_CHANGE_TIMEOUT, author=self.options.get("author")
+                )
+                is_acknowledged = True
             self.component = await component.client.successor(
                 component, system, timeout=SYSTEM_CHANGE_TIMEOUT
             )
@@ -514,14 +489,12 @@ class _Run:
             self._settle(row, ApplyStatus.REFUSED, str(error))
             return
         except NoReply as error:
-            is_kept = component.node.presence.beat_at >= acknowledged_at + SYSTEM_CHANGE_DELAY
-            if not is_kept:
+            if not is_acknowledged:
                 self._settle(row, ApplyStatus.UNKNOWN, str(error))
                 return
-            self._next_system_id = system
         finally:
             self._written_at = anyio.current_time()
-        self._accept(replace(row, needs_reboot=is_kept))
+        self._accept(replace(row, needs_reboot=self.component is component))
 
     async def _reboot(self) -> None:
         """Reboot the vehicle, continue with it under its new system id if one is pending, and inspect it.
@@ -531,9 +504,7 @@ class _Run:
         """
         await self._check_armed()
         self._report("rebooting")
-        system = self._pending_system_id() if self._next_system_id is None else self._next_system_id
-        self.component = await self.component.reboot(system=system)
-        self._next_system_id = None
+        self.component = await self.component.reboot(system=self._pending_system_id())
         self._reboots += 1
         # values that a resetting parameter has reverted are written again
         is_reset = any(self._rules.has("resets", name) for name in self._reboot_for)
@@ -553,7 +524,7 @@ class _Run:
             VehicleArmed: a component is armed, or the armed state is unknown.
         """
         component = self.component
-        if self.allow_armed:
+        if self.options.get("allow_armed"):
             return
         with anyio.move_on_after(ARMED_STATE_TIMEOUT):
             while component.is_armed is None and component.state != "lost":  # noqa: ASYNC110 - no event
@@ -587,9 +558,8 @@ class _Run:
 
     def _outcome(self, row: ApplyRow, status: ApplyStatus, reason: str = "", category: str = "") -> ApplyRow:
         """Return a row of the plan with its outcome, and with the values before and as last sent."""
-        name = row.name
-        before = None if self._before is None else self._before.get(name)
-        held = self.component.params.get(name)
+        before = None if self._before is None else self._before.get(row.name)
+        held = self.component.params.get(row.name)
         return replace(
             row,
             status=status,
@@ -600,37 +570,31 @@ class _Run:
         )
 
     def _report(self, phase: str, row: ApplyRow | None = None) -> None:
-        if self.progress is not None:
+        if (progress := self.options.get("progress")) is not None:
             done = self._settled.keys() | self._written.keys()
             to_write = [] if self._before is None else self._plan.to_write
             left = sum(each.name not in done for each in to_write)
-            self.progress(ApplyProgress(phase, len(done), len(done) + left, row))
+            progress(ApplyProgress(phase, len(done), len(done) + left, row))
 
     def _final_row(self, planned: ApplyRow) -> ApplyRow:
         """Return the row of a parameter at the end of the run."""
-        name, reported = planned.name, planned.before
-        is_acknowledged, is_sent = bool(self._written[name]), name in self.sent
-
-        def row(status: ApplyStatus, reason: str = "", category: str = "") -> ApplyRow:
-            return self._outcome(planned, status, reason, category)
-
+        name, is_sent = planned.name, planned.name in self.sent
+        row = partial(self._outcome, planned)
         if planned.status is ApplyStatus.UNCHANGED:
             return row(ApplyStatus.ACCEPTED, self._notes.get(name, "")) if is_sent else row(planned.status)
         if (settled := self._settled.get(name)) is not None:
             return row(settled.status, settled.reason, settled.category)
-        unread = ApplyStatus.UNPROVEN if is_acknowledged else ApplyStatus.UNKNOWN
-        answered = "acknowledged" if is_acknowledged else "sent, not acknowledged"
-        if is_sent and reported is None:
-            reason = f"{answered}, and the vehicle no longer reports it"
-            return replace(row(unread, reason), nearest=())
+        unread, answered = ApplyStatus.UNKNOWN, "sent, not acknowledged"
+        if self._written[name]:
+            unread, answered = ApplyStatus.UNPROVEN, "acknowledged"
+        if is_sent and planned.before is None:
+            return replace(row(unread, f"{answered}, and the vehicle no longer reports it"), nearest=())
         if planned.status is not ApplyStatus.SET:
             return row(ApplyStatus.SKIPPED, planned.reason, planned.category)
         if not is_sent:
             return row(ApplyStatus.NOT_TRIED, "not reached")
         if self._inspected_at < self._written_at:
             return row(unread, f"{answered}, and not read back")
-        if self._rules.is_action(name):
-            return row(ApplyStatus.ACCEPTED, "done by the vehicle")
         return row(ApplyStatus.ADJUSTED, "the vehicle acknowledged it, and changed it afterwards")
 
 

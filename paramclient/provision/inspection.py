@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, TypeAlias, Unpack
@@ -11,7 +10,7 @@ import anyio
 
 from paramclient.client.component import Component
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
-from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, ParamType, Settable, Trust
 from paramclient.provision.planning import Plan, PlanOptions, check_component, plan_from
 from paramclient.provision.sources import component_set
@@ -193,13 +192,11 @@ async def reread(
     if given_up and not found:
         subject = f"the values of {component.system}/{component.component}"
         raise NoReply(subject, attempts=0, waited=anyio.current_time() - began)
-    known = {name: component.params[name] for name in inspection.table if name in component.params}
-    current = {name: WrittenParam.of(param) for name, param in (known | found).items()}
-    params = {**inspection.table.params, **current}
-    reported = {name: param for name, param in params.items() if name not in unknown}
+    known = (inspection.table.keys() | found.keys()) - unknown
+    params = (param for name, param in component.params.items() if name in known)
     return replace(
         inspection,
-        table=replace(inspection.table, params=reported, at=time.time()),
+        table=component_set(component, params, inspection.table.source),
         absent=(inspection.absent | unknown).difference(found),
     )
 

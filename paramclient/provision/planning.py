@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterable, Mapping
 from ctypes import c_float
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Final, Protocol, TypedDict, Unpack
+from typing import Final, TypedDict, Unpack
 
 from paramclient.errors import UsageError
+from paramclient.metadata import ParamInfo
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite, version_difference
 from paramclient.model.names import nearest_names
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -27,14 +28,13 @@ from paramclient.model.values import (
     same_bits,
 )
 from paramclient.protocol.dialect import EXTENDED, PLAIN
-from paramclient.provision.apply_rules import CATEGORIES, OUT_OF_RANGE, READ_ONLY, Choice, rules_for
+from paramclient.provision.apply_rules import ACTION, CATEGORIES, OUT_OF_RANGE, READ_ONLY, Choice, rules_for
 
 __all__ = [
     "MISSING",
     "WRONG",
     "ApplyRow",
     "ApplyStatus",
-    "ParamInfo",
     "Plan",
     "PlanOptions",
     "Rows",
@@ -50,26 +50,6 @@ WRONG: Final = "wrong"
 SUGGESTIONS_MAX: Final = 40
 """Missing names up to which similar names are suggested. With more, the file is for another vehicle and has
 no typing errors."""
-
-
-class ParamInfo(Protocol):
-    """The metadata of one parameter that a plan uses."""
-
-    @property
-    def minimum(self) -> float | None:
-        """The lowest valid value in the unit of the parameter, or None."""
-
-    @property
-    def maximum(self) -> float | None:
-        """The highest valid value in the unit of the parameter, or None."""
-
-    @property
-    def is_read_only(self) -> bool:
-        """Whether only the vehicle writes the parameter."""
-
-    @property
-    def reboot_required(self) -> bool:
-        """Whether a change takes effect after a reboot."""
 
 
 class PlanOptions(TypedDict, total=False):
@@ -124,8 +104,8 @@ class ApplyRow:
         before: the value before `apply`, or None if the vehicle did not have the parameter.
         actual: the value that the vehicle last sent, or None; None in a plan.
         type: the vehicle's type of the parameter; None if unknown.
-        category: for skipped and invalid parameters, the kind of reason: one of `CATEGORIES`, `MISSING`, or
-            `WRONG`; else "".
+        category: for skipped and invalid parameters, the kind of reason: one of `CATEGORIES`, "action",
+            `MISSING`, or `WRONG`; else "".
         reason: the reason for the status as a sentence; may be "".
         nearest: for a parameter that the vehicle does not have, the most similar names, most similar first.
         needs_reboot: whether a change takes effect after a reboot.
@@ -407,7 +387,7 @@ class _Planner:
             return ApplyRow(wanted, status, before, None, kind, category, reason, needs_reboot=needs_reboot)
 
         rule = self.rules.left_out(name, self._value_to_be)
-        if rule is not None and not self.choice.has(name, rule.category):
+        if rule is not None and (rule.category == ACTION or not self.choice.has(name, rule.category)):
             return verdict(ApplyStatus.SKIPPED, rule.category, f"left out: it {rule.reason}")
         if before is None:
             return verdict(ApplyStatus.LATER, MISSING)
@@ -474,8 +454,7 @@ class _Planner:
         names = [name for name, row in rows.items() if row.status is ApplyStatus.LATER]
         unnamed = self.current.keys() - self.wanted.keys()
         spelled = {name.upper(): name for name in self.current} if names else {}
-        settled = dict(rows)
-        may_be_revealed = self._revealed_names(rows)
+        settled, may_be_revealed = dict(rows), self._revealed_names(rows)
         for name in names:
             nearest: tuple[str, ...] = ()
             if len(names) <= SUGGESTIONS_MAX:
@@ -488,13 +467,11 @@ class _Planner:
         """Return a function that decides whether a step may reveal a name that the vehicle does not have.
 
         A switch reveals names that begin like its own: the members of its group, which may end in a digit
-        (OSD_TYPE: OSD1_ENABLE). One that is turned on may also start a driver whose names share only the part
-        up to the first underscore (CAN_P1_DRIVER: CAN_D1_UC_NODE). A new frame, and ArduPilot's scripts, may
-        bring names of every group.
+        (OSD_TYPE: OSD1_ENABLE), or a driver's, whose names share only the part up to the first underscore
+        (CAN_P1_DRIVER: CAN_D1_UC_NODE). A new frame, and ArduPilot's scripts, may bring names of every group.
         """
-        groups: set[str] = set()
-        for row in rows.values():
-            name = row.name
+        groups: list[str] = []
+        for name, row in rows.items():
             if row.status is not ApplyStatus.SET or self.rules.has("last", name):
                 continue
             is_switch = self.rules.reveals(name)
@@ -503,11 +480,8 @@ class _Planner:
             if self.rules.has("brings_any", name) or (not is_switch and self.rules.has("frame", name)):
                 return lambda _: True
             if is_switch:
-                groups.add(name.rpartition("_")[0])
-                if row.before == 0:
-                    groups.add(name[: name.index("_") + 1])
-        prefixes = tuple(groups)
-        return lambda name: name.startswith(prefixes)
+                groups.append(name.partition("_")[0])
+        return lambda name: name.startswith(tuple(groups))
 
     def _find_fault(
         self, target: WrittenParam, before: WireValue, kind: ParamType | int | None
@@ -569,5 +543,5 @@ def _float32(value: float) -> float:
     return c_float(value).value
 
 
-_INTENDED_CATEGORIES: Final = frozenset(CATEGORIES) - {OUT_OF_RANGE}
+_INTENDED_CATEGORIES: Final = frozenset({*CATEGORIES, ACTION}) - {OUT_OF_RANGE}
 """Categories of parameters that are left out on purpose: a skipped row of one is no failure."""

@@ -37,7 +37,7 @@ from paramclient.model.values import check_name
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision import ApplyProgress, apply, restore
 from paramclient.provision import plan as plan_of
-from paramclient.provision.restore_point import load_restore_point
+from paramclient.provision.apply_restore import load_restore_point
 from paramclient.provision.sources import fetched_set, select_non_defaults
 from paramclient.service.hub import Hub, Target
 from paramclient.service.problems import ServiceError

@@ -24,8 +24,8 @@ from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
 from paramclient.protocol.watch import SyncState
+from paramclient.provision.apply_restore import FleetResult, Outcome
 from paramclient.provision.execution import ApplyOptions, ApplyResult
-from paramclient.provision.fleet import FleetResult, Outcome
 from paramclient.provision.planning import Plan, PlanOptions
 from paramclient.sim import Endpoint
 from paramclient.wire.signing import SigningKey, SigningReport

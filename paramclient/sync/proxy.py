@@ -24,7 +24,7 @@ from anyio.from_thread import BlockingPortal, start_blocking_portal
 import paramclient.client.client as asynchronous
 from paramclient.client import component, events, streams
 from paramclient.errors import ClientClosed, ParamClientError, UsageError
-from paramclient.provision.fleet import FleetResult
+from paramclient.provision.apply_restore import FleetResult
 
 __all__ = ["Changes", "Component", "Events", "ParamClient", "blocking", "for_each"]
 

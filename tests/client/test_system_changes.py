@@ -56,7 +56,7 @@ def test_only_the_keeping_of_things_knows_the_time_of_day() -> None:
     library = {module for module in asking if module.split(".")[1:2] not in (["cli"], ["service"])}
     keeping = {
         *("client.cache_writer", "client.recording", "cache.store", "cache.sqlite"),
-        *("provision.inspection", "provision.restore_point", "provision.sources"),
+        *("provision.apply_restore", "provision.sources"),
     }
     signing = {"client.signing"}  # whose timestamps are times of day by definition
     assert library == {f"paramclient.{module}" for module in keeping | signing}

@@ -18,7 +18,7 @@ from paramclient import (
 )
 from paramclient.files import read_file
 from paramclient.provision import ApplyStatus, apply, plan, restore
-from paramclient.provision.restore_point import load_restore_point
+from paramclient.provision.apply_restore import load_restore_point
 from paramclient.sim import Air, Camera, PX4Vehicle
 from tests.shell import a_client, in_simulated_time
 

@@ -8,7 +8,7 @@ import pytest
 
 from paramclient import AlreadyRestored, Component, NotInCache, ParamCache, ParamSet, WrittenParam
 from paramclient.provision import apply, restore
-from paramclient.provision.restore_point import load_restore_point
+from paramclient.provision.apply_restore import load_restore_point
 from paramclient.sim import GenericVehicle
 from tests.shell import a_client, in_simulated_time
 
