@@ -5,10 +5,10 @@ from __future__ import annotations
 import shlex
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import anyio
 import anyio.to_thread
@@ -136,10 +136,7 @@ async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags =
 
     async def load(session: CommandSession) -> _State:
         state = await (source.state_of(session) if source else _earlier_state(session, url, moment))
-        prefix = session.prefix
-        say(f"{prefix}the state: {described(state.params)}")
-        if state.point:
-            say(f"{prefix}the state is that {state.point}; {state.changes}")
+        say(f"{session.prefix}the state: {described(state.params)}")
         return state
 
     return await _run(url, options, load, source, None, {})
@@ -156,14 +153,12 @@ class _State:
         params: the values.
         point: the restore point in words, such as `before the last apply, 9 min ago (snapshot 4)`; "" for a
             state that the user chose.
-        changes: the changes since then in words; "" for a state that the user chose.
         again: the command that continues after an error; "" for the given one. A restore without a time is
             refused the second time, and an age is another time later.
     """
 
     params: ParamSet
     point: str = ""
-    changes: str = ""
     again: str = ""
 
 
@@ -233,45 +228,30 @@ async def _earlier_state(session: CommandSession, url: str, moment: float | int 
     except NotInCache as error:
         raise NotInCache(f"{error}, such as '2h ago', or a backup file") from None
     except AlreadyRestored as error:
-        raise UsageError(_choices(error, url, session)) from None
+        raise UsageError(
+            f"{error.summary}; choose the state: `{_command(url, error.before_apply, session)}` for that "
+            f"before the apply, snapshot {error.before_restore} for that before the restore, or another of "
+            f"`paramclient history {vehicle.system}{' --extended' * extended} --snapshots`"
+        ) from None
     except CacheError as error:
         raise CacheError(
             f"nothing was sent, as the state before the last apply cannot be read: {error}. A backup file"
             " can be restored without the cache (--no-cache)"
         ) from error
     now = time.time()
+    words = f"before the last apply, {age_in_words(now - point.at)} ago (snapshot {point.snapshot})"
     changes = [f"{name} {age_in_words(now - at)} ago" for name, at in point.changes.items()]
-    return _State(
-        point.state,
-        f"before the last apply, {age_in_words(now - point.at)} ago (snapshot {point.snapshot})",
-        f"changed since then: {first_of(changes, APPLY_NAMES_MAX)}"
-        if changes
-        else "nothing is known to have changed since then",
-        _command(url, point.snapshot, session),
-    )
-
-
-def _choices(error: AlreadyRestored, url: str, session: CommandSession) -> str:
-    """Return the error with the commands that choose a state."""
-
-    def command(when: object) -> str:
-        return f"`{_command(url, when, session)}`"
-
-    more = ["--extended"] if session.component.is_extended else []
-    listing = shlex.join(["paramclient", "history", str(session.component.system), *more, "--snapshots"])
-    seconds = max(1, int(time.time() - error.restored_at) + 1)
-    return (
-        f"{error.summary}; choose the state: {command(error.before_apply)} for the state before that apply, "
-        f"also to continue that restore; {command(error.before_restore)} for the state before that restore; "
-        f"or a time, as in {command(f'{seconds}s ago')}; `{listing}` lists the snapshots"
-    )
+    changed = f"changed since then: {first_of(changes, APPLY_NAMES_MAX)}"
+    known = changed if changes else "nothing is known to have changed since then"
+    say(f"{session.prefix}the state is that {words}; {known}")
+    return _State(point.state, words, _command(url, point.snapshot, session))
 
 
 def _command(url: str, when: object, session: CommandSession) -> str:
     """Return the command that restores a state of a vehicle, for messages."""
     vehicle = str(session.component.system) if session.choice.is_all else session.options.vehicle
     chosen = [] if vehicle is None else ["--vehicle", vehicle]
-    more = ["--extended"] if session.component.is_extended else []
+    more = ["--extended"] * session.component.is_extended
     return shlex.join(["paramclient", "restore", url, str(when), *chosen, *more])
 
 
@@ -327,14 +307,13 @@ async def _run(
         if flags.dry_run or (not flags.yes and not flags.json and can_ask()):
             made = await ready.work(lambda session: jobs[session].planned()) if ready else []
             plans = [each.result for each in made if each.result is not None]
-            if flags.dry_run or any(each.has_work for each in plans):
-                made += [Done(each.session, error=each.error) for each in failed]
-                code = found.show(made)
-                for planned in [] if flags.json else plans:
-                    planned.say_summary()
+            has_work = any(each.has_work for each in plans)
+            if flags.dry_run or has_work:
+                code = found.show([*made, *failed])
+                codes = [each.say_plan() for each in plans]
             if flags.dry_run:
-                return max([code, *(each.check() for each in plans)])
-            if any(each.has_work for each in plans) and not await confirm("go on?"):
+                return max([code, *codes])
+            if has_work and not await confirm("go on?"):
                 return ExitCode.INCOMPLETE
         if flags.no_cache and flags.backup is None and not url.startswith("sim:"):
             say("the state before is not stored: --no-cache is given, and --backup is not")
@@ -350,7 +329,7 @@ async def _run(
             )
             raise
         code = found.show([*done, *failed])
-        code = max([code, *(each.result.say_summary() for each in done if each.result is not None)])
+        code = max([code, *(each.result.say_result() for each in done if each.result is not None)])
         return max(code, ExitCode.INCOMPLETE) if file is not None and file.left_out else code
 
 
@@ -368,7 +347,7 @@ def _new(path: str) -> Path:
 
 @dataclass(eq=False)
 class _Job:
-    """What apply or restore does with one vehicle, and what became of it.
+    """What apply or restore does with one vehicle: its plan, and what became of it.
 
     Attributes:
         session: the vehicle.
@@ -376,22 +355,22 @@ class _Job:
         flags: the options of the subcommand.
         more: further options of `apply`.
         is_restore: whether the values are an earlier state of the vehicle.
+        plan: the plan, until the writes begin.
         arrived: the outcomes so far.
         result: the result at the end.
     """
-
-    columns: ClassVar[Sequence[str]] = ("name", "before", "wanted", "now", "status", "reason")
 
     session: CommandSession
     state: _State
     flags: ApplyFlags
     more: dict[str, Any]
     is_restore: bool
+    plan: Plan | None = None
     arrived: dict[str, ApplyRow] = field(default_factory=dict)
     result: ApplyResult | None = None
 
-    async def planned(self) -> _Planned:
-        """Return the plan, if it is known before the deadline of the command.
+    async def planned(self) -> _Job:
+        """Plan before the deadline of the command, and return the job.
 
         Raises:
             NoReply: the deadline has passed.
@@ -400,7 +379,8 @@ class _Job:
         own = await restore_categories(component, params) if self.is_restore else ()
         with anyio.move_on_after(left):
             include = (*own, *self.flags.include)
-            return _Planned(self, await plan(component, params, include=include, info=self.more["info"]))
+            self.plan = await plan(component, params, include=include, info=self.more["info"])
+            return self
         raise NoReply(f"the parameters of {self.session.label}", attempts=0, waited=left or 0.0)
 
     async def run(self, backup: Path | None) -> _Job:
@@ -420,6 +400,7 @@ class _Job:
             await session.check_only()
             session.announce_write()
 
+        self.plan = None
         title = f"{'restoring' if self.is_restore else 'setting'} {session.label}"
         with Status(f"{title}: waiting for the first response", title) as status:
             self.result = await (restore_state if self.is_restore else apply_to_vehicle)(
@@ -437,81 +418,32 @@ class _Job:
         return self
 
     def as_json(self) -> JsonObject:
-        """Return the JSON of the result; after an interruption, of the outcomes so far."""
-        if self.result is None:
-            rows = rows_json(self._so_far)
-            return {**self.session.ids, "complete": False, "params": rows, "error": "interrupted"}
-        return apply_json(self.result, self.session.component)
+        """Return the JSON of the plan or the result; after an interruption, of the outcomes so far."""
+        if self.plan is not None:
+            return plan_json(self.plan, self.session.component)
+        if self.result is not None:
+            return apply_json(self.result, self.session.component)
+        rows = rows_json(self._so_far)
+        return {**self.session.ids, "complete": False, "params": rows, "error": "interrupted"}
+
+    @property
+    def columns(self) -> Sequence[str]:
+        """The headings; a plan has no values that the vehicle has now, besides those before."""
+        return "name", "before", "wanted", *([] if self.plan else ["now"]), "status", "reason"
 
     def rows(self) -> Iterator[Sequence[object]]:
-        """Yield the cells of each row."""
+        """Yield the cells of each row; those of a plan in the order of writing."""
+        if self.plan is not None:
+            yield from self._plan_rows(self.plan)
+            return
         for row in self._so_far if self.result is None else self.result.shown_rows:
             name, before, wanted, *more = _cells(row, row.why)
             yield name, before, wanted, _text(row.actual, row), *more
 
-    @property
-    def _so_far(self) -> Iterable[ApplyRow]:
-        """The outcomes before an interruption: no value was read back."""
-        unproven, reason = ApplyStatus.UNPROVEN, "acknowledged, and not read back"
-        for row in self.arrived.values():
-            is_proven = row.status is not ApplyStatus.ACCEPTED
-            yield row if is_proven else replace(row, status=unproven, reason=reason)
-
-    def say_summary(self) -> int:
-        """Print what became of the vehicle; return the exit code."""
-        result, session = self.result, self.session
-        assert result is not None
-        say(f"{session.receiver}: {_counted(result)} in {result.elapsed:.1f} s")
-        self.say_notes(result, result.plan)
-        if result.system != session.component.system:
-            say(f"{session.address} is {result.system}/{result.component} now")
-        if result.reboot_required:
-            names = first_of(result.reboot_required, APPLY_NAMES_MAX)
-            say(f"{session.label}: takes effect after a reboot: {names}")
-        if result.error is not None:
-            report(f"{session.label}: {result.error}; {self.to_continue}")
-            return max(code_of(result.error), ExitCode.INCOMPLETE)
-        if self.state.point:
-            say(f"{session.label}: restored the state {self.state.point}")
-        return ExitCode.DONE if result.complete else ExitCode.INCOMPLETE
-
-    def say_notes(self, shown: Rows, made: Plan) -> None:
-        """Print what was left out, with the options that write it, and what was not checked."""
-        left_out = [
-            row for row in shown.of(ApplyStatus.SKIPPED) if row.category in CATEGORIES and row.differs
-        ]
-        if left_out:
-            counts = Counter(row.category for row in left_out)
-            listed = ", ".join(f"{count} {category}" for category, count in counts.items())
-            options = " ".join(f"--include {category}" for category in counts)
-            say(f"{self.session.label}: left out: {listed}; to write them: {options}")
-        if made.unchecked_note:
-            say(f"{self.session.label}: {made.unchecked_note}")
-
-    @property
-    def to_continue(self) -> str:
-        """How to continue after an error, in words."""
-        again = self.state.again
-        return f"to continue: `{again}`" if again else "run it again to continue"
-
-
-@dataclass(frozen=True, slots=True)
-class _Planned:
-    """The plan for one vehicle, as it is printed."""
-
-    columns: ClassVar[Sequence[str]] = ("name", "before", "wanted", "status", "reason")
-
-    job: _Job
-    plan: Plan
-
-    def as_json(self) -> JsonObject:
-        return plan_json(self.plan, self.job.session.component)
-
-    def rows(self) -> Iterator[Sequence[object]]:
-        """Yield the cells of each row, in the order of writing."""
-        reboots = self.job.flags.reboot and bool(self.plan.reboot_for or self.plan.awaiting_reboot)
+    def _plan_rows(self, made: Plan) -> Iterator[Sequence[object]]:
+        reboots = self.flags.reboot and bool(made.reboot_for or made.awaiting_reboot)
         restart = (None, None, None, Coloured("reboot", "yellow"), "the vehicle reboots")
-        for stage in self.plan.stages:
+        for stage in made.stages:
             for row in stage.rows:
                 purpose = stage.purpose + (", takes effect after a reboot" if row.needs_reboot else "")
                 yield _cells(row, row.reason or purpose)
@@ -520,41 +452,87 @@ class _Planned:
                 yield restart
         if reboots:
             yield restart
-        for row in self.plan.rows.values():
-            if row.status is not ApplyStatus.SET and row.is_shown:
+        for row in made.shown_rows:
+            if row.status is not ApplyStatus.SET:
                 yield _cells(row, row.why)
 
-    def say_summary(self) -> None:
-        session, made = self.job.session, self.plan
-        if made.firmware_note:
-            say(f"{session.label}: {made.firmware_note}")
-        say(f"{session.receiver}: {_counted(made)}; nothing was sent")
-        self.job.say_notes(made, made)
-        if made.reboot_for and not self.job.flags.reboot:
-            names = first_of(made.reboot_for, APPLY_NAMES_MAX)
-            say(f"{session.label}: would take effect after a reboot: {names}")
+    @property
+    def _so_far(self) -> Iterator[ApplyRow]:
+        """The outcomes before an interruption: no value was read back."""
+        unproven, reason = ApplyStatus.UNPROVEN, "acknowledged, and not read back"
+        for row in self.arrived.values():
+            is_proven = row.status is not ApplyStatus.ACCEPTED
+            yield row if is_proven else replace(row, status=unproven, reason=reason)
 
     @property
     def _is_refused(self) -> bool:
-        return bool(self.plan.problems) and not (self.job.is_restore or self.job.more["partial"])
+        """Whether the plan has problems, and nothing is written because of them."""
+        return bool(self.plan and self.plan.problems) and not (self.is_restore or self.more["partial"])
 
     @property
     def has_work(self) -> bool:
-        """Whether something is written."""
-        waits = self.job.flags.reboot and bool(self.plan.awaiting_reboot)
-        return not self._is_refused and (bool(self.plan.to_write) or waits)
+        """Whether the plan writes something."""
+        if self.plan is None or self._is_refused:
+            return False
+        return bool(self.plan.to_write) or (self.flags.reboot and bool(self.plan.awaiting_reboot))
 
-    def check(self) -> int:
-        """Report that the vehicle is armed; return the exit code that the command is expected to have."""
-        session, code = self.job.session, ExitCode.DONE
+    def say_plan(self) -> int:
+        """Print a summary of the plan; return the exit code that the command is expected to have."""
+        session, made, code = self.session, self.plan, ExitCode.DONE
+        assert made is not None
+        if not self.flags.json:
+            if made.firmware_note:
+                say(f"{session.label}: {made.firmware_note}")
+            reboot_for = () if self.flags.reboot else made.reboot_for
+            self._say(made, made, "; nothing was sent", "would take effect", reboot_for)
         if self._is_refused:
             code = ExitCode.USAGE
-        elif any(not row.is_as_wanted for row in self.plan.of(ApplyStatus.SKIPPED, ApplyStatus.INVALID)):
+        elif any(not row.is_as_wanted for row in made.of(ApplyStatus.SKIPPED, ApplyStatus.INVALID)):
             code = ExitCode.INCOMPLETE
-        if session.component.is_armed and not self.job.flags.allow_armed:
+        if session.component.is_armed and not self.flags.allow_armed:
             report(f"{session.label} is armed; nothing would be set now without --allow-armed")
             code = max(code, ExitCode.INCOMPLETE)
         return code
+
+    def say_result(self) -> int:
+        """Print what became of the vehicle; return the exit code."""
+        result, session = self.result, self.session
+        assert result is not None
+        end = f" in {result.elapsed:.1f} s"
+        self._say(result, result.plan, end, "takes effect", result.reboot_required)
+        if result.system != session.component.system:
+            say(f"{session.address} is {result.system}/{result.component} now")
+        if result.error is not None:
+            report(f"{session.label}: {result.error}; {self.to_continue}")
+            return max(code_of(result.error), ExitCode.INCOMPLETE)
+        if self.state.point:
+            say(f"{session.label}: restored the state {self.state.point}")
+        return ExitCode.DONE if result.complete else ExitCode.INCOMPLETE
+
+    def _say(self, shown: Rows, made: Plan, end: str, effect: str, reboot_for: Sequence[str]) -> None:
+        """Print counts, what was left out with the options that write it, and what was not checked."""
+        words = (f"{count} {_WORDS.get(status, status)}" for status, count in shown.counts.items())
+        say(f"{self.session.receiver}: {', '.join(words) or 'nothing to set'}{end}")
+        left_out = Counter(
+            row.category
+            for row in shown.of(ApplyStatus.SKIPPED)
+            if row.category in CATEGORIES and row.differs
+        )
+        if left_out:
+            listed = ", ".join(f"{count} {category}" for category, count in left_out.items())
+            options = " ".join(f"--include {category}" for category in left_out)
+            say(f"{self.session.label}: left out: {listed}; to write them: {options}")
+        if made.unchecked_note:
+            say(f"{self.session.label}: {made.unchecked_note}")
+        if reboot_for:
+            names = first_of(reboot_for, APPLY_NAMES_MAX)
+            say(f"{self.session.label}: {effect} after a reboot: {names}")
+
+    @property
+    def to_continue(self) -> str:
+        """How to continue after an error, in words."""
+        again = self.state.again
+        return f"to continue: `{again}`" if again else "run it again to continue"
 
 
 def _cells(row: ApplyRow, reason: str) -> list[object]:
@@ -564,9 +542,3 @@ def _cells(row: ApplyRow, reason: str) -> list[object]:
 
 def _text(value: WireValue | None, row: ApplyRow) -> str | None:
     return None if value is None else format_value(*typed(value, row.type))
-
-
-def _counted(rows: Rows) -> str:
-    counts = rows.counts
-    found = [f"{counts[kind]} {_WORDS.get(kind, kind)}" for kind in ApplyStatus if counts.get(kind)]
-    return ", ".join(found) or "nothing to set"

@@ -271,7 +271,7 @@ def test_restore_reverts_the_last_apply(command: Command, put: Put, file: Callab
     assert vehicle.values["RTL_ALT"] == 2500
     back = command("restore", put(vehicle))
     assert back.code == 0
-    assert re.match(r"the state: 6 parameters of 1/1 ardupilot from snapshot 1 of uid:", back.err)
+    assert "the state: 6 parameters of 1/1 ardupilot from snapshot 1 of uid:" in back.err
     assert vehicle.values == copter().values
     vehicle.set_param("RTL_ALT", 77)  # as after an interrupted restore
     assert command("restore", put(vehicle), 1).code == 0
@@ -315,10 +315,9 @@ def test_restore_does_not_undo_an_apply_twice(command: Command, put: Put, file: 
         again = command("restore", put(vehicle), *options)
         assert again.code == 2
         assert "a restore ran " in again.err
-        assert "`paramclient restore udpin:0.0.0.0:14550 1` for the state before that apply" in again.err
-        assert "`paramclient restore udpin:0.0.0.0:14550 2` for the state before that restore" in again.err
-        assert "`paramclient history 1 --snapshots` lists the snapshots" in again.err
-        assert re.search(r"or a time, as in `paramclient restore udpin:0.0.0.0:14550 '\d+s ago'`", again.err)
+        assert "`paramclient restore udpin:0.0.0.0:14550 1` for that before the apply" in again.err
+        assert "snapshot 2 for that before the restore" in again.err
+        assert "`paramclient history 1 --snapshots`" in again.err
     assert vehicle.requests["PARAM_SET"] == sets
     vehicle = restarted(vehicle)
     assert command("restore", put(vehicle), 2).code == 0
@@ -443,7 +442,7 @@ def test_all_vehicles_are_restored_each_to_its_own_state(
     air = Air(vehicles)
     again = command("restore", put(air), "--vehicle", "all")
     assert (again.code, again.err.count("a restore ran ")) == (2, 3)
-    assert all(f" --vehicle {each}` for the state before that apply" in again.err for each in (1, 2, 3))
+    assert all(f" --vehicle {each}` for that before the apply" in again.err for each in (1, 2, 3))
     files = command("restore", put(air), tmp_path / "{system}.json", "--vehicle", "all", "--json")
     assert files.code == 0
     assert [each["complete"] for each in files.json["vehicles"]] == [True] * 3
