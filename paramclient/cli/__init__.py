@@ -8,8 +8,8 @@
 - `session`: open links with the vehicles of --vehicle, on which a subcommand works. `options`: options.
 - `sources`: the parameters that an argument names: of a file, a link or the cache. `time_arguments`: times.
 - `param_names`: names and patterns of parameters, and suggestions.
-- `metadata`, `default_sources`: descriptions and defaults that a subcommand uses.
-- `output`: tables, lines, the status line. `param_table`: the parameters of a vehicle. `file_output`: files.
+- `metadata`: descriptions and defaults that a subcommand uses.
+- `output`: tables, lines, the status line. `file_output`: sets of parameters in words.
 - `json_output`, `json_apply`: JSON.
 - `exit_codes`: exit codes.
 """

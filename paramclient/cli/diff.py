@@ -6,11 +6,18 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
-from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.file_output import described, value_text
 from paramclient.cli.json_apply import diff_json
-from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
+from paramclient.cli.metadata import (
+    METADATA_HINT,
+    MetadataChoice,
+    defaults_in,
+    from_file,
+    known_of_sets,
+    meaning_of,
+    units_of,
+)
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Coloured, print_json, print_table, say
 from paramclient.cli.sources import resolve_all
@@ -87,7 +94,7 @@ async def diff(
         try:
             before = collect_defaults([first, second], [*map(defaults_in, known, (first, second))])
         except UsageError as error:
-            raise UsageError(f"{error}; {STORED_DEFAULTS_HINT}") from None
+            raise UsageError(f"{error}; {METADATA_HINT}") from None
         known.append(known[0] or known[1])
     outcome = compare(first, second, base=before, names=only or None)
     if options.json:
@@ -139,7 +146,7 @@ def _shown(param: WrittenParam | None, metadata: Metadata | None) -> str | None:
     """Return a value with its meaning, if known: `5 (Loiter)`. `info` prints all names of a bit mask."""
     if param is None:
         return None
-    meaning = meaning_of(metadata, param.name, param.settable)
+    meaning = meaning_of(metadata, param.name, param.settable) or ""
     if len(meaning) > MEANING_LENGTH_MAX:
         meaning = f"{meaning[:MEANING_LENGTH_MAX]}..."
     return f"{value_text(param)} ({meaning})" if meaning else value_text(param)

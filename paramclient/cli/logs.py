@@ -1,10 +1,8 @@
-"""The subcommand import, and a temporary cache with the content of one telemetry log."""
+"""The subcommand import: logs into the cache."""
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -17,14 +15,13 @@ from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import print_json, print_table, report
 from paramclient.errors import FileError, LinkError, ParamClientError
 from paramclient.files import read_file
-from paramclient.links import LinkKind, parse_link
 from paramclient.logs.logged_params import ImportedTable
 from paramclient.logs.onboard import import_onboard_log, is_onboard_log
 from paramclient.logs.telemetry import import_log
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import hash_text
 
-__all__ = ["cache_of_log", "import_"]
+__all__ = ["import_"]
 
 KIND_BYTES: Final = 4096
 """Bytes at the beginning of a file that identify its format."""
@@ -106,24 +103,6 @@ def _kind_of(path: Path) -> str | None:
         begin.decode()
         return "a text file, and no log"
     return "neither a telemetry log (.tlog) nor an on-board log (.bin, .ulg): it has no MAVLink frame"
-
-
-@contextmanager
-def cache_of_log(url: str) -> Iterator[ParamCache]:
-    """Yield a temporary cache with the content of a telemetry log.
-
-    Raises:
-        UsageError: the link name is invalid.
-        LinkError: the file cannot be read, or is not a telemetry log.
-    """
-    spec = parse_link(url)
-    assert spec.kind is LinkKind.REPLAY
-    with (
-        tempfile.TemporaryDirectory(prefix="paramclient-") as folder,
-        ParamCache(Path(folder) / "log.sqlite3") as cache,
-    ):
-        anyio.run(import_log, spec.host, cache)
-        yield cache
 
 
 def _table_json(file: Path, table: ImportedTable) -> dict[str, object]:

@@ -1,12 +1,11 @@
-"""Metadata in the command line: where it comes from, names of values, units, descriptions.
+"""Metadata in the command line: where it comes from, names of values, units, descriptions, defaults.
 
 The subcommands metadata add, list and remove: metadata files that are stored for a firmware.
 """
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Final, TypeAlias
 
@@ -16,11 +15,11 @@ from cyclopts import Parameter
 
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.json_output import JsonObject
 from paramclient.cli.options import CacheOptions, LinkOptions
-from paramclient.cli.output import Status, print_json, print_line, say, show
+from paramclient.cli.output import Status, print_json, print_line, report, say, show
 from paramclient.cli.session import CommandSession, wait_for_firmware
 from paramclient.errors import UsageError
-from paramclient.links import LinkKind
 from paramclient.metadata import (
     AddedMetadata,
     Metadata,
@@ -30,20 +29,19 @@ from paramclient.metadata import (
     metadata_of,
     read_metadata,
 )
-from paramclient.metadata.store import AddedFiles, file_address
-from paramclient.model.identity import autopilot_name
+from paramclient.metadata.store import AddedFiles
+from paramclient.model.defaults import Default, DefaultSource
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param, WireValue, format_value
+from paramclient.model.values import WireValue, format_value
 from paramclient.model.wording import counted
 from paramclient.protocol.fetch import Progress
 
 __all__ = [
-    "DESCRIBED_COLUMNS",
+    "METADATA_HINT",
     "VEHICLE",
     "MetadataChoice",
-    "described_cells",
+    "defaults_in",
     "from_file",
-    "how_to_describe",
     "info_of",
     "known_of_session",
     "known_of_sets",
@@ -52,9 +50,10 @@ __all__ = [
     "metadata_add",
     "metadata_list",
     "metadata_remove",
-    "needs_reboot",
     "print_descriptions",
+    "report_no_defaults",
     "request_from_vehicle",
+    "say_sources",
     "units_of",
 ]
 
@@ -63,10 +62,12 @@ MetadataChoice: TypeAlias = Annotated[str | None, Parameter(name="--metadata")]
 
 VEHICLE: Final = "vehicle"
 """The value of --metadata that downloads the metadata from the vehicle."""
-_ARDUPILOT_FILES: Final = "ArduPilot's files are at https://autotest.ardupilot.org/Parameters/"
-"""Where the files of firmware that does not provide its metadata are, for messages."""
-ARDUPILOT_NAME: Final = "ardupilot"
-"""The autopilot that does not serve its metadata."""
+METADATA_HINT: Final = (
+    "`paramclient fetch LINK --metadata vehicle` requests metadata from a vehicle that serves it, as PX4 "
+    "does, and stores it; --metadata FILE takes a file, and `paramclient metadata add FILE` remembers one. "
+    "ArduPilot's files are at https://autotest.ardupilot.org/Parameters/"
+)
+"""What to do if metadata is not known."""
 
 _DEFAULTS: Final = CacheOptions()
 
@@ -106,11 +107,7 @@ async def known_of_session(
         found = await _stored(session, added_only=True)
     if found is None:
         problem = f"{needed_for}. " if needed_for else ""
-        files = f" {_ARDUPILOT_FILES}" if session.component.autopilot == ARDUPILOT_NAME else ""
-        raise UsageError(
-            f"{problem}{session.label} does not describe its parameters; --metadata takes a file that "
-            f"does, and `paramclient metadata add` remembers one.{files}"
-        )
+        raise UsageError(f"{problem}{session.label} does not describe its parameters; {METADATA_HINT}")
     return found
 
 
@@ -155,31 +152,7 @@ def known_of_sets(sets: Sequence[ParamSet], options: LinkOptions) -> list[Metada
     """Return the stored metadata of the firmware of each set; a set without a firmware gets another set's."""
     if options.place is False:
         return [None] * len(sets)
-    store = MetadataStore.beside(ParamCache(options.cache).path)
-    return store.known_of_sets(sets)
-
-
-def how_to_describe(tables: Sequence[CachedComponent], name: str) -> str:
-    """Return that no metadata is stored for the firmware of cached tables, and the command that stores it.
-
-    Args:
-        tables: tables without metadata; the command is that for the first one of each autopilot.
-        name: a parameter, for the command that reads it.
-    """
-    firsts = {autopilot_name(table.autopilot): table for table in reversed(tables)}
-    requests = []
-    for autopilot, table in sorted(firsts.items()):
-        if autopilot == ARDUPILOT_NAME:
-            requests.append(
-                f"For {table.system}/{table.component} download {file_address(table.identity)}, then run "
-                "`paramclient metadata add apm.pdef.xml`."
-            )
-            continue
-        link = "LINK" if table.identity.link.startswith(f"{LinkKind.REPLAY}:") else table.identity.link
-        shown = name if name in table.params else next(iter(table.params), name)
-        words = ["paramclient", "get", link, shown, "--vehicle", str(table.system), "--metadata", VEHICLE]
-        requests.append(f"`{shlex.join(words)}` loads it from {table.system}/{table.component}.")
-    return f"no metadata is stored for the firmware of {' and '.join(sorted(firsts))}. {' '.join(requests)}"
+    return MetadataStore.beside(ParamCache(options.cache).path).known_of_sets(sets)
 
 
 def info_of(metadata: Metadata | None, name: str) -> ParamInfo | None:
@@ -187,44 +160,52 @@ def info_of(metadata: Metadata | None, name: str) -> ParamInfo | None:
     return None if metadata is None else metadata.find(name)
 
 
+# Defaults
+
+
+def defaults_in(metadata: Metadata | None, names: Iterable[str]) -> Mapping[str, int | float]:
+    """Return the defaults that metadata gives for parameters, by name; see `default_of`."""
+    return {} if metadata is None else metadata.defaults_of(names)
+
+
+def say_sources(label: str, defaults: Iterable[Default | None]) -> None:
+    """Print how many defaults of a vehicle are from the metadata of the firmware, if any are."""
+    sources = [default.source for default in defaults if default is not None]
+    if described := sources.count(DefaultSource.METADATA):
+        what = f"{described} of {counted(len(sources), 'default')} from the metadata of the firmware"
+        say(f"{label}: {what}, which does not have the defaults of an airframe")
+
+
+def report_no_defaults() -> None:
+    """Print that the defaults are not known, and what to do."""
+    from paramclient.provision.sources import NO_DEFAULTS  # only here: loads provision
+
+    report(f"{NO_DEFAULTS}; {METADATA_HINT}")
+
+
 # Output
 
-DESCRIBED_COLUMNS: Final = ("meaning", "units")
-"""Columns of a table for which metadata is needed."""
 
-
-def described_cells(metadata: Metadata, param: Param) -> tuple[str, str]:
-    """Return the cells of `DESCRIBED_COLUMNS` for a parameter."""
-    return meaning_of(metadata, param.name, param.settable), units_of(metadata, param.name)
-
-
-def meaning_of(metadata: Metadata | None, name: str, value: WireValue) -> str:
-    """Return the meaning of a value in a word, or ""."""
+def meaning_of(metadata: Metadata | None, name: str, value: WireValue) -> str | None:
+    """Return the meaning of a value in a word, or None."""
     info = info_of(metadata, name)
-    return ("" if info is None else info.text(value)) or ""
+    return None if info is None else info.text(value) or None
 
 
-def units_of(metadata: Metadata | None, name: str) -> str:
-    """Return the units of a parameter, or ""."""
+def units_of(metadata: Metadata | None, name: str) -> str | None:
+    """Return the units of a parameter, or None."""
     info = info_of(metadata, name)
-    return "" if info is None else info.units
-
-
-def needs_reboot(name: str, metadata: Metadata | None) -> bool:
-    """Return whether a change is known to take effect after a reboot."""
-    info = info_of(metadata, name)
-    return info is not None and info.reboot_required
+    return None if info is None else info.units or None
 
 
 def print_descriptions(names: Iterable[str], metadata: Metadata) -> None:
     """Print the whole metadata of parameters as text."""
     for name in names:
-        info = info_of(metadata, name)
         print_line("")
-        if info is None:
+        if (info := metadata.find(name)) is None:
             print_line(f"{name} is not described.")
             continue
-        print_line(f"{name}: {info.short_description}" if info.short_description else name)
+        print_line(f"{name}: {info.short_description}".removesuffix(": "))
         for line in info.long_description.splitlines():
             print_line(f"  {line}" if line.strip() else "")
         for label, text in _fields(info):
@@ -233,11 +214,9 @@ def print_descriptions(names: Iterable[str], metadata: Metadata) -> None:
 
 def _fields(info: ParamInfo) -> Iterator[tuple[str, str]]:
     units = f" {info.units}" if info.units else ""
-    low, high = (None if bound is None else format_value(bound) for bound in (info.minimum, info.maximum))
-    if low is not None and high is not None:
+    if info.minimum is not None or info.maximum is not None:
+        low, high = ("..." if each is None else format_value(each) for each in (info.minimum, info.maximum))
         yield "range", f"{low} to {high}{units}"
-    elif low is not None or high is not None:
-        yield "range", f"from {low} up{units}" if high is None else f"up to {high}{units}"
     elif units:
         yield "units", info.units
     if info.increment is not None:
@@ -253,6 +232,9 @@ def _fields(info: ParamInfo) -> Iterator[tuple[str, str]]:
         yield "read-only", "the vehicle sets it"
     if info.reboot_required:
         yield "reboot", "a change takes effect after a reboot"
+
+
+# Subcommands
 
 
 def metadata_add(
@@ -313,7 +295,7 @@ def metadata_remove(
     return ExitCode.DONE
 
 
-def _added_json(added: AddedMetadata, count: int) -> dict[str, object]:
+def _added_json(added: AddedMetadata, count: int) -> JsonObject:
     """Return the JSON of an added file with this number of descriptions."""
     return {"vehicle": added.kind, "firmware": added.firmware, "descriptions": count}
 

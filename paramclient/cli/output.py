@@ -151,7 +151,7 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
 
     Args:
         columns: the headings.
-        rows: the cells of each row; None is an empty cell.
+        rows: the cells of each row; None is an empty cell. A column without any cell is left out.
         right: the headings of the right-aligned columns, separated by spaces.
     """
     print("\n".join(_table_lines(columns, rows, right.split(), is_terminal=sys.stdout.isatty())), flush=True)
@@ -196,7 +196,11 @@ def _table_lines(
     columns: Sequence[str], rows: Iterable[Sequence[object]], right: Sequence[str], *, is_terminal: bool
 ) -> Iterable[str]:
     """Yield the lines of a table; for a terminal with styles, and with sentences that are wrapped."""
-    table: list[Sequence[object]] = [[Coloured(each, "bold") for each in columns], *rows]
+    given = [*rows]
+    kept = [at for at in range(len(columns)) if not given or any(row[at] is not None for row in given)]
+    columns = [columns[at] for at in kept]
+    table: list[Sequence[object]] = [[Coloured(each, "bold") for each in columns]]
+    table += [[row[at] for at in kept] for row in given]
     texts = [["" if cell is None else printable(str(cell)) for cell in row] for row in table]
     widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
     begin = sum(len(GAP) + each for each in widths[:-1])  # of the last column

@@ -2,25 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 import anyio
 
-from paramclient.cli.default_sources import find_defaults, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode, code_of
-from paramclient.cli.json_output import JsonObject, fetch_json
-from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
+from paramclient.cli.json_output import JsonObject, fetch_json, param_json
+from paramclient.cli.metadata import (
+    MetadataChoice,
+    defaults_in,
+    from_file,
+    info_of,
+    known_of_session,
+    meaning_of,
+    report_no_defaults,
+    say_sources,
+    units_of,
+)
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Status, by_index, milliseconds, report, say
 from paramclient.cli.param_names import check_given, choose_names, learn_spelling, suggest
-from paramclient.cli.param_table import ParamTable
 from paramclient.cli.session import CommandSession, sessions
 from paramclient.errors import ParamClientError
+from paramclient.metadata import Metadata
+from paramclient.model.defaults import Default, add_default, default_of
 from paramclient.model.names import NameChoice, is_pattern
 from paramclient.model.notation import hash_text
-from paramclient.model.values import Param, Trust
+from paramclient.model.values import Param, Trust, format_value
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.fetch import FetchResult
 
@@ -60,29 +70,31 @@ async def fetch(
         async def work(session: CommandSession) -> _Fetched:
             result = await session.fetch(refresh=refresh)
             params = by_index(each for name, each in result.params.items() if name not in result.cached)
-            table = ParamTable(params, more=("trust", lambda param: param.trust))
-            if changed or options.json or metadata is not None:
-                table.described = await find_defaults(session, metadata, given, params)
-            return _Fetched(session, result, table)
+            unknown = [param.name for param in params if param.default is None]
+            described: Mapping[str, int | float] = {}
+            if unknown and (changed or options.json or metadata is not None):
+                described = defaults_in(given or await known_of_session(session, metadata), unknown)
+            return _Fetched(session, result, params, described, shows_defaults=changed)
 
         done = await found.work(work)
         found.report_others()
     fetched = [each.result for each in done if each.result is not None]
+    lacks_defaults = changed and not any(each.defaults for each in fetched)
     if chosen and fetched:
-        _keep([each.table for each in fetched], chosen)
+        kept = NameChoice(chosen).choose({param.name for each in fetched for param in each.params})
+        for each in fetched:
+            each.params = [param for param in each.params if param.name in kept]
     for each in fetched:
+        if changed:
+            each.params = [param for param in each.params if each.filled(param).is_changed]
         for note in each.result.notes:
             report(f"{each.session.prefix}{note}")
-    lacks_defaults = changed and not any(each.table.defaults for each in fetched)
-    if changed:
-        for each in fetched:
-            each.table.keep_changed()
     code = found.show(done)
-    for each in [] if options.json or lacks_defaults else fetched:
-        if changed:
-            say_sources(each.session.label, each.table.defaults)
-        say(each.summary)
     for each in fetched:
+        if not (options.json or lacks_defaults):
+            if changed:
+                say_sources(each.session.label, each.defaults)
+            say(each.summary)
         if missing := each.result.missing:
             report(
                 f"incomplete: {each.session.label} did not send {counted(len(missing), 'parameter')}, "
@@ -120,26 +132,48 @@ async def get(
         async def work(session: CommandSession) -> _Read:
             params, errors = await get_chosen(session, chosen)
             known = given or await known_of_session(session, metadata)
-            return _Read(ParamTable(params, metadata=known), errors)
+            return _Read(session, params, errors, known)
 
         done = await found.work(work)
         found.report_others()
-    read = [(each.session, each.result) for each in done if each.result is not None]
+    read = [each.result for each in done if each.result is not None]
     code = found.show(done)
-    for session, each in read:
-        if doubt := session.component.session.encoding_doubt:
-            report(f"{session.prefix}{doubt}")
-        code = max(code, report_all(each.errors.values(), session.prefix))
+    for each in read:
+        if doubt := each.session.component.session.encoding_doubt:
+            report(f"{each.session.prefix}{doubt}")
+        code = max(code, report_all(each.errors.values(), each.session.prefix))
     return code
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Fetched:
-    """The parameters that were received or confirmed in this session: values that are only cached are not."""
+    """The parameters that were received or confirmed in this session: values that are only cached are not.
+
+    Attributes:
+        session: the vehicle.
+        result: the fetch.
+        params: the parameters.
+        described: the defaults in the metadata by name, where the vehicle has given none.
+        shows_defaults: whether the table has the defaults.
+    """
+
+    columns: ClassVar[Sequence[str]] = ("name", "value", "type", "index", "trust", "default")
 
     session: CommandSession
     result: FetchResult
-    table: ParamTable
+    params: list[Param]
+    described: Mapping[str, int | float]
+    shows_defaults: bool
+
+    @property
+    def defaults(self) -> list[Default]:
+        """The known defaults of the parameters."""
+        found = (default_of(param, self.described.get(param.name)) for param in self.params)
+        return [default for default in found if default is not None]
+
+    def filled(self, param: Param) -> Param:
+        """Return a parameter with its default."""
+        return add_default(param, self.described.get(param.name))
 
     @property
     def summary(self) -> str:
@@ -158,50 +192,43 @@ class _Fetched:
 
     def as_json(self) -> JsonObject:
         """Return the JSON object."""
-        return fetch_json(self.session.component, self.result, self.table.params, self.table.described)
+        return fetch_json(self.session.component, self.result, self.params, self.described)
 
-    @property
-    def columns(self) -> Sequence[str]:
-        """The headings."""
-        return self.table.columns
-
-    def rows(self) -> Iterable[Sequence[object]]:
-        """Return the rows of the table."""
-        return self.table.rows()
+    def rows(self) -> Iterator[Sequence[object]]:
+        """Yield the cells of each parameter."""
+        for param in self.params:
+            default = self.filled(param).default if self.shows_defaults else None
+            yield *_cells(param), param.trust, None if default is None else format_value(default, param.type)
 
 
 @dataclass(frozen=True, slots=True)
 class _Read:
-    """The parameters that were read from a vehicle, and the errors by name."""
+    """The parameters that were read from a vehicle, the errors by name, and the metadata or None."""
 
-    table: ParamTable
+    columns: ClassVar[Sequence[str]] = ("name", "value", "type", "index", "meaning", "units")
+
+    session: CommandSession
+    params: list[Param]
     errors: Mapping[str, ParamClientError]
+    metadata: Metadata | None
 
     def as_json(self) -> JsonObject:
         """Return the JSON of the parameters with all their metadata, and of the errors."""
         failed = {name: str(error) for name, error in self.errors.items()}
-        return {"params": self.table.as_json(whole=True)} | ({"errors": failed} if failed else {})
+        found = {
+            each.name: param_json(each, info_of(self.metadata, each.name), whole=True) for each in self.params
+        }
+        return {"params": found} | ({"errors": failed} if failed else {})
 
-    @property
-    def columns(self) -> Sequence[str]:
-        """The headings."""
-        return self.table.columns
-
-    def rows(self) -> Iterable[Sequence[object]]:
-        """Return the rows of the table."""
-        return self.table.rows()
+    def rows(self) -> Iterator[Sequence[object]]:
+        """Yield the cells of each parameter, with meaning and units if metadata is known."""
+        for param in self.params:
+            meaning = meaning_of(self.metadata, param.name, param.settable)
+            yield *_cells(param), meaning, units_of(self.metadata, param.name)
 
 
-def _keep(tables: Sequence[ParamTable], chosen: Sequence[str]) -> None:
-    """Leave out all parameters that names and patterns do not choose.
-
-    Raises:
-        UsageError: one of them fits no parameter of any table.
-    """
-    received = {param.name for each in tables for param in each.params}
-    kept = NameChoice(chosen).choose(received)
-    for each in tables:
-        each.keep(kept)
+def _cells(param: Param) -> Sequence[object]:
+    return param.name, format_value(param.settable, param.type), param.type.name, param.index
 
 
 async def get_chosen(

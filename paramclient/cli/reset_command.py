@@ -8,10 +8,15 @@ from typing import Annotated, ClassVar, Final
 
 from cyclopts import Parameter
 
-from paramclient.cli.default_sources import say_sources
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_output import JsonObject, param_value, vehicle_json
-from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session, request_from_vehicle
+from paramclient.cli.metadata import (
+    MetadataChoice,
+    from_file,
+    known_of_session,
+    request_from_vehicle,
+    say_sources,
+)
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Coloured, by_index, can_ask, confirm, report, say
 from paramclient.cli.param_names import check_given

@@ -12,10 +12,17 @@ from typing import Annotated, Final
 import anyio.to_thread
 from cyclopts import Parameter
 
-from paramclient.cli.default_sources import DEFAULTS_HINT, STORED_DEFAULTS_HINT, defaults_in, say_sources
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.file_output import noun_of
-from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session, known_of_sets
+from paramclient.cli.metadata import (
+    METADATA_HINT,
+    MetadataChoice,
+    defaults_in,
+    from_file,
+    known_of_session,
+    known_of_sets,
+    say_sources,
+)
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_json, report, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
@@ -112,7 +119,7 @@ async def save(
             try:
                 sets.append(differing := sources.select_non_defaults(whole, described))
             except UsageError as error:
-                hint = f"; {STORED_DEFAULTS_HINT if offline else DEFAULTS_HINT}"
+                hint = f"; {METADATA_HINT}"
                 hint = hint if str(error) == sources.NO_DEFAULTS else ""
                 faults.append(f"{address(whole)}: {error}{hint}")
                 continue

@@ -10,19 +10,19 @@ from paramclient.cli.cached import load_tables
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_output import JsonObject, history_json, info_json, table_param_json
 from paramclient.cli.metadata import (
+    METADATA_HINT,
     MetadataChoice,
     from_file,
-    how_to_describe,
     known_of_table,
     print_descriptions,
 )
 from paramclient.cli.options import CacheOptions, Positive
 from paramclient.cli.output import local_time, print_json, print_line, print_table, report, say
-from paramclient.cli.param_names import unmatched_text
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata, ParamInfo
-from paramclient.model.defaults import DefaultSource, default_of
+from paramclient.model.defaults import default_of
 from paramclient.model.identity import autopilot_name, has_autopilot
+from paramclient.model.names import NameChoice
 from paramclient.model.notation import time_text
 from paramclient.model.values import Param, check_name, format_value
 from paramclient.model.wording import counted
@@ -61,23 +61,20 @@ def search(
     lowered_words = " ".join((word, *words)).casefold().split()
     if not lowered_words:
         raise UsageError("search takes one or more words")
-    found = _Known(options, vehicle, from_file(metadata, offline=True))
-    ranks = {name: _rank(name, found.info(name), lowered_words) for name in found.names}
+    known = _Known(options, vehicle, from_file(metadata, offline=True))
+    ranks = {name: _rank(name, known.info(name), lowered_words) for name in known.names}
     ranked = sorted((rank, name) for name, rank in ranks.items() if rank is not None)
     names = [name for _, name in ranked[:limit]]
     if options.json:
-        print_json({"results": [found.as_json(name) for name in names]})
+        print_json({"results": [known.as_json(name) for name in names]})
     elif names:
-        print_table(["name", "value", "vehicle", "description"], map(found.cells, names), right="value")
+        print_table(["name", "value", "vehicle", "description"], map(known.cells, names), right="value")
         if len(ranked) > len(names):
             say(f"{len(names)} of {counted(len(ranked), 'parameter')} shown")
     if not names:
-        report(f"nothing found; {counted(len(found.names), 'parameter')} searched")
-    if found.undescribed and not options.json:
-        addresses = ", ".join(f"{each.system}/{each.component}" for each in found.undescribed)
-        of_some = f"of {addresses}, " if found.metadata else ""
-        request = how_to_describe(found.undescribed, names[0] if names else "")
-        say(f"{of_some}only names were searched: {request}")
+        report(f"nothing found; {counted(len(known.names), 'parameter')} searched")
+    if known.undescribed and not options.json:
+        say(f"only names of {known.undescribed} were searched: {METADATA_HINT}")
     return ExitCode.DONE if names else ExitCode.INCOMPLETE
 
 
@@ -97,24 +94,24 @@ def info(
         metadata: A file that describes parameters. Default: the stored metadata of each vehicle's firmware.
     """
     check_name(name)
-    found = _Known(options, vehicle, from_file(metadata, offline=True))
-    # a description of a group, FOO{n}_BAR, is not among the names
-    spelled = next((each for each in found.names if each.upper() == name.upper()), name.upper())
-    described, tables = found.info(spelled), found.having(spelled)
-    if described is None and not tables:
-        text = unmatched_text([name], found.names, lambda: ())
-        raise UsageError(f"no parameter of the cache is called {text}")
+    known = _Known(options, vehicle, from_file(metadata, offline=True))
+    spelled = next((each for each in known.names if each.upper() == name.upper()), name.upper())
+    described = known.info(spelled)  # also that of a group, FOO{n}_BAR, which is not among the names
+    if described is None:
+        NameChoice([name]).choose(known.names, " of the cache")
     with ParamCache(options.cache) as cache:
-        changes = [cache.history(each.key, each.component, spelled, CHANGES_SHOWN) for each in tables]
+        found = [
+            (each, cache.history(each.key, each.component, spelled, CHANGES_SHOWN))
+            for each in known.having(spelled)
+        ]
     if options.json:
-        values = [_value_json(*each, spelled, described) for each in zip(tables, changes, strict=True)]
-        known = None if described is None else info_json(described)
-        print_json({"name": spelled, "metadata": known, "vehicles": values})
+        values = [_value_json(*each, spelled, described) for each in found]
+        print_json({"name": spelled, "metadata": described and info_json(described), "vehicles": values})
         return ExitCode.DONE
     print_descriptions([spelled], Metadata.of([described] if described is not None else []))
-    if described is None and found.undescribed:
-        say(how_to_describe(found.undescribed, spelled))
-    for each in zip(tables, changes, strict=True):
+    if described is None and known.undescribed:
+        say(f"no metadata of {known.undescribed} is known: {METADATA_HINT}")
+    for each in found:
         print_line("")
         for line in _lines_of(*each, spelled, described):
             print_line(line)
@@ -125,42 +122,43 @@ class _Known:
     """The cached tables of all vehicles or of one, and the metadata of each.
 
     Attributes:
-        tables: the tables.
-        metadata: all metadata.
         names: the names of the tables; without a table, those of the metadata.
-        undescribed: the tables without metadata. A camera has none: its firmware has no such metadata.
+        undescribed: the vehicles without metadata, in words. A camera has none: its firmware has none.
     """
 
     def __init__(self, options: CacheOptions, vehicle: str | None, given: Metadata | None) -> None:
         with ParamCache(options.cache) as cache:
             summaries = sorted(tables_in(cache, vehicle), key=lambda each: (each.system, each.component))
-            self.tables = load_tables(cache, summaries)
-            found = [given or known_of_table(cache.path, table) for table in self.tables]
+            self._tables = load_tables(cache, summaries)
+            found = [given or known_of_table(cache.path, table) for table in self._tables]
         known = [each for each in [given, *found] if each is not None]
-        self.metadata = list({id(each): each for each in known}.values())
-        self.names = {name for table in self.tables for name in table.params}
+        self._metadata = list({id(each): each for each in known}.values())
+        self.names = {name for table in self._tables for name in table.params}
         if given is not None:
             self.names.update(name for name in given if "{" not in name)
-        self.undescribed = [
-            table
-            for table, each in zip(self.tables, found, strict=True)
+        self.undescribed = ", ".join(
+            f"{table.system}/{table.component} {autopilot_name(table.autopilot)}"
+            for table, each in zip(self._tables, found, strict=True)
             if each is None and has_autopilot(table.autopilot)
-        ]
+        )
 
     def info(self, name: str) -> ParamInfo | None:
         """Return the description of a parameter, or None."""
-        return next((known for each in self.metadata if (known := each.find(name)) is not None), None)
+        return next((known for each in self._metadata if (known := each.find(name)) is not None), None)
 
     def having(self, name: str) -> list[CachedComponent]:
         """Return the tables with this parameter."""
-        return [table for table in self.tables if name in table.params]
+        return [table for table in self._tables if name in table.params]
 
     def as_json(self, name: str) -> JsonObject:
         """Return the JSON of a found parameter; `vehicles` are the keys of the vehicles that have it."""
         described = self.info(name)
         description = None if described is None else described.short_description or None
-        vehicles = [each.key for each in self.having(name)]
-        return {"name": name, "description": description, "vehicles": vehicles}
+        return {
+            "name": name,
+            "description": description,
+            "vehicles": [each.key for each in self.having(name)],
+        }
 
     def cells(self, name: str) -> tuple[object, ...]:
         """Return the row of a found parameter, with its value if that is the same on all vehicles."""
@@ -207,13 +205,11 @@ def _lines_of(
 ) -> Iterator[str]:
     """Yield the lines about the value of one vehicle."""
     param = table.params[name]
-    meaning = "" if described is None else described.text(param.settable) or ""
+    meaning = described and described.text(param.settable)
     yield f"{table.system}/{table.component} {autopilot_name(table.autopilot)} ({table.key})"
     yield f"  value: {_value(param)}{f' ({meaning})' if meaning else ''}, {param.type.name}"
-    default = default_of(param, None if described is None else described.default)
-    if default is not None:
-        origin = " (from the metadata)" if default.source is DefaultSource.METADATA else ""
-        yield f"  default of the firmware: {format_value(default.value, param.type)}{origin}"
+    if (default := default_of(param, None if described is None else described.default)) is not None:
+        yield f"  default: {format_value(default.value, param.type)} (of the {default.source})"
     yield f"  heard: {local_time(table.heard_at[name])}"
     for entry in changes:
         new = "removed" if entry.new is None else _value(entry.new)

@@ -285,14 +285,13 @@ class Sessions(list[CommandSession]):
         failed = [(each.session, each.error) for each in done if each.error is not None]
         if not first.options.json:
             is_named = self.is_all or (not first.choice.is_named and len(first.client.autopilots) > 1)
-            columns = max([result.columns for _, result in found], key=len, default=())
-            rows = [  # a vehicle without metadata has fewer cells
-                [*([session.address] if is_named else []), *cells, *[None] * (len(columns) - len(cells))]
+            rows = [
+                (session.address if is_named else None, *cells)
                 for session, result in found
                 for cells in result.rows()
             ]
             if rows:
-                print_table([*(["vehicle"] if is_named else []), *columns], rows, right=NUMBERS)
+                print_table(["vehicle", *found[0][1].columns], rows, right=NUMBERS)
         elif self.is_all:
             vehicles = [session.ids | result.as_json() for session, result in found]
             failures = [session.ids | {"error": str(error)} for session, error in failed]

@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import ClassVar, Final
 
 import anyio
 
@@ -49,6 +49,8 @@ class WriteJob:
         more: further members of the JSON object.
         arrived: the outcomes so far, by name.
     """
+
+    columns: ClassVar[Sequence[str]] = ("name", "before", "requested", "actual", "status")
 
     session: CommandSession
     writes: Mapping[str, WireValue]
@@ -118,21 +120,18 @@ class WriteJob:
         ]
         return {"vehicle": vehicle_json(self.session.component), "results": results, **self.more}
 
-    @property
-    def columns(self) -> list[str]:
-        """The headings."""
-        return ["name", *(["before"] if self.before else []), "requested", "actual", "status"]
-
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the rows; the reported value with its meaning, if that is known."""
         for each in self.outcomes:
             kind, name = self._type_of(each), each.name
-            before = [_text(self.before[name])] if self.before else []
+            before = self.before.get(name)
             requested = kind if self.before or isinstance(each.requested, bytes) else ParamType.REAL64
             actual = None if each.reported is None else format_value(each.reported, kind)
             meaning = None if each.reported is None else meaning_of(self.described, name, each.reported)
             yield (
-                *(name, *before, format_value(each.requested, requested)),
+                name,
+                None if before is None else format_value(before.settable, before.type),
+                format_value(each.requested, requested),
                 f"{actual} ({meaning})" if meaning else actual,
                 Coloured(each.status, _STYLES[each.status]),
             )
@@ -199,7 +198,3 @@ async def write_all(
             say(f"{job.summary}{'' if found.is_all else f' in {elapsed:.2f} s, {traffic}'}")
         job.report()
     return max(job.code for job in jobs)
-
-
-def _text(param: Param) -> str:
-    return format_value(param.settable, param.type)

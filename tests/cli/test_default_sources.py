@@ -68,7 +68,7 @@ def test_unknown_defaults_are_an_error_that_says_what_to_do(command: Command, pu
     done = command("fetch", put(quad()), "--changed")
     assert (done.code, done.out) == (1, "")
     assert "defaults are not known" in done.err
-    assert "--metadata vehicle requests it from a vehicle that serves it" in done.err
+    assert "--metadata vehicle` requests metadata from a vehicle that serves it" in done.err
 
 
 # without a link, and files
@@ -80,12 +80,12 @@ def test_a_cached_table_is_compared_with_the_remembered_metadata(command: Comman
     assert command("fetch", put(quad()), "--changed", "--metadata", "vehicle").code == 0
     shown = command("show", "1", "--changed")
     assert shown.code == 0, shown.err
-    assert [[row[0], row[1], row[5]] for row in shown.rows[1:]] == [["MC_ROLL_P", "6.25", "4.0"]]
+    assert [row[:3] for row in shown.rows[1:]] == [["MC_ROLL_P", "6.25", "4.0"]]
     assert "1 of 1 default from the metadata" in shown.err
     found = command("show", "1", "--changed", "--json").json["components"][0]["params"]
     assert {name: each["default_source"] for name, each in found.items()} == {"MC_ROLL_P": "metadata"}
     reported = command("info", "MC_ROLL_P")
-    assert "default of the firmware: 4.0 (from the metadata)" in reported.out
+    assert "default: 4.0 (of the metadata)" in reported.out
     (vehicle,) = command("info", "MC_ROLL_P", "--json").json["vehicles"]
     assert (vehicle["param"]["default_source"], vehicle["param"]["is_default"]) == ("metadata", False)
 
@@ -125,8 +125,8 @@ def test_a_comparison_with_the_defaults_takes_those_of_the_metadata(
     words = ("diff", "1", file, "--partial", "--base", "defaults")
     unknown = command(*words)
     assert unknown.code == 2
-    stores = "`paramclient fetch LINK --metadata vehicle` stores that of a vehicle that serves it"
-    assert f"{stores}, as PX4 does; --metadata FILE takes a file" in unknown.err
+    stores = "`paramclient fetch LINK --metadata vehicle` requests metadata from a vehicle that serves it"
+    assert stores in unknown.err
     for others in (("show", "1", "--changed"), ("show", file, "--changed")):
         assert stores in command(*others).err
     assert stores in command("save", "1", tmp_path / "none.parm", "--changed").err

@@ -155,7 +155,7 @@ def test_snapshots_are_listed_with_their_numbers(command: Command) -> None:
         },
     ]  # fmt: skip
     assert command("history", "1", "--snapshots").words == [
-        ["id", "time", "component", "params", "hash", "reason"],
+        ["id", "time", "component", "params", "reason"],
         ["1", first, "1", "2", "before", "apply", "\\x1b[31m.parm"],
         ["2", second, "154", "1", "by", "hand", "(not", "complete)"],
     ]

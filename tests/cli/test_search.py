@@ -47,11 +47,7 @@ def test_search_limits_and_reports_nothing(command: Command) -> None:
     nothing = command("search", "xyzzy")
     assert (nothing.code, nothing.out) == (1, "")
     assert nothing.err.startswith("paramclient: nothing found; ")
-    assert (
-        "of 2/1, only names were searched: no metadata is stored for the firmware of ardupilot. "
-        "For 2/1 download https://autotest.ardupilot.org/Parameters/ArduCopter/apm.pdef.xml, then run "
-        "`paramclient metadata add apm.pdef.xml`.\n" in nothing.err
-    )
+    assert "only names of 2/1 ardupilot were searched: `paramclient fetch LINK --metadata " in nothing.err
     of_described = command("search", "xyzzy", "--vehicle", 1)
     assert of_described.err == "paramclient: nothing found; 903 parameters searched\n"
     assert command("search", "xyzzy", "--json").json == {"results": []}
@@ -76,9 +72,7 @@ def test_a_camera_needs_no_metadata(command: Command) -> None:
     found = command("search", "roll")
     assert (found.code, found.err) == (0, "")
     assert command("fetch", "sim:ardupilot").code == 0
-    assert command("search", "roll").err.startswith(
-        "of 1/1, only names were searched: no metadata is stored for the firmware of ardupilot. "
-    )
+    assert command("search", "roll").err.startswith("only names of 1/1 ardupilot were searched: ")
 
 
 @pytest.mark.usefixtures("tables")
@@ -110,4 +104,4 @@ def test_info_of_an_unknown_name_suggests_others(command: Command) -> None:
     assert command("info", "RTL_ALT", "--vehicle", 1).code == 2
     undescribed = command("info", "RTL_ALT")
     assert "2/1 ardupilot" in undescribed.out
-    assert "no metadata is stored for the firmware of ardupilot" in undescribed.err
+    assert "no metadata of 2/1 ardupilot is known: " in undescribed.err
