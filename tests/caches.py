@@ -24,7 +24,7 @@ from paramclient.cache import (
     TableState,
     TableUpdate,
 )
-from paramclient.cache.sqlite import APPLICATION_ID
+from paramclient.cache.database import APPLICATION_ID
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, ParamType, from_bits
 

@@ -2,8 +2,8 @@
 
 - `store`: `ParamCache`, the public class, and the default path of the file.
 - `records`: records that the cache stores and returns.
-- `database`: the tables in one SQL text, and the store; `sqlite`, `postgres`: its two kinds of place.
-- `tables`: reads of tables; `updates`: updates of tables, import by time.
+- `database`: the tables in one SQL text, and the store in a SQLite file; `postgres`: in a shared database.
+- `tables`: reads and updates of tables, import by time.
 - `history`: lines of changes, values at an earlier time.
 - `snapshots`: snapshots, and tables at an earlier time.
 - `lookup`: vehicles by system id, address, kind, hardware id or key.

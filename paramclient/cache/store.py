@@ -13,7 +13,7 @@ from typing import TypeVar
 import platformdirs
 
 from paramclient.cache import history, snapshots, tables
-from paramclient.cache.database import Store, Transaction
+from paramclient.cache.database import SqliteStore, Store, Transaction
 from paramclient.cache.lookup import find_vehicle
 from paramclient.cache.records import (
     CachedComponent,
@@ -24,8 +24,7 @@ from paramclient.cache.records import (
     StoredTable,
     TableUpdate,
 )
-from paramclient.cache.sqlite import SqliteStore
-from paramclient.cache.updates import ensure_table, import_tables, save_table
+from paramclient.cache.tables import ensure_table, import_tables, save_table
 from paramclient.errors import NotInCache, UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet

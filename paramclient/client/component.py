@@ -466,7 +466,7 @@ class Component:
     def _fetched(self, result: FetchResult, generation: int) -> FetchResult:
         self._last = result
         logger.debug("%s: %r", self.core.link.name, result)
-        if not result.params and self.policy is not Policy.AUTO:
+        if self.policy is not Policy.AUTO and not result.params:
             raise CacheError(f"nothing is cached of {self.node.channel}, and nothing may be downloaded")
         if result.source == "cache" and result.hash is None:
             self.watch.unconfirmed()

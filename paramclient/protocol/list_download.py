@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -113,6 +114,7 @@ class _Download:
         self._received: set[int] = set()  # indices of this list
         self._count: int | None = None
         self._began = self._last = 0.0
+        self._begins_at = -math.inf  # at the latest, of a list that was requested repeatedly
         self._reached = -1  # the highest index
         self._listed = 0  # values of this pass that no read had asked for
         self._listed_at = 0.0  # when the last of them arrived
@@ -130,6 +132,7 @@ class _Download:
 
         def request(attempt: int) -> Message:
             self.session.report(0, self.table.count)
+            self._begins_at = anyio.current_time() if attempt else -math.inf
             if attempt < LIST_REQUESTS_ALONE or attempt % 2 == 0:
                 return dialect.request_list(target)
             which = attempt // 2 % 2 ^ 1
@@ -145,6 +148,7 @@ class _Download:
             timeout_min=LIST_TIMEOUT_MIN,
         )
         channel.is_streaming = True
+        self._begins_at += anyio.current_time() - self._began
         if self._reading:
             self._began = anyio.current_time()  # of the list, if there is one
         self._listed_at = self._began
@@ -215,7 +219,7 @@ class _Download:
         """
         async with task_group() as tasks:
             while not self._is_read() and not self.channel.is_silent(self._began):
-                self.channel.is_streaming = not self._is_over()
+                self.channel.is_streaming = not self._is_over() or self._may_begin_again()
                 for index in self._gaps():
                     if len(self._reading) >= self.channel.window_size:
                         break
@@ -291,6 +295,11 @@ class _Download:
         elif 0 in gaps and self._is_given_up(0):
             gaps.add(count)
         return sorted(gaps - self._received)
+
+    def _may_begin_again(self) -> bool:
+        """Return whether the list may run once more, as it was requested again before it began."""
+        seconds = len(self.table.names) / self._rate() if self._is_served else 0.0
+        return anyio.current_time() < self._begins_at + seconds
 
     def _is_over(self) -> bool:
         """Return whether the list has ended: by its last index, or by a pause."""

@@ -132,8 +132,8 @@ class Table:
 
     # messages
 
-    def store(self, message: ReportedValue, now: float, *, is_exact: bool = False) -> Change | None:
-        """Store one received value, whatever its index is, and return the change, if there is one.
+    def store(self, message: ReportedValue, now: float, *, is_exact: bool = False) -> None:
+        """Store one received value, whatever its index is.
 
         Args:
             message: the value.
@@ -143,12 +143,12 @@ class Table:
         """
         name, raw, number, count, index = message
         if name == HASH_CHECK:
-            return None
+            return
         place = self._take_count(name, count, index)
         if not self._may_store(name):
             if place is not None:
                 self.names[place] = name
-            return None
+            return
         old = self.params.get(name)
         if place is None and old is not None:
             place = old.index
@@ -158,7 +158,7 @@ class Table:
         self._take_evidence(name, raw, number)
         if old is None:
             if len(self.params) >= NAMES_MAX:
-                return None
+                return
             new = self.dialect.param(name, raw, number, place, self._encoding)
         elif not is_exact and self._is_reported(old, raw, number):
             new = self._placed(old, place)
@@ -168,7 +168,7 @@ class Table:
                 new = replace(new, default=old.default)
         if self._held is not None:
             self._wire[name] = (raw, number)
-        return self._put(name, old, new)
+        self._put(name, old, new)
 
     def _take_count(self, name: str, count: int, index: int) -> int | None:
         """Take the count of a value, unless it is false. Return the index; None for a value without one."""
@@ -218,9 +218,7 @@ class Table:
         )
         return f"each integer looks like {looks}; {name} = {read} is {meant} with --encoding {against}"
 
-    def store_entry(
-        self, entry: PackedParam, index: int, now: float, *, with_defaults: bool
-    ) -> Change | None:
+    def store_entry(self, entry: PackedParam, index: int, now: float, *, with_defaults: bool) -> None:
         """Store one entry of a parameter file: its integers are exact, its default may be given.
 
         A value that was received after the file was requested wins, unless it is a rounded form of it.
@@ -234,7 +232,7 @@ class Table:
         name = entry.name
         if not self._may_store(name):
             self.names[index] = name
-            return None
+            return
         old = self.params.get(name)
         self._take_place(name, index)
         default_bits = entry.default if entry.default is not None else entry.bits if with_defaults else None
@@ -246,11 +244,11 @@ class Table:
         is_newer = old is not None and self.moments[name] > now and old.trust is Trust.LIVE
         if old is not None and is_newer and not self._is_reported(old, raw, entry.type):
             self.params[name] = replace(old, index=index, default=default)
-            return None
+            return
         self.moments[name] = now
         if self._held is not None:
             self._wire[name] = (raw, entry.type)
-        return self._put(name, old, new)
+        self._put(name, old, new)
 
     def _take_place(self, name: str, index: int) -> None:
         before = self.names.get(index, name)
@@ -266,10 +264,10 @@ class Table:
             self.left_out.add(name)
         return False
 
-    def complete(self) -> list[Change]:
-        """Drop the parameters that a complete list no longer has, and return their removals."""
+    def complete(self) -> None:
+        """Drop the parameters that a complete list no longer has."""
         if not self.is_complete:
-            return []
+            return
         self._was_complete = True
         names, outdated = self.names, self._outdated
         gone = [
@@ -278,14 +276,14 @@ class Table:
             if name in outdated or (param.index is not None and names.get(param.index) != name)
         ]
         self._outdated.clear()
-        changes = [Change(name, self.params[name], None, "vehicle", "removed") for name in gone]
-        for change in changes:
-            del self.params[change.name]
-            self.moments.pop(change.name, None)
-            self._wire.pop(change.name, None)
-            self._report(change)
+        for name in gone:
+            self._report(Change(name, self._drop(name), None, "vehicle", "removed"))
         self._hash_is_stale = self._hash is not None
-        return changes
+
+    def _drop(self, name: str) -> Param:
+        self.moments.pop(name, None)
+        self._wire.pop(name, None)
+        return self.params.pop(name)
 
     def recount(self, count: int) -> None:
         """Take a count; another one invalidates all indices."""
@@ -314,19 +312,17 @@ class Table:
             return int.from_bytes(raw, "little") == known.bits
         return as_reported(known.bits, number, self._encoding) == raw
 
-    def _put(self, name: str, old: Param | None, new: Param) -> Change | None:
+    def _put(self, name: str, old: Param | None, new: Param) -> None:
         self.params[name] = new
         if old is not None and old.same_value(new):
-            return None
+            return
         if self._hash is not None:
             self._invalidate_hash(name)
         by = self.author_of(name)
-        if old is None:
-            change = Change(name, None, new, by, "added" if self._was_complete else "first")
+        if old is not None:
+            self._report(Change(name, old, new, by, "changed"))
         else:
-            change = Change(name, old, new, by, "changed")
-        self._report(change)
-        return change
+            self._report(Change(name, None, new, by, "added" if self._was_complete else "first"))
 
     def _report(self, change: Change) -> None:
         if self._held is None:
@@ -396,9 +392,7 @@ class Table:
         if any(param.trust is Trust.VERIFIED for param in self.params.values()):
             return
         for name in [name for name, param in self.params.items() if param.trust is Trust.CACHED]:
-            index = self.params.pop(name).index
-            self.moments.pop(name, None)
-            self._wire.pop(name, None)
+            index = self._drop(name).index
             if index is not None and self.names.get(index) == name:
                 del self.names[index]
         if not self.params:

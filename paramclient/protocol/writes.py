@@ -403,8 +403,8 @@ class _Write:
         if not actual.same_value(param):
             actual = replace(param, index=actual.index, default=actual.default)
         exact = self._is_wanted(param)
-        if exact and actual.type != ParamType.REAL32 and not isinstance(self.value, bytes):
-            exact = actual.settable == self.value
+        if exact and actual.type not in (ParamType.REAL32, ParamType.REAL64):
+            exact = isinstance(self.value, bytes) or actual.settable == self.value
         return SetResult(self.name, "accepted" if exact else "adjusted", self.value, actual, self.attempts)
 
     def _retype(self, answer: Param) -> None:

@@ -175,7 +175,7 @@ async def test_apply(kind: str) -> None:
             result = await apply(component, wanted)
             assert result.error is not None
             assert result.rows.keys() == world.wanted.keys()
-            shown = apply_json(result, component, full=True)
+            shown = apply_json(result, component)
             rows = {name: row["actual"] for name, row in shown["params"].items()}
             assert rows == {name: row.actual for name, row in result.rows.items()}
             accepted = {name: value for name, value in rows.items() if value == world.wanted[name]}

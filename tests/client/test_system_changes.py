@@ -55,7 +55,7 @@ def test_only_the_keeping_of_things_knows_the_time_of_day() -> None:
     asking = {module for module, path in MODULES.items() if CLOCKS.search(path.read_text(encoding="utf-8"))}
     library = {module for module in asking if module.split(".")[1:2] not in (["cli"], ["service"])}
     keeping = {
-        *("client.cache_writer", "client.recording", "cache.store", "cache.sqlite"),
+        *("client.cache_writer", "client.recording", "cache.store", "cache.database"),
         *("provision.apply_restore", "provision.sources"),
     }
     signing = {"client.signing"}  # whose timestamps are times of day by definition

@@ -13,7 +13,7 @@ import anyio
 import pytest
 
 from paramclient import CacheError, Component, ParamCache, ParamClient
-from paramclient.cache import sqlite
+from paramclient.cache import database
 from paramclient.client.cache_writer import FLUSH_INTERVAL, PENDING_MAX, RETRY_INTERVAL
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.provision import apply
@@ -27,7 +27,7 @@ NAME = "PARAM_01"
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sqlite, "LOCK_WAIT_MAX", 0.05)
+    monkeypatch.setattr(database, "LOCK_WAIT_MAX", 0.05)
 
 
 @pytest.fixture

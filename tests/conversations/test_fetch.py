@@ -66,15 +66,19 @@ def test_every_value_arrives_on_a_lossy_link(kind: str, loss: float, backend: st
     run(main, backend=backend)
 
 
-@pytest.mark.parametrize("kind", ["px4", "ardupilot"])
-def test_every_value_arrives_over_a_satellite(kind: str) -> None:
+@pytest.mark.parametrize("loss", [0.0, 0.1])
+@pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
+def test_every_value_arrives_over_a_satellite(kind: str, loss: float) -> None:
     async def main() -> None:
-        vehicle = new_vehicle(kind)
-        async with converse(Air.symmetric([vehicle], delay=1.25, seed=1)) as conversation:
-            node = await conversation.node()
-            result = await fetch_all(node.plain)
-            assert not result.missing
-            assert result.elapsed < 60
+        for seed in range(4 if loss else 1):
+            vehicle = new_vehicle(kind)
+            air = Air.symmetric([vehicle], delay=1.2, jitter=0.05, loss=loss, seed=seed)
+            async with converse(air) as conversation:
+                node = await conversation.node()
+                result = await fetch_all(node.plain)
+                assert not result.missing
+                assert result.elapsed < 60
+                assert node.channel.timing.round_trip >= 2.4
 
     run(main)
 
