@@ -1,4 +1,4 @@
-"""The subcommands cache (list, path, remove) and history, which need no link."""
+"""The subcommands cache (list, remove) and history, which need no link."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from paramclient.cache import CachedComponent, CachedSummary, HistoryEntry, ParamCache, SnapshotSummary
+from paramclient.cache import CachedComponent, CachedSummary, ParamCache, SnapshotSummary
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_output import history_json, snapshot_json
-from paramclient.cli.options import CacheOptions, Positive
+from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import local_time, print_json, print_line, say, show
-from paramclient.cli.param_names import cached_names, check_given, unmatched_text
+from paramclient.cli.param_names import check_given
 from paramclient.cli.time_arguments import parse_time
 from paramclient.errors import UsageError
 from paramclient.model.identity import autopilot_name
@@ -23,7 +23,6 @@ from paramclient.provision.sources import component_of, tables_in
 
 __all__ = [
     "cache_list",
-    "cache_path",
     "cache_remove",
     "extended_sizes",
     "history",
@@ -39,17 +38,6 @@ def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     with ParamCache(options.cache) as cache:
         summaries, sizes = cache.components(), extended_sizes(cache)
     show_summaries(cache, summaries, sizes, json=options.json)
-    return ExitCode.DONE
-
-
-def cache_path(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
-    """Print the path or the URL of the cache."""
-    with ParamCache(options.cache) as cache:
-        path = cache.place
-    if options.json:
-        print_json({"path": path})
-    else:
-        print_line(path)
     return ExitCode.DONE
 
 
@@ -78,28 +66,19 @@ def show_summaries(
     json: bool = False,
 ) -> None:
     """Print a line for each table, with the number of extended parameters if any table has some."""
-    more = ["extended"] if sizes else []
-    components = [_summary_json(each, sizes.get((each.key, each.component))) for each in summaries]
-    rows = (
-        (
-            f"{each.system}/{each.component}",
-            autopilot_name(each.autopilot),
-            each.size,
-            *(sizes.get((each.key, each.component)) for _ in more),
-            hash_text(each.hash),
-            None if each.synced_at is None else local_time(each.synced_at),
-            each.key,
-        )
-        for each in summaries
-    )
-    show(
-        {"path": cache.place, "components": components},
-        ["component", "autopilot", "params", *more, "hash", "synced", "key"],
-        rows,
-        json=json,
-        right="params extended",
-        empty=f"the cache {cache.place} is empty",
-    )
+    rows, components = [], []
+    for each in summaries:
+        extended = sizes.get((each.key, each.component))
+        components.append(_summary_json(each, extended))
+        synced = None if each.synced_at is None else local_time(each.synced_at)
+        row = [f"{each.system}/{each.component}", autopilot_name(each.autopilot), each.size]
+        rows.append([*row, *[extended] * bool(sizes), hash_text(each.hash), synced, each.key])
+    more = ["extended"] * bool(sizes)
+    columns = ["component", "autopilot", "params", *more, "hash", "synced", "key"]
+    found = {"path": cache.place, "components": components}
+    show(found, columns, rows, json=json, right="params extended", empty="no table is in the cache")
+    if not json:
+        say(f"the cache is {cache.place}")
 
 
 def _summary_json(summary: CachedSummary, extended: int | None) -> dict[str, object]:
@@ -141,7 +120,6 @@ def history(
     /,
     *names: str,
     since: str | None = None,
-    limit: Positive = None,
     snapshots: bool = False,
     extended: bool = False,
     options: CacheOptions = _DEFAULTS,
@@ -156,25 +134,24 @@ def history(
         names: Print only these parameters: names in upper or lower case, or patterns such as "MC_*".
         since: Print only changes from this time on: 2h ago, yesterday, '2026-11-20 14:00'. A time without a
             time zone is in the time zone of this computer, like the printed times.
-        limit: Print at most this number of changes, the newest ones.
         snapshots: Print the snapshots instead of the changes.
         extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
     begin = None if since is None else parse_time(since, time.time())
     if begin is not None and not options.json:
         say(f"since {local_time(begin)}")
-    chosen = check_given(names)
-    if snapshots and chosen:
+    if snapshots and names:
         raise UsageError("--snapshots lists whole tables and takes no parameter name")
     with ParamCache(options.cache) as cache:
-        key, component = tables_in(cache, vehicle, extended=extended)[0].key, component_of(vehicle)
+        tables = tables_in(cache, vehicle, extended=extended)
+        key, component = tables[0].key, component_of(vehicle)
         if snapshots:
             kept = cache.snapshots(key, component, extended=extended)
             kept = [each for each in kept if begin is None or each.at >= begin]
-            kept = kept[-limit:] if limit else kept
         else:
-            entries = _entries(cache, key, component, chosen, begin, extended=extended)
-            entries = entries[-limit:] if limit else entries
+            entries = cache.history(key, component, extended=extended)
+            known = {each.name for each in entries}
+            known.update(*(each.params for each in load_tables(cache, tables, extended=extended)))
     if snapshots:
         show(
             {"snapshots": [snapshot_json(each) for each in kept]},
@@ -184,45 +161,18 @@ def history(
             right="id params",
             empty="no snapshots: apply and restore store one before they write",
         )
-    else:
-        show(
-            {"history": [history_json(each) for each in entries]},
-            ["time", "component", "name", "old", "new", "by"],
-            map(_entry_cells, entries),
-            json=options.json,
-        )
+        return ExitCode.DONE
+    chosen = NameChoice(check_given(names)).choose(known, f" of {key} in the cache")
+    entries = [
+        each for each in entries if (each.name in chosen or not names) and (begin is None or each.at >= begin)
+    ]
+    rows = (
+        (local_time(each.at), each.component, each.name, _value(each.old), _value(each.new), each.by)
+        for each in entries
+    )
+    columns = ["time", "component", "name", "old", "new", "by"]
+    show({"history": [history_json(each) for each in entries]}, columns, rows, json=options.json)
     return ExitCode.DONE
-
-
-def _entries(
-    cache: ParamCache,
-    key: str,
-    component: int | None,
-    chosen: Sequence[str],
-    begin: float | None,
-    *,
-    extended: bool,
-) -> list[HistoryEntry]:
-    """Return the changes of the parameters that names and patterns choose; of all parameters without any.
-
-    Raises:
-        UsageError: the vehicle has and had no such parameter.
-    """
-    if not chosen:
-        return cache.history(key, component, None, None, begin, extended=extended)
-    entries = cache.history(key, component, extended=extended)
-    known = {entry.name for entry in entries}
-    summaries = [each for each in cache.components(key) if component in (None, each.component)]
-    known.update(name for each in load_tables(cache, summaries, extended=extended) for name in each.params)
-    names, unmatched = NameChoice(chosen).divide(known)
-    if unmatched:
-        text = unmatched_text(unmatched, known, lambda: cached_names(cache))
-        raise UsageError(f"no parameter of {key} in the cache is called {text}")
-    return [entry for entry in entries if entry.name in names and (begin is None or entry.at >= begin)]
-
-
-def _entry_cells(each: HistoryEntry) -> Sequence[object]:
-    return local_time(each.at), each.component, each.name, _value(each.old), _value(each.new), each.by
 
 
 def _snapshot_cells(each: SnapshotSummary) -> Sequence[object]:

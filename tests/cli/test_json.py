@@ -226,7 +226,6 @@ CASES: Final = {
         (
             FETCH,
             "cache list --json",
-            "cache path --json",
             "cache remove 1 --json",
         ),
     ),
