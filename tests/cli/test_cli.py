@@ -841,7 +841,7 @@ def test_sim_ends_cleanly() -> None:
 
 
 def test_a_closed_pipe_ends_the_command_silently(warm: Path) -> None:
-    for arguments in (["fetch", "sim:px4"], ["fetch", "sim:px4", "--json"], ["show"], ["cache", "path"]):
+    for arguments in (["fetch", "sim:px4"], ["fetch", "sim:px4", "--json"], ["show"], ["cache", "list"]):
         reading, writing = os.pipe()
         os.close(reading)
         try:
