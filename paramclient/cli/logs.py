@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Final
-
-import anyio
-import anyio.to_thread
 
 from paramclient.cache import ParamCache
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import print_json, print_table, report
 from paramclient.errors import FileError, LinkError, ParamClientError
-from paramclient.files import read_file
+from paramclient.files.other_files import kind_of
 from paramclient.logs.logged_params import ImportedTable
 from paramclient.logs.onboard import import_onboard_log, is_onboard_log
 from paramclient.logs.telemetry import import_log
@@ -25,8 +23,6 @@ __all__ = ["import_"]
 
 KIND_BYTES: Final = 4096
 """Bytes at the beginning of a file that identify its format."""
-SQLITE_MAGIC: Final = b"SQLite format 3\0"
-"""The first bytes of an SQLite database (its file format, section 1.3)."""
 
 _DEFAULTS: Final = CacheOptions()
 
@@ -41,8 +37,7 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS
         file: A telemetry log (.tlog), or an on-board log of ArduPilot (.bin) or PX4 (.ulg).
         files: Further logs.
     """
-    found: list[tuple[Path, ImportedTable]] = []
-    code = ExitCode.DONE
+    code, found = ExitCode.DONE, []
     with ParamCache(options.cache) as cache:
         for each in (file, *files):
             try:
@@ -51,17 +46,28 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS
                 report(str(error))
                 code = max(code, code_of(error))
                 continue
-            found += ((each, table) for table in tables)
             for table in tables:
+                autopilot = None if table.autopilot is None else autopilot_name(table.autopilot)
+                more = {"autopilot": autopilot, "hash": hash_text(table.hash)}
+                found.append({"file": str(each)} | asdict(table) | more)
                 for note in table.notes:
                     report(f"{each.name}, {table.system}/{table.component}: {note}")
             if not tables:
                 report(f"{each} has no parameters")
     if options.json:
-        print_json({"tables": [_table_json(log, table) for log, table in found]})
+        print_json({"tables": found})
     elif found:
         columns = ["file", "component", "autopilot", "params", "complete", "hash", "key"]
-        print_table(columns, (_cells(*each) for each in found), right="params")
+        rows = (
+            {
+                **each,
+                "file": Path(each["file"]).name,
+                "component": f"{each['system']}/{each['component']}",
+                "complete": "yes" if each["complete"] else "no",
+            }
+            for each in found
+        )
+        print_table(columns, ([row[name] for name in columns] for row in rows), right="params")
     return code
 
 
@@ -77,56 +83,7 @@ async def _import(path: Path, cache: ParamCache) -> tuple[ImportedTable, ...]:
     try:
         return await import_log(path, cache)
     except LinkError as error:
-        kind = await anyio.to_thread.run_sync(_kind_of, path)
-        if kind is None:
-            raise FileError(str(error).partition(": ")[2]) from error
-        raise FileError(f"not imported: {kind}", source=str(path)) from error
-
-
-def _kind_of(path: Path) -> str | None:
-    """Return the kind of a file that is no log, in words; None if it cannot be read."""
-    try:
-        if not path.is_file():
-            return None
-        with path.open("rb") as file:
-            begin = file.read(KIND_BYTES)
-    except OSError:
-        return None
-    if not begin:
-        return "the file is empty"
-    if begin.startswith(SQLITE_MAGIC):
-        return "an SQLite database, and no log"
-    with suppress(ParamClientError):
-        file_format = read_file(path).file_format
-        return f"a parameter file ({file_format}), and no log"
-    with suppress(UnicodeDecodeError):
-        begin.decode()
-        return "a text file, and no log"
-    return "neither a telemetry log (.tlog) nor an on-board log (.bin, .ulg): it has no MAVLink frame"
-
-
-def _table_json(file: Path, table: ImportedTable) -> dict[str, object]:
-    return {
-        "file": str(file),
-        "key": table.key,
-        "system": table.system,
-        "component": table.component,
-        "autopilot": _autopilot(table),
-        "params": table.params,
-        "complete": table.complete,
-        "hash": hash_text(table.hash),
-        "notes": list(table.notes),
-    }
-
-
-def _cells(file: Path, table: ImportedTable) -> tuple[object, ...]:
-    address = f"{table.system}/{table.component}"
-    complete = "yes" if table.complete else "no"
-    return (
-        *(file.name, address, _autopilot(table), table.params),
-        *(complete, hash_text(table.hash), table.key),
-    )
-
-
-def _autopilot(table: ImportedTable) -> str | None:
-    return None if table.autopilot is None else autopilot_name(table.autopilot)
+        with suppress(OSError), path.open("rb") as file:
+            kind = kind_of(file.read(KIND_BYTES)) or "neither a telemetry log (.tlog) nor one of .bin or .ulg"
+            raise FileError(f"not imported: {kind}", source=str(path)) from error
+        raise FileError(str(error).partition(": ")[2]) from error

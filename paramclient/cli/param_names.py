@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Iterable
 from typing import Final
 
 import anyio.to_thread
@@ -17,14 +16,11 @@ from paramclient.model.names import NameChoice, did_you_mean, is_group_switch, i
 from paramclient.model.values import check_name
 
 __all__ = [
-    "cached_names",
     "check_given",
     "choose_names",
-    "learn_spelling",
     "may_appear",
     "spelling",
     "suggest",
-    "unmatched_text",
 ]
 
 CACHED_TABLES_MAX: Final = 20
@@ -54,20 +50,6 @@ def choose_names(component: Component, given: Iterable[str]) -> tuple[list[str],
             what = f"{system}/{number} has no parameter that matches {text}"
             errors[text] = UnknownParameter(what, system, number, name=text)
     return list(names), errors
-
-
-async def learn_spelling(component: Component, given: Iterable[str]) -> None:
-    """Read names in lower case of which it is not known how the vehicle spells them."""
-    known = {each.upper() for each in component.params}
-    for name in given:
-        upper = name.upper()
-        if name == upper or upper in known or is_pattern(name) or component.autopilot not in _CAPITALS:
-            continue
-        with suppress(ParamClientError):
-            try:
-                await component.get(upper)
-            except UnknownParameter:
-                await component.get(name)
 
 
 def check_given(given: Iterable[str]) -> list[str]:
@@ -107,7 +89,7 @@ async def suggest(
     }
     if cache is None or not lacking:
         return errors
-    known = await anyio.to_thread.run_sync(cached_names, cache, session.component.autopilot)
+    known = await anyio.to_thread.run_sync(_cached_names, cache, session.component.autopilot)
     better: dict[str, ParamClientError] = {}
     for name, error in lacking.items():
         if nearest := nearest_names(name, known):
@@ -117,7 +99,7 @@ async def suggest(
     return errors | better
 
 
-def cached_names(cache: ParamCache, autopilot: str | None = None) -> frozenset[str]:
+def _cached_names(cache: ParamCache, autopilot: str | None = None) -> frozenset[str]:
     """Return the names of the parameters in the cache; none if the cache cannot be read.
 
     Args:
@@ -137,25 +119,6 @@ def cached_names(cache: ParamCache, autopilot: str | None = None) -> frozenset[s
     except CacheError:
         return frozenset()
     return frozenset(names)
-
-
-def unmatched_text(
-    unmatched: Sequence[str], known: Collection[str], others: Callable[[], Collection[str]]
-) -> str:
-    """Return names and patterns without a match in words, each with the most similar names.
-
-    Args:
-        unmatched: the names and patterns.
-        known: the names of the vehicle.
-        others: returns further names, for a name without a similar one among `known`.
-    """
-    texts = []
-    for text in unmatched:
-        nearest: Sequence[str] = ()
-        if not is_pattern(text):
-            nearest = nearest_names(text, known) or nearest_names(text, others())
-        texts.append(f"{text} (did you mean {', '.join(nearest)}?)" if nearest else text)
-    return ", ".join(texts)
 
 
 def spelling(name: str, component: Component) -> str:

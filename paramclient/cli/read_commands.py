@@ -23,7 +23,7 @@ from paramclient.cli.metadata import (
 )
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Status, by_index, milliseconds, report, say
-from paramclient.cli.param_names import check_given, choose_names, learn_spelling, suggest
+from paramclient.cli.param_names import check_given, choose_names, suggest
 from paramclient.cli.session import CommandSession, sessions
 from paramclient.errors import ParamClientError
 from paramclient.metadata import Metadata
@@ -242,7 +242,6 @@ async def get_chosen(
     component = session.component
     if not is_fetched and (is_fetched := any(map(is_pattern, name_patterns))):
         await session.fetch()
-    await learn_spelling(component, name_patterns)
     names, unmatched = choose_names(component, name_patterns)
     known = component.params if is_fetched else {}
     found = {name: known[name] for name in names if name in known and known[name].trust is not Trust.CACHED}

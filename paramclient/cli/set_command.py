@@ -13,7 +13,7 @@ from cyclopts.validators import Number
 from paramclient.cli.metadata import MetadataChoice, from_file, info_of, known_of_session
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import can_ask, confirm, report
-from paramclient.cli.param_names import learn_spelling, spelling
+from paramclient.cli.param_names import spelling
 from paramclient.cli.read_commands import get_chosen
 from paramclient.cli.session import CommandSession, sessions
 from paramclient.cli.writes import WriteJob, write_all
@@ -109,7 +109,6 @@ async def _prepare(
         UsageError: a text is no value of its parameter.
     """
     component = session.component
-    await learn_spelling(component, wanted)
     texts = {spelling(name, component): text for name, text in wanted.items()}
     if described is None:
         named = [f"{name}: {text!r} is not a number" for name, text in texts.items() if not _is_number(text)]

@@ -116,11 +116,10 @@ def test_help_whose_reader_closes_it_is_no_error(words: list[str]) -> None:
 @pytest.mark.parametrize(
     ("content", "kind"),
     [
-        (b"", "the file is empty"),
-        (b"dear diary\n", "a text file, and no log"),
-        (b"MC_ROLL_P,4.5\nMC_YAW_P,2\n", "a parameter file (mission-planner), and no log"),
-        (b"SQLite format 3\0" + bytes(100), "an SQLite database, and no log"),
-        (bytes(range(256)), "neither a telemetry log (.tlog) nor an on-board log (.bin, .ulg)"),
+        (b"", "neither a telemetry log"),
+        (b"MC_ROLL_P,4.5\nMC_YAW_P,2\n", "neither a telemetry log"),
+        (b"SQLite format 3\0" + bytes(100), "an SQLite database"),
+        (bytes(range(256)), "neither a telemetry log"),
         (None, "No such file or directory"),
     ],
 )
