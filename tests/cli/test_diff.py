@@ -6,7 +6,7 @@ import io
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import pytest
 
@@ -27,6 +27,7 @@ FIRST = replace(PX4, system=1, uid="aa00000000000001")
 SECOND = replace(PX4, system=2, uid="bb00000000000002")
 THIRD = replace(PX4, system=3, uid="cc00000000000003")
 
+Write: TypeAlias = Callable[..., str]
 Content = dict[str, tuple[WireValue, int] | tuple[WireValue, int, WireValue]]
 
 
@@ -204,7 +205,7 @@ def test_the_autopilot_is_the_default_component(command: Command, cache: Path) -
 
 
 @pytest.fixture
-def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
+def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Write:
     """Write a file of these lines to the working directory."""
     monkeypatch.chdir(tmp_path)
 
@@ -216,7 +217,7 @@ def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]
 
 
 @pytest.mark.usefixtures("two")
-def test_an_existing_file_has_precedence(command: Command, write: Callable[..., str], tmp_path: Path) -> None:
+def test_an_existing_file_has_precedence(command: Command, write: Write, tmp_path: Path) -> None:
     for name in ("1", "aa0000", "tcp:one:1"):
         write(name, "A 1")
         outcome = command("diff", name, "cache:1", "--json")
@@ -225,14 +226,14 @@ def test_an_existing_file_has_precedence(command: Command, write: Callable[..., 
     assert command("diff", "2", "2").code == 0
 
 
-def test_a_damaged_file_is_exit_code_2(command: Command, write: Callable[..., str]) -> None:
+def test_a_damaged_file_is_exit_code_2(command: Command, write: Write) -> None:
     write("\x1bquad.param", "A,1", "B,one")
     outcome = command("diff", "\x1bquad.param", "\x1bquad.param")
     assert (outcome.code, outcome.out) == (2, "")
     assert outcome.err.startswith("paramclient: \\x1bquad.param:2: ")
 
 
-def test_a_name_that_no_vehicle_has_is_left_out(command: Command, write: Callable[..., str]) -> None:
+def test_a_name_that_no_vehicle_has_is_left_out(command: Command, write: Write) -> None:
     left, right = write("left.param", "A,1", "SIM_GPS1_BYTELOSS,0"), write("right.param", "A,1")
     for words in (["diff", left, right], ["show", left]):
         outcome = command(*words)
@@ -243,7 +244,7 @@ def test_a_name_that_no_vehicle_has_is_left_out(command: Command, write: Callabl
 
 
 def test_a_file_is_read_from_the_standard_input(
-    command: Command, write: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+    command: Command, write: Write, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write("quad.param", "A,1", "B,2")
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(b"A 1\nB 3\n")))
@@ -252,7 +253,7 @@ def test_a_file_is_read_from_the_standard_input(
     assert outcome.json["right"]["source"] == "standard input"
 
 
-def test_show_prints_a_file(command: Command, write: Callable[..., str]) -> None:
+def test_show_prints_a_file(command: Command, write: Write) -> None:
     path = write("both.params", "1\t1\tA\t1\t6", "1\t100\tB\t0.1\t9")
     shown = command("show", path)
     assert (shown.code, shown.rows[:2]) == (0, [["name", "value", "type"], ["A", "1", "INT32"]])

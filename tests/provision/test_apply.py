@@ -523,27 +523,14 @@ async def test_a_reboot_follows_values_that_take_effect_after_it() -> None:
         assert awaiting_reboot.rows["EK2_ALT_M_NSE"].category == MISSING
         made = await plan(component, wanted)
         assert made.awaiting_reboot == ("EK2_ENABLE",)
+        tap.received.clear()
         reported: list[str] = []
         result = await apply(component, wanted, reboot=True, progress=lambda how: reported.append(how.phase))
     assert result.complete
     assert (result.reboots, result.reboot_required) == (1, ())
+    assert sets(tap) == ["EK2_ALT_M_NSE"], "revealed by the reboot"
     assert list(dict.fromkeys(reported)) == ["reading", "rebooting", "writing"]
     assert vehicle.param("EK2_ALT_M_NSE").value == 1.5
-
-
-@in_simulated_time
-async def test_a_group_revealed_by_a_reboot_is_set_after_it() -> None:
-    vehicle = ardupilot(reboot_groups=["EK2_ENABLE"], make=HidingGroup)
-    tap = Tap(vehicle)
-    async with a_client(tap) as client:
-        result = await apply(
-            await client.component(),
-            written(another("TUNE_01") | {"EK2_ALT_M_NSE": 1.5, "EK2_ENABLE": 1}),
-            reboot=True,
-        )
-    assert result.complete
-    assert result.reboots == 1
-    assert sets(tap) == ["EK2_ENABLE", "TUNE_01", "EK2_ALT_M_NSE"]
 
 
 @EVERY_KIND
@@ -570,52 +557,30 @@ async def test_a_changed_system_id_is_followed(make: Callable[..., Any]) -> None
     assert (undone.system, vehicle.system) == (1, 1)
 
 
+@pytest.mark.parametrize(
+    ("options", "wanted", "status", "reboots", "system"),
+    [
+        ({"kind": "plane"}, [7], "accepted", False, 7),  # as a rover, within a second
+        ({}, [7], "accepted", True, 1),
+        ({}, [7, 1], "accepted", None, 1),  # set back before it has taken effect
+        ({"read_only": ["SYSID_THISMAV"], "param_error": True}, [7], "refused", True, 1),
+    ],
+)
 @in_simulated_time
-async def test_plane_and_rover_take_their_system_id_without_a_reboot() -> None:
-    vehicle = ardupilot(kind="plane")
-    async with a_client(vehicle) as client:
-        result = await apply(
-            await client.component(), written({"SYSID_THISMAV": 7}), include="identity", reboot=True
-        )
-    assert result.complete
-    assert (result.reboots, result.reboot_required, result.plan.reboot_for) == (0, (), ())
-    assert (result.system, vehicle.system) == (7, 7)
-
-
-@in_simulated_time
-async def test_copter_keeps_its_system_id_until_it_reboots() -> None:
-    """The list says so, and the heartbeats show it: another firmware may change the id immediately."""
-    vehicle = ardupilot()
+async def test_a_system_id_takes_effect_at_once_or_after_a_reboot(
+    options: dict[str, Any], wanted: list[int], status: str, reboots: bool | None, system: int
+) -> None:
+    vehicle = ardupilot(**options)
     async with a_client(vehicle) as client:
         component = await client.component()
-        result = await apply(component, written({"SYSID_THISMAV": 7}), include="identity")
-        assert (result.system, vehicle.system) == (1, 1)
-        assert result.plan.reboot_for == result.reboot_required == ("SYSID_THISMAV",)
-        assert statuses(result) == {"SYSID_THISMAV": "accepted"}
-        started = await apply(component, written({"SYSID_THISMAV": 7}), include="identity", reboot=True)
-    assert (started.reboots, started.system, vehicle.system) == (1, 7, 7)
-
-
-@EVERY_KIND
-@in_simulated_time
-async def test_a_system_id_that_waits_for_a_reboot_can_be_set_back(make: Callable[..., Any]) -> None:
-    vehicle = make()
-    name = "SYSID_THISMAV" if make is ardupilot else "MAV_SYS_ID"
-    async with a_client(vehicle) as client:
-        component = await client.component()
-        for system in (7, 1):
-            result = await apply(component, {name: system}, include="identity")
-            assert statuses(result) == {name: "accepted"}
-    assert (vehicle.system, vehicle.param(name).value) == (1, 1)
-
-
-@in_simulated_time
-async def test_a_refused_system_id_is_reported_with_its_reason() -> None:
-    vehicle = ardupilot(read_only=["SYSID_THISMAV"], param_error=True)
-    async with a_client(vehicle) as client:
-        result = await apply(await client.component(), {"SYSID_THISMAV": 7}, include="identity")
-    assert statuses(result) == {"SYSID_THISMAV": "refused"}
-    assert "read only" in result.rows["SYSID_THISMAV"].reason
+        for each in wanted:
+            result = await apply(component, {"SYSID_THISMAV": each}, include="identity")
+            assert statuses(result) == {"SYSID_THISMAV": status}
+    assert (result.system, vehicle.system, result.reboots) == (system, system, 0)
+    if status == "refused":
+        assert "read only" in result.rows["SYSID_THISMAV"].reason
+    elif reboots is not None:
+        assert result.plan.reboot_for == result.reboot_required == ("SYSID_THISMAV",) * reboots
 
 
 @in_simulated_time
