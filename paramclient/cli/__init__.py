@@ -1,7 +1,7 @@
 """The command line: parses arguments, calls the client, and prints tables or JSON.
 
 - `app`: all subcommands, the main function, signals and errors.
-- Subcommands: `read_commands` (fetch, get), `set_command`, `reset_command`, `writes` of both, `watch`,
+- Subcommands: `read_commands` (fetch, get), `set_command` with `writes`, `reset_command`, `watch`,
   `show`, `cached` (cache, history), `search` (search, info), `logs` (import), `apply` (apply, restore),
   `save`, `diff`, `metadata`, `link`, `check`, `ports`, `signing`, `serve` (serve, token) and `simulate`
   (sim).

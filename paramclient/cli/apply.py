@@ -46,7 +46,7 @@ from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.planning import Rows
 from paramclient.provision.sources import choose, is_file, read_source
 
-__all__ = ["apply", "restore"]
+__all__ = ["State", "apply", "restore", "run"]
 
 APPLY_NAMES_MAX: Final = 10
 """Parameters that a line names, so that it stays short; it gives the number of further ones."""
@@ -95,10 +95,10 @@ async def apply(
     if source is None:
         (params,) = await resolve_all([file], options, writes=True, extended=options.extended)
 
-    async def load(session: CommandSession) -> _State:
-        return _State(params) if source is None else await source.state_of(session)
+    async def load(session: CommandSession) -> State:
+        return State(params) if source is None else await source.state_of(session)
 
-    return await _run(url, options, load, source, metadata, {"partial": partial})
+    return await run(url, options, load, source, metadata, {"partial": partial})
 
 
 async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags = _OPTIONS) -> int:
@@ -134,19 +134,19 @@ async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags =
                 "backup file"
             )
 
-    async def load(session: CommandSession) -> _State:
+    async def load(session: CommandSession) -> State:
         state = await (source.state_of(session) if source else _earlier_state(session, url, moment))
         say(f"{session.prefix}the state: {described(state.params)}")
         return state
 
-    return await _run(url, options, load, source, None, {})
+    return await run(url, options, load, source, None, {})
 
 
 # The values to write
 
 
 @dataclass(frozen=True, slots=True)
-class _State:
+class State:
     """The values to write to one vehicle.
 
     Attributes:
@@ -176,7 +176,7 @@ class _Files:
             return cls(name, read_source(name))
         return cls(name, None) if is_pattern_name(name) else None
 
-    async def state_of(self, session: CommandSession) -> _State:
+    async def state_of(self, session: CommandSession) -> State:
         """Return the values for a vehicle; as its own, if its hardware id is named and the file has none.
 
         The id is named by --vehicle, or in the name of the file.
@@ -196,10 +196,10 @@ class _Files:
         is_named = session.choice.uid is not None or (own.uid is not None and own.uid in params.source)
         if is_named and own.uid is not None and (origin is None or origin.uid is None):
             params = replace(params, identity=own if origin is None else replace(origin, uid=own.uid))
-        return _State(params)
+        return State(params)
 
 
-async def _earlier_state(session: CommandSession, url: str, moment: float | int | None) -> _State:
+async def _earlier_state(session: CommandSession, url: str, moment: float | int | None) -> State:
     """Return the state at a time, of a snapshot, or without either before the last apply.
 
     Raises:
@@ -220,7 +220,7 @@ async def _earlier_state(session: CommandSession, url: str, moment: float | int 
             message = f"the cache {cache.place} has no earlier state of {key}, component {component}"
             raise NotInCache(message) from None
         is_number = isinstance(moment, int)
-        return _State(state, again="" if is_number else _command(url, local_time(moment), session))
+        return State(state, again="" if is_number else _command(url, local_time(moment), session))
     try:
         point = await anyio.to_thread.run_sync(
             lambda: load_restore_point(cache, key, component, extended=extended)
@@ -244,7 +244,7 @@ async def _earlier_state(session: CommandSession, url: str, moment: float | int 
     changed = f"changed since then: {first_of(changes, APPLY_NAMES_MAX)}"
     known = changed if changes else "nothing is known to have changed since then"
     say(f"{session.prefix}the state is that {words}; {known}")
-    return _State(point.state, words, _command(url, point.snapshot, session))
+    return State(point.state, words, _command(url, point.snapshot, session))
 
 
 def _command(url: str, when: object, session: CommandSession) -> str:
@@ -258,10 +258,10 @@ def _command(url: str, when: object, session: CommandSession) -> str:
 # Plans and writes
 
 
-async def _run(
+async def run(
     url: str,
     flags: ApplyFlags,
-    load: Callable[[CommandSession], Awaitable[_State]],
+    load: Callable[[CommandSession], Awaitable[State]],
     source: _Files | None,
     metadata: str | None,
     more: dict[str, Any],
@@ -361,7 +361,7 @@ class _Job:
     """
 
     session: CommandSession
-    state: _State
+    state: State
     flags: ApplyFlags
     more: dict[str, Any]
     is_restore: bool

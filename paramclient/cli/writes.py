@@ -1,4 +1,4 @@
-"""Writes of set and reset: the values for each vehicle, one outcome for each, and what is printed of them."""
+"""Writes of set: the values for each vehicle, one outcome for each, and what is printed of them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from paramclient.cli.param_names import suggest
 from paramclient.cli.session import CommandSession, Done, Sessions
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
-from paramclient.model.values import Param, ParamType, WireValue, format_value
+from paramclient.model.values import ParamType, WireValue, format_value
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.fetch import Progress
 from paramclient.protocol.set_results import SetOutcome, SetStatus
@@ -45,18 +45,14 @@ class WriteJob:
         session: the vehicle.
         writes: the values by name.
         described: the metadata of the vehicle, or None.
-        before: the parameters before the writes, or empty.
-        more: further members of the JSON object.
         arrived: the outcomes so far, by name.
     """
 
-    columns: ClassVar[Sequence[str]] = ("name", "before", "requested", "actual", "status")
+    columns: ClassVar[Sequence[str]] = ("name", "requested", "actual", "status")
 
     session: CommandSession
     writes: Mapping[str, WireValue]
     described: Metadata | None
-    before: Mapping[str, Param] = field(default_factory=dict)
-    more: JsonObject = field(default_factory=dict)
     arrived: dict[str, SetOutcome] = field(default_factory=dict)
 
     async def write(self, *, settle: float, force: bool) -> None:
@@ -118,19 +114,17 @@ class WriteJob:
             outcome_json(each, self._type_of(each), info_of(self.described, each.name))
             for each in self.outcomes
         ]
-        return {"vehicle": vehicle_json(self.session.component), "results": results, **self.more}
+        return {"vehicle": vehicle_json(self.session.component), "results": results}
 
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the rows; the reported value with its meaning, if that is known."""
         for each in self.outcomes:
             kind, name = self._type_of(each), each.name
-            before = self.before.get(name)
-            requested = kind if self.before or isinstance(each.requested, bytes) else ParamType.REAL64
+            requested = kind if isinstance(each.requested, bytes) else ParamType.REAL64
             actual = None if each.reported is None else format_value(each.reported, kind)
             meaning = None if each.reported is None else meaning_of(self.described, name, each.reported)
             yield (
                 name,
-                None if before is None else format_value(before.settable, before.type),
                 format_value(each.requested, requested),
                 f"{actual} ({meaning})" if meaning else actual,
                 Coloured(each.status, _STYLES[each.status]),
@@ -162,9 +156,7 @@ class WriteJob:
         return ParamType.REAL32 if known is None else known.type
 
 
-async def write_all(
-    found: Sessions, jobs: Sequence[WriteJob], *, settle: float = 0.0, force: bool = False
-) -> int:
+async def write_all(found: Sessions, jobs: Sequence[WriteJob], *, settle: float, force: bool) -> int:
     """Write the values of all vehicles, and print the outcomes, also those so far after an interruption.
 
     Returns:

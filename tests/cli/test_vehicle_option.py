@@ -101,12 +101,14 @@ def test_reset_writes_to_every_vehicle(command: Command, put: Put, tmp_path: Pat
     done = command(*words)
     assert done.code == 0, done.err
     assert [row[:5] for row in done.rows] == [
-        ["vehicle", "name", "before", "requested", "actual"],
+        ["vehicle", "name", "before", "wanted", "now"],
         *([address, "A", "1.0", "2.5", "2.5"] for address in ("1/1", "4/1")),
     ]
     assert [each.values["A"] for each in vehicles] == [2.5, 2.5]
     again = command(*words, "--json").json
-    assert [(each["system"], each["unchanged"]) for each in again["vehicles"]] == [(1, ["A"]), (4, ["A"])]
+    assert [(each["system"], each["counts"]) for each in again["vehicles"]] == [
+        (number, {"unchanged": 1}) for number in (1, 4)
+    ]
 
 
 def test_watch_prints_the_changes_of_every_vehicle(command: Command, put: Put) -> None:
