@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from functools import partial
 
 import pytest
 
 from paramclient.errors import UsageError
+from paramclient.metadata import ParamInfo
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Encoding, Param, ParamType, WireValue, bits_of, from_bits
@@ -15,13 +16,7 @@ from paramclient.provision import CATEGORIES, MISSING, WRONG, ApplyStatus, Plan,
 from paramclient.provision.apply_rules import OUT_OF_RANGE, READ_ONLY
 from paramclient.sim.param_table import SimParam, ardupilot_table, px4_table
 
-
-@dataclass(frozen=True)
-class Info:
-    minimum: float | None = None
-    maximum: float | None = None
-    is_read_only: bool = False
-    reboot_required: bool = False
+Info = partial(ParamInfo, "NAME")
 
 
 def held(**values: WireValue | tuple[ParamType | int, WireValue]) -> dict[str, Param]:
