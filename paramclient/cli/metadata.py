@@ -79,7 +79,9 @@ def from_file(choice: str | None, *, offline: bool = False) -> Metadata | None:
         UsageError: the file has no metadata, or --metadata is `vehicle` in a subcommand without a link.
     """
     if choice == VEHICLE and offline:
-        raise UsageError("--metadata vehicle needs a link; here --metadata takes a file")
+        raise UsageError(
+            "--metadata takes a file here; `paramclient fetch LINK --metadata vehicle` stores that of a vehicle"
+        )
     return None if choice in (None, VEHICLE) else read_metadata(choice)
 
 

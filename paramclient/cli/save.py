@@ -19,7 +19,6 @@ from paramclient.cli.metadata import (
     MetadataChoice,
     defaults_in,
     from_file,
-    known_of_session,
     known_of_sets,
     say_sources,
 )
@@ -72,18 +71,16 @@ async def save(
             those of its metadata.
         only: Write only this name or pattern, such as "MC_*". May be given several times.
         incomplete: Write the parameters that were received where others were not; the file names these.
-        metadata: With --changed, a file with the firmware's defaults; or vehicle, to download the vehicle's
-            own metadata. Default: the stored metadata of the firmware.
+        metadata: With --changed, a file with the firmware's defaults. Default: the stored metadata of the
+            firmware.
         extended: Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them.
     """
     if metadata is not None and not changed:
         raise UsageError("--metadata gives the defaults for --changed")
     written = file_format or format_of_name(str(file))
-    offline, choice = sources.is_offline(where), ChosenVehicle.parse(options.vehicle)
-    given = from_file(metadata, offline=offline)
-    found: list[tuple[ParamSet, Metadata | None]] = []
+    choice, given = ChosenVehicle.parse(options.vehicle), from_file(metadata, offline=True)
     faults: list[str] = []
-    if offline:
+    if sources.is_offline(where):
         with _hint_at_incomplete():
             stored = sources.read_source(
                 where,
@@ -95,36 +92,22 @@ async def save(
             )
         assert stored is not None, "it is no link"
         sets = [*stored.sets] if choice.is_all else [sources.choose(stored, choice.component, choice.system)]
-        known = known_of_sets(sets, options) if changed and given is None else [given] * len(sets)
-        found = [*zip(sets, known, strict=True)]
     else:
         link = sources.source_of(where)
         check_link(link)
 
-        async def fetch(session: CommandSession) -> tuple[ParamSet, Metadata | None]:
+        async def fetch(session: CommandSession) -> ParamSet:
             with _hint_at_incomplete():
-                table = await whole_table(session, partial=incomplete)
-            return table, given or (await known_of_session(session, metadata) if changed else None)
+                return await whole_table(session, partial=incomplete)
 
         async with sessions(link, options, extended=extended) as opened:
             done = await opened.work(fetch)
             opened.report_others()
-        found = [each.result for each in done if each.result is not None]
+        sets = [each.result for each in done if each.result is not None]
         faults = [f"{each.session.address}: {each.error}" for each in done if each.error is not None]
-    sets = [each for each, _ in found]
     if changed:
-        sets = []
-        for whole, info in found:
-            described = defaults_in(info, whole)
-            try:
-                sets.append(differing := sources.select_non_defaults(whole, described))
-            except UsageError as error:
-                hint = f"; {METADATA_HINT}"
-                hint = hint if str(error) == sources.NO_DEFAULTS else ""
-                faults.append(f"{address(whole)}: {error}{hint}")
-                continue
-            defaults = (default_of(each, described.get(each.name)) for each in differing.values())
-            say_sources(address(whole), defaults)
+        known = known_of_sets(sets, options) if given is None else [given] * len(sets)
+        sets = [*filter(None, map(partial(_differing, faults), sets, known))]
     for fault in faults:
         report(fault)
     files: dict[Path, list[ParamSet]] = {}
@@ -143,6 +126,20 @@ async def save(
     else:
         report(f"nothing was written to {file}")
     return ExitCode.INCOMPLETE if faults or not files else ExitCode.DONE
+
+
+def _differing(faults: list[str], whole: ParamSet, metadata: Metadata | None) -> ParamSet | None:
+    """Return the parameters that differ from the defaults; None, and a fault, if none is known to."""
+    described = defaults_in(metadata, whole)
+    try:
+        differing = sources.select_non_defaults(whole, described)
+    except UsageError as error:
+        hint = f"; {METADATA_HINT}" if str(error) == sources.NO_DEFAULTS else ""
+        faults.append(f"{address(whole)}: {error}{hint}")
+        return None
+    defaults = (default_of(each, described.get(each.name)) for each in differing.values())
+    say_sources(address(whole), defaults)
+    return differing
 
 
 @contextmanager

@@ -92,7 +92,9 @@ def test_a_cached_table_is_compared_with_the_remembered_metadata(command: Comman
 
 def test_save_writes_what_differs(command: Command, put: Put, tmp_path: Path) -> None:
     file = tmp_path / "changed.json"
-    done = command("save", put(quad()), file, "--changed", "--metadata", "vehicle")
+    assert command("save", put(quad()), file, "--changed", "--metadata", "vehicle").code == 2
+    assert command("fetch", put(quad()), "--changed", "--metadata", "vehicle").code == 0
+    done = command("save", put(quad()), file, "--changed")
     assert done.code == 0, done.err
     written = read_file(file).choose(None)
     assert list(written) == ["MC_ROLL_P"]
