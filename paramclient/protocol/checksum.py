@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from itertools import accumulate, pairwise
 from typing import Final
 
@@ -75,7 +75,7 @@ PART_TIME: Final = 0.008
 """Seconds of round trip for each of these: on a quick link few parts take the fewest bytes, and on a slow one
 many parts take the fewest round trips."""
 SLOW_ROUND_TRIP: Final = 0.05
-"""Seconds of round trip from which on values that move are compared at once."""
+"""Seconds of round trip from which on more is compared at once."""
 GUESS_BITS: Final = 26
 """Bits of a value, and of the number of rows in which it may be, up to which a guess is hardly chance: in
 each wrong row, any of 2**32 values would explain the difference."""
@@ -170,8 +170,8 @@ class _Proof:
         }
         rare = {at for at, row in enumerate(rows) if RARE.fullmatch(row.name) or may_be_rounded(row)}
         suspects: set[int] = set()
-        early = moving | rare if self._is_slow else moving if len(moving) > 1 else set()
-        await self._request({len(whole)} | self._ends_of(early, whole))
+        early = {1} if self._is_slow else set()  # shows another number of parameters by its header
+        await self._request({len(whole), *early, *(at + 1 for at in sorted(moving)[:-1])})
         while places := self._places():
             if any(len(place) == 1 and rows[place.start].name == BOOT_COUNT for place in places):
                 suspects = {at for at in whole if MEASURED.fullmatch(rows[at].name) and rows[at].bits}
@@ -179,14 +179,18 @@ class _Proof:
             numbers: set[int] = set()
             divided: list[range] = []
             for place, difference in places.items():
-                if ends := self._ends_of(moving, place) or self._ends_of(rare, place):
-                    numbers |= ends
-                elif place.stop == next(iter(self._found)) == len(whole) > len(place):
-                    numbers.add(len(whole))  # it was the first one, and values may have moved since
-                elif len(place) > 1 and (suspected := suspects.intersection(place)):
-                    guesses.update((at, rows[at].bits) for at in suspected)
+                suspected = suspects.intersection(place) if len(place) > 1 else ()
+                guess = self._guess_moved(place, difference)
+                if guess or suspected:
+                    guesses |= guess or {at: rows[at].bits for at in suspected}
                 elif guess := self._guess(place, difference):
                     guesses |= guess
+                elif ends := self._ends_of(moving, place) or self._ends_of(rare, place):
+                    numbers |= ends
+                    if self._is_slow:
+                        numbers |= self._ends_of(rare, place) | self._divide(place)
+                elif place.stop == next(iter(self._found)) == len(whole) > len(place):
+                    numbers.add(len(whole))  # it was the first one, and values may have moved since
                 elif len(place) > 1:
                     numbers |= self._divide(place)
                     divided.append(place)
@@ -235,6 +239,26 @@ class _Proof:
                 places[range(start, stop)] = difference
         return places
 
+    def _explanations(self, place: range, difference: int) -> Iterator[tuple[int, int]]:
+        """Yield each index in a range, from the last, with the bits of a value that explains a difference
+        alone."""
+        for at in reversed(place):
+            row = self._rows[at]
+            change = crc32_px4_before(difference, row.type.size)
+            if not change >> 8 * row.type.size and (at, row.bits ^ change) not in self._refuted:
+                yield at, row.bits ^ change
+            difference = crc32_px4_before(difference, self._ends[at + 1] - self._ends[at])
+
+    def _guess_moved(self, place: range, difference: int) -> dict[int, int]:
+        """Return the index and the bits of a value that has just moved as it always does, and explains a
+        difference alone: hardly anything else explains it. Empty without one."""
+        table, now = self._session.table, anyio.current_time()
+        for at, bits in self._explanations(place, difference):
+            row = self._rows[at]
+            if _has_just_moved(row, bits, now - table.moments.get(row.name, now)):
+                return {at: bits}
+        return {}
+
     def _guess(self, place: range, difference: int) -> dict[int, int]:
         """Return the index and the bits of the simplest value that explains a difference alone, unless there
         is none, or it may be chance.
@@ -245,16 +269,11 @@ class _Proof:
         guess: dict[int, int] = {}
         bits = GUESS_BITS_SHORT if len(place) <= PARTS_MAX else GUESS_BITS
         bits_max = bits - math.log2(len(place)) if len(place) > 1 else math.inf
-        for at in reversed(place):
-            row = self._rows[at]
-            change = crc32_px4_before(difference, row.type.size)
-            bits = row.bits ^ change
-            if not change >> 8 * row.type.size and (at, bits) not in self._refuted:
-                size = _bits_to_write(bits, row.type)
-                if size <= bits_max:
-                    guess, bits_max = {at: bits}, size
-            difference = crc32_px4_before(difference, self._ends[at + 1] - self._ends[at])
-        if place.start == 0 and not crc32_px4_before(difference, 2) >> 16:
+        for at, value in self._explanations(place, difference):
+            size = _bits_to_write(value, self._rows[at].type)
+            if size <= bits_max:
+                guess, bits_max = {at: value}, size
+        if place.start == 0 and not crc32_px4_before(difference, self._ends[place.stop] + 2) >> 16:
             raise TableDiffers(OTHER)
         return guess
 
@@ -305,7 +324,7 @@ class _Proof:
     async def _read(self, guesses: dict[int, int]) -> None:
         """Read values by their indices, and take over those that are others; `guesses` has their exact bits.
 
-        A value that has just moved as it always does needs no read: hardly anything else explains it.
+        A value that has just moved as it always does needs no read.
 
         Raises:
             TableDiffers: the vehicle has another parameter at such an index.
