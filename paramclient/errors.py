@@ -219,7 +219,6 @@ class AlreadyRestored(UsageError):
             it again, also after an interruption, name this number.
         before_restore: number of the snapshot from before the latest restore.
         restored_at: time of that restore, in unix seconds.
-        summary: the text of the error without the advice.
     """
 
     def __init__(self, summary: str, *, before_apply: int, before_restore: int, restored_at: float) -> None:
@@ -231,7 +230,6 @@ class AlreadyRestored(UsageError):
         self.before_apply = before_apply
         self.before_restore = before_restore
         self.restored_at = restored_at
-        self.summary = summary
 
 
 class UnknownVehicle(UsageError):
@@ -253,7 +251,6 @@ class AmbiguousVehicle(UsageError):
         vehicles: the matching vehicles, in words: `1/1 PX4 quadrotor` on a link.
         choose_by: the argument that selects one of them, "system", "component" or "peer"; "" for vehicles in
             the cache, which have keys.
-        summary: the text of the error without the advice.
     """
 
     def __init__(self, message: str, *, vehicles: Sequence[str], choose_by: str = "") -> None:

@@ -24,7 +24,6 @@ from paramclient.cli.session import ChosenVehicle, CommandSession, Done, Session
 from paramclient.cli.sources import check_pattern, fill_pattern, is_pattern_name, resolve_all
 from paramclient.cli.time_arguments import parse_when
 from paramclient.errors import (
-    AlreadyRestored,
     CacheError,
     FileError,
     NoReply,
@@ -151,14 +150,11 @@ class State:
 
     Attributes:
         params: the values.
-        point: the restore point in words, such as `before the last apply, 9 min ago (snapshot 4)`; "" for a
-            state that the user chose.
         again: the command that continues after an error; "" for the given one. A restore without a time is
             refused the second time, and an age is another time later.
     """
 
     params: ParamSet
-    point: str = ""
     again: str = ""
 
 
@@ -225,26 +221,21 @@ async def _earlier_state(session: CommandSession, url: str, moment: float | int 
         point = await anyio.to_thread.run_sync(
             lambda: load_restore_point(cache, key, component, extended=extended)
         )
-    except NotInCache as error:
-        raise NotInCache(f"{error}, such as '2h ago', or a backup file") from None
-    except AlreadyRestored as error:
-        raise UsageError(
-            f"{error.summary}; choose the state: `{_command(url, error.before_apply, session)}` for that "
-            f"before the apply, snapshot {error.before_restore} for that before the restore, or another of "
-            f"`paramclient history {vehicle.system}{' --extended' * extended} --snapshots`"
-        ) from None
+    except NotInCache:
+        raise
     except CacheError as error:
         raise CacheError(
             f"nothing was sent, as the state before the last apply cannot be read: {error}. A backup file"
             " can be restored without the cache (--no-cache)"
         ) from error
     now = time.time()
-    words = f"before the last apply, {age_in_words(now - point.at)} ago (snapshot {point.snapshot})"
     changes = [f"{name} {age_in_words(now - at)} ago" for name, at in point.changes.items()]
-    changed = f"changed since then: {first_of(changes, APPLY_NAMES_MAX)}"
-    known = changed if changes else "nothing is known to have changed since then"
-    say(f"{session.prefix}the state is that {words}; {known}")
-    return State(point.state, words, _command(url, point.snapshot, session))
+    changed = first_of(changes, APPLY_NAMES_MAX) or "nothing, as far as is known"
+    say(
+        f"{session.prefix}the state is that before the last apply, {age_in_words(now - point.at)} ago "
+        f"(snapshot {point.snapshot}); changed since then: {changed}"
+    )
+    return State(point.state, _command(url, point.snapshot, session))
 
 
 def _command(url: str, when: object, session: CommandSession) -> str:
@@ -505,8 +496,6 @@ class _Job:
         if result.error is not None:
             report(f"{session.label}: {result.error}; {self.to_continue}")
             return max(code_of(result.error), ExitCode.INCOMPLETE)
-        if self.state.point:
-            say(f"{session.label}: restored the state {self.state.point}")
         return ExitCode.DONE if result.complete else ExitCode.INCOMPLETE
 
     def _say(self, shown: Rows, made: Plan, end: str, effect: str, reboot_for: Sequence[str]) -> None:

@@ -79,9 +79,7 @@ def from_file(choice: str | None, *, offline: bool = False) -> Metadata | None:
         UsageError: the file has no metadata, or --metadata is `vehicle` in a subcommand without a link.
     """
     if choice == VEHICLE and offline:
-        raise UsageError(
-            "--metadata takes a file here; `paramclient fetch LINK --metadata vehicle` stores that of a vehicle"
-        )
+        raise UsageError("--metadata takes a file here; that of a vehicle is stored by `paramclient fetch`")
     return None if choice in (None, VEHICLE) else read_metadata(choice)
 
 

@@ -136,7 +136,8 @@ def load_restore_point(
         CacheError: the cache cannot be read.
     """
     missing = NotInCache(
-        f"the cache has no snapshot from before an apply to {key}; name the time of the state to restore"
+        f"the cache has no snapshot from before an apply to {key}; name the time of the state to restore, "
+        "such as '2h ago', or a backup file"
     )
     try:
         snapshots = cache.snapshots(key, component, extended=extended)
