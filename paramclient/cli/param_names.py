@@ -12,13 +12,12 @@ from paramclient.cli.session import CommandSession
 from paramclient.client.component import Component
 from paramclient.errors import CacheError, ParamClientError, UnknownParameter, UsageError
 from paramclient.model.identity import autopilot_name
-from paramclient.model.names import NameChoice, did_you_mean, is_group_switch, is_pattern, nearest_names
+from paramclient.model.names import NameChoice, did_you_mean, is_pattern, nearest_names
 from paramclient.model.values import check_name
 
 __all__ = [
     "check_given",
     "choose_names",
-    "may_appear",
     "spelling",
     "suggest",
 ]
@@ -65,16 +64,6 @@ def check_given(given: Iterable[str]) -> list[str]:
         elif not (text.isascii() and text.isprintable()):
             raise UsageError(f"pattern {text!r}: only printable ASCII characters are allowed")
     return chosen
-
-
-def may_appear(text: str, component: Component) -> bool:
-    """Return whether a name or pattern is of a group that a parameter of the vehicle shows, and hides now."""
-    return any(
-        not param.settable
-        and is_group_switch(name, component.autopilot)
-        and text.upper().startswith(f"{name.rpartition('_')[0]}_")
-        for name, param in dict(component.params).items()
-    )
 
 
 async def suggest(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.output import show
-from paramclient.links import SerialPort, list_ports
+from paramclient.links import list_ports
 
 __all__ = ["ports"]
 
@@ -17,36 +19,22 @@ def ports(*, json: bool = False) -> ExitCode:
     Args:
         json: Print JSON.
     """
-    found = list_ports()
+    found = [
+        {
+            **asdict(port),
+            "link": port.link,
+            "autopilot": port.autopilot,
+            "vendor_id": None if port.vendor_id is None else f"{port.vendor_id:04x}",
+            "product_id": None if port.product_id is None else f"{port.product_id:04x}",
+        }
+        for port in list_ports()
+    ]
+    columns = ["device", "autopilot", "product", "manufacturer", "vendor_id", "product_id", "link"]
     show(
-        {"ports": [_port_json(port) for port in found]},
-        ["device", "autopilot", "product", "manufacturer", "usb id", "link"],
-        map(_port_cells, found),
+        {"ports": found},
+        columns,
+        ([port[name] for name in columns] for port in found),
         json=json,
         empty="this computer has no serial ports",
     )
     return ExitCode.DONE
-
-
-def _port_json(port: SerialPort) -> dict[str, object]:
-    return {
-        "device": port.device,
-        "by_id": port.by_id,
-        "link": port.link,
-        "autopilot": port.autopilot,
-        "vendor_id": _hex(port.vendor_id),
-        "product_id": _hex(port.product_id),
-        "manufacturer": port.manufacturer,
-        "product": port.product,
-        "serial_number": port.serial_number,
-        "interface": port.interface,
-    }
-
-
-def _port_cells(port: SerialPort) -> tuple[object, ...]:
-    usb_id = None if port.vendor_id is None else f"{_hex(port.vendor_id)}:{_hex(port.product_id)}"
-    return port.device, port.autopilot, port.product, port.manufacturer, usb_id, port.link
-
-
-def _hex(number: int | None) -> str | None:
-    return None if number is None else f"{number:04x}"

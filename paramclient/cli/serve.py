@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
 import anyio
-from cyclopts import Parameter
 
 from paramclient.cli.app import on_end_signal
 from paramclient.cli.exit_codes import ExitCode
@@ -28,7 +27,6 @@ async def serve(
     listen: str = "127.0.0.1:8765",
     cache: str | None = None,
     no_cache: bool = False,
-    fetch: Annotated[bool, Parameter(negative="--no-fetch")] = True,
     listen_only: bool = False,
     tokens: Path | None = None,
     verbose: Verbose = False,
@@ -51,7 +49,6 @@ async def serve(
         listen: Address to listen on, HOST:PORT; with port 0, the system chooses the port.
         cache: The cache file, or the postgresql:// URL of a shared cache. Default: the user's own cache.
         no_cache: Neither read nor write a cache.
-        fetch: Fetch the parameters of all vehicles that are heard.
         listen_only: Send nothing to vehicles; receive the parameters that other stations on the links
             request.
         tokens: A file with access tokens, made by `paramclient token`. Without it, only this computer can
@@ -69,7 +66,6 @@ async def serve(
     hub = service.Hub(
         links,
         cache=not no_cache if cache is None else cache,
-        fetches=fetch,
         mavlink=mavlink,
         listen_only=listen_only,
         signing=options.signing,

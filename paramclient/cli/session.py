@@ -7,7 +7,7 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, replace
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 import anyio
 
@@ -307,16 +307,11 @@ class Sessions(list[CommandSession]):
 
         For subcommands that only read: they use the first vehicle heard, which may be another one next time.
         """
-        first, used = self[0], {each.component.node for each in self}
-        others = first.client.autopilots
-        if self.is_all:
-            components = first.client.components.values()
-            others = [each for each in components if each.node.identification.has_parameters]
-        words = [node_in_words(each.node) for each in others if each.node not in used]
-        listed = first_of(words, OTHERS_SHOWN_MAX)
-        if words and self.is_all:
-            report(f"--vehicle all chooses autopilots. Also heard, and not asked: {listed}")
-        elif words and not first.choice.is_named:
+        first = self[0]
+        others = [each.node for each in first.client.autopilots if each.node is not first.component.node]
+        words = [*map(node_in_words, others)]
+        if words and not first.choice.is_named:
+            listed = first_of(words, OTHERS_SHOWN_MAX)
             report(
                 f"{first.label} was used, the first vehicle heard. Also on this link: {listed}. "
                 "--vehicle chooses one"
@@ -349,14 +344,12 @@ async def sessions(
     """
     one = "--extended works on one vehicle" if extended else ""
     choice, deadline = ChosenVehicle.parse(options.vehicle, one=one), Deadline(options.timeout)
-    async with ParamClient(
+    async with _client(
         url if is_live else _at_full_speed(url),
+        options,
         cache=None if options.place is True else options.place,
         encoding=options.encoding,
         listen_only=options.listen_only,
-        tlog=options.tlog,
-        signing=options.signing,
-        system=options.source_system,
     ) as client:
         timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
         if choice.is_all:
@@ -379,15 +372,12 @@ def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> P
     Raises:
         UsageError: no such link.
     """
-    return ParamClient(
-        url,
-        cache=False,
-        traffic=True,
-        signing=options.signing,
-        listen_only=listen_only,
-        tlog=options.tlog,
-        system=options.source_system,
-    )
+    return _client(url, options, cache=False, traffic=True, listen_only=listen_only)
+
+
+def _client(url: str, options: TrafficOptions, **more: Any) -> ParamClient:
+    system, signing = options.source_system, options.signing
+    return ParamClient(url, tlog=options.tlog, signing=signing, system=system, **more)
 
 
 def _at_full_speed(url: str) -> str:

@@ -27,12 +27,11 @@ import paramclient
 from paramclient import LinkError, ParamCache, ParamType
 from paramclient.cli import run
 from paramclient.cli.exit_codes import ExitCode, code_of
-from paramclient.errors import ClientClosed, ParamClientError, ParamErrorCode
+from paramclient.errors import ClientClosed, ParamClientError
 from paramclient.links import Peer, SimLink
-from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
+from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.wire import frames, messages
 from tests.commands import Command, Outcome, Put, in_process, leaping, strict
-from tests.conversations.virtual import Tap
 
 ROOT = Path(__file__).parents[2]
 URL = "sim:custom"
@@ -180,46 +179,6 @@ def test_missing_parameters_are_named(command: Command, put: Put) -> None:
     assert "paramclient: incomplete: 1/1 generic did not send 1 parameter, index 1; " in fetched.err
 
 
-class ListOnlyValues(PX4Vehicle):
-    """A vehicle that sends a value that its hash does not cover only in the list."""
-
-    secret = next(row.name for row in px4_table() if row.volatile)
-
-    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
-        secret = self.params[self.secret]
-        if not isinstance(message, messages.ParamRequestRead) or (
-            message.param_id != secret.name and message.param_index != secret.index
-        ):
-            super().respond(message, sender)
-
-
-def test_a_value_that_is_only_cached_is_missing(command: Command, put: Put, tmp_path: Path) -> None:
-    cache = tmp_path / "cache.sqlite3"
-    url = put(ListOnlyValues())
-    known = command("fetch", url, "--json", "--cache", cache).json
-    fetched = command("fetch", url, "--json", "--cache", cache, "--timeout", 2)
-    assert fetched.code == 1
-    assert fetched.json["source"] == "cache"
-    assert fetched.json["missing"] == [known["params"][ListOnlyValues.secret]["index"]]
-    assert fetched.json["received"] == len(fetched.json["params"]) == 902
-    assert ListOnlyValues.secret not in fetched.json["params"]
-
-
-def test_what_came_of_a_refresh_until_the_vehicle_was_lost_is_printed(
-    command: Command, put: Put, tmp_path: Path
-) -> None:
-    cache = tmp_path / "cache.sqlite3"
-    known = command("fetch", put(PX4Vehicle()), "--json", "--cache", cache).json
-    messages_left = iter(range(300))
-    dying = Tap(PX4Vehicle(), down=lambda message: next(messages_left, None) is not None)
-    fetched = command("fetch", put(dying), "--refresh", "--json", "--cache", cache)
-    assert fetched.code == 1
-    found = fetched.json
-    assert 200 < found["received"] == len(found["params"]) == 903 - len(found["missing"]) < 300
-    assert found["params"].items() <= known["params"].items()
-    assert "paramclient: incomplete: " in fetched.err
-
-
 def test_the_system_and_the_component_can_be_chosen(command: Command) -> None:
     assert command("fetch", "sim:px4?system=7", "--vehicle", 7, "--json", "--no-cache").json["system"] == 7
     absent = command("get", "sim:px4?system=7", "MC_ROLL_P", "--vehicle", 6, "--timeout", 0.2, "--no-cache")
@@ -284,74 +243,6 @@ def test_nan_can_be_forced(command: Command) -> None:
     ]
 
 
-class Unchanging(GenericVehicle):
-    """A vehicle that keeps its values without a reason."""
-
-    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
-        if isinstance(message, messages.ParamSet):
-            message = messages.ParamRequestRead(self.system, self.component, message.param_id, -1)
-        super().respond(message, sender)
-
-
-class Mistyped(GenericVehicle):
-    """A vehicle that reports a wrong type for every set."""
-
-    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
-        if isinstance(message, messages.ParamSet):
-            self.send(
-                messages.ParamError(
-                    *(sender.system, sender.component, message.param_id, -1), ParamErrorCode.TYPE_MISMATCH
-                )
-            )
-        else:
-            super().respond(message, sender)
-
-
-class SilentOnParams(GenericVehicle):
-    """A vehicle with heartbeats that answers no parameter requests."""
-
-    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
-        if not isinstance(message, messages.ParamRequestRead | messages.ParamSet):
-            super().respond(message, sender)
-
-
-@pytest.mark.parametrize(
-    ("vehicle", "name", "value", "actual", "error", "code"),
-    [
-        (
-            ArduPilotVehicle(read_only=["RTL_ALT"], param_error=True),
-            *("RTL_ALT", 5, None, "Refused", 1),
-        ),
-        (PX4Vehicle(param_error=True), "NOPE", 5, None, "UnknownParameter", 2),
-        (Mistyped({"A": 1}, param_error=True), "A", 5, None, "TypeMismatch", 1),
-        (Unchanging({"A": 0.1}), "A", 5, 0.1, "ValueNotApplied", 1),
-        (SilentOnParams({"A": 1}), "A", 5, None, "NoReply", 3),
-        (GenericVehicle([SimParam("A", ParamType.UINT8, 1)]), "A", 300, None, "UsageError", 2),
-    ],
-    ids=["refused", "unknown", "mismatch", "not-applied", "no-reply", "invalid"],
-)
-def test_a_failed_set_prints_its_reason(
-    command: Command,
-    put: Put,
-    vehicle: Endpoint,
-    name: str,
-    value: int,
-    actual: float | None,
-    error: str,
-    code: int,
-) -> None:
-    # without a timeout, only the answer of the vehicle can end the command
-    limit = ["--timeout", 2] if error == "NoReply" else []
-    done = command("set", put(vehicle), name, value, "--json", "--no-cache", *limit)
-    assert done.code == code
-    [result] = done.json["results"]
-    reason = result.pop("reason")
-    status = "not tried" if error == "NoReply" else "refused"  # the type is read before the write
-    assert result == {"name": name, "requested": value, "actual": actual, "status": status, "error": error}
-    assert done.err in (f"paramclient: {name}: {reason}\n", f"paramclient: {reason}\n")
-    assert name in done.err
-
-
 @pytest.mark.parametrize(
     ("name", "text", "held"),
     [
@@ -394,23 +285,6 @@ def test_fetch_names_what_has_changed_since_an_ardupilot_was_cached(
 # Differences from the defaults
 
 
-def test_fetch_prints_parameters_that_differ_from_the_defaults(command: Command) -> None:
-    shown = command("fetch", "sim:ardupilot", "--changed", "--no-cache")
-    assert shown.code == 0
-    assert shown.words[0] == ["name", "value", "type", "index", "trust", "default"]
-    assert len(shown.words) == 42
-    assert ["RELAY1_FUNCTION", "1", "INT8", "61", "live", "0"] in shown.words
-    found = command("fetch", "sim:ardupilot", "--changed", "--json", "--no-cache").json
-    assert list(found) == FETCH_KEYS
-    assert (found["count"], found["received"], len(found["params"])) == (1382, 1382, 41)
-    assert list(found["params"]["RELAY1_FUNCTION"]) == [*PARAM_KEYS, "default", "default_source"]
-    assert found["params"]["RELAY1_FUNCTION"]["default"] == 0
-    everything = command("fetch", "sim:ardupilot", "--json", "--no-cache").json["params"]
-    assert {name: param for name, param in everything.items() if param["value"] != param["default"]} == (
-        found["params"]
-    )
-
-
 # watch
 
 
@@ -438,21 +312,6 @@ def test_watch_prints_lines_of_json_as_values_change(live_command: Command, tmp_
         watching.send_signal(signal.SIGINT)
         outcome = ended(watching)
     assert (outcome.code, outcome.out, outcome.err) == (130, "", "")
-
-
-def test_watch_without_names_fetches_the_table_first(live_command: Command, tmp_path: Path) -> None:
-    cache = tmp_path / "cache.sqlite3"
-    with simulated("px4?system=3") as url, process("watch", url, "--cache", cache) as watching:
-        assert line_of(watching.stderr) == "watching 903 parameters of 3/1 px4\n"
-        assert live_command("set", url, "MC_ROLL_P", 6.1, "--no-cache").code == 0
-        line = line_of(watching.stdout)
-        assert re.fullmatch(r"[0-9T:.-]+Z  MC_ROLL_P  4\.0 -> 6\.1  \(vehicle\)\n", line)
-        watching.send_signal(signal.SIGTERM)
-        assert ended(watching) == Outcome(143, "", "")
-    # the parameters received by then were cached
-    [kept] = live_command("show", "3", "--json", "--cache", cache).json["components"]
-    assert kept["params"]["MC_ROLL_P"]["value"] == 6.1
-    assert len(kept["params"]) == 903
 
 
 def test_watch_prints_added_and_removed_parameters(live_command: Command) -> None:
@@ -503,8 +362,8 @@ def test_watch_prints_events_of_the_vehicle(command: Command, put: Put, as_json:
     lines = printed.out.splitlines()
     if not as_json:
         reported = [line.partition("Z  ")[2] for line in lines]
-        assert reported[0] == "1/1 lost: nothing received for 5.0 s"
-        assert re.fullmatch(r"1/1 found after \d\d?\.\d s", reported[1])
+        assert reported[0] == "1/1 lost after 5.0 s without a message"
+        assert re.fullmatch(r"1/1 found after \d\d?\.\d s without a message", reported[1])
         assert reported[2:] == [
             "1/1 rebooted",
             "B  2 -> 3  (vehicle)",
@@ -617,50 +476,7 @@ def test_link_is_live_on_a_terminal() -> None:
     assert strict(one.out)["components"][0]["system"] == 1
 
 
-def test_a_live_link_ends_with_ctrl_c() -> None:
-    ours, theirs = pty.openpty()
-    try:
-        with process("link", "sim:px4", stdout=theirs, env={**PLAIN, "TERM": "xterm"}) as looking:
-            os.close(theirs)
-            printed = b""
-            while b"1/1 standby" not in printed:
-                assert select.select([ours], [], [], TIMEOUT)[0]
-                printed += os.read(ours, 65536)
-            looking.send_signal(signal.SIGINT)
-            while select.select([ours], [], [], TIMEOUT)[0]:
-                try:
-                    printed += os.read(ours, 65536)
-                except OSError:
-                    break
-            assert (looking.wait(TIMEOUT), looking.stderr and looking.stderr.read()) == (130, "")
-        *_, last = printed.decode().split("heartbeat")
-        assert "1/1 standby: " in last
-    finally:
-        os.close(ours)
-
-
 # Without a link
-
-
-def test_show_prints_the_cached_table(command: Command, warm: Path) -> None:
-    shown = command("show", "--json", "--cache", warm)
-    assert (shown.code, shown.err) == (0, "")
-    assert list(shown.json) == ["components"]
-    [component] = shown.json["components"]
-    assert (component["system"], component["component"], component["autopilot"]) == (1, 1, "px4")
-    assert (component["uid"], component["count"]) == ("4954414c44494e4f", 903)
-    at = datetime.fromisoformat(component["at"])
-    assert at.utcoffset() is not None
-    assert at.timestamp() <= time.time()
-    fetched = command("fetch", "sim:px4", "--json", "--no-cache").json
-    assert {name: each["bits"] for name, each in component["params"].items()} == {
-        name: each["bits"] for name, each in fetched["params"].items()
-    }
-
-    table = command("show", "--cache", warm)
-    assert table.words[0] == ["name", "value", "type"]
-    assert len(table.words) == 904
-    assert table.err.startswith(f"903 parameters of 1/1 px4 from cache {key_of(warm)}, 20")
 
 
 def test_show_lists_several_vehicles_and_prints_one(command: Command, warm: Path) -> None:
@@ -1023,17 +839,3 @@ def test_sim_serves_other_processes_through_a_faulty_link(live_command: Command)
     assert (fetched.json["system"], fetched.json["received"], fetched.json["missing"]) == (42, 903, [])
     with simulated("px4?loss=1") as url:
         assert live_command("get", url, "MC_ROLL_P", "--timeout", 1, "--no-cache").code == 3
-
-
-def test_a_command_loads_its_own_modules_only() -> None:
-    """The start is part of the duration of each call."""
-    program = (
-        "import sys; from paramclient.cli import run; run(['ports', '--json']); "
-        "print([name for name in sys.modules if name.startswith('paramclient.cli.')])"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, env=PLAIN, capture_output=True, text=True, timeout=TIMEOUT
-    )
-    loaded = set(strict(done.stdout.splitlines()[-1].replace("'", '"')))
-    assert "paramclient.cli.ports" in loaded
-    assert not loaded & {f"paramclient.cli.{name}" for name in ("diff", "setup", "serve", "vehicle", "fleet")}

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from paramclient.files import read_file
-from paramclient.model.values import ParamType
-from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
+from paramclient.sim import PX4Vehicle
 from paramclient.wire import messages
 from tests.commands import Command, Put
 from tests.shell import Tap
@@ -50,18 +49,6 @@ def test_without_changed_nothing_is_requested_for_defaults(command: Command, put
     done = command("fetch", put(tap), "--json")
     assert "default" not in done.json["params"]["MC_ROLL_P"]
     assert not tap.messages(messages.FileTransfer)
-
-
-def test_the_default_of_the_vehicle_has_priority(command: Command, put: Put, tmp_path: Path) -> None:
-    vehicle = ArduPilotVehicle(
-        table=[SimParam("A", ParamType.REAL32, 5.0, default=1.0), SimParam("B", ParamType.REAL32, 2.0)],
-        live=(),
-    )
-    described = a_file(tmp_path, A=5.0, B=2.0)
-    done = command("fetch", put(vehicle), "--changed", "--json", "--metadata", described)
-    assert {
-        name: (each["default"], each["default_source"]) for name, each in done.json["params"].items()
-    } == {"A": (1, "vehicle")}
 
 
 def test_unknown_defaults_are_an_error_that_says_what_to_do(command: Command, put: Put) -> None:

@@ -26,24 +26,6 @@ def test_without_the_option_a_camera_gets_a_hint(command: Command, put: Put) -> 
     assert done.err.startswith("1/100 usually has extended parameters: --extended uses them\n")
 
 
-def test_fetch_finds_them(command: Command, put: Put) -> None:
-    url = put(small())
-    done = command("fetch", url, *CAMERA)
-    assert done.code == 0
-    assert done.rows == [
-        ["name", "value", "type", "index", "trust"],
-        ["CAM_MODE", "1", "INT32", "0", "live"],
-        ["CAM_NAME", "Front", "CUSTOM", "1", "live"],
-        ["CAM_KEY", "hex:ff00fe", "CUSTOM", "2", "live"],
-        ["CAM_EV", "0.5", "REAL32", "3", "live"],
-    ]
-    assert done.err.startswith("4 extended parameters of 1/100 camera from stream in 0.")
-    document = command("fetch", url, *CAMERA, "--json").json
-    assert (document["count"], document["missing"], document["component"]) == (4, [], 100)
-    assert document["params"]["CAM_KEY"]["value"] == "hex:ff00fe"
-    assert document["params"]["CAM_NAME"]["value"] == "Front"
-
-
 def test_get_and_set(command: Command, put: Put) -> None:
     camera = small()
     url = put(camera)
@@ -200,19 +182,6 @@ def test_a_cached_table_is_applied(command: Command, put: Put) -> None:
     assert (done.code, camera.ext_values["CAM_NAME"]) == (0, "Front"), done.err
 
 
-def test_an_unknown_name_does_not_stop_the_other_values(command: Command, put: Put) -> None:
-    camera = small()
-    done = command("set", put(camera), *CAMERA, "CAM_NAM", "x", "CAM_MODE", 5, "CAM_NAME", "Rear")
-    assert done.code == 2
-    assert done.rows[1:] == [
-        ["CAM_NAM", "x", "refused"],
-        ["CAM_MODE", "5", "5", "accepted"],
-        ["CAM_NAME", "Rear", "Rear", "accepted"],
-    ]
-    assert "1/100 has no CAM_NAM" in done.err
-    assert (camera.ext_values["CAM_MODE"], camera.ext_values["CAM_NAME"]) == (5, "Rear")
-
-
 def test_cached_extended_parameters_are_shown_offline(command: Command, put: Put) -> None:
     url = put(Air.symmetric([PX4Vehicle(table={"A": 1}), small()]))
     assert command("fetch", url).code == 0
@@ -272,12 +241,3 @@ def test_watch_prints_changes(command: Command, put: Put) -> None:
         "CAM_NAME  Front -> Rear  (vehicle)",
         "CAM_KEY  hex:ff00fe -> hex:ff  (vehicle)",
     ]
-
-
-def test_watch_checks_its_names(command: Command, put: Put) -> None:
-    url = put(changing())
-    unknown = command("watch", url, "NO_SUCH", *CAMERA, "--timeout", 10)
-    assert (unknown.code, unknown.out, "NO_SUCH" in unknown.err) == (2, "", True)
-    one = command("watch", url, "CAM_MODE", *CAMERA, "--timeout", 10)
-    assert (one.code, one.out, one.err) == (0, "", "watching CAM_MODE of 1/100 camera\n")
-    assert command("watch", url, *CAMERA, "--plain").code == 2

@@ -8,7 +8,7 @@ import pytest
 
 from paramclient.metadata import MetadataStore
 from paramclient.model.values import ParamType
-from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
+from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from tests.commands import Command, Put
 
 DATA = Path(__file__).parents[1] / "data"
@@ -113,20 +113,6 @@ def test_a_value_outside_of_the_range_is_sent_with_force(command: Command, put: 
 # get
 
 
-def test_get_prints_meaning_and_units(command: Command, put: Put) -> None:
-    done = command(
-        *("get", put(quad()), "EKF2_GPS_CTRL", "MC_ROLL_P", "COM_FLTMODE1"),
-        *("--metadata", "vehicle", "--no-cache"),
-    )
-    assert done.code == 0
-    assert [line.split() for line in done.out.splitlines()] == [
-        ["name", "value", "type", "index", "meaning", "units"],
-        ["EKF2_GPS_CTRL", "7", "INT32", "1", "Position|Altitude|Velocity"],
-        ["MC_ROLL_P", "6.5", "REAL32", "3", "1/s"],
-        ["COM_FLTMODE1", "-1", "INT32", "0", "Unassigned"],
-    ]
-
-
 def test_downloaded_metadata_is_stored(command: Command, put: Put) -> None:
     """The stored metadata is used for its firmware without a request, also without a link."""
     plain = command("get", put(quad()), "MC_ROLL_P", "--json")
@@ -214,11 +200,3 @@ def test_show_prints_the_metadata_of_a_parameter(command: Command, put: Put) -> 
         "  step: 1 cm",
         "  reboot: a change takes effect after a reboot",
     ]
-
-
-def test_a_vehicle_without_metadata_beside_one_with_it(command: Command, put: Put) -> None:
-    url = put(Air([quad(), copter(2)]))
-    assert command("get", url, "MC_ROLL_P", "--vehicle", 1, "--metadata", "vehicle").code == 0
-    done = command("get", url, "MC_ROLL_P", "TST_ALT", "--vehicle", "all")
-    assert done.rows[0][-1] == "units"
-    assert [row[:3] for row in done.rows[1:]] == [["1/1", "MC_ROLL_P", "6.5"], ["2/1", "TST_ALT", "100.0"]]

@@ -153,7 +153,6 @@ class Growing(ArduPilotVehicle):
     ("names", "first", "printed"),
     [
         (["grp_*"], "watching grp_*", ["GRP_ENABLE", "GRP_ONE", "GRP_TWO"]),
-        (["grp_o*"], "not there at present: grp_o*", ["GRP_ONE"]),
         (["GRP_ENABLE"], "watching GRP_ENABLE", ["GRP_ENABLE"]),
     ],
 )

@@ -25,22 +25,14 @@ def command(command: Command) -> Command:
     return lambda *words: command(*words, "--no-cache")
 
 
-class Ending(GenericVehicle):
-    """A vehicle that does something else instead of its 41st set, and sets nothing from then on."""
+class Interrupting(GenericVehicle):
+    """A vehicle that is interrupted by the user at the 41st set, and sets nothing from then on."""
 
     def respond(self, message: messages.Message, sender: frames.Frame) -> None:
         if self.requests["PARAM_SET"] <= 40:
             super().respond(message, sender)
         elif isinstance(message, messages.ParamSet) and self.requests["PARAM_SET"] == 41:
-            self.end()
-
-    def end(self) -> None:
-        """Keep silent from now on."""
-
-
-class Interrupting(Ending):
-    def end(self) -> None:
-        signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
 
 
 def statuses(outcome: Outcome) -> dict[str, str]:
@@ -87,24 +79,6 @@ def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put) -> No
     as_json = command("set", put(vehicle), *words, "--force", "--json")
     failed = dict.fromkeys(["NO_SUCH", "SMALL", "FIXED"], "refused")
     assert statuses(as_json) == failed | {"A": "accepted", "COUNT": "adjusted"}
-
-
-def test_a_vehicle_that_ends_in_the_middle_loses_no_outcome(command: Command, put: Put) -> None:
-    vehicle = Ending(TABLE)
-    url = put(vehicle)
-    done = command("set", url, *PAIRS, "--json")
-    found = statuses(done)
-    assert done.code == 3
-    assert [*found] == NAMES
-    accepted = {name for name in NAMES if found[name] == "accepted"}
-    written = {name for name, value in vehicle.values.items() if value == 7}
-    assert set() < accepted <= written
-    assert {found[name] for name in NAMES if name not in accepted} == {"unknown", "not tried"}
-    assert {found[name] for name in written - accepted} <= {"unknown"}
-    assert {each["error"] for each in done.json["results"] if each["name"] not in accepted} == {"NoReply"}
-    assert done.err.count("\n") == 2, "one line for those sent, one for the others"
-    not_tried = [name for name in NAMES if found[name] == "not tried"]
-    assert f"paramclient: {', '.join(not_tried[:10])}" in done.err, "one line for those of one cause"
 
 
 @pytest.mark.parametrize("as_json", [False, True])

@@ -16,7 +16,6 @@ from paramclient.cli import signing as signing_commands
 from paramclient.links import SimLink
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, bits_of
-from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, Vehicle
 from paramclient.wire import messages
 from tests.caches import NOW, update
@@ -264,51 +263,6 @@ def test_all_writes_to_every_vehicle(
 
 
 # time
-
-
-class Watch:
-    """Records the time of each PARAM_SET since the first heartbeat of a vehicle."""
-
-    def __init__(self, endpoint: Endpoint) -> None:
-        self.tap = Tap(endpoint)
-        self.first_received: float | None = None
-
-    def receive(self, data: bytes, now: float) -> None:
-        self.tap.receive(data, now)
-
-    def tick(self, now: float) -> None:
-        self.tap.tick(now)
-
-    def next_deadline(self) -> float | None:
-        return self.tap.next_deadline()
-
-    def data_to_send(self) -> list[bytes]:
-        data = self.tap.data_to_send()
-        if data and self.first_received is None:
-            self.first_received = anyio.current_time()
-        return data
-
-    def written_after(self) -> float:
-        assert self.first_received is not None
-        first = next(at for at, _, message in self.tap.received if isinstance(message, messages.ParamSet))
-        return first - self.first_received
-
-
-@pytest.mark.parametrize(
-    ("named", "least", "most"),
-    [
-        ([], HEARTBEAT_WAIT, HEARTBEAT_WAIT + 0.1),
-        (["--vehicle", "1"], 0.0, 0.1),
-        (["--vehicle", "1/1"], 0.0, 0.1),
-    ],
-)
-def test_a_write_waits_for_the_documented_time(
-    command: Command, put: Put, named: list[str], least: float, most: float
-) -> None:
-    watch = Watch(px4())
-    put(watch)
-    assert command("set", URL, "MC_ROLL_P", "7.5", *named).code == 0
-    assert least <= watch.written_after() <= most
 
 
 @pytest.mark.parametrize("air", [lambda one: one, lambda one: Air([one]), lambda one: Air([Air([one])])])
