@@ -93,7 +93,7 @@ async def save(
         assert stored is not None, "it is no link"
         sets = [*stored.sets] if choice.is_all else [sources.choose(stored, choice.component, choice.system)]
     else:
-        link = sources.source_of(where)
+        link = sources.link_of(where)
         check_link(link)
 
         async def fetch(session: CommandSession) -> ParamSet:

@@ -128,7 +128,10 @@ class _Known:
 
     def __init__(self, options: CacheOptions, vehicle: str | None, given: Metadata | None) -> None:
         with ParamCache(options.cache) as cache:
-            summaries = sorted(tables_in(cache, vehicle), key=lambda each: (each.system, each.component))
+            summaries = sorted(
+                cache.components() if vehicle is None else tables_in(cache, vehicle),
+                key=lambda each: (each.system, each.component),
+            )
             self._tables = load_tables(cache, summaries)
             found = [given or known_of_table(cache.path, table) for table in self._tables]
         known = [each for each in [given, *found] if each is not None]

@@ -32,7 +32,7 @@ from paramclient.model.comparison import non_defaults
 from paramclient.model.defaults import Default, add_default, default_of
 from paramclient.model.names import NameChoice
 from paramclient.model.paramset import ParamSet
-from paramclient.provision.sources import read_source, resolve, source_of
+from paramclient.provision.sources import link_of, read_source, resolve
 
 __all__ = ["show"]
 
@@ -71,7 +71,7 @@ async def show(
                 show_summaries(cache, summaries, extended_sizes(cache), json=options.json)
                 return ExitCode.DONE
             vehicle = f"cache:{summaries[0].key}"
-        check_link(source_of(vehicle))
+        check_link(link_of(vehicle))
         found = read_source(vehicle, every=True, extended=extended, incomplete=True, cache=cache)
         sets = [await resolve(vehicle, cache=False)] if found is None else found.sets
         everything = {name for each in sets for name in each}

@@ -15,7 +15,7 @@ from paramclient.files.formats import ENDINGS
 from paramclient.links import FORMS, parse_link
 from paramclient.model.paramset import ParamSet
 from paramclient.provision.inspection import wait_for_identity
-from paramclient.provision.sources import fetched_set, is_file, is_offline, resolve, source_of
+from paramclient.provision.sources import fetched_set, is_file, is_offline, link_of, resolve
 
 __all__ = [
     "check_link",
@@ -68,7 +68,7 @@ async def resolve_all(
 
     found: dict[str, ParamSet] = {}
     for text in texts:
-        check_link(source_of(text))
+        check_link(link_of(text))
     for text in sorted(texts, key=lambda text: (not is_file(text), not is_offline(text))):
         if text not in found:
             found[text] = await resolve(

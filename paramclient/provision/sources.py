@@ -6,7 +6,7 @@ import logging
 import sys
 import time
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Final
@@ -37,10 +37,10 @@ __all__ = [
     "fetched_set",
     "is_file",
     "is_offline",
+    "link_of",
     "read_source",
     "resolve",
     "select_non_defaults",
-    "source_of",
     "tables_in",
 ]
 
@@ -94,10 +94,10 @@ async def resolve(
     found = read_source(text, component=component, extended=extended, cache=cache)
     if found is not None:
         return choose(found, component, system)
-    link = source_of(text)
+    link = link_of(text)
     if fetch is not None:
         return await fetch(link)
-    async with ParamClient(link if link == text else f"{link}?speed=0", cache=cache) as client:
+    async with ParamClient(link, cache=cache if link == text else False) as client:
         vehicle = await client.component(system, component)
         vehicle = vehicle.ext if extended else vehicle
         return fetched_set(vehicle, await vehicle.fetch_all(), source=f"link {client.link.name}")
@@ -122,21 +122,20 @@ def read_source(
     Raises:
         ParamClientError: as in `resolve`.
     """
-    if is_file(source_of(text)):
+    if is_file(text):
         return _read(text)
     if not is_offline(text):
         return None
     if cache is False:
         raise UsageError(f"{text!r} is a vehicle in the cache, which --no-cache excludes")
     place = cache if isinstance(cache, str) else None
-    with cache if isinstance(cache, ParamCache) else ParamCache(place) as opened:
+    with nullcontext(cache) if isinstance(cache, ParamCache) else ParamCache(place) as opened:
         tables = tables_in(opened, text, component, extended=extended)
-        pilots = [each for each in tables if each.component == AUTOPILOT]
         if not every and len(tables) > 1:
-            if not pilots:
-                known = ", ".join(f"{each.system}/{each.component}" for each in tables)
+            known = ", ".join(f"{each.system}/{each.component}" for each in tables)
+            tables = [each for each in tables if each.component == AUTOPILOT]
+            if not tables:
                 raise UsageError(f"no autopilot is among {known}; name one of them instead of {text}")
-            tables = pilots
         loaded = [opened.load(each.key, each.component, extended=extended) for each in tables]
     sets = [_cached_set(each, extended=extended, partial=incomplete) for each in loaded if each is not None]
     if not sets:  # removed meanwhile
@@ -159,27 +158,28 @@ def _read(path: str) -> ParamFile:
 
 
 def is_file(text: str) -> bool:
-    """Return whether a text names an existing file or the standard input.
+    """Return whether a text names a file with parameters that exists, or the standard input.
 
-    A device is not a file: it may be a link.
+    A telemetry log is a link, and a device may be one.
     """
-    if text == STANDARD_INPUT:
-        return True
-    with suppress(OSError, ValueError):  # a text that is too long or has a NUL is not a file name
-        path = Path(text)
-        return path.is_file() or path.is_fifo()
-    return False
+    return text == STANDARD_INPUT or (_exists(text) and link_of(text) == text)
 
 
 def is_offline(text: str) -> bool:
     """Return whether a text names a file or a vehicle in the cache, and no link."""
-    return is_file(source_of(text)) or text.startswith(_CACHED) or is_vehicle_name(text)
+    return is_file(text) or text.startswith(_CACHED) or is_vehicle_name(text)
 
 
-def source_of(text: str) -> str:
-    """Return the link `replay:FILE` for a telemetry log, else the text."""
-    is_telemetry = PurePath(text).suffix.lower() == ".tlog" and is_file(text)
-    return f"replay:{text}" if is_telemetry else text
+def link_of(text: str) -> str:
+    """Return the link that replays a telemetry log at full speed, for the name of one; else the text."""
+    is_telemetry = PurePath(text).suffix.lower() == ".tlog" and _exists(text)
+    return f"replay:{text}?speed=0" if is_telemetry else text
+
+
+def _exists(text: str) -> bool:
+    with suppress(OSError, ValueError):  # a text that is too long or has a NUL is not a file name
+        return Path(text).is_file() or Path(text).is_fifo()
+    return False
 
 
 def choose(file: ParamFile, component: int | None, system: int | None) -> ParamSet:
@@ -193,13 +193,13 @@ def choose(file: ParamFile, component: int | None, system: int | None) -> ParamS
 
 
 def tables_in(
-    cache: ParamCache, vehicle: str | None, component: int | None = None, *, extended: bool = False
+    cache: ParamCache, vehicle: str, component: int | None = None, *, extended: bool = False
 ) -> list[CachedSummary]:
     """Return the tables in the cache that an argument names. All subcommands use this function.
 
     Args:
         cache: the cache.
-        vehicle: the name of the vehicle, also with the prefix `cache:`; None for all vehicles.
+        vehicle: the name of the vehicle, also with the prefix `cache:`.
         component: return only the table of this component, unless the name has one.
         extended: only components with extended parameters. A system id is then enough, also if a camera of
             the system has a hardware id of its own.
@@ -210,17 +210,16 @@ def tables_in(
         UnknownVehicle: no vehicle in the cache has this name, or none of its tables is of this component.
         AmbiguousVehicle: several vehicles have this name.
     """
-    name = None if vehicle is None else vehicle.removeprefix(_CACHED)
-    if name == "":
+    name, own = vehicle.removeprefix(_CACHED), component_of(vehicle)
+    if not name:
         raise UsageError("a vehicle in the cache needs a name: its system id, its hardware id, or its key")
-    is_system = extended and name is not None and name.isdecimal()
+    is_system = extended and name.isdecimal()
     known = cache.components(None if is_system else name, extended=extended)
     known = [each for each in known if not is_system or str(each.system) == name]
-    component = component if name is None or component_of(name) is None else component_of(name)
-    chosen = [each for each in known if component in (None, each.component)]
+    chosen = [each for each in known if (component if own is None else own) in (None, each.component)]
     if not chosen and extended:
         raise NotInCache("there are no extended parameters of that vehicle in the cache")
-    if not chosen and (known or vehicle is not None):
+    if not chosen:
         addresses = [f"{each.system}/{each.component} ({each.key})" for each in known]
         raise UnknownVehicle(
             f"component {component} is not in the cache {cache.place}, which has {', '.join(addresses)}",

@@ -1,0 +1,70 @@
+"""`resolve`: the parameters of a file, a log, a vehicle of the cache, or a link."""
+
+from __future__ import annotations
+
+import io
+import logging
+from pathlib import Path
+
+import pytest
+
+from paramclient import FileError, ParamCache, UsageError, VehicleError
+from paramclient.provision import resolve
+from paramclient.provision.sources import read_source
+from paramclient.sim import PX4Vehicle
+from tests.shell import a_client, in_simulated_time
+
+DATA = Path(__file__).parents[1] / "data"
+
+
+def placed(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@in_simulated_time
+async def test_every_source_becomes_a_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(b"A 1\n")))
+    monkeypatch.chdir(tmp_path)
+    placed(tmp_path / "4", "B 2\n")
+    with ParamCache(tmp_path / "cache.sqlite3") as cache:
+        async with a_client(PX4Vehicle(table={"MC_ROLL_P": 6.5}, system=4), cache=cache) as client:
+            await client.fetch_all()
+        found = {
+            text: await resolve(text, cache=cache)
+            for text in ("-", "4", "cache:4", str(DATA / "px4_full_download.tlog"))
+        }
+        assert len(cache.components()) == 1, "the cache is still open"
+    assert {text: next(iter(each.items()))[0] for text, each in found.items() if len(each) == 1} == {
+        "-": "A",
+        "4": "B",
+        "cache:4": "MC_ROLL_P",
+    }
+    assert [each.system for each in found.values()] == [None, None, 4, 1]
+
+
+@in_simulated_time
+async def test_a_set_that_a_text_does_not_give_is_an_error(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = placed(tmp_path / "quad.param", "A,1\nA_NAME_THAT_IS_TOO_LONG,2\n")
+    with caplog.at_level(logging.WARNING, "paramclient"):
+        assert list(await resolve(str(file))) == ["A"]
+    assert "line 2" in caplog.text
+    with ParamCache(tmp_path / "cache.sqlite3") as cache:
+        async with a_client(PX4Vehicle(table={"A": 1, "B": 2}, dead=["B"]), cache=cache) as client:
+            await client.fetch_all()
+        with pytest.raises(VehicleError, match="1 of 2 parameters are in the cache"):
+            await resolve("1", cache=cache)
+        partial = read_source("1", cache=cache, incomplete=True)
+        assert partial is not None
+        assert list(partial.choose()) == ["A"]
+        with pytest.raises(UsageError, match="is not in the cache"):
+            await resolve("7", cache=cache)
+    placed(file, "A;1\n")
+    with pytest.raises(FileError):
+        await resolve(str(file))
+    with pytest.raises(UsageError, match="excludes"):
+        await resolve("1", cache=False)
+    with pytest.raises(UsageError, match="the kind of link is missing"):
+        await resolve("quad", cache=False)
