@@ -22,7 +22,6 @@ __all__ = [
     "ApplyFlags",
     "CacheOptions",
     "KeyOptions",
-    "Positive",
     "LinkOptions",
     "Seconds",
     "TrafficOptions",
@@ -43,8 +42,6 @@ def _check_seconds(_: object, seconds: float | None) -> None:
 
 Seconds: TypeAlias = Annotated[float | None, Parameter(validator=_check_seconds)]
 """A timeout in seconds."""
-Positive: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1))]
-"""A whole number from 1 up, or none."""
 Verbose: TypeAlias = Annotated[bool, Parameter(name=("--verbose", "-v"))]
 """Whether each step is logged on stderr."""
 

@@ -16,7 +16,7 @@ from paramclient.cli.metadata import (
     known_of_table,
     print_descriptions,
 )
-from paramclient.cli.options import CacheOptions, Positive
+from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import local_time, print_json, print_line, print_table, report, say
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata, ParamInfo
@@ -41,7 +41,6 @@ def search(
     /,
     *words: str,
     vehicle: str | None = None,
-    limit: Positive = None,
     metadata: MetadataChoice = None,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
@@ -55,7 +54,6 @@ def search(
         word: A word or a part of one, or several words in quotes.
         words: Further words.
         vehicle: Search only this vehicle in the cache: 4, px4 or ardupilot, its hardware id, or its key.
-        limit: Print at most this number of parameters.
         metadata: A file that describes parameters. Default: the stored metadata of each vehicle's firmware.
     """
     lowered_words = " ".join((word, *words)).casefold().split()
@@ -64,13 +62,11 @@ def search(
     known = _Known(options, vehicle, from_file(metadata, offline=True))
     ranks = {name: _rank(name, known.info(name), lowered_words) for name in known.names}
     ranked = sorted((rank, name) for name, rank in ranks.items() if rank is not None)
-    names = [name for _, name in ranked[:limit]]
+    names = [name for _, name in ranked]
     if options.json:
         print_json({"results": [known.as_json(name) for name in names]})
     elif names:
         print_table(["name", "value", "vehicle", "description"], map(known.cells, names), right="value")
-        if len(ranked) > len(names):
-            say(f"{len(names)} of {counted(len(ranked), 'parameter')} shown")
     if not names:
         report(f"nothing found; {counted(len(known.names), 'parameter')} searched")
     if known.undescribed and not options.json:
