@@ -15,13 +15,11 @@ from paramclient.errors import AlreadyRestored, NotInCache, ParamClientError, Un
 from paramclient.model.paramset import ParamSet, RestorePoint
 from paramclient.model.wording import age_in_words
 from paramclient.provision.apply_rules import OUT_OF_RANGE
-from paramclient.provision.execution import ApplyOptions, ApplyResult, run
+from paramclient.provision.execution import BEFORE_APPLY, BEFORE_RESTORE, ApplyOptions, ApplyResult, run
 from paramclient.provision.inspection import Wanted, wait_for_identity, wanted_set
 from paramclient.provision.planning import Rows
 
 __all__ = [
-    "BEFORE_APPLY",
-    "BEFORE_RESTORE",
     "FleetResult",
     "apply",
     "for_each",
@@ -31,11 +29,6 @@ __all__ = [
 ]
 
 Outcome = TypeVar("Outcome", bound=Rows)
-
-BEFORE_APPLY: Final = "before apply"
-"""The reason of the snapshot that `apply` stores before its first write."""
-BEFORE_RESTORE: Final = "before restore"
-"""The reason of the snapshot that `restore` stores before its first write."""
 
 OWN_STATE_CATEGORIES: Final = ("identity", "hardware", "calibration", OUT_OF_RANGE)
 """Categories that `restore` includes if the state is the vehicle's own."""
@@ -73,7 +66,7 @@ async def apply(component: Component, wanted: Wanted, **options: Unpack[ApplyOpt
         NoReply: the vehicle did not answer before the first write.
         LinkError: the link failed, or the client was closed, before the first write.
     """
-    return await run(component, wanted_set(component, wanted), BEFORE_APPLY, **options)
+    return await run(component, wanted_set(component, wanted), options, is_restore=False)
 
 
 async def restore(component: Component, state: Wanted, **options: Unpack[ApplyOptions]) -> ApplyResult:
@@ -97,7 +90,7 @@ async def restore(component: Component, state: Wanted, **options: Unpack[ApplyOp
     given = (include,) if isinstance(include, str) else tuple(include)
     options["include"] = (*await restore_categories(component, state), *given)
     options.setdefault("partial", True)
-    return await run(component, state, BEFORE_RESTORE, skips_read_only=True, **options)
+    return await run(component, state, options, is_restore=True)
 
 
 async def restore_categories(component: Component, state: ParamSet) -> tuple[str, ...]:

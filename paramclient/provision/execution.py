@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, Unpack, cast
+from typing import Final, cast
 
 import anyio
 
@@ -49,8 +49,12 @@ from paramclient.provision.planning import (
     plan_from,
 )
 
-__all__ = ["ApplyOptions", "ApplyProgress", "ApplyResult", "run"]
+__all__ = ["BEFORE_APPLY", "BEFORE_RESTORE", "ApplyOptions", "ApplyProgress", "ApplyResult", "run"]
 
+BEFORE_APPLY: Final = "before apply"
+"""The reason of the snapshot that `apply` stores before its first write."""
+BEFORE_RESTORE: Final = "before restore"
+"""The reason of the snapshot that `restore` stores before its first write."""
 WRITE_ATTEMPTS_MAX: Final = 2
 """Times that a value is written if the vehicle acknowledges it and later holds another value: a write of
 another parameter may have changed it."""
@@ -114,11 +118,8 @@ class ApplyResult(Rows):
         return self.error is None and all(row.is_as_wanted for row in self.rows.values())
 
     def __repr__(self) -> str:
-        counts = ", ".join(f"{count} {status}" for status, count in self.counts.items())
         end = f", ended by {self.error}" if self.error is not None else ""
-        return (
-            f"<ApplyResult {self.system}/{self.component} {counts or 'nothing'} in {self.elapsed:.2f} s{end}>"
-        )
+        return f"<ApplyResult {self.system}/{self.component} {self.summary} in {self.elapsed:.2f} s{end}>"
 
 
 class ApplyOptions(PlanOptions, total=False):
@@ -153,24 +154,18 @@ class ApplyOptions(PlanOptions, total=False):
 
 
 async def run(
-    component: Component,
-    wanted: ParamSet,
-    reason: str,
-    *,
-    skips_read_only: bool = False,
-    **options: Unpack[ApplyOptions],
+    component: Component, wanted: ParamSet, options: ApplyOptions, *, is_restore: bool
 ) -> ApplyResult:
     """Apply wanted parameters to a vehicle; see `apply`.
 
     Args:
         component, wanted, options: as in `apply`.
-        reason: the reason of the snapshot of the state before the first write.
-        skips_read_only: skip a parameter that the vehicle refuses as read-only, rather than report it as
-            refused.
+        is_restore: whether they are an earlier state of the vehicle. A parameter that it refuses as read-only
+            is then skipped, and not reported as refused.
     """
     began = anyio.current_time()
     error: ParamClientError | None = None
-    one = _Run(component, wanted, reason, options, skips_read_only=skips_read_only)
+    one = _Run(component, wanted, options, is_restore=is_restore)
     with anyio.move_on_after(options.get("timeout")) as scope:
         await one.begin()
         try:
@@ -199,17 +194,11 @@ class _Run:
     """
 
     def __init__(
-        self,
-        component: Component,
-        wanted: ParamSet,
-        reason: str,
-        options: ApplyOptions,
-        *,
-        skips_read_only: bool,
+        self, component: Component, wanted: ParamSet, options: ApplyOptions, *, is_restore: bool
     ) -> None:
         check_author(options.get("author"))
-        self.component, self.wanted, self.reason, self.options = component, wanted, reason, options
-        self.skips_read_only, self._reboots_allowed = skips_read_only, options.get("reboot", False)
+        self.component, self.wanted, self.options = component, wanted, options
+        self.is_restore, self._reboots_allowed = is_restore, options.get("reboot", False)
         self._planned = cast(
             PlanOptions, {name: each for name, each in options.items() if name in PlanOptions.__annotations__}
         )
@@ -264,7 +253,7 @@ class _Run:
                     component.identity,
                     component.component,
                     inspection.table,
-                    reason=self.reason,
+                    reason=BEFORE_RESTORE if self.is_restore else BEFORE_APPLY,
                     hash=inspection.hash,
                     complete=inspection.complete,
                     is_of_operation=True,
@@ -452,7 +441,7 @@ class _Run:
                 self._settle(row, ApplyStatus.ADJUSTED, "the vehicle changed the value")
             else:
                 self._accept(row, done.note)
-        elif self.skips_read_only and _is_read_only(error):
+        elif self.is_restore and _is_read_only(error):
             reason = "left out: the vehicle reports that it is read-only"
             self._settle(row, ApplyStatus.SKIPPED, reason, READ_ONLY)
         elif outcome.status is SetStatus.REFUSED:

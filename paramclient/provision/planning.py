@@ -193,6 +193,11 @@ class Rows:
         return Counter(row.status for row in self.rows.values())
 
     @property
+    def summary(self) -> str:
+        """The number of rows with each status, in words."""
+        return ", ".join(f"{count} {status}" for status, count in self.counts.items()) or "nothing"
+
+    @property
     def complete(self) -> bool:
         """Whether the vehicle has all wanted values, except those left out on purpose."""
         return all(row.is_as_wanted for row in self.rows.values())
@@ -253,8 +258,7 @@ class Plan(Rows):
         return tuple(row.name for row in self.to_write if row.needs_reboot)
 
     def __repr__(self) -> str:
-        counts = ", ".join(f"{count} {status}" for status, count in self.counts.items())
-        return f"<Plan {counts or 'nothing'} in {len(self.stages)} stages>"
+        return f"<Plan {self.summary} in {len(self.stages)} stages>"
 
 
 def plan_from(
