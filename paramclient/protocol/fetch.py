@@ -189,7 +189,7 @@ class _Fetch:
         self._began = anyio.current_time()
         self._before = dict(session.table.params)
         self._changed: tuple[str, ...] = ()
-        self._is_silent = False  # MAVFTP
+        self._ftp_is_silent = False
         self._vehicles = session.identification.vehicles
 
     async def run(self, *, refresh: bool) -> FetchResult:
@@ -211,7 +211,7 @@ class _Fetch:
             self.notes.append(UNCONFIRMED.format(answer.reason))
         if self.policy is Policy.HASH_ONLY:
             return self._unconfirmed()
-        self._is_silent = answer.is_silent
+        self._ftp_is_silent = answer.is_silent
         source: FetchSource = "stream"
         digest = answer.digest
         for _ in range(ROUNDS_MAX):
@@ -223,7 +223,7 @@ class _Fetch:
                 not is_whole or await settle(self.session, digest, self.listed.digest, self.notes)
             ):
                 break
-            digest = None
+            digest = None  # it was of the table before
         if answer.is_other:
             self._name_changes()
         return self._result(source)
@@ -246,7 +246,7 @@ class _Fetch:
     async def _download(self) -> FetchSource:
         """Download the file, or the list where there is none."""
         session = self.session
-        if not self._is_silent and session.serves_file is not False and not session.dialect.has_ack:
+        if not self._ftp_is_silent and session.serves_file is not False and not session.dialect.has_ack:
             with session.channel.gate.until_closed(or_failed=True), anyio.move_on_after(IDENTITY_TIME):
                 await session.identification.encoding_certain()
             if session.identification.may_serve_file:
@@ -258,10 +258,10 @@ class _Fetch:
                     if session.channel.is_silent(self._began):
                         return "ftp"
                     self.notes.append(f"Downloaded as a list: {error.reason}.")
-                    self._is_silent = error.is_silent
+                    self._ftp_is_silent = error.is_silent
         self.listed = await download_list(session)
         by_loss = session.channel.timing.attempts_for(SILENT_LOST) if self.listed.lost else 0
-        if self._is_silent and not self.listed.missing and session.ftp_unanswered >= by_loss:
+        if self._ftp_is_silent and not self.listed.missing and session.ftp_unanswered >= by_loss:
             session.serves_file = False
         with session.channel.gate.until_closed(or_failed=True):
             await session.identification.encoding_certain()

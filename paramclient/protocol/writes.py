@@ -300,7 +300,7 @@ class _Write:
                 inbox,
                 self._accept,
                 what=what,
-                attempts=lambda: 0 if self._has_other_value else SILENT_SETS_MAX,
+                attempts=lambda: 0 if self._has_other_value else SILENT_SETS_MAX,  # a read shows more
                 ready=self._confirm,
             )
         until = anyio.current_time() + EXT_PROGRESS_TIMEOUT
