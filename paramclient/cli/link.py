@@ -13,7 +13,7 @@ import anyio
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_output import JsonObject
 from paramclient.cli.options import Seconds, TrafficOptions
-from paramclient.cli.output import LiveView, milliseconds, print_json, print_line, print_table
+from paramclient.cli.output import clear_screen, milliseconds, print_json, print_line, print_table
 from paramclient.cli.session import Deadline, listen, received_in_words
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
@@ -62,12 +62,13 @@ async def link(
     limit = seconds if is_live or seconds is not None else LINK_LISTENING_TIME
     async with listen(url, options, listen_only=listen_only) as client, task_group() as tasks:
         tasks.start_soon(_measure_round_trips, client)
-        view, deadline = LiveView(), Deadline(limit)
+        deadline = Deadline(limit)
         while True:
             report = client.traffic_report()  # raises if the link has failed
             found = _json(client, report)
             if is_live:
-                view.draw(_COLUMNS, map(_row, found["components"]), _lines(found))
+                clear_screen()
+                _print(found)
             if not (left := deadline.left(REFRESH_INTERVAL)):
                 break
             await anyio.sleep(left)
@@ -78,9 +79,7 @@ async def link(
     if options.json:
         print_json(found)
     elif not is_live:
-        print_table(_COLUMNS, map(_row, found["components"]), right=" ".join(_COLUMNS[2:]))
-        for line in _lines(found):
-            print_line(line)
+        _print(found)
     return ExitCode.DONE
 
 
@@ -158,6 +157,12 @@ def _component_json(client: ParamClient, now: float, each: ComponentTraffic) -> 
 
 _COLUMNS: Final = ("from", "what", "v", "frames/s", "bytes/s", "loss", "round trip", "heartbeat")
 """Columns of the table of components."""
+
+
+def _print(found: JsonObject) -> None:
+    print_table(_COLUMNS, map(_row, found["components"]), right=" ".join(_COLUMNS[2:]))
+    for line in _lines(found):
+        print_line(line)
 
 
 def _row(each: JsonObject) -> tuple[object, ...]:

@@ -26,10 +26,10 @@ from paramclient.protocol.fetch import Progress
 __all__ = [
     "STDIN",
     "Coloured",
-    "LiveView",
     "Status",
     "by_index",
     "can_ask",
+    "clear_screen",
     "confirm",
     "local_time",
     "milliseconds",
@@ -175,21 +175,9 @@ def show(
         say(empty)
 
 
-class LiveView:
-    """A table with lines below it that is drawn again and again in the same place of a terminal."""
-
-    def __init__(self) -> None:
-        self._height = 0
-
-    def draw(self, columns: Sequence[str], rows: Iterable[Sequence[object]], lines: Iterable[str]) -> None:
-        """Draw in the place of the last drawing. All columns except the first two are right-aligned."""
-        width, height = shutil.get_terminal_size()
-        shown = [*_table_lines(columns, rows, columns[2:], is_terminal=True)]
-        shown += [part for line in lines for part in _fold(printable(line), width)]
-        shown = shown[: height - 1]  # a line that has left the screen cannot be drawn again
-        up = f"\x1b[{self._height}A\r\x1b[J" if self._height else ""
-        print(up + "\n".join(shown), flush=True)
-        self._height = len(shown)
+def clear_screen() -> None:
+    """Erase a terminal, for a table that is printed again and again in the same place."""
+    sys.stdout.write("\x1b[H\x1b[J")
 
 
 def _table_lines(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from typing import Final
 
-from paramclient.cache import CachedComponent, HistoryEntry, ParamCache
+from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.cached import load_tables
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.json_output import JsonObject, history_json, info_json, table_param_json
+from paramclient.cli.json_output import JsonObject, info_json, table_param_json
 from paramclient.cli.metadata import (
     METADATA_HINT,
     MetadataChoice,
@@ -29,9 +29,6 @@ from paramclient.model.wording import counted
 from paramclient.provision.sources import tables_in
 
 __all__ = ["info", "search"]
-
-CHANGES_SHOWN: Final = 5
-"""Last changes of a parameter that info prints, so that the values stay in view; history prints all."""
 
 _DEFAULTS: Final = CacheOptions()
 
@@ -82,7 +79,7 @@ def info(
     metadata: MetadataChoice = None,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
-    """Print the description, range, value names, cached values and last changes of a parameter.
+    """Print the description, range, value names and cached values of a parameter.
 
     Args:
         name: The parameter, in upper or lower case.
@@ -95,22 +92,29 @@ def info(
     described = known.info(spelled)  # also that of a group, FOO{n}_BAR, which is not among the names
     if described is None:
         NameChoice([name]).choose(known.names, " of the cache")
-    with ParamCache(options.cache) as cache:
-        found = [
-            (each, cache.history(each.key, each.component, spelled, CHANGES_SHOWN))
-            for each in known.having(spelled)
-        ]
+    found = [(each, each.params[spelled]) for each in known.having(spelled)]
+    default = None if described is None else described.default
     if options.json:
-        values = [_value_json(*each, spelled, described) for each in found]
-        print_json({"name": spelled, "metadata": described and info_json(described), "vehicles": values})
+        vehicles = [
+            {
+                "key": each.key,
+                "system": each.system,
+                "component": each.component,
+                "autopilot": autopilot_name(each.autopilot),
+                "heard_at": time_text(each.heard_at[spelled]),
+                "param": table_param_json(param, described=default),
+            }
+            for each, param in found
+        ]
+        print_json({"name": spelled, "metadata": described and info_json(described), "vehicles": vehicles})
         return ExitCode.DONE
     print_descriptions([spelled], Metadata.of([described] if described is not None else []))
     if described is None and known.undescribed:
         say(f"no metadata of {known.undescribed} is known: {METADATA_HINT}")
-    for each in found:
+    if found:
         print_line("")
-        for line in _lines_of(*each, spelled, described):
-            print_line(line)
+        columns = ("vehicle", "value", "meaning", "type", "default", "source", "heard", "key")
+        print_table(columns, (_cells(*each, described) for each in found), right="value default")
     return ExitCode.DONE
 
 
@@ -183,36 +187,19 @@ def _rank(name: str, described: ParamInfo | None, lowered_words: Iterable[str]) 
     )
 
 
-def _value_json(
-    table: CachedComponent, changes: Sequence[HistoryEntry], name: str, described: ParamInfo | None
-) -> JsonObject:
-    """Return the JSON of the cached value of one vehicle, with its last changes."""
-    default = None if described is None else described.default
-    return {
-        "key": table.key,
-        "system": table.system,
-        "component": table.component,
-        "autopilot": autopilot_name(table.autopilot),
-        "heard_at": time_text(table.heard_at[name]),
-        "param": table_param_json(table.params[name], described=default),
-        "changes": [history_json(each) for each in changes],
-    }
-
-
-def _lines_of(
-    table: CachedComponent, changes: Sequence[HistoryEntry], name: str, described: ParamInfo | None
-) -> Iterator[str]:
-    """Yield the lines about the value of one vehicle."""
-    param = table.params[name]
-    meaning = described and described.text(param.settable)
-    yield f"{table.system}/{table.component} {autopilot_name(table.autopilot)} ({table.key})"
-    yield f"  value: {_value(param)}{f' ({meaning})' if meaning else ''}, {param.type.name}"
-    if (default := default_of(param, None if described is None else described.default)) is not None:
-        yield f"  default: {format_value(default.value, param.type)} (of the {default.source})"
-    yield f"  heard: {local_time(table.heard_at[name])}"
-    for entry in changes:
-        new = "removed" if entry.new is None else _value(entry.new)
-        yield f"  changed: {local_time(entry.at)}  {_value(entry.old)} -> {new}  ({entry.by})"
+def _cells(table: CachedComponent, param: Param, described: ParamInfo | None) -> tuple[object, ...]:
+    """Return the row of the value of one vehicle."""
+    default = default_of(param, None if described is None else described.default)
+    return (
+        f"{table.system}/{table.component}",
+        _value(param),
+        None if described is None else described.text(param.settable),
+        param.type.name,
+        None if default is None else format_value(default.value, param.type),
+        None if default is None else default.source,
+        local_time(table.heard_at[param.name]),
+        table.key,
+    )
 
 
 def _value(param: Param) -> str:

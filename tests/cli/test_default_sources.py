@@ -72,7 +72,7 @@ def test_a_cached_table_is_compared_with_the_remembered_metadata(command: Comman
     found = command("show", "1", "--changed", "--json").json["components"][0]["params"]
     assert {name: each["default_source"] for name, each in found.items()} == {"MC_ROLL_P": "metadata"}
     reported = command("info", "MC_ROLL_P")
-    assert "default: 4.0 (of the metadata)" in reported.out
+    assert reported.rows[-1][3:5] == ["4.0", "metadata"]
     (vehicle,) = command("info", "MC_ROLL_P", "--json").json["vehicles"]
     assert (vehicle["param"]["default_source"], vehicle["param"]["is_default"]) == ("metadata", False)
 
