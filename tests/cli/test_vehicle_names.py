@@ -172,9 +172,7 @@ COMMANDS = [
 """With NAME for the vehicle, and FILE for a file that is not there."""
 
 
-@pytest.mark.parametrize(
-    "name", ["4", "cache:4", "4a00", "4a000000", "uid:4a00", "9", "cache:9", "uid:c0ffee"]
-)
+@pytest.mark.parametrize("name", ["4", "4a000000", "cache:9", "uid:c0ffee"])
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_no_subcommand_guesses_a_vehicle(
     command: Command, put: Put, cache: Path, tmp_path: Path, words: list[str], name: str
@@ -195,7 +193,7 @@ def test_no_subcommand_guesses_a_vehicle(
     assert not vehicle.requests, "nothing is sent"
 
 
-@pytest.mark.parametrize("name", ["3", "cache:3", "uid:4a0000", f"cache:{FOUR}", f"uid:{FOUR}"])
+@pytest.mark.parametrize("name", ["3", "uid:4a0000", f"cache:{FOUR}"])
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_every_subcommand_accepts_each_kind_of_name(
     command: Command, put: Put, cache: Path, tmp_path: Path, words: list[str], name: str
