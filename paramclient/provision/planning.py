@@ -15,6 +15,7 @@ from typing import Final, TypedDict, Unpack
 
 from paramclient.errors import UsageError
 from paramclient.metadata import ParamInfo
+from paramclient.model.comparison import same_value
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite, version_difference
 from paramclient.model.names import nearest_names
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -23,9 +24,7 @@ from paramclient.model.values import (
     Param,
     ParamType,
     WireValue,
-    bits_of,
     format_value,
-    same_bits,
 )
 from paramclient.protocol.dialect import EXTENDED, PLAIN
 from paramclient.provision.apply_rules import ACTION, CATEGORIES, OUT_OF_RANGE, READ_ONLY, Choice, rules_for
@@ -530,16 +529,7 @@ class _Planner:
 
 def _is_same(wanted: WireValue, current: WireValue, kind: ParamType | int | None) -> bool:
     """Return whether two values are equal in the vehicle's type; as float32 if the type is unknown."""
-    if kind != ParamType.CUSTOM and (isinstance(wanted, bytes) or isinstance(current, bytes)):
-        return wanted == current
-    if kind is None:
-        if isinstance(wanted, int) and isinstance(current, int):
-            return wanted == current
-        kind = ParamType.REAL32
-    try:
-        return same_bits(kind, bits_of(wanted, kind), bits_of(current, kind))
-    except UsageError:
-        return False
+    return same_value(*(WrittenParam("", value, kind) for value in (wanted, current)))
 
 
 def _float32(value: float) -> float:
