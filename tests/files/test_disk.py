@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from paramclient import FileError, ParamFile, ParamSet, ParamType, WrittenParam, read_file, write_file
+from paramclient import FileError, ParamSet, ParamType, WrittenParam, read_file, write_file
 from paramclient.files import LARGEST_FILE, FileFormat, dumps, loads
 from paramclient.files.formats import ENDINGS
 from paramclient.files.lists import FILES_MAX
@@ -39,14 +39,6 @@ def test_the_extension_selects_the_format_to_write(ending: str, form: FileFormat
     assert (file.file_format, file.source, file.choose().source) == (form, str(path), str(path))
     assert file.choose()["A"].value == 5
     assert listed(tmp_path) == [path.name]
-
-
-def test_an_unknown_extension_is_rejected(tmp_path: Path) -> None:
-    error = refused(lambda: write_file(tmp_path / "quad.txt", PARAMS))
-    assert "unknown file extension '.txt'. Choose a format (qgc, parm, mission-planner" in str(error)
-    assert "one of the extensions .params, .parm, .param" in str(error)
-    assert error.source == str(tmp_path / "quad.txt")
-    assert listed(tmp_path) == []
 
 
 def test_replacing_a_file_keeps_its_mode(tmp_path: Path) -> None:
@@ -157,14 +149,6 @@ def test_a_too_large_file_is_rejected(tmp_path: Path) -> None:
     with path.open("wb") as file:
         file.truncate(LARGEST_FILE + 1)
     assert f"a parameter file has at most {LARGEST_FILE} bytes" in str(refused(lambda: read_file(path)))
-
-
-def test_bytes_without_a_name() -> None:
-    file = loads(b"A 1")
-    assert isinstance(file, ParamFile)
-    assert repr(file) == "<ParamFile unnamed parm ?/?: 1>"
-    with pytest.raises(FileError, match=r"^line 1: expected NAME VALUE, found 'x'$"):
-        loads(b"x")
 
 
 # Included files

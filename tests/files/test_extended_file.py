@@ -8,8 +8,6 @@ import struct
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from paramclient.errors import FileError
 from paramclient.files import loads, read_file, write_file
@@ -65,14 +63,6 @@ def test_a_written_file_reads_back_unchanged(tmp_path: Path) -> None:
     assert dict(found.params) == params
     assert list(found.params) == list(params)
     assert (found.system, found.component, found.at, found.source) == (1, 100, 1_700_000_000.0, str(path))
-
-
-@given(raw=st.binary(max_size=128) | st.text(max_size=30).map(str.encode))
-def test_any_custom_value_is_restored(tmp_path_factory: pytest.TempPathFactory, raw: bytes) -> None:
-    path = tmp_path_factory.getbasetemp() / "any.json"
-    param = written("A", raw[:128])
-    write_file(path, ParamSet({"A": param}, is_extended=True))
-    assert read(path).params["A"] == param
 
 
 @pytest.mark.parametrize("ending", ["param", "parm", "params", "pck"])

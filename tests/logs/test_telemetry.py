@@ -19,7 +19,6 @@ from paramclient import (
     UsageError,
 )
 from paramclient.cache import BY_US, StoredParam, TableUpdate
-from paramclient.links import LinkKind, ReplayLink, create_link, parse_link
 from paramclient.links.replay import PAUSE_MAX
 from paramclient.logs.logged_params import ImportedTable
 from paramclient.logs.telemetry import import_log
@@ -41,23 +40,6 @@ def a_replay(path: Path | str, **options: object) -> ParamClient:
 
 
 # Names
-
-
-@pytest.mark.parametrize(
-    ("text", "name", "path", "options"),
-    [
-        ("replay:flight.tlog", "replay:flight.tlog", "flight.tlog", ()),
-        ("replay:///logs/a b.tlog", "replay:/logs/a b.tlog", "/logs/a b.tlog", ()),
-        ("REPLAY:/x.tlog?speed=2", "replay:/x.tlog?speed=2.0", "/x.tlog", (("speed", 2.0),)),
-        ("replay:/x.tlog?speed=inf", "replay:/x.tlog?speed=0.0", "/x.tlog", (("speed", 0.0),)),
-        ("replay:what?.tlog", "replay:what?.tlog", "what?.tlog", ()),
-    ],
-)
-def test_link_names_of_logs(text: str, name: str, path: str, options: tuple[tuple[str, float], ...]) -> None:
-    spec = parse_link(text)
-    assert (spec.kind, spec.name, spec.host, spec.options) == (LinkKind.REPLAY, name, path, options)
-    assert parse_link(name) == spec
-    assert isinstance(create_link(text), ReplayLink)
 
 
 @in_simulated_time
@@ -160,31 +142,6 @@ async def test_requests_to_a_log_fail(tmp_path: Path) -> None:
         assert anyio.current_time() - began < 2.0
     with pytest.raises(UsageError, match="paramclient import"):
         a_replay(path, cache=tmp_path / "cache")
-
-
-@in_simulated_time
-async def test_a_replay_can_be_closed_at_any_moment(tmp_path: Path) -> None:
-    path = Log().beat().wait(1000.0).beat().write(tmp_path / "flight.tlog")
-    link = create_link(f"replay:{path}")
-    await link.open()
-    assert len(await link.receive()) == 1
-    caught: list[LinkError] = []
-
-    async def wait() -> None:
-        try:
-            await link.receive()
-        except LinkError as error:
-            caught.append(error)
-
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(wait)
-        await anyio.sleep(1.0)
-        await link.close()
-    assert str(caught[0]) == f"replay:{path}: not open"
-    await link.close()
-    await link.open()
-    assert len(await link.receive()) == 1
-    await link.close()
 
 
 # Import into a cache

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import lzma
-import os
 import stat
 from dataclasses import replace
 from pathlib import Path
@@ -17,10 +16,10 @@ import pytest
 
 from paramclient import ClientClosed, FileTransferError, NoReply
 from paramclient.errors import FileError
-from paramclient.metadata import Metadata, MetadataStore, download, metadata_of, store
+from paramclient.metadata import Metadata, MetadataStore, download, metadata_of
 from paramclient.model.identity import Identity
 from paramclient.model.px4_hash import crc32_px4
-from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.sim.metadata import GENERAL_FILE, METADATA_FILE
 from paramclient.wire.messages import FileTransfer
 from tests.shell import (
@@ -85,16 +84,6 @@ async def test_a_vehicle_describes_its_parameters() -> None:
 
 
 @in_simulated_time
-async def test_download_with_packet_loss() -> None:
-    vehicle = describing(ftp_rate=10_000)
-    link = Air([vehicle], uplink=FaultyLink(loss=0.3, seed=5), downlink=FaultyLink(loss=0.3, seed=6))
-    async with a_client(link) as client:
-        read = await metadata_of(await client.component())
-        assert read is not None
-        assert "PARAM_03" in read
-
-
-@in_simulated_time
 async def test_a_cached_file_is_not_downloaded_again(tmp_path: Path) -> None:
     cache = tmp_path / "cache.sqlite3"
     for expected in (True, False):
@@ -113,18 +102,6 @@ async def test_a_cached_file_is_not_downloaded_again(tmp_path: Path) -> None:
             known = MetadataStore(folder).known(component.identity, 1)
             assert known is not None
             assert known.params == read.params
-
-
-@in_simulated_time
-async def test_without_a_cache_nothing_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def forbidden(*_: object) -> None:
-        raise AssertionError
-
-    monkeypatch.setattr(MetadataStore, "put", forbidden)
-    async with a_client(describing()) as client:
-        assert await metadata_of(await client.component()) is not None
-    async with a_client(describing(), cache=str(tmp_path / "c")) as client:
-        assert await metadata_of(await client.component(), store=False) is not None
 
 
 # Errors
@@ -150,14 +127,6 @@ async def test_nothing_is_downloaded_from_the_internet() -> None:
         ) as caught:
             await metadata_of(await client.component())
     assert caught.value.source == "https://example.invalid/parameters.json.xz"
-
-
-@in_simulated_time
-async def test_a_file_on_board_is_preferred_to_the_internet() -> None:
-    vehicle = describing()
-    publish(vehicle, uri="https://example.invalid/p", uriFallback=f"mftp://{METADATA_FILE}")
-    async with a_client(vehicle) as client:
-        assert await metadata_of(await client.component()) is not None
 
 
 @in_simulated_time
@@ -311,19 +280,6 @@ def test_a_damaged_file_is_deleted(damage: bytes, tmp_path: Path, caplog: pytest
         assert kept.known(IDENTITY, 1) is None
     assert "is damaged and was removed" in caplog.text
     assert not list(tmp_path.iterdir())
-
-
-def test_the_number_of_files_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(store, "CACHED_FILES_MAX", 4)
-    kept = MetadataStore(tmp_path)
-    contents = [described(f"P{number}") for number in range(6)]
-    for number, content in enumerate(contents):
-        kept.put(content, crc32_px4(content))
-        os.utime(tmp_path / f"{crc32_px4(content):08x}.metadata", (number, number))
-        if number == 3:
-            assert kept.get(crc32_px4(contents[0])) == contents[0]  # used most recently
-    held = [kept.get(crc32_px4(content)) is not None for content in contents]
-    assert held == [True, False, False, True, True, True]
 
 
 def test_disk_errors_are_logged_as_warnings(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

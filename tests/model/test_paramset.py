@@ -6,7 +6,6 @@ import struct
 
 import pytest
 
-from paramclient.errors import UsageError
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import Param, ParamType, WireValue, bits_of
 
@@ -49,8 +48,3 @@ def test_raw_bytes_of_a_small_type_have_four_bytes() -> None:
     param = Param("P", raw, ParamType.INT8, 0, int.from_bytes(raw, "little"))
     assert WrittenParam.of(param).is_held_by(param)
     assert not WrittenParam("P", struct.pack("<f", 2e20)).is_held_by(param)
-
-
-def test_bits_as_raises_for_a_value_that_does_not_fit() -> None:
-    with pytest.raises(UsageError, match="300 does not fit UINT8"):
-        WrittenParam("P", 300).bits_as(ParamType.UINT8)
