@@ -376,18 +376,10 @@ async def test_closing_wakes_the_receiver(kind: str) -> None:
             while not failures:
                 await anyio.lowlevel.checkpoint()
         assert failures[0].link == link.name
-
-
-@pytest.mark.asyncio
-@pytest.mark.parametrize("kind", KINDS)
-async def test_a_closed_link_raises_and_can_be_closed_again(kind: str) -> None:
-    async with connected(kind) as (link, _):
         await link.close()
-        await link.close()
-        with pytest.raises(LinkError, match="not open"):
-            await link.receive()
-        with pytest.raises(LinkError, match="not open"):
-            await link.send(HEARTBEAT, None)
+        for call in (link.receive(), link.send(HEARTBEAT, None)):
+            with pytest.raises(LinkError, match="not open"):
+                await call
 
 
 @pytest.mark.asyncio
@@ -456,14 +448,6 @@ async def test_udpin_and_udpout_communicate(host: str) -> None:
         assert far[:2] == station.address
         await vehicle.send(frame(2), far)
         assert await collect(station, 1) == [(peer, frame(2))]
-
-
-@pytest.mark.asyncio
-async def test_a_host_name_is_resolved() -> None:
-    async with opened("udpin:localhost:0") as link, opened(f"udpout:localhost:{link.address[1]}") as far:
-        assert link.address[0] == "127.0.0.1"
-        await far.send(HEARTBEAT, None)
-        assert len(await collect(link, 1)) == 1
 
 
 @pytest.mark.asyncio

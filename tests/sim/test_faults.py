@@ -18,7 +18,7 @@ from paramclient.sim import (
     Vehicle,
 )
 from paramclient.wire import frames, messages
-from tests.ground_station import LIST, Station, cast, indices, names, read, write
+from tests.ground_station import LIST, Station, indices, names, read, write
 
 NO_INDEX = messages.NO_INDEX
 TEN = {f"P{number}": number for number in range(10)}
@@ -48,12 +48,6 @@ class TestDead:
         assert not station.receive(messages.ParamError)
         assert len(station.ask(read(index=2), read("P6"))) == 2
         assert len(vehicle.params) == 10
-
-    def test_a_set_of_a_dead_parameter_is_answered(self, kind: Callable[..., Vehicle]) -> None:
-        vehicle = kind(table=TEN, dead=["P7"])
-        request = cast("P7", 70) if kind is ArduPilotVehicle else write("P7", 70, ParamType.INT32)
-        assert set(names(Station(vehicle).ask(request))) == {"P7"}
-        assert vehicle.values["P7"] == 70
 
 
 @EVERY_KIND
@@ -92,13 +86,6 @@ class TestWhenListed:
         stream = [value for value in values if value.param_index != NO_INDEX]
         assert names(stream) == [*TEN, "Q_ENABLE", "Q_A", "R"]
         assert indices(stream) == list(range(13))
-
-    def test_a_parameter_comes_into_use(self) -> None:
-        vehicle = PX4Vehicle(table=TEN, not_in_use=["P0"], burst=1)
-        vehicle.when_listed(4, lambda: vehicle.use("P0"))
-        values = Station(vehicle).ask(LIST, seconds=1.0)[1:]
-        assert [value.param_count for value in values] == [9] * 4 + [10] * 6
-        assert names(values) == ["P1", "P2", "P3", "P4", "P4", "P5", "P6", "P7", "P8", "P9"]
 
 
 @EVERY_KIND

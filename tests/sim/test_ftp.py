@@ -92,15 +92,6 @@ def test_a_burst_reads_a_file_to_its_end() -> None:
     assert sequences == list(range(sequences[0], sequences[0] + 5))
 
 
-def test_single_reads_at_any_offset() -> None:
-    pilot = Pilot(ArduPilotVehicle())
-    pilot.vehicle.files["a"] = b"abcdefgh"
-    pilot.ask(Opcode.OPEN_FILE_RO, b"a")
-    assert pilot.ask(Opcode.READ_FILE, offset=2, size=3).data == b"cde"
-    assert pilot.ask(Opcode.READ_FILE, offset=6, size=30).data == b"gh"
-    assert refusal(pilot.ask(Opcode.READ_FILE, offset=8, size=30)) == (FileErrorCode.EOF,)
-
-
 def test_param_pck_is_read_with_one_size() -> None:
     pilot = Pilot(ArduPilotVehicle())
     assert pilot.ask(Opcode.OPEN_FILE_RO, PARAMS).data == (12 * 1382).to_bytes(4, "little")
@@ -144,11 +135,6 @@ def test_param_pck_has_the_current_values() -> None:
     assert after["COMPASS_DEC"].default is None
 
 
-def test_a_table_with_other_types_has_no_param_pck() -> None:
-    pilot = Pilot(ArduPilotVehicle(table={"A": (ParamType.UINT16, 1)}))
-    assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, PARAMS)) == (FileErrorCode.FILE_NOT_FOUND,)
-
-
 def test_the_checksum_of_param_pck_is_that_of_reads_of_64_bytes() -> None:
     pilot = Pilot(ArduPilotVehicle())
     rows = packed(pilot.vehicle)
@@ -189,17 +175,6 @@ class TestSessions:
         assert pilot.ask(Opcode.RESET_SESSIONS, session=3).opcode == Opcode.ACK
         assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
 
-    @pytest.mark.parametrize("opcode", [Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS])
-    def test_ardupilot_acknowledges_closing_other_sessions(self, opcode: Opcode) -> None:
-        pilot = Pilot(ArduPilotVehicle())
-        pilot.vehicle.files["a"] = b"a"
-        pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
-        assert pilot.ask(opcode, session=4).opcode == Opcode.ACK
-        assert pilot.vehicle.open_files == ["a"]
-        assert pilot.ask(opcode, session=3).opcode == Opcode.ACK
-        assert pilot.vehicle.open_files == []
-        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
-
     @pytest.mark.parametrize(
         "opcode",
         [Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE, Opcode.LIST_DIRECTORY, Opcode.CALC_FILE_CRC32],
@@ -222,15 +197,6 @@ class TestSessions:
         pilot.listen(2.95)
         assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
         assert refusal(pilot.ask(Opcode.READ_FILE, session=3, size=1)) == (FileErrorCode.INVALID_SESSION,)
-
-    def test_refusals_extend_ardupilots_session(self) -> None:
-        pilot = Pilot(ArduPilotVehicle())
-        pilot.vehicle.files["a"] = b"a"
-        pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
-        for _ in range(20):
-            pilot.listen(0.4)
-            answer = pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4)
-            assert refusal(answer) == (FileErrorCode.INVALID_SESSION,)
 
     @pytest.mark.parametrize(("path", "texts"), [(b"a", 0), (PARAMS, 3), (PARAMS + b"?withdefaults=1", 3)])
     def test_ardupilot_sends_its_banner_with_the_parameters(self, path: bytes, texts: int) -> None:
