@@ -148,18 +148,10 @@ class FaultyLink:
         if not self.bit_errors:
             return data
         damaged = bytearray(data)
-        at = self._gap()
-        while at < 8 * len(damaged):
-            damaged[at // 8] ^= 1 << at % 8
-            at += 1 + self._gap()
+        for bit in range(8 * len(damaged)):
+            if self._random.random() < self.bit_errors:
+                damaged[bit // 8] ^= 1 << bit % 8
         return bytes(damaged)
-
-    def _gap(self) -> int:
-        """Return the number of undamaged bits before the next damaged one."""
-        if self.bit_errors == 1.0:
-            return 0
-        # 1 - random() is above 0. The limit avoids overflow with tiny error rates.
-        return int(min(math.log(1.0 - self._random.random()) / math.log1p(-self.bit_errors), _FAR))
 
 
 class Air:
@@ -243,8 +235,6 @@ class Air:
 
 _HELD_BACK = 0.03
 """Largest additional delay of a reordered datagram, in seconds."""
-_FAR = 1e9
-"""Largest gap between bit errors, in bits."""
 
 
 def _at(part: Endpoint | FaultyLink) -> float:

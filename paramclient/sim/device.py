@@ -260,13 +260,12 @@ class Device:
 
     def _take(self, frame: frames.Frame) -> None:
         message = messages.decode(frame)
+        name = frames.message_name(frame.message_id)
         if isinstance(message, messages.Heartbeat):
-            self.requests["HEARTBEAT"] += 1
-        name = _REQUESTS.get(type(message))
-        if message is None or name is None:
-            return
-        system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
-        if self._answers_system(system) and component in (messages.COMP_ID_ALL, self.component):
+            self.requests[name] += 1
+        system, component = getattr(message, "target_system", -1), getattr(message, "target_component", -1)
+        is_mine = self._answers_system(system) and component in (messages.COMP_ID_ALL, self.component)
+        if message is not None and is_mine:
             self.requests[name] += 1
             self.respond(message, frame)
 
@@ -304,17 +303,6 @@ class Device:
             self.send(answer)
 
 
-_REQUESTS: dict[type, str] = {
-    messages.ParamRequestRead: "PARAM_REQUEST_READ",
-    messages.ParamRequestList: "PARAM_REQUEST_LIST",
-    messages.ParamSet: "PARAM_SET",
-    messages.ParamExtRequestRead: "PARAM_EXT_REQUEST_READ",
-    messages.ParamExtRequestList: "PARAM_EXT_REQUEST_LIST",
-    messages.ParamExtSet: "PARAM_EXT_SET",
-    messages.CommandLong: "COMMAND_LONG",
-    messages.FileTransfer: "FILE_TRANSFER_PROTOCOL",
-    messages.SetupSigning: "SETUP_SIGNING",
-}
 _REBOOT = 1
 """Value of the command that reboots the autopilot; other values shut down, or stay in the bootloader."""
 _ATTITUDE = 30

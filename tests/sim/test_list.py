@@ -18,7 +18,7 @@ SET = cast("RTL_ALT", 1234.0)
 LOOP = 0.006
 """Period of the vehicle's loop in seconds."""
 
-quiet = partial(ArduPilotVehicle, live_period=0.0)
+quiet = ArduPilotVehicle
 near = partial(pytest.approx, abs=LOOP)
 
 

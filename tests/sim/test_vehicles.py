@@ -468,20 +468,8 @@ class TestArduPilot:
         assert indices(listed) == list(range(1434))
         assert names(listed) == list(vehicle.params)
 
-    def test_live_values_are_sent_unsolicited(self) -> None:
-        vehicle = ArduPilotVehicle(live_period=10.0)
-        before = vehicle.values
-        station = Station(vehicle).wait(35.0)
-        assert station.times() == pytest.approx([t for t in (10, 20, 30) for _ in "ab"], abs=0.007)
-        values = station.values()
-        assert names(values) == ["BARO1_GND_PRESS", "STAT_RUNTIME"] * 3
-        assert set(indices(values)) == {NO_INDEX}
-        assert vehicle.values["STAT_RUNTIME"] == before["STAT_RUNTIME"] + 30  # type: ignore[operator]  # both are int
-        assert vehicle.values["BARO1_GND_PRESS"] == pytest.approx(before["BARO1_GND_PRESS"])
-        assert values[0].raw != values[2].raw
-
     def test_a_restart_changes_ten_values(self) -> None:
-        vehicle = ArduPilotVehicle(live_period=0.0)
+        vehicle = ArduPilotVehicle()
         before = vehicle.values
         station = Station(vehicle).wait(3.0)
         assert vehicle.values == before
