@@ -33,6 +33,7 @@ __all__ = [
     "check_range",
     "ek2_group",
     "px4_table",
+    "third_compass",
     "typed",
 ]
 
@@ -155,6 +156,12 @@ def typed(entry: WireValue | tuple[ParamType | int, WireValue]) -> tuple[ParamTy
 def px4_table() -> tuple[SimParam, ...]:
     """Return the 903 parameters of a PX4 1.17 quad, read from a real one; 58 of them are volatile."""
     return _read("px4.csv")
+
+
+@cache
+def third_compass() -> tuple[SimParam, ...]:
+    """Return the parameters of a third compass, not in use on that quad, with the second's values."""
+    return _read("px4_compass.csv")
 
 
 @cache

@@ -19,6 +19,7 @@ from paramclient.sim.param_table import (
     Table,
     as_table,
     px4_table,
+    third_compass,
 )
 from paramclient.sim.vehicle import SIMULATED_COMMIT, Vehicle
 from paramclient.wire import frames, messages
@@ -131,7 +132,7 @@ class PX4Vehicle(Vehicle):
         commit = SIMULATED_COMMIT + (SIMULATED_COMMIT if is_built_in else _checksum(rows))
         late_use = self.late_use or {}
         if is_built_in and self.late_use is None:
-            compass = _third_compass(rows)
+            compass = third_compass()
             late_use = {"CAL_MAG2_ID": [row.name for row in compass]}
             rows += compass
         self._late_use = {name: frozenset(more) for name, more in late_use.items()}
@@ -364,14 +365,3 @@ def _checksum(rows: Iterable[SimParam]) -> str:
     """Return the second half of the commit, different for each table: metadata is stored by commit."""
     content = repr([(row.name, int(row.type), row.bits) for row in rows])
     return f"{zlib.crc32(content.encode()):08x}"
-
-
-def _third_compass(rows: tuple[SimParam, ...]) -> tuple[SimParam, ...]:
-    """Return the parameters of a third compass, not in use on the real quad, with the second's values."""
-    names = {row.name for row in rows}
-    return tuple(
-        SimParam(name, row.type, row.value, row.volatile)
-        for row in rows
-        if row.name.startswith("CAL_MAG1_")
-        and (name := row.name.replace("CAL_MAG1_", "CAL_MAG2_")) not in names
-    )
