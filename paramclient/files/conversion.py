@@ -22,8 +22,6 @@ from paramclient.model.values import ParamType, bits_of, check_name, from_bits, 
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol import param_pck
 
-__all__ = ["Content", "dumps", "loads", "read_file", "writable", "write_file"]
-
 LEFT_OUT_SHOWN_MAX: Final = 20
 """Names that the header of a file shows, of those that are left out."""
 

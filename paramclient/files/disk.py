@@ -13,8 +13,6 @@ from typing import Final
 
 from paramclient.errors import FileError
 
-__all__ = ["LARGEST_FILE", "read_bytes", "replace_file"]
-
 LARGEST_FILE: Final = 16 * 1024 * 1024
 """Largest parameter file, in bytes. 65,535 parameters, the most that an index can count, with names, bits,
 defaults and comments take less in the longest format."""

@@ -10,8 +10,6 @@ from typing import Final, NoReturn
 from paramclient.errors import FileError, UsageError
 from paramclient.model.paramset import ParamSet
 
-__all__ = ["AUTOPILOT", "ENDINGS", "FileFormat", "LogFormat", "ParamFile", "address", "format_of_name"]
-
 AUTOPILOT: Final = 1
 """MAV_COMP_ID_AUTOPILOT1: the component of a file that names no component."""
 

@@ -42,8 +42,6 @@ from paramclient.model.values import (
     from_bits,
 )
 
-__all__ = ["json_fields", "read_json", "read_json_text", "write_json"]
-
 FAULT_LENGTH_MAX: Final = 300
 """Characters of one fault in an error, so that a long field does not make the error unreadable."""
 

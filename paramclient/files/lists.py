@@ -36,17 +36,6 @@ from paramclient.files.reading import (
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, WireValue, check_portable_name, is_portable_name
 
-__all__ = [
-    "is_pair",
-    "is_qgc_row",
-    "pair_line",
-    "qgc_line",
-    "read_pairs",
-    "read_qgc",
-    "write_list",
-    "write_qgc",
-]
-
 FILES_MAX: Final = 64
 """Files that one file may include in total, nested or not. Two lines in each of a few files could include
 thousands."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from typing import Final
 
-__all__ = ["kind_of"]
-
 BEGIN_SIZE: Final = 65_536
 """Bytes at the beginning of a file that show what it is."""
 

@@ -18,21 +18,6 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, WireValue, bits_of, format_value, from_bits
 from paramclient.model.wording import first_of
 
-__all__ = [
-    "Reading",
-    "TextLine",
-    "as_type",
-    "comment_lines",
-    "decode_text",
-    "excerpt",
-    "is_plain",
-    "lines_of",
-    "parse_number",
-    "time_of",
-    "undecoded_byte",
-    "value_text",
-]
-
 FAULTS_MAX: Final = 20
 """Bad lines that an error lists: in a file of another kind, every line is bad."""
 EXCERPT_LENGTH_MAX: Final = 80

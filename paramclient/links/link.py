@@ -20,8 +20,6 @@ from paramclient.errors import LinkError
 from paramclient.links.names import LinkSpec
 from paramclient.links.refusals import host_refusal, reason, socket_refusal
 
-__all__ = ["Address", "BaseLink", "Link", "Peer", "SocketLink", "claim", "close_socket"]
-
 Peer: TypeAlias = Hashable
 """The sender of data: an address on UDP, a connection on TCP, a constant on links with one remote end."""
 

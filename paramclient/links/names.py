@@ -16,8 +16,6 @@ from urllib.parse import parse_qsl
 
 from paramclient.errors import UsageError
 
-__all__ = ["FORMS", "LinkKind", "LinkSpec", "parse_link"]
-
 FORMS: Final = """\
   udpin:HOST:PORT     listen for vehicles; also udp:HOST:PORT, udpin:PORT, HOST:PORT
   udpout:HOST:PORT    send to one address

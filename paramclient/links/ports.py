@@ -10,8 +10,6 @@ from typing import Final
 from paramclient.errors import UsageError
 from paramclient.links.names import DEFAULT_BAUD, LinkKind, LinkSpec
 
-__all__ = ["SerialPort", "list_ports", "need_serialx"]
-
 AUTOPILOT_VENDORS: Final = {
     0x26AC: "Pixhawk",  # 3D Robotics, and after it PX4's own boards
     0x27AC: "VRBrain",  # Laser Navigation

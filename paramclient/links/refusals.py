@@ -7,8 +7,6 @@ import socket
 import sys
 from typing import Final
 
-__all__ = ["device_refusal", "host_refusal", "reason", "socket_refusal"]
-
 PRIVILEGED_PORTS: Final = 1024
 """Ports below this number need privileges on POSIX systems."""
 _NO_ROUTE: Final = {errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN}

@@ -13,8 +13,6 @@ from paramclient.links.names import LinkSpec
 from paramclient.links.refusals import reason
 from paramclient.links.tlog import Record, open_log, read_records
 
-__all__ = ["LOG_PEER", "ReplayLink"]
-
 LOG_PEER: Final = "log"
 """The only peer of a log."""
 RECORDS_PER_READ: Final = 256

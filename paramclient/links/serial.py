@@ -38,8 +38,6 @@ if sys.platform != "win32":
 if TYPE_CHECKING:
     import serialx
 
-__all__ = ["AsyncioPort", "SerialDevice", "SerialLink", "open_here"]
-
 READ_SIZE: Final = 65536
 """Bytes per read. Linux holds 4,095 for a reader, and bytes that arrive meanwhile in the driver."""
 

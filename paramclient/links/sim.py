@@ -20,8 +20,6 @@ from paramclient.links.names import VEHICLE_OPTIONS, LinkSpec
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint, Vehicle
 
-__all__ = ["SimLink", "serve_endpoint", "simulated"]
-
 SIM_PEER: Final = "sim"
 """The only peer of a `SimLink`."""
 

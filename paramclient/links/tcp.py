@@ -17,8 +17,6 @@ from paramclient.links.link import Peer, SocketLink, claim, close_socket
 from paramclient.links.names import LinkSpec
 from paramclient.links.refusals import reason
 
-__all__ = ["TcpConnection", "TcpIn", "TcpOut"]
-
 SEND_TIMEOUT: Final = 5.0
 """Seconds that a peer may leave the send buffer full before its connection counts as dropped."""
 

@@ -17,8 +17,6 @@ from typing import BinaryIO, Final, NamedTuple
 
 from paramclient.errors import LinkError
 
-__all__ = ["Record", "open_log", "packed_time", "read_records"]
-
 BLOCK_SIZE: Final = 65536
 """Bytes per read."""
 FIRST_FRAME_OFFSET_MAX: Final = 1 << 20

@@ -37,8 +37,6 @@ from paramclient.links.names import LinkSpec
 from paramclient.links.refusals import reason
 from paramclient.wire.frames import Framer
 
-__all__ = ["UdpIn", "UdpOut"]
-
 RECEIVE_BUFFER: Final = 4 * 1024 * 1024
 """Bytes requested for the kernel's buffer; Linux doubles them. Holds about 10,000 PARAM_VALUEs."""
 

@@ -23,8 +23,6 @@ from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import WireValue, check_name, shortest_float
 from paramclient.wire.messages import MAV_AUTOPILOT_ARDUPILOTMEGA
 
-__all__ = ["read_dataflash"]
-
 VEHICLE_TYPES: Final = {name: types[0] for name, types in ARDUPILOT.values()}
 """MAV_TYPE by the name of the firmware in MSG. A copter with other than four rotors reports another type in
 its heartbeat."""

@@ -10,8 +10,6 @@ from paramclient.files.formats import AUTOPILOT, LogFormat
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 
-__all__ = ["ImportedTable", "OnboardLog", "log_link"]
-
 
 @dataclass(frozen=True, slots=True)
 class OnboardLog:

@@ -20,8 +20,6 @@ from paramclient.logs.logged_params import ImportedTable, OnboardLog
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import ParamType
 
-__all__ = ["import_onboard_log", "is_onboard_log", "read_onboard_log"]
-
 LOG_MAGICS: Final = {b"ULog\x01\x12\x35": LogFormat.ULOG, b"\xa3\x95": LogFormat.DATAFLASH}
 """The first bytes of a ULog file, and of each message of a dataflash log."""
 

@@ -28,8 +28,6 @@ from paramclient.protocol.station import Station
 from paramclient.wire.frames import Framer
 from paramclient.wire.messages import AutopilotVersion, Heartbeat, message_id
 
-__all__ = ["import_log"]
-
 RECORDS_PER_CHECKPOINT: Final = 1_000
 """Frames between two checkpoints, at which other tasks can run: a few milliseconds."""
 

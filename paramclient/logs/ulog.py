@@ -21,8 +21,6 @@ from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import ParamType, is_portable_name
 from paramclient.wire.messages import MAV_AUTOPILOT_PX4
 
-__all__ = ["read_ulog"]
-
 ID_NAMES: Final = ("MAV_SYS_ID", "MAV_TYPE")
 """The parameters that contain the system id and the MAV_TYPE of the heartbeat."""
 CURRENT_DEFAULTS: Final = 1

@@ -20,8 +20,6 @@ from paramclient.errors import UsageError
 from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo, finite, names_of, number_of
 from paramclient.metadata.px4 import PARAMS_MAX, VALUE_NAMES_MAX, validated
 
-__all__ = ["read_json", "read_xml"]
-
 
 def read_xml(content: bytes) -> Metadata:
     """Read an apm.pdef.xml.

@@ -22,8 +22,6 @@ from paramclient.metadata.store import MetadataStore, has_checksum
 from paramclient.protocol.commands import request_message
 from paramclient.wire.messages import ComponentMetadata
 
-__all__ = ["metadata_of"]
-
 P = ParamSpec("P")
 Result = TypeVar("Result")
 

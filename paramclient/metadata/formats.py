@@ -13,8 +13,6 @@ from paramclient.errors import FileError, UsageError
 from paramclient.files.disk import read_bytes
 from paramclient.metadata.info import Metadata
 
-__all__ = ["PACKED_SIZE_MAX", "json_of", "naming", "read_content", "read_metadata", "unpacked"]
-
 PACKED_SIZE_MAX: Final = 4 << 20
 """Bytes of a packed file, or of a file from a vehicle; PX4's has about 0.1 million."""
 CONTENT_SIZE_MAX: Final = 8 << 20

@@ -17,8 +17,6 @@ from paramclient.errors import UsageError
 from paramclient.model.values import ParamType, WireValue, format_value, shortest_float
 from paramclient.model.wording import counted
 
-__all__ = ["BITS_MAX", "Metadata", "ParamInfo", "finite", "names_of", "number_of", "whole"]
-
 CHOICES_LISTED_MAX: Final = 12
 """Names that an error lists; of more names it lists the closest ones, so that the error stays readable."""
 BITS_MAX: Final = 64

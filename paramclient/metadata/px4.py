@@ -16,8 +16,6 @@ from paramclient.errors import UsageError
 from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo, finite, names_of, whole
 from paramclient.model.values import ParamType
 
-__all__ = ["MetadataFile", "read_general", "read_parameters", "validated"]
-
 PARAMS_MAX: Final = 65_535
 """Parameters of a file: as many as param_count can count."""
 VALUE_NAMES_MAX: Final = 10_000

@@ -22,8 +22,6 @@ from paramclient.model.identity import Identity, autopilot_name, version_text
 from paramclient.model.paramset import ParamSet
 from paramclient.model.px4_hash import crc32_px4
 
-__all__ = ["AddedFiles", "AddedMetadata", "MetadataStore", "VehicleKind", "file_address", "has_checksum"]
-
 CACHED_FILES_MAX: Final = 64
 """Most recently used files that are kept: three for a firmware, with about 0.1 million bytes for PX4."""
 PARSED_FILES_MAX: Final = 2

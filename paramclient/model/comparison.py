@@ -15,17 +15,6 @@ from paramclient.model.names import NameChoice
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, Value, WireValue, bits_of, from_bits, same_bits
 
-__all__ = [
-    "Comparison",
-    "Difference",
-    "ChangedSide",
-    "DifferenceStatus",
-    "compare",
-    "defaults_of",
-    "non_defaults",
-    "same_value",
-]
-
 
 class DifferenceStatus(StrEnum):
     """How the left parameter compares with the right parameter of the same name."""

@@ -11,8 +11,6 @@ from paramclient.errors import UsageError
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Param, Value, WireValue, bits_of, from_bits
 
-__all__ = ["Default", "DefaultSource", "add_default", "add_defaults", "default_of"]
-
 AnyParam = TypeVar("AnyParam", Param, WrittenParam)
 
 

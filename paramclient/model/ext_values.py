@@ -19,16 +19,6 @@ from paramclient.model.values import (
     from_bits,
 )
 
-__all__ = [
-    "EXT_VALUE_SIZE",
-    "check_ext_value",
-    "encode_ext_value",
-    "ext_bytes",
-    "ext_param",
-    "own_bytes",
-    "parse_ext_value",
-]
-
 EXT_VALUE_SIZE: Final = 128
 """Bytes of `param_value` in PARAM_EXT_VALUE, PARAM_EXT_SET and PARAM_EXT_ACK (MAVLink common message set)."""
 

@@ -5,19 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = [
-    "PX4_SITL_UID",
-    "Identity",
-    "autopilot_name",
-    "commit_text",
-    "hardware_id",
-    "has_autopilot",
-    "is_sitl_uid",
-    "reason_against_non_finite",
-    "version_difference",
-    "version_text",
-]
-
 PX4_SITL_UID: Final = "4954414c44494e4f"
 """The hardware id of PX4's SITL and of `sim:px4` with system id 1 (measured). With system id N, SITL adds
 N - 1 to it and to the first byte of `uid2`, whose other bytes are zero (measured; AUTOPILOT_VERSION in PX4's

@@ -10,15 +10,6 @@ from typing import Final, TypeVar
 
 from paramclient.errors import UsageError
 
-__all__ = [
-    "ByName",
-    "NameChoice",
-    "did_you_mean",
-    "is_group_switch",
-    "is_pattern",
-    "nearest_names",
-]
-
 UNMATCHED_LISTED_MAX: Final = 20
 """Names and patterns without a match that one message lists, so that the message stays readable."""
 SIMILAR_NAMES_MAX: Final = 3

@@ -10,19 +10,6 @@ from paramclient.errors import UsageError
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import Param, ParamType, WireValue, format_value, shortest_float
 
-__all__ = [
-    "Scalar",
-    "bits_text",
-    "bits_written",
-    "hash_text",
-    "rounded",
-    "time_or_none",
-    "time_text",
-    "typed",
-    "value_json",
-    "value_written",
-]
-
 Scalar: TypeAlias = int | float | str
 """A value in strict JSON."""
 

@@ -10,8 +10,6 @@ from paramclient.model.names import ByName
 from paramclient.model.values import Param, WireValue
 from paramclient.model.wording import counted
 
-__all__ = ["ParamMap"]
-
 
 class ParamMap(ByName[Param]):
     """Parameters by name: a read-only view of a table that may still change.

@@ -24,8 +24,6 @@ from paramclient.model.values import (
 )
 from paramclient.model.wording import counted
 
-__all__ = ["ParamSet", "RestorePoint", "WrittenParam"]
-
 
 @dataclass(frozen=True, slots=True, init=False)
 class WrittenParam:

@@ -18,8 +18,6 @@ from typing import Final
 
 from paramclient.model.values import Param
 
-__all__ = ["crc32_px4", "crc32_px4_before", "find_volatile", "hash_bits", "hash_params"]
-
 HASHED_PARAMETERS_MAX: Final = 1_000_000
 """Parameters hashed while single names are tried, about 0.1 s: each attempt hashes the whole table."""
 GROUP_NAMES_MAX: Final = 4_096

@@ -18,33 +18,6 @@ from typing import Final, SupportsFloat, SupportsIndex, TypeAlias
 
 from paramclient.errors import UsageError
 
-__all__ = [
-    "HEX",
-    "WIRE_SIZE",
-    "Encoding",
-    "TYPES_BY_NAME",
-    "Param",
-    "ParamType",
-    "Settable",
-    "Trust",
-    "Value",
-    "WireValue",
-    "as_reported",
-    "bits_of",
-    "check_name",
-    "check_number",
-    "check_portable_name",
-    "check_value",
-    "decode_value",
-    "encode_value",
-    "encoding_of",
-    "format_value",
-    "from_bits",
-    "is_portable_name",
-    "same_bits",
-    "shortest_float",
-]
-
 Value: TypeAlias = int | float | str | bytes
 """The value of a parameter: a number; text or bytes for an extended parameter of the type CUSTOM."""
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-__all__ = ["age_in_words", "counted", "first_of"]
-
 _AGES: Final = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
 """Units of an age in seconds, longest first. An age is given in the longest unit of which it has two."""
 

@@ -13,8 +13,6 @@ from paramclient.errors import UsageError
 from paramclient.sim.device import OUT_LIMIT
 from paramclient.sim.param_table import check_range
 
-__all__ = ["Air", "Endpoint", "FaultyLink"]
-
 
 class Endpoint(Protocol):
     """The remote end of a link: a vehicle, or an `Air` with several vehicles.

@@ -7,7 +7,7 @@ import re
 import struct
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
@@ -18,7 +18,6 @@ from paramclient.protocol.param_pck import PARAM_FILE
 from paramclient.sim.ftp import Address, FileServer
 from paramclient.sim.param_table import (
     Entry,
-    SimParam,
     Table,
     ardupilot_table,
     as_table,
@@ -26,8 +25,6 @@ from paramclient.sim.param_table import (
 )
 from paramclient.sim.vehicle import SIMULATED_COMMIT, Vehicle
 from paramclient.wire import frames, messages
-
-__all__ = ["ArduPilotVehicle"]
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -55,8 +52,7 @@ class ArduPilotVehicle(Vehicle):
       default, the parameter never had another value, and it belongs to a group: of the real quad's table,
       all but the first 57.
     - A parameter that switches a group shows it while it is not 0 and hides it at 0: count and indices
-      change. A group may contain the switch of another one, which is shown while both are not 0. Hidden
-      parameters can be read and set by name.
+      change. Hidden parameters can be read and set by name.
     - MAVFTP serves `@PARAM/param.pck` and `files`: one session, 5 requests waiting, bursts limited to a third
       of the link (see `FileServer`).
     - SYSID_THISMAV takes effect with the next full second, on a Copter after a reboot, without announcement.
@@ -75,8 +71,8 @@ class ArduPilotVehicle(Vehicle):
             `ardupilot_table()`. SYSID_THISMAV, if the table has it, is set to `system`.
         kind: "copter", "plane" or "rover".
         uid2: the reported hardware id, up to 18 bytes; by default unique for every system.
-        groups: by the name of a switch in the table or in another group, the parameters that are shown behind
-            it while it is not 0.
+        groups: by the name of a switch in the table, the parameters that are shown behind it while it is not
+            0.
             None: with the table of the real quad, the 52 of EK2_ENABLE; with another table, none.
         reboot_groups: names of switches that take effect only after a reboot.
         read_only: names that cannot be set. None: those that ArduPilot marks as internal, such as
@@ -115,7 +111,7 @@ class ArduPilotVehicle(Vehicle):
             groups = {"EK2_ENABLE": ek2_group()} if is_built_in else {}
         members = {switch: as_table(group) for switch, group in groups.items()}
         table = tuple(replace(row, value=self.system) if row.name == _SYSTEM_ID else row for row in table)
-        rows = tuple(_with_groups(table, dict(members)))
+        rows = tuple(each for row in table for each in (row, *members.get(row.name, ())))
         self._in_groups = (
             frozenset(row.name for row in table[_NOT_IN_GROUPS:]) if is_built_in else frozenset()
         )
@@ -165,12 +161,7 @@ class ArduPilotVehicle(Vehicle):
             self._due[self._measure] = at + self._clock_delay
 
     def _tasks(self) -> list[Callable[[float], None]]:
-        first = [
-            self._change_system_id,
-            self._measure,
-            self._end_look_up,
-            self._send_reads,
-        ]
+        first = [self._change_system_id, self._measure, self._end_look_up, self._send_reads]
         return [*first, *super()._tasks(), self._open_window, self._answer_sets]
 
     def _next(self, period: float, *, after: float | None = None) -> float:
@@ -217,12 +208,9 @@ class ArduPilotVehicle(Vehicle):
 
     def _is_listed(self, entry: Entry) -> bool:
         switch = self._switch_of.get(entry.name)
-        while switch is not None:
-            is_on = switch in self._was_on if switch in self._late_switches else self._entry(switch).bits != 0
-            if not is_on:
-                return False
-            switch = self._switch_of.get(switch)
-        return True
+        if switch in self._late_switches:
+            return switch in self._was_on
+        return switch is None or self._entry(switch).bits != 0
 
     # Sets
 
@@ -461,13 +449,6 @@ _FILE_QUEUE = 19
 """MAVFTP responses that wait while a list occupies the main loop, in addition to the one in preparation."""
 _BACKLOG = 1000
 """Received frames that wait for processing."""
-
-
-def _with_groups(rows: Iterable[SimParam], groups: dict[str, tuple[SimParam, ...]]) -> Iterator[SimParam]:
-    """Yield parameters, each with the group behind it that it switches, and take that group."""
-    for row in rows:
-        yield row
-        yield from _with_groups(groups.pop(row.name, ()), groups)
 
 
 def _converted(value: float, kind: ParamType | int) -> int:

@@ -14,8 +14,6 @@ from paramclient.sim.param_table import Table, as_table, typed
 from paramclient.sim.vehicle import Vehicle
 from paramclient.wire import frames, messages
 
-__all__ = ["Camera", "ExtEntries", "camera_table"]
-
 MAV_TYPE_CAMERA: Final = 30
 CAMERA_COMPONENT: Final = 100
 """MAV_COMP_ID_CAMERA."""

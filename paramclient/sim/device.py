@@ -14,8 +14,6 @@ from paramclient.errors import CommandResult
 from paramclient.sim.param_table import check_range
 from paramclient.wire import frames, messages, signing
 
-__all__ = ["OUT_LIMIT", "Device"]
-
 OUT_LIMIT: Final = 20_000
 """Frames that an endpoint keeps for `data_to_send`; further ones are dropped to bound the memory."""
 

@@ -14,8 +14,6 @@ from paramclient.protocol import param_pck
 from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.param_pck import PARAM_FILE, PackedParam
 
-__all__ = ["Address", "FileServer"]
-
 IDLE_LIMIT: Final = 3.0
 """Seconds without a response after which ArduPilot reassigns the session; each response restarts the time."""
 PX4_IDLE_LIMIT: Final = 11.0
@@ -196,8 +194,6 @@ class FileServer:
                 case Opcode.BURST_READ_FILE:
                     self._begin_burst(request, sender, now)
                     return None
-                case Opcode.LIST_DIRECTORY:
-                    return answer._replace(data=self._list(_text(request.data), request.offset))
                 case Opcode.CALC_FILE_CRC32:
                     path = _text(request.data)
                     content = self.files.get(path)
@@ -329,25 +325,6 @@ class FileServer:
         if block.burst_complete or block.opcode == Opcode.NAK:
             self._burst = None
         return block
-
-    def _list(self, path: str, skip: int) -> bytes:
-        prefix = path.rstrip("/") + "/" if path else ""
-        entries: dict[str, bytes] = {}
-        for name in sorted(self.files):
-            if name.startswith(prefix):
-                first, *rest = name.removeprefix(prefix).split("/")
-                size = "" if rest else f"\t{len(self.files[name])}"
-                entries[first] = f"{'D' if rest else 'F'}{first}{size}\0".encode()
-        if not entries:
-            raise _Refusal(FileErrorCode.FILE_NOT_FOUND)
-        data = b""
-        for entry in list(entries.values())[skip:]:
-            if len(data) + len(entry) > DATA_SIZE_MAX:
-                break
-            data += entry
-        if not data:
-            raise _Refusal(FileErrorCode.EOF)
-        return data
 
 
 class _Query(NamedTuple):

@@ -13,8 +13,6 @@ from paramclient.model.px4_hash import crc32_px4
 from paramclient.model.values import TYPES_BY_NAME, ParamType
 from paramclient.sim.param_table import SimParam
 
-__all__ = ["GENERAL_FILE", "METADATA_FILE", "metadata_files"]
-
 GENERAL_FILE: Final = "etc/extras/component_general.json.xz"
 """Path of PX4's general metadata file (COMPONENT_METADATA.hpp)."""
 METADATA_FILE: Final = "etc/extras/parameters.json.xz"

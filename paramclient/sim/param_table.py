@@ -24,19 +24,6 @@ from paramclient.model.values import (
 )
 from paramclient.protocol.param_pck import PACKABLE, PackedParam
 
-__all__ = [
-    "Entry",
-    "SimParam",
-    "Table",
-    "ardupilot_table",
-    "as_table",
-    "check_range",
-    "ek2_group",
-    "px4_table",
-    "third_compass",
-    "typed",
-]
-
 FLT_EPSILON = 2.0**-23
 """Difference from the default up to which ArduPilot does not report the default separately."""
 

@@ -24,21 +24,15 @@ from paramclient.sim.param_table import (
 from paramclient.sim.vehicle import SIMULATED_COMMIT, Vehicle
 from paramclient.wire import frames, messages
 
-__all__ = ["PX4Vehicle"]
-
 LIMITS: Final[tuple[tuple[str, Callable[[float, float], float], str | float], ...]] = (
     ("MPC_TILTMAX_AIR", min, 89.0),
     ("MPC_TILTMAX_LND", min, "MPC_TILTMAX_AIR"),
     ("MPC_XY_CRUISE", min, "MPC_XY_VEL_MAX"),
     ("MPC_VEL_MANUAL", min, "MPC_XY_VEL_MAX"),
-    ("MPC_VEL_MAN_BACK", min, "MPC_VEL_MANUAL"),
-    ("MPC_VEL_MAN_SIDE", min, "MPC_VEL_MANUAL"),
-    ("MPC_Z_V_AUTO_UP", min, "MPC_Z_VEL_MAX_UP"),
-    ("MPC_Z_V_AUTO_DN", min, "MPC_Z_VEL_MAX_DN"),
     ("MPC_THR_HOVER", min, "MPC_THR_MAX"),
     ("MPC_THR_HOVER", max, "MPC_THR_MIN"),
 )
-"""Limits that PX4's position controller enforces: parameters, the choice of the lower or the higher value,
+"""Some limits that PX4's position controller enforces: parameters, the choice of the lower or the higher value,
 and the limit or the parameter that has it (measured with 1.17)."""
 RESET_KEEPS: Final = (
     *("SYS_AUTOSTART", "SYS_PARAM_VER", "RC", "CAL_", "COM_FLTMODE", "LND_FLIGHT", "TC_", "COM_FLIGHT"),

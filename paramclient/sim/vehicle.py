@@ -15,8 +15,6 @@ from paramclient.sim.ftp import FileServer
 from paramclient.sim.param_table import Entry, SimParam, Table, as_table
 from paramclient.wire import frames, messages
 
-__all__ = ["SIMULATED_COMMIT", "GenericVehicle", "Vehicle"]
-
 SIMULATED_COMMIT: Final = "5eed5eed"
 """The commit that simulated autopilots report, in hexadecimal; a simulated PX4 reports it twice, in 16
 digits. Their tables and versions are those of a real firmware, but their descriptions are not: with its

@@ -148,14 +148,9 @@ def test_the_checksum_of_param_pck_is_that_of_reads_of_64_bytes() -> None:
     )
 
 
-def test_directories_and_checksums() -> None:
+def test_checksums_of_files() -> None:
     pilot = Pilot(ArduPilotVehicle())
-    pilot.vehicle.files.update({"logs/1.bin": b"abc", "logs/old/2.bin": b"", "x": b"y"})
-    assert pilot.ask(Opcode.LIST_DIRECTORY, b"logs").data == b"F1.bin\t3\0Dold\0"
-    assert pilot.ask(Opcode.LIST_DIRECTORY, b"logs/", offset=1).data == b"Dold\0"
-    assert refusal(pilot.ask(Opcode.LIST_DIRECTORY, b"logs", offset=2)) == (FileErrorCode.EOF,)
-    assert refusal(pilot.ask(Opcode.LIST_DIRECTORY, b"log")) == (FileErrorCode.FILE_NOT_FOUND,)
-    assert pilot.ask(Opcode.LIST_DIRECTORY, b"").data == b"Dlogs\0Fx\t1\0"
+    pilot.vehicle.files["logs/1.bin"] = b"abc"
     checksum = pilot.ask(Opcode.CALC_FILE_CRC32, b"logs/1.bin")
     assert int.from_bytes(checksum.data, "little") == crc32_px4(b"abc")
     assert refusal(pilot.ask(Opcode.CALC_FILE_CRC32, b"nothing")) == (FileErrorCode.FILE_NOT_FOUND,)
@@ -177,7 +172,7 @@ class TestSessions:
 
     @pytest.mark.parametrize(
         "opcode",
-        [Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE, Opcode.LIST_DIRECTORY, Opcode.CALC_FILE_CRC32],
+        [Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE, Opcode.CALC_FILE_CRC32],
     )
     def test_ardupilot_has_one_session_for_all_stations(self, opcode: Opcode) -> None:
         pilot = Pilot(ArduPilotVehicle())
