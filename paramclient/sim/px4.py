@@ -32,8 +32,8 @@ LIMITS: Final[tuple[tuple[str, Callable[[float, float], float], str | float], ..
     ("MPC_THR_HOVER", min, "MPC_THR_MAX"),
     ("MPC_THR_HOVER", max, "MPC_THR_MIN"),
 )
-"""Some limits that PX4's position controller enforces: parameters, the choice of the lower or the higher value,
-and the limit or the parameter that has it (measured with 1.17)."""
+"""Some limits that PX4's position controller enforces: parameters, the choice of the lower or the higher
+value, and the limit or the parameter that has it (measured with 1.17)."""
 RESET_KEEPS: Final = (
     *("SYS_AUTOSTART", "SYS_PARAM_VER", "RC", "CAL_", "COM_FLTMODE", "LND_FLIGHT", "TC_", "COM_FLIGHT"),
 )
