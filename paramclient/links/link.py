@@ -212,13 +212,14 @@ class SocketLink(BaseLink):
     async def _resolve(self, kind: socket.SocketKind) -> list[tuple[socket.AddressFamily, Address]]:
         """Return the addresses of the host, IPv4 first, because most MAVLink programs listen on IPv4."""
         try:
-            return _addresses(socket.getaddrinfo(self._host, self._port, type=kind, flags=_NUMERIC))
-        except socket.gaierror:
-            pass  # not an address: use the resolver, in a thread
-        try:
-            return _addresses(await anyio.getaddrinfo(self._host, self._port, type=kind))
-        except socket.gaierror as error:
-            raise self._error(host_refusal(self._host, error)) from error
+            found: Any = socket.getaddrinfo(self._host, self._port, type=kind, flags=_NUMERIC)
+        except socket.gaierror:  # not an address: use the resolver, in a thread
+            try:
+                found = await anyio.getaddrinfo(self._host, self._port, type=kind)
+            except socket.gaierror as error:
+                raise self._error(host_refusal(self._host, error)) from error
+        pairs = [(family, address) for family, _, _, _, address in found]
+        return sorted(pairs, key=lambda pair: pair[0] != socket.AF_INET)
 
 
 def claim(sock: socket.socket) -> None:
@@ -238,8 +239,3 @@ def close_socket(sock: socket.socket | None) -> None:
 
 
 _NUMERIC = socket.AI_NUMERICHOST | socket.AI_NUMERICSERV
-
-
-def _addresses(found: Any) -> list[tuple[socket.AddressFamily, Address]]:
-    pairs = [(family, address) for family, _, _, _, address in found]
-    return sorted(pairs, key=lambda pair: pair[0] != socket.AF_INET)

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import math
 import re
-import stat
 import struct
 from collections.abc import Iterator
-from contextlib import ExitStack
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
@@ -69,21 +67,19 @@ def open_log(path: str, name: str) -> BinaryIO:
     def error(problem: str) -> LinkError:
         return LinkError(f"{name}: {problem}", link=name)
 
+    where = Path(path)
+    if where.exists() and not (where.is_file() or where.is_dir()):
+        raise error(f"{path} is not a regular file")
     try:
-        mode = Path(path).stat().st_mode
-        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-            raise error(f"{path} is not a regular file")
-        with ExitStack() as stack:
-            file = stack.enter_context(Path(path).open("rb"))
-            if next(read_records(BytesIO(file.read(FIRST_FRAME_OFFSET_MAX))), None) is None:
-                raise error(f"{path} is not a telemetry log, or contains no frames")
-            file.seek(0)
-            stack.pop_all()
-            return file
-    except LinkError:
-        raise
+        file = where.open("rb")
+        first = next(read_records(BytesIO(file.read(FIRST_FRAME_OFFSET_MAX))), None)
+        file.seek(0)
     except OSError as problem:
         raise error(f"cannot open {path}: {problem.strerror}") from problem
+    if first is None:
+        file.close()
+        raise error(f"{path} is not a telemetry log, or contains no frames")
+    return file
 
 
 def read_records(file: BinaryIO) -> Iterator[Record]:
@@ -108,11 +104,8 @@ def read_records(file: BinaryIO) -> Iterator[Record]:
             return
         end = start + 8 + size
         at = _time_at(buffer, start)
-        if (
-            size
-            and at <= TIME_MAX
-            and (_are_near(at, before) or _is_confirmed(buffer, end, at, alone=before == -math.inf))
-        ):
+        is_near = abs(at - before) <= TIME_STEP_MAX
+        if size and at <= TIME_MAX and (is_near or _is_confirmed(buffer, end, at, before == -math.inf)):
             if end > len(buffer):
                 return
             yield Record(at, buffer[start + 8 : end])
@@ -138,13 +131,9 @@ def _time_at(buffer: bytes, at: int) -> float:
     return float(_TIME.unpack_from(buffer, at)[0] / 1e6)
 
 
-def _are_near(at: float, before: float) -> bool:
-    return abs(at - before) <= TIME_STEP_MAX
-
-
-def _is_confirmed(buffer: bytes, end: int, at: float, *, alone: bool) -> bool:
+def _is_confirmed(buffer: bytes, end: int, at: float, alone: bool) -> bool:
     """Return whether the next record has about the same time; at the end of the file, return `alone`."""
     size = _size_at(buffer, end + 8)
     if size is None:
         return alone
-    return size > 0 and _are_near(_time_at(buffer, end), at)
+    return size > 0 and abs(_time_at(buffer, end) - at) <= TIME_STEP_MAX

@@ -109,7 +109,6 @@ class _Messages:
         ids = [each.value for name in SYSTEM_ID_NAMES if (each := self.initial.get(name)) is not None]
         system = next((each for each in ids if isinstance(each, int) and 0 < each < 256), 0)
         autopilot = MAV_AUTOPILOT_ARDUPILOTMEGA
-        damaged = f"{self._damaged} PARM messages are damaged and left out"
         return OnboardLog(
             path,
             LogFormat.DATAFLASH,
@@ -119,7 +118,7 @@ class _Messages:
             self._began,
             self._ended,
             self._boot_time,
-            (damaged,) if self._damaged else (),
+            (f"{self._damaged} PARM messages are damaged and left out",) if self._damaged else (),
         )
 
     def _receive_param(self, fields: dict[str, Any]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import stat
 from collections.abc import Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
@@ -69,7 +68,7 @@ def read_onboard_log(path: str | os.PathLike[str]) -> OnboardLog:
 
 def _format_of(path: Path) -> LogFormat | None:
     """Return the format of a log; None if it is not a regular file of a known format."""
-    if not stat.S_ISREG(path.stat().st_mode):
+    if path.exists() and not path.is_file():
         return None
     with path.open("rb") as file:
         begin = file.read(max(map(len, LOG_MAGICS)))
