@@ -18,7 +18,7 @@ from pydantic import AfterValidator, BaseModel, Field
 
 from paramclient.errors import UsageError
 from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo, finite, names_of, number_of
-from paramclient.metadata.px4 import PARAMS_MAX, VALUE_NAMES_MAX, validated
+from paramclient.metadata.px4 import validated
 
 
 def read_xml(content: bytes) -> Metadata:
@@ -132,7 +132,7 @@ def _number(text: str) -> int | float | None:
         return None
 
 
-_Names: TypeAlias = Annotated[dict[str, str], Field(max_length=VALUE_NAMES_MAX)] | str
+_Names: TypeAlias = dict[str, str] | str
 _Flag: TypeAlias = Annotated[str, AfterValidator(lambda text: text.strip().lower() == "true")]
 
 
@@ -165,9 +165,7 @@ def _gathered(found: Iterable[ParamInfo]) -> Metadata:
     """Return the parameters of all groups. Leaves out those that two vehicles describe differently."""
     infos: dict[str, ParamInfo] = {}
     doubtful = set()
-    for count, info in enumerate(found):
-        if count >= PARAMS_MAX:
-            raise UsageError(f"describes more than {PARAMS_MAX} parameters")
+    for info in found:
         before = infos.setdefault(info.name, info)
         if replace(before, group="") != replace(info, group=""):
             doubtful.add(info.name)

@@ -20,9 +20,6 @@ CONTENT_SIZE_MAX: Final = 8 << 20
 up to seven times as much memory, if its text is not ASCII."""
 UNPACKING_MEMORY_MAX: Final = 96 << 20
 """Bytes of memory for unpacking. PX4 packs with a dictionary of 64 million, `xz -9`."""
-TEXT_LENGTH_MAX: Final = 65_536
-"""Characters of all texts of one parameter: ten times the longest of ArduPilot. The description of a group
-may be that of thousands of parameters."""
 
 
 def read_metadata(path: str | os.PathLike[str]) -> Metadata:
@@ -49,9 +46,6 @@ def read_content(content: bytes, *, source: str) -> Metadata:
     """
     with naming(source):
         metadata = _read_unpacked(unpacked(content).removeprefix(b"\xef\xbb\xbf"))
-        for name, info in metadata.params.items():
-            if info.text_length > TEXT_LENGTH_MAX:
-                raise UsageError(f"the texts of {name!r:.40} have more than {TEXT_LENGTH_MAX:,} characters")
     return replace(metadata, source=source)
 
 

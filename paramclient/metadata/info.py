@@ -69,12 +69,6 @@ class ParamInfo:
     category: str = ""
     group: str = ""
 
-    @property
-    def text_length(self) -> int:
-        """Return the number of characters of all its texts."""
-        own = (self.short_description, self.long_description, self.units, self.category, self.group)
-        return sum(map(len, (*own, *self.values.values(), *self.bits.values())))
-
     def text(self, value: WireValue) -> str | None:
         """Return the name of a value: `Loiter`, or for a mask `GPS|Baro`. None without a name.
 

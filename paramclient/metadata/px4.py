@@ -16,15 +16,6 @@ from paramclient.errors import UsageError
 from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo, finite, names_of, whole
 from paramclient.model.values import ParamType
 
-PARAMS_MAX: Final = 65_535
-"""Parameters of a file: as many as param_count can count."""
-VALUE_NAMES_MAX: Final = 10_000
-"""Named values of one parameter."""
-METADATA_FILES_MAX: Final = 1_000
-"""Kinds of metadata; MAVLink has six."""
-DECIMALS_MAX: Final = 50
-"""Decimal places; a float32 never needs more."""
-
 _STRICT: Final = ConfigDict(strict=True, frozen=True)
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -71,9 +62,9 @@ class _Parameter(_Strict):
     minimum: _Number = Field(None, alias="min")
     maximum: _Number = Field(None, alias="max")
     increment: _Number = None
-    decimals: int | None = Field(None, alias="decimalPlaces", ge=0, le=DECIMALS_MAX)
+    decimals: int | None = Field(None, alias="decimalPlaces", ge=0)
     default: Annotated[float | None, AfterValidator(whole)] = None
-    values: Annotated[list[_Named], AfterValidator(_values)] = Field([], max_length=VALUE_NAMES_MAX)
+    values: Annotated[list[_Named], AfterValidator(_values)] = Field([])
     bits: Annotated[list[_Bit], AfterValidator(_bits)] = Field([], alias="bitmask", max_length=BITS_MAX)
     reboot_required: bool = Field(False, alias="rebootRequired")
     is_read_only: bool = Field(False, alias="readOnly")
@@ -90,7 +81,7 @@ class _Parameter(_Strict):
 
 class _Parameters(_Strict):
     version: int = Field(ge=1)
-    parameters: list[_Parameter] = Field(max_length=PARAMS_MAX)
+    parameters: list[_Parameter]
 
 
 class MetadataFile(_Strict):
@@ -112,7 +103,7 @@ class MetadataFile(_Strict):
 
 class _General(_Strict):
     version: int = Field(ge=1)
-    files: list[MetadataFile] = Field(alias="metadataTypes", max_length=METADATA_FILES_MAX)
+    files: list[MetadataFile] = Field(alias="metadataTypes")
 
 
 def read_parameters(document: object) -> Metadata:

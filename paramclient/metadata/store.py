@@ -22,8 +22,6 @@ from paramclient.model.identity import Identity, autopilot_name, version_text
 from paramclient.model.paramset import ParamSet
 from paramclient.model.px4_hash import crc32_px4
 
-CACHED_FILES_MAX: Final = 64
-"""Most recently used files that are kept: three for a firmware, with about 0.1 million bytes for PX4."""
 PARSED_FILES_MAX: Final = 2
 """Most recently used files that are kept parsed: a comparison has mostly one or two firmwares. The largest
 takes 50 MB."""
@@ -91,8 +89,6 @@ class MetadataStore:
             logger.warning("%s is damaged and was removed", path)
             _remove(path)
             return None
-        with suppress(OSError):
-            os.utime(path)  # marks the file as recently used
         return content
 
     def put(self, content: bytes, crc: int) -> None:
@@ -165,18 +161,10 @@ class MetadataStore:
             return None
 
     def _write(self, path: Path, content: bytes) -> None:
-        """Replace a file, and delete the least recently used ones and those of killed processes."""
         try:
             _replace(path, content)
         except FileError as error:
             logger.warning("%s", error)
-            return
-        times = {}
-        for each in self._files():
-            with suppress(OSError):
-                times[each] = each.stat().st_mtime
-        for each in sorted(times, key=times.__getitem__, reverse=True)[CACHED_FILES_MAX:]:
-            _remove(each)
 
 
 def has_checksum(content: bytes, crc: int) -> bool:
