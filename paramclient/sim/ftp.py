@@ -47,13 +47,6 @@ class _Refusal(Exception):
         self.offset = offset
 
 
-class _File(NamedTuple):
-    """A file that can be opened: the size that the response to the open gives, and the bytes at an offset."""
-
-    size: int
-    read: Callable[[int, int], bytes]
-
-
 class _Request(NamedTuple):
     """A request, and when it is served."""
 
@@ -66,8 +59,8 @@ class _Request(NamedTuple):
 class _Session:
     number: int
     path: str
-    file: _File
     used_at: float
+    read_size: int = 0
 
 
 @dataclass(slots=True)
@@ -195,10 +188,7 @@ class FileServer:
                     self._begin_burst(request, sender, now)
                     return None
                 case Opcode.CALC_FILE_CRC32:
-                    path = _text(request.data)
-                    content = self.files.get(path)
-                    if content is None:  # ArduPilot reads param.pck 64 bytes at a time
-                        content = self._param_file(self._query(path)[0], CHECKSUM_READ)
+                    content = self._content(_text(request.data), CHECKSUM_READ)
                     return answer._replace(data=crc32_px4(content).to_bytes(4, "little"))
                 case _:
                     raise _Refusal(FileErrorCode.UNKNOWN_COMMAND)
@@ -236,66 +226,45 @@ class FileServer:
             raise _Refusal(FileErrorCode.FAIL)
         path = _text(request.data)
         self._session = None
-        file = self._file(path)
-        self._session = _Session(0 if self.is_px4 else request.session, path, file, now)
-        return file.size
+        content = self._content(path, DATA_SIZE_MAX)
+        self._session = _Session(0 if self.is_px4 else request.session, path, now)
+        return len(content) if path in self.files else ENTRY_SIZE * len(self.params() or ())
 
-    def _file(self, path: str) -> _File:
-        content = self.files.get(path)
-        if content is not None:
-            return _File(len(content), lambda offset, size: content[offset : offset + size])
-        query, total = self._query(path)
-        first_size: int | None = None
-
-        def read(offset: int, size: int) -> bytes:
-            nonlocal first_size
-            first_size = size if first_size is None else first_size
-            if size != first_size and not self.is_px4:
-                raise _Refusal(FileErrorCode.FAIL_ERRNO, EINVAL)
-            read_size = DATA_SIZE_MAX if self.is_px4 else min(size, DATA_SIZE_MAX)
-            return self._param_file(query, read_size)[offset : offset + size] if size else b""
-
-        return _File(ENTRY_SIZE * total, read)
-
-    def _param_file(self, query: _Query, read_size: int) -> bytes:
-        """Return the current param.pck, or a part of it, for reads of this size."""
-        rows = self.params()
-        if rows is None:
-            raise _Refusal(FileErrorCode.FAIL_ERRNO, EINVAL)
-        key = (query, read_size, rows)
-        if self._packed is None or self._packed[0] != key:
-            end = query.start + query.length if query.length else None
-            part = rows[query.start : end]
-            content = param_pck.encode(
-                part, total=len(rows), with_defaults=query.with_defaults, read_size=read_size
-            )
-            self._packed = (key, content)
-        return self._packed[1]
-
-    def _query(self, path: str) -> tuple[_Query, int]:
-        """Return the part of param.pck that a path names, and the number of all parameters."""
+    def _content(self, path: str, read_size: int) -> bytes:
+        """Return a file; of the current param.pck, the part that the path names, for reads of this size."""
+        if path in self.files:
+            return self.files[path]
         name, _, options = path.partition("?")
         rows = self.params() if name == PARAM_FILE else None
         if rows is None:
             raise _Refusal(FileErrorCode.FILE_NOT_FOUND)
-        given = {"start": 0, "count": 0, "withdefaults": 0}
-        for key, _, text in (each.partition("=") for each in options.split("&")):
-            if key in given:
-                limit = 2 if key == "withdefaults" else 65535
-                if not (text.isascii() and text.isdigit()) or int(text) >= limit:
-                    raise _Refusal(FileErrorCode.FAIL_ERRNO, EINVAL)
-                given[key] = int(text)
-        query = _Query(given["start"], given["count"], bool(given["withdefaults"]))
-        if query.start >= len(rows):
-            raise _Refusal(FileErrorCode.FAIL_ERRNO, EINVAL)
-        return query, len(rows)
+        key = (options, read_size, rows)
+        if self._packed is None or self._packed[0] != key:
+            given = {"start": 0, "count": 0, "withdefaults": 0}
+            for option, _, text in (each.partition("=") for each in options.split("&")):
+                if option in given:
+                    limit = 2 if option == "withdefaults" else 65535
+                    if not (text.isascii() and text.isdigit()) or int(text) >= limit:
+                        raise _Refusal(FileErrorCode.FAIL_ERRNO, EINVAL)
+                    given[option] = int(text)
+            start, count, with_defaults = given.values()
+            if start >= len(rows):
+                raise _Refusal(FileErrorCode.FAIL_ERRNO, EINVAL)
+            part, has_defaults = rows[start : start + count if count else None], bool(with_defaults)
+            content = param_pck.encode(part, total=len(rows), with_defaults=has_defaults, read_size=read_size)
+            self._packed = (key, content)
+        return self._packed[1]
 
     def _read(self, number: int, offset: int, size: int, now: float) -> bytes:
         session = self._session
         if session is None or session.number != number:
             raise _Refusal(FileErrorCode.INVALID_SESSION if self.is_px4 else FileErrorCode.FILE_NOT_FOUND)
         session.used_at = now
-        data = session.file.read(offset, size)
+        session.read_size = session.read_size or size
+        if size != session.read_size and not self.is_px4 and session.path not in self.files:
+            raise _Refusal(FileErrorCode.FAIL_ERRNO, EINVAL)
+        read_size = DATA_SIZE_MAX if self.is_px4 else min(size, DATA_SIZE_MAX)
+        data = self._content(session.path, read_size)[offset : offset + size] if size else b""
         if not data:
             raise _Refusal(FileErrorCode.EOF, offset=offset)
         return data
@@ -325,14 +294,6 @@ class FileServer:
         if block.burst_complete or block.opcode == Opcode.NAK:
             self._burst = None
         return block
-
-
-class _Query(NamedTuple):
-    """A part of param.pck; `length` 0 for all that follows."""
-
-    start: int = 0
-    length: int = 0
-    with_defaults: bool = False
 
 
 _CLOSING = (Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS)

@@ -15,7 +15,6 @@ from paramclient.sim.ftp import FileServer
 from paramclient.sim.metadata import GENERAL_FILE, metadata_files
 from paramclient.sim.param_table import (
     Entry,
-    SimParam,
     Table,
     as_table,
     px4_table,
@@ -123,7 +122,8 @@ class PX4Vehicle(Vehicle):
         is_built_in = self.table is None
         table = px4_table() if self.table is None else as_table(self.table)
         rows = tuple(replace(row, value=self.system) if row.name == _SYSTEM_ID else row for row in table)
-        commit = SIMULATED_COMMIT + (SIMULATED_COMMIT if is_built_in else _checksum(rows))
+        own = f"{zlib.crc32(repr(rows).encode()):08x}"  # metadata is stored by commit
+        commit = SIMULATED_COMMIT + (SIMULATED_COMMIT if is_built_in else own)
         late_use = self.late_use or {}
         if is_built_in and self.late_use is None:
             compass = third_compass()
@@ -353,9 +353,3 @@ _SAVE_INTERVAL = 2.0
 """Seconds between two saves, at least."""
 _RESET_ALL = 2.0
 """First parameter of MAV_CMD_PREFLIGHT_STORAGE that resets all parameters."""
-
-
-def _checksum(rows: Iterable[SimParam]) -> str:
-    """Return the second half of the commit, different for each table: metadata is stored by commit."""
-    content = repr([(row.name, int(row.type), row.bits) for row in rows])
-    return f"{zlib.crc32(content.encode()):08x}"

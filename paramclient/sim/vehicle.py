@@ -359,7 +359,6 @@ class GenericVehicle(Vehicle):
         table: the parameters (see `Table`), listed in the given order.
         uid: the reported hardware id; by default unique for every system.
         autopilot: MAV_AUTOPILOT in the heartbeat.
-        capabilities: as in AUTOPILOT_VERSION; by default MAVLink 2 and byte-wise parameters.
 
     Other arguments are those of every `Vehicle`.
 
@@ -370,12 +369,11 @@ class GenericVehicle(Vehicle):
     table: Table = field(kw_only=False)
     uid: int | None = None
     autopilot: int = messages.MAV_AUTOPILOT_GENERIC
-    capabilities: int = 8192 | messages.CAPABILITY_PARAM_ENCODE_BYTEWISE
 
     def __post_init__(self) -> None:
         uid = 0x5EED_0000 + self.system if self.uid is None else self.uid
         self._set_up_table(
             as_table(self.table),
             messages.Heartbeat(0, self.autopilot, system_status=messages.MAV_STATE_ACTIVE),
-            messages.AutopilotVersion(self.capabilities, uid=uid),
+            messages.AutopilotVersion(8192 | messages.CAPABILITY_PARAM_ENCODE_BYTEWISE, uid=uid),
         )
