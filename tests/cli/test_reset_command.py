@@ -27,7 +27,7 @@ CHANGED = {"MC_ENABLE": 0, "MC_ROLL_P": pytest.approx(0.1), "COUNT": 12}
 
 def copter(**others: Any) -> ArduPilotVehicle:
     """An ArduPilot whose parameter file has defaults."""
-    options: dict[str, Any] = {"table": TABLE, "live": (), "read_only": ["FIXED"], "param_error": True}
+    options: dict[str, Any] = {"table": TABLE, "read_only": ["FIXED"], "param_error": True}
     return ArduPilotVehicle(**options | others)
 
 

@@ -154,7 +154,7 @@ async def test_by_default_a_hash_is_watched_and_a_list_is_not() -> None:
 async def test_parameters_that_appear_are_added_and_can_be_set(path: Path, source: str) -> None:
     group = {f"GRIP_{number}": number for number in range(5)}
     table = {**VALUES, "GRIP_ENABLE": 0}
-    options: dict[str, Any] = {"groups": {"GRIP_ENABLE": group}, "ftp": source == "file", "live": ()}
+    options: dict[str, Any] = {"groups": {"GRIP_ENABLE": group}, "ftp": source == "file"}
     vehicle = ArduPilotVehicle(table=table, **options)
     async with a_client(vehicle, cache=path) as client:
         component = await client.component()

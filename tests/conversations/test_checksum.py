@@ -215,7 +215,7 @@ async def test_changed_values_are_found_in_less_time_than_the_file_takes() -> No
 async def test_a_search_ends_where_the_file_is_quicker(delay: float, is_simple: bool) -> None:
     floats = [each.name for each in ArduPilotVehicle().listed if each.type is ParamType.REAL32]
     for number in (5, 12, 20):
-        vehicle = ArduPilotVehicle(live_period=0.0)
+        vehicle = ArduPilotVehicle()
         cached = vehicle.params
         names = [name for name in floats if name[:3] not in ("INS", "BAR")][number :: 400 // number][:number]
         vehicle.load({name: at + (2.5 if is_simple else 1 / 7) for at, name in enumerate(names)})

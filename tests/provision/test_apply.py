@@ -90,7 +90,7 @@ CLAMPED: dict[str, WireValue | tuple[ParamType, WireValue]] = {
 
 
 def ardupilot(make: type[ArduPilotVehicle] = ArduPilotVehicle, **options: Any) -> ArduPilotVehicle:
-    defaults: dict[str, Any] = {"table": SETTINGS | OTHERS, "groups": {"EK2_ENABLE": GROUP}, "live": ()}
+    defaults: dict[str, Any] = {"table": SETTINGS | OTHERS, "groups": {"EK2_ENABLE": GROUP}}
     return make(**defaults | options)
 
 
