@@ -122,8 +122,9 @@ class PX4Vehicle(Vehicle):
         is_built_in = self.table is None
         table = px4_table() if self.table is None else as_table(self.table)
         rows = tuple(replace(row, value=self.system) if row.name == _SYSTEM_ID else row for row in table)
-        own = f"{zlib.crc32(repr(rows).encode()):08x}"  # metadata is stored by commit
-        commit = SIMULATED_COMMIT + (SIMULATED_COMMIT if is_built_in else own)
+        content = repr([(row.name, int(row.type), row.bits) for row in rows]).encode()
+        own = SIMULATED_COMMIT if is_built_in else f"{zlib.crc32(content):08x}"
+        commit = SIMULATED_COMMIT + own  # metadata is stored by commit
         late_use = self.late_use or {}
         if is_built_in and self.late_use is None:
             compass = third_compass()
