@@ -111,11 +111,6 @@ class UdpIn(SocketLink):
                 if error.errno not in _TRANSIENT:
                     raise self._error(f"cannot send: {reason(error)}") from error
 
-    async def close(self) -> None:
-        """See `Link.close`."""
-        await super().close()
-        self._local_port = 0
-
     async def _open(self, opening: int) -> None:
         family, (host, port, *more) = (await self._resolve(socket.SOCK_DGRAM))[0]
         sock = self._new_socket(family, opening)
