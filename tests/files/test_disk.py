@@ -51,15 +51,6 @@ def test_replacing_a_file_keeps_its_mode(tmp_path: Path) -> None:
     assert listed(tmp_path) == ["quad.param"]
 
 
-def test_a_new_file_follows_the_umask(tmp_path: Path) -> None:
-    before = os.umask(0o027)
-    try:
-        write_file(tmp_path / "quad.param", PARAMS)
-    finally:
-        os.umask(before)
-    assert stat.S_IMODE((tmp_path / "quad.param").stat().st_mode) == 0o640
-
-
 def test_a_symbolic_link_is_kept(tmp_path: Path) -> None:
     folder = tmp_path / "real"
     folder.mkdir()

@@ -34,10 +34,6 @@ def test_a_real_vehicle() -> None:
     assert found(REAL, announced(REAL, VOLATILE)) == (VOLATILE, True)
 
 
-def test_a_firmware_that_leaves_nothing_out() -> None:
-    assert found(REAL, announced(REAL, ())) == (frozenset(), True)
-
-
 @pytest.mark.parametrize("groups", [["CAL_ACC"], ["LND_FLIGHT_T_"], ["EKF2_MAG_DECL", "SENS_DPRES_OFF"]])
 def test_a_firmware_that_counts_in_one_or_two_of_the_usual_groups(groups: list[str]) -> None:
     counted = set().union(*map(names_of, groups))

@@ -158,14 +158,6 @@ def test_encode_rejects_an_integer_outside_the_type(kind: ParamType, encoding: E
             encode_value(value, kind, encoding)
 
 
-@pytest.mark.parametrize("kind", SMALL)
-def test_bytewise_accepts_whole_floats_and_rejects_fractions(kind: ParamType) -> None:
-    assert encode_value(6.0, kind, BYTEWISE) == b"\x06\0\0\0"
-    assert encode_value(-0.0, kind, BYTEWISE) == bytes(4)
-    with pytest.raises(UsageError, match=r"1\.5 is not a whole number"):
-        encode_value(1.5, kind, BYTEWISE)
-
-
 # C-cast
 
 

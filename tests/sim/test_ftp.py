@@ -157,32 +157,6 @@ def test_checksums_of_files() -> None:
 
 
 class TestSessions:
-    def test_ardupilot_has_one_session(self) -> None:
-        pilot = Pilot(ArduPilotVehicle())
-        pilot.vehicle.files["a"] = b"a"
-        pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
-        assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)) == (FileErrorCode.FAIL,)
-        assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4)) == (FileErrorCode.INVALID_SESSION,)
-        assert refusal(pilot.ask(Opcode.READ_FILE, session=4, size=1)) == (FileErrorCode.INVALID_SESSION,)
-        assert refusal(pilot.ask(Opcode.WRITE_FILE, b"x", session=4)) == (FileErrorCode.INVALID_SESSION,)
-        assert pilot.ask(Opcode.RESET_SESSIONS, session=4).opcode == Opcode.ACK
-        assert pilot.ask(Opcode.READ_FILE, session=3, size=1).data == b"a"
-        assert pilot.ask(Opcode.RESET_SESSIONS, session=3).opcode == Opcode.ACK
-        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
-
-    @pytest.mark.parametrize(
-        "opcode",
-        [Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE, Opcode.CALC_FILE_CRC32],
-    )
-    def test_ardupilot_has_one_session_for_all_stations(self, opcode: Opcode) -> None:
-        pilot = Pilot(ArduPilotVehicle())
-        pilot.vehicle.files["a"] = b"a"
-        pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
-        other = Pilot(pilot.vehicle, component=191)
-        other.now = pilot.now
-        assert refusal(other.ask(opcode, b"a", session=4)) == (FileErrorCode.INVALID_SESSION,)
-        assert other.ask(Opcode.READ_FILE, session=3, size=1).data == b"a"
-
     def test_ardupilots_session_ends_after_3_s_without_a_response(self) -> None:
         pilot = Pilot(ArduPilotVehicle())
         pilot.vehicle.files["a"] = b"a"
@@ -192,17 +166,6 @@ class TestSessions:
         pilot.listen(2.95)
         assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
         assert refusal(pilot.ask(Opcode.READ_FILE, session=3, size=1)) == (FileErrorCode.INVALID_SESSION,)
-
-    @pytest.mark.parametrize(("path", "texts"), [(b"a", 0), (PARAMS, 3), (PARAMS + b"?withdefaults=1", 3)])
-    def test_ardupilot_sends_its_banner_with_the_parameters(self, path: bytes, texts: int) -> None:
-        vehicle = ArduPilotVehicle()
-        vehicle.files["a"] = b"a"
-        vehicle.tick(0.0)
-        vehicle.receive(file_request(Packet(2, 3, Opcode.OPEN_FILE_RO, path)), 0.0)
-        vehicle.tick(0.1)
-        framer = frames.Framer(stream=False)
-        sent = [frame for data in vehicle.data_to_send() for frame in framer.receive(data)]
-        assert sum(isinstance(messages.decode(frame), messages.StatusText) for frame in sent) == texts
 
     def test_px4_closes_a_session_after_11_s(self) -> None:
         pilot = Pilot(PX4Vehicle())
