@@ -112,15 +112,13 @@ class FileServer:
     _waiting: deque[_Request] = field(default_factory=deque)
     _burst: _Burst | None = None
     _free_at: float = -math.inf
-    _now: float = 0.0
     _answered_at: float = -math.inf
     _last: tuple[Address, Packet] | None = None
     _packed: tuple[object, bytes] | None = None
 
-    @property
-    def open_files(self) -> list[str]:
-        """The paths of the open files that are in the way of other stations."""
-        is_over = not self.is_px4 and self._now - self._answered_at > IDLE_LIMIT
+    def open_files(self, now: float) -> list[str]:
+        """Return the paths of the open files that are in the way of other stations."""
+        is_over = not self.is_px4 and now - self._answered_at > IDLE_LIMIT
         return [] if self._session is None or is_over else [self._session.path]
 
     def reset(self) -> None:
@@ -143,7 +141,6 @@ class FileServer:
     def work(self, now: float, packets_max: float = math.inf) -> list[tuple[Packet, Address]]:
         """Do the due work, limited to `packets_max` responses; return the responses with their receivers."""
         out: list[tuple[Packet, Address]] = []
-        self._now = now
         while (due := self.next_deadline()) <= now:
             if len(out) >= packets_max:
                 self._free_at = now

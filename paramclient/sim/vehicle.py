@@ -135,7 +135,7 @@ class Vehicle(Device):
     @property
     def open_files(self) -> list[str]:
         """The paths of the files that are open in a MAVFTP session."""
-        return [] if self.file_server is None else self.file_server.open_files
+        return [] if self.file_server is None else self.file_server.open_files(self._now)
 
     def set_param(self, name: str, value: WireValue) -> None:
         """Change a value as if on board or by another station; announced as this kind of vehicle does.
