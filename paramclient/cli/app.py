@@ -35,13 +35,10 @@ def run(arguments: Sequence[str]) -> int:
     shows_help = _shows_help(arguments)
     if shows_help:
         _load(_app)
-    with _warnings_shown() as printer:
+    with _messages_shown(verbose=not {"--verbose", "-v"}.isdisjoint(arguments)):
         try:
             words = [STDIN if word == "-" else word for word in arguments]
             command, bound, _ = _app.parse_args(words, exit_on_error=False, print_error=False)
-            given = bound.arguments
-            if given.get("verbose", getattr(given.get("options"), "verbose", False)):
-                printer.show_steps()
             words = ["-" if word == STDIN else word for word in bound.args]
             call = partial(command, *words, **bound.kwargs)
             code = anyio.run(_until_signal, call) if inspect.iscoroutinefunction(command) else call()
@@ -126,11 +123,6 @@ async def _until_signal(work: Callable[[], Awaitable[int | None]]) -> int | None
 class _LogPrinter(logging.Handler):
     """Prints warnings of the library on stderr, and with --verbose each step."""
 
-    def show_steps(self) -> None:
-        """Print each step from now on."""
-        self.setLevel(logging.DEBUG)
-        _logger.setLevel(logging.DEBUG)
-
     def emit(self, record: logging.LogRecord) -> None:
         """Print a log record."""
         if record.levelno >= logging.WARNING:
@@ -140,19 +132,18 @@ class _LogPrinter(logging.Handler):
             say(f"{record.relativeCreated / 1000:8.3f} {name}: {record.getMessage()}")
 
 
-_logger: Final = logging.getLogger("paramclient")
-
-
 @contextmanager
-def _warnings_shown() -> Iterator[_LogPrinter]:
-    handler = _LogPrinter(logging.WARNING)
-    level = _logger.level
-    _logger.addHandler(handler)
+def _messages_shown(*, verbose: bool) -> Iterator[None]:
+    logger, handler = logging.getLogger("paramclient"), _LogPrinter()
+    level = logger.level
+    logger.addHandler(handler)
+    handler.setLevel(logging.DEBUG if verbose else logging.WARNING)
+    logger.setLevel(logging.DEBUG if verbose else level)
     try:
-        yield handler
+        yield
     finally:
-        _logger.removeHandler(handler)
-        _logger.setLevel(level)
+        logger.removeHandler(handler)
+        logger.setLevel(level)
 
 
 def _examples(*lines: str) -> str:
@@ -167,13 +158,7 @@ Exit codes: 0 done; 1 refused, incomplete, different; 2 usage; 3 no vehicle or n
 _app: Final = App(
     name="paramclient",
     help="Fetch, get and set the parameters of MAVLink vehicles, and show them later without a link.",
-    help_epilogue=_examples(
-        "fetch sim:px4",
-        "get udpin:0.0.0.0:14550 MC_ROLL_P",
-        "set udpin:0.0.0.0:14550 MC_ROLL_P 6.5",
-        "show",
-    )
-    + _EXIT_CODES,
+    help_epilogue=_examples("fetch sim:px4", "set udpin:0.0.0.0:14550 MC_ROLL_P 6.5", "show") + _EXIT_CODES,
     version=f"paramclient {__version__}",
     default_parameter=Parameter(negative=(), show_default=False),
     help_format="plaintext",
@@ -210,20 +195,8 @@ def _add(group: App, function: str, arguments: str | None = None, *examples: str
 
 _add(_app, "read_commands:fetch", "URL [NAME...]", "sim:px4 'MC_*'", "tcp:127.0.0.1:5760 --vehicle 3 --json")
 _add(_app, "read_commands:get", "URL NAME [NAME...]", "udpin:0.0.0.0:14550 MC_ROLL_P 'MC_PITCH*'")
-_add(
-    _app,
-    "set_command:set_",
-    "URL NAME VALUE|NAME=VALUE [NAME VALUE|NAME=VALUE...]",
-    "udpin:0.0.0.0:14550 MC_ROLL_P 6.5 MC_PITCH_P 6.5",
-    "udpin:0.0.0.0:14550 FLTMODE1=Loiter --metadata apm.pdef.xml",
-)
-_add(
-    _app,
-    "reset_command:reset",
-    "URL NAME [NAME...]|--all|--changed",
-    "udpin:0.0.0.0:14550 MC_ROLL_P 'MC_PITCH*'",
-    "udpin:0.0.0.0:14550 --changed --dry-run",
-)
+_add(_app, "set_command:set_", "URL NAME VALUE [NAME VALUE...]", "sim:px4 MC_ROLL_P 6.5 MC_PITCH_P 6.5")
+_add(_app, "reset_command:reset", "URL NAME [NAME...]|--all|--changed", "sim:ardupilot 'RTL_*' --dry-run")
 _add(_app, "watch:watch", "URL [NAME...]", "udpin:0.0.0.0:14550 MC_ROLL_P --json")
 _add(_app, "link:link", None, "udpin:0.0.0.0:14550 --seconds 10 --json")
 _add(_app, "check:check", None, "udpin:0.0.0.0:14550")
@@ -234,11 +207,7 @@ _add(_app, "search:search", "WORD [WORD...]", "roll rate", "geofence --metadata 
 _add(_app, "search:info", None, "MC_ROLL_P", "rtl_alt --vehicle 1 --json")
 _add(_app, "save:save", "URL|LOG|VEHICLE FILE", "udpin:0.0.0.0:14550 quad.params", "1 tuned.param --changed")
 _add(
-    _app,
-    "apply:apply",
-    "URL FILE",
-    "udpin:0.0.0.0:14550 quad.params --dry-run",
-    "udpin:0.0.0.0:14550 'own/{system}.param' --vehicle all",
+    _app, "apply:apply", "URL FILE", "sim:px4 quad.params --dry-run", "sim:px4 '{system}.param' --vehicle all"
 )
 _add(_app, "apply:restore", "URL [WHEN|FILE]", "sim:px4 --dry-run", "udpin:0.0.0.0:14550 '2h ago'")
 _add(_app, "logs:import_", "FILE [FILE...]", "flight.tlog")

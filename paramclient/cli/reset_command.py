@@ -15,6 +15,7 @@ from paramclient.cli.metadata import (
     defaults_in,
     from_file,
     known_of_session,
+    report_no_defaults,
     request_from_vehicle,
     say_sources,
 )
@@ -60,7 +61,7 @@ async def reset(
         names: The parameters, in upper or lower case, or patterns such as "MC_*".
         all_: Reset all parameters, except those that apply leaves out: identity, calibration, counters and so
             on, see --include.
-        changed: The same, without a complaint about parameters whose default is not known.
+        changed: The same, without a complaint about single parameters whose default is not known.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
     """
     if bool(names) + all_ + changed != 1:
@@ -80,7 +81,10 @@ async def reset(
         known = defaults_in(given or await _known(session, metadata, params), [each.name for each in params])
         found = {param: default_of(param, known.get(param.name)) for param in params}
         without = [param.name for param, default in found.items() if default is None]
-        if without and not changed:
+        if len(without) == len(found):
+            is_part = True
+            report_no_defaults()
+        elif without and not changed:
             is_part = True
             listed = first_of(without, RESET_NAMES_MAX)
             report(f"{session.prefix}not written, as their default is not known: {listed}")
