@@ -12,7 +12,7 @@ import anyio
 from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.json_output import JsonObject
+from paramclient.cli.json_output import JsonObject, taken
 from paramclient.cli.options import Seconds, TrafficOptions
 from paramclient.cli.output import Coloured, Status, milliseconds, print_json, print_line, print_table
 from paramclient.cli.session import VEHICLE_TIMEOUT, ChosenVehicle, Deadline, listen, wait_for_vehicle
@@ -139,15 +139,11 @@ async def _measure(client: ParamClient, component: Component, deadline: Deadline
     )
     kind = identification.vehicle_type
     found: JsonObject = {
-        "system": component.system,
-        "component": component.component,
-        "autopilot": component.autopilot,
+        **taken(component, "system", "component", "autopilot"),
         "vehicle_type": None if kind is None else enum_word("MAV_TYPE", kind),
         "identity": asdict(component.identity),
         "has_version": identification.capabilities is not None,
-        "encoding": component.encoding.value,
-        "encoding_reason": component.encoding_reason,
-        "is_armed": component.is_armed,
+        **taken(component, "encoding", "encoding_reason", "is_armed"),
     }
     trips = await step("round trip", lambda: _round_trips(component, deadline))
     crc = await step("hash", lambda: _hash(client, component, deadline))

@@ -11,6 +11,7 @@ from paramclient.cli.json_output import (
     known_members,
     origin_json,
     short_text,
+    taken,
     vehicle_json,
 )
 from paramclient.model.comparison import ChangedSide, DifferenceStatus
@@ -122,8 +123,7 @@ def plan_json(plan: Plan, component: Component) -> JsonObject:
 
     rows = [row for row in plan.rows.values() if row.status is not ApplyStatus.UNCHANGED]
     found: JsonObject = {
-        "system": component.system,
-        "component": component.component,
+        **taken(component, "system", "component"),
         "dry_run": True,
         "counts": _counts(plan),
         "stages": [
@@ -151,10 +151,9 @@ def apply_json(result: ApplyResult, component: Component) -> JsonObject:
     Unchanged parameters, and left-out ones that do not differ, are not included.
     """
     return {
-        "system": component.system,
-        "component": component.component,
+        **taken(component, "system", "component"),
         "vehicle": vehicle_json(component),
-        "now": {"system": result.system, "component": result.component},
+        "now": taken(result, "system", "component"),
         "complete": result.complete,
         "counts": _counts(result),
         "params": rows_json(result.shown_rows),

@@ -48,6 +48,7 @@ __all__ = [
     "short_text",
     "snapshot_json",
     "table_param_json",
+    "taken",
     "vehicle_json",
     "written_json",
 ]
@@ -62,6 +63,11 @@ SHORT_TEXT_LENGTH_MAX: Final = 400
 def known_members(**members: object) -> JsonObject:
     """Return the members that are not None."""
     return {name: value for name, value in members.items() if value is not None}
+
+
+def taken(source: object, *names: str) -> JsonObject:
+    """Return attributes of an object as members."""
+    return {name: getattr(source, name) for name in names}
 
 
 def short_text(text: str | None) -> str | None:
@@ -160,8 +166,7 @@ def vehicle_json(vehicle: Component) -> JsonObject:
     """Return a vehicle that is written to."""
     identity = vehicle.identity
     return {
-        "system": vehicle.system,
-        "component": vehicle.component,
+        **taken(vehicle, "system", "component"),
         "autopilot": autopilot_name(identity.autopilot),
         "kind": kind_in_words(identity.autopilot, identity.vehicle_type),
         "firmware": version_text(identity.firmware) if identity.firmware else None,
@@ -173,9 +178,7 @@ def origin_json(params: ParamSet) -> JsonObject:
     """Return the origin of a set, and the time at which the vehicle had these values."""
     identity = params.identity
     return {
-        "source": params.source,
-        "system": params.system,
-        "component": params.component,
+        **taken(params, "source", "system", "component"),
         "autopilot": None if identity is None else autopilot_name(identity.autopilot),
         "uid": None if identity is None else identity.uid,
         "at": time_or_none(params.at),
@@ -196,25 +199,15 @@ def fetch_json(
     component: Component, result: FetchResult, params: Iterable[Param], described: Mapping[str, int | float]
 ) -> JsonObject:
     """Return a fetch with these parameters; `described` has defaults of the metadata by name."""
-    traffic = component.core.link_task
     return {
-        "system": component.system,
-        "component": component.component,
-        "autopilot": component.autopilot,
+        **taken(component, "system", "component", "autopilot"),
         "uid": component.identity.uid,
-        "count": result.count,
-        "received": result.received,
-        "source": result.source,
+        **taken(result, "count", "received", "source"),
         "hash": hash_text(result.hash),
-        "missing": result.missing,
-        "cached": result.cached,
-        "changed": result.changed,
-        "lost": result.lost,
-        "repeated": result.repeated,
+        **taken(result, "missing", "cached", "changed", "lost", "repeated"),
         "round_trip_s": rounded(result.round_trip),
         "elapsed_s": round(result.elapsed, 4),
-        "bytes_received": traffic.bytes_received,
-        "bytes_sent": traffic.bytes_sent,
+        **taken(component.core.link_task, "bytes_received", "bytes_sent"),
         "params": {each.name: param_json(each, described=described.get(each.name)) for each in params},
     }
 
@@ -249,8 +242,7 @@ def history_json(entry: HistoryEntry) -> JsonObject:
     """Return one change of a value."""
     return {
         "time": time_text(entry.at),
-        "component": entry.component,
-        "name": entry.name,
+        **taken(entry, "component", "name"),
         "old": param_value(entry.old),
         "new": param_value(entry.new),
         "by": entry.by,
@@ -262,9 +254,7 @@ def snapshot_json(summary: SnapshotSummary) -> JsonObject:
     return {
         "id": summary.id,
         "time": time_text(summary.at),
-        "component": summary.component,
-        "size": summary.size,
-        "complete": summary.complete,
+        **taken(summary, "component", "size", "complete"),
         "hash": hash_text(summary.hash),
         "reason": summary.reason,
     }

@@ -11,7 +11,7 @@ from typing import Final
 import anyio
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.json_output import JsonObject
+from paramclient.cli.json_output import JsonObject, taken
 from paramclient.cli.options import Seconds, TrafficOptions
 from paramclient.cli.output import clear_screen, milliseconds, print_json, print_line, print_table
 from paramclient.cli.session import Deadline, listen, received_in_words
@@ -113,9 +113,8 @@ def _json(client: ParamClient, report: TrafficReport) -> JsonObject:
         "sent_per_s": round(report.recent["sent"], 1),
         "frames": report.totals["frames"],
         "unknown": report.totals["unknown"],
-        "damaged": report.damaged,
-        "other_bytes": report.other_bytes,
-        "signing": None if signing is None else {name: getattr(signing, name) for name in names},
+        **taken(report, "damaged", "other_bytes"),
+        "signing": None if signing is None else taken(signing, *names),
         "components": [_component_json(client, report.at, each) for each in report.components],
     }
 
@@ -123,23 +122,17 @@ def _json(client: ParamClient, report: TrafficReport) -> JsonObject:
 def _component_json(client: ParamClient, now: float, each: ComponentTraffic) -> JsonObject:
     beat, component = each.heartbeat, client.components.get((each.system, each.component))
     return {
-        "system": each.system,
-        "component": each.component,
+        **taken(each, "system", "component"),
         "mavlink": each.version,
         "autopilot": None if beat is None else autopilot_name(beat.autopilot),
         "type": None if beat is None else enum_word("MAV_TYPE", beat.type),
         "state": None if beat is None else enum_word("MAV_STATE", beat.system_status),
         "heartbeat_age_s": None if each.heartbeat_at is None else rounded(now - each.heartbeat_at),
         "age_s": round(now - each.received_at, 4),
-        "frames": each.totals["frames"],
-        "bytes": each.totals["bytes"],
+        **{name: each.totals[name] for name in ("frames", "bytes", "lost", "repeated", "late", "signed")},
         "frames_per_s": round(each.recent["frames"], 2),
         "bytes_per_s": round(each.recent["bytes"], 1),
-        "lost": each.totals["lost"],
         "loss": rounded(each.loss),
-        "repeated": each.totals["repeated"],
-        "late": each.totals["late"],
-        "signed": each.totals["signed"],
         "round_trip_s": None if component is None else rounded(component.round_trip),
         "messages": {
             message_name(message): {

@@ -8,7 +8,7 @@ from typing import Final
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.cached import load_tables
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.json_output import JsonObject, info_json, table_param_json
+from paramclient.cli.json_output import JsonObject, info_json, table_param_json, taken
 from paramclient.cli.metadata import (
     METADATA_HINT,
     MetadataChoice,
@@ -97,9 +97,7 @@ def info(
     if options.json:
         vehicles = [
             {
-                "key": each.key,
-                "system": each.system,
-                "component": each.component,
+                **taken(each, "key", "system", "component"),
                 "autopilot": autopilot_name(each.autopilot),
                 "heard_at": time_text(each.heard_at[spelled]),
                 "param": table_param_json(param, described=default),
