@@ -7,6 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -209,18 +210,16 @@ async def _earlier_state(session: CommandSession, url: str, moment: float | int 
     key, component, extended = vehicle.identity.key, vehicle.component, vehicle.is_extended
     if moment is not None:
         try:
-            state = await anyio.to_thread.run_sync(
-                lambda: cache.state_at(key, component, moment, extended=extended)
-            )
+            load = partial(cache.state_at, key, component, moment, extended=extended)
+            state = await anyio.to_thread.run_sync(load)
         except UnknownVehicle:  # the vehicle was heard on the link; the user named none of the cache
             message = f"the cache {cache.place} has no earlier state of {key}, component {component}"
             raise NotInCache(message) from None
         is_number = isinstance(moment, int)
         return State(state, again="" if is_number else _command(url, local_time(moment), session))
     try:
-        point = await anyio.to_thread.run_sync(
-            lambda: load_restore_point(cache, key, component, extended=extended)
-        )
+        find = partial(load_restore_point, cache, key, component, extended=extended)
+        point = await anyio.to_thread.run_sync(find)
     except NotInCache:
         raise
     except CacheError as error:

@@ -8,8 +8,11 @@ import time
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path, PurePath
 from typing import Final
+
+import anyio.to_thread
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
 from paramclient.cache.lookup import address_of, is_vehicle_name
@@ -91,8 +94,8 @@ async def resolve(
         VehicleError: some parameters were not received; the message names them, or counts those in the cache.
         NoReply, LinkError: as from `ParamClient.component` and `Component.fetch_all`.
     """
-    found = read_source(text, component=component, extended=extended, cache=cache)
-    if found is not None:
+    read = partial(read_source, text, component=component, extended=extended, cache=cache)
+    if (found := await anyio.to_thread.run_sync(read)) is not None:  # a log of 100 MB takes seconds
         return choose(found, component, system)
     link = link_of(text)
     if fetch is not None:
