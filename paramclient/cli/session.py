@@ -6,7 +6,7 @@ import re
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
 from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 import anyio
@@ -18,7 +18,7 @@ from paramclient.cli.output import Status, print_json, print_table, report, say
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, NoReply, ParamClientError, UsageError
-from paramclient.links import LinkKind, ReplayLink, parse_link
+from paramclient.links import LinkKind, ReplayLink
 from paramclient.model.identity import version_text
 from paramclient.model.values import Trust
 from paramclient.model.wording import first_of
@@ -382,10 +382,8 @@ def _client(url: str, options: TrafficOptions, **more: Any) -> ParamClient:
 
 def _at_full_speed(url: str) -> str:
     """Return the link name; for a log without a speed, with the option for full speed."""
-    if not url.lower().startswith(f"{LinkKind.REPLAY}:"):
-        return url
-    spec = parse_link(url)
-    return spec.name if spec.options else replace(spec, options=(("speed", 0.0),)).name
+    is_log = url.lower().startswith(f"{LinkKind.REPLAY}:")
+    return f"{url}?speed=0" if is_log and "?speed=" not in url else url
 
 
 # Vehicles
