@@ -27,10 +27,10 @@ from paramclient.protocol.channel import task_group
 from paramclient.protocol.ftp import BUSY, attempts_unproven, checksum, is_free
 from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode_entries, header
 from paramclient.protocol.reads import READS_PER_SLOT_ARDUPILOT, SLOT_ARDUPILOT, read
-from paramclient.protocol.session import Session
+from paramclient.protocol.session import FileUnavailable, Session
 from paramclient.protocol.table import Table
 
-__all__ = ["CHECKED_READ_SIZE", "ChecksumUnavailable", "TableDiffers", "is_moving", "may_be_rounded", "prove"]
+__all__ = ["CHECKED_READ_SIZE", "TableDiffers", "is_moving", "may_be_rounded", "prove"]
 
 CHECKED_READ_SIZE: Final = 64
 """Bytes that ArduPilot reads at a time for a checksum: the padding of the file depends on it (measured)."""
@@ -83,21 +83,7 @@ GUESS_BITS_SHORT: Final = 29
 """The same in a short range, where hardly two values differ."""
 
 
-class ChecksumUnavailable(Exception):
-    """The checksum cannot prove the table.
-
-    Attributes:
-        reason: why, as a sentence for the notes of a fetch.
-        is_silent: whether MAVFTP did not answer at all.
-    """
-
-    def __init__(self, reason: str, *, is_silent: bool = False) -> None:
-        super().__init__(reason)
-        self.reason = reason
-        self.is_silent = is_silent
-
-
-class TableDiffers(ChecksumUnavailable):
+class TableDiffers(FileUnavailable):
     """The vehicle's table is another one, and a search is not worth it."""
 
 
@@ -105,30 +91,30 @@ async def prove(session: Session) -> None:
     """Prove a complete table by the vehicle's checksum, after reading the values that have changed.
 
     Raises:
-        ChecksumUnavailable: the vehicle computes no checksum now.
+        FileUnavailable: the vehicle computes no checksum now.
         TableDiffers: its table is too different.
         LinkError: the link is closed for good.
     """
     vehicles = session.identification.vehicles
     if not await is_free(session.channel):
-        raise ChecksumUnavailable(BUSY)
+        raise FileUnavailable(BUSY)
     async with session.channel.ftp:
         try:
             for _ in range(PROOFS_MAX):
                 proof = _Proof(session, _rows(session.table))
                 is_proven = await proof.run()
                 if session.identification.vehicles != vehicles:
-                    raise ChecksumUnavailable("another vehicle has taken the address")
+                    raise FileUnavailable("another vehicle has taken the address")
                 if is_proven and proof.take_over():
                     return
         except FileTransferError as error:
             if error.code == FileErrorCode.UNKNOWN_COMMAND:
                 session.serves_checksum = False
-            raise ChecksumUnavailable(f"the checksum was refused: {error.reason}") from None
+            raise FileUnavailable(f"the checksum was refused: {error.reason}") from None
         except NoReply as error:
             session.ftp_unanswered += error.attempts
             is_silent = session.serves_checksum is None
-            raise ChecksumUnavailable("MAVFTP did not answer", is_silent=is_silent) from None
+            raise FileUnavailable("MAVFTP did not answer", is_silent=is_silent) from None
     raise TableDiffers(OTHER)
 
 
@@ -179,10 +165,10 @@ class _Proof:
             numbers: set[int] = set()
             divided: list[range] = []
             for place, difference in places.items():
-                suspected = suspects.intersection(place) if len(place) > 1 else ()
-                guess = self._guess_moved(place, difference)
-                if guess or suspected:
-                    guesses |= guess or {at: rows[at].bits for at in suspected}
+                if moved := self._guess_moved(place, difference):
+                    self._take(*moved, anyio.current_time())
+                elif len(place) > 1 and (suspected := suspects.intersection(place)):
+                    guesses |= {at: rows[at].bits for at in suspected}
                 elif guess := self._guess(place, difference):
                     guesses |= guess
                 elif ends := self._ends_of(moving, place) or self._ends_of(rare, place):
@@ -201,7 +187,7 @@ class _Proof:
             self._weigh(len(guesses), len(numbers), divided)
             if numbers:
                 await self._request(numbers)
-            else:
+            elif guesses:
                 await self._read(guesses)
                 suspects -= guesses.keys()
         return True
@@ -249,15 +235,15 @@ class _Proof:
                 yield at, row.bits ^ change
             difference = crc32_px4_before(difference, self._ends[at + 1] - self._ends[at])
 
-    def _guess_moved(self, place: range, difference: int) -> dict[int, int]:
+    def _guess_moved(self, place: range, difference: int) -> tuple[int, int] | None:
         """Return the index and the bits of a value that has just moved as it always does, and explains a
-        difference alone: hardly anything else explains it. Empty without one."""
-        table, now = self._session.table, anyio.current_time()
+        difference alone: hardly anything else explains it, so that it needs no read."""
+        moments, now = self._session.table.moments, anyio.current_time()
         for at, bits in self._explanations(place, difference):
             row = self._rows[at]
-            if _has_just_moved(row, bits, now - table.moments.get(row.name, now)):
-                return {at: bits}
-        return {}
+            if _has_just_moved(row, bits, now - moments.get(row.name, now)):
+                return at, bits
+        return None
 
     def _guess(self, place: range, difference: int) -> dict[int, int]:
         """Return the index and the bits of the simplest value that explains a difference alone, unless there
@@ -324,26 +310,21 @@ class _Proof:
     async def _read(self, guesses: dict[int, int]) -> None:
         """Read values by their indices, and take over those that are others; `guesses` has their exact bits.
 
-        A value that has just moved as it always does needs no read.
-
         Raises:
             TableDiffers: the vehicle has another parameter at such an index.
         """
-        table, now = self._session.table, anyio.current_time()
+        encoding, now = self._session.table.encoding, anyio.current_time()
 
         async def read_one(at: int, guess: int) -> None:
             row = self._rows[at]
-            if _has_just_moved(row, guess, now - table.moments.get(row.name, now)):
-                self._take(at, guess, now)
-                return
             try:
                 found = await read(self._session, at)
             except (NoReply, VehicleError):
                 raise TableDiffers(OTHER) from None
             if (found.param_id, found.param_type) != (row.name, row.type):
                 raise TableDiffers(OTHER)
-            for bits in (guess, row.bits, bits_of_wire(found.raw, row.type, table.encoding)[0]):
-                if as_reported(bits, row.type, table.encoding) == found.raw:
+            for bits in (guess, row.bits, bits_of_wire(found.raw, row.type, encoding)[0]):
+                if as_reported(bits, row.type, encoding) == found.raw:
                     break
             if bits != guess:
                 self._refuted.add((at, guess))
@@ -402,12 +383,12 @@ def _bits_to_write(bits: int, kind: ParamType) -> float:
 def _rows(table: Table) -> list[PackedParam]:
     names = [table.names.get(index, "") for index in range(table.count or 0)]
     if not table.params.keys() >= set(names) or len(set(names)) < len(names):
-        raise ChecksumUnavailable(
+        raise FileUnavailable(
             "the list of parameters has a gap, a name twice, or one that no file can contain"
         )
     params = [table.params[name] for name in names]
     if inexact := [each.name for each in params if each.is_raw or each.type not in PACKABLE]:
-        raise ChecksumUnavailable(f"the exact value of {inexact[0]} is not known")
+        raise FileUnavailable(f"the exact value of {inexact[0]} is not known")
     return [PackedParam(each.name, ParamType(each.type), each.bits) for each in params]
 
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Final
 
 from paramclient.errors import NoReply, VehicleError
-from paramclient.protocol.checksum import ChecksumUnavailable, TableDiffers, prove
+from paramclient.protocol.checksum import TableDiffers, prove
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.reads import read
-from paramclient.protocol.session import Session
+from paramclient.protocol.session import FileUnavailable, Session
 from paramclient.wire.messages import HASH_CHECK
 
 __all__ = ["Answer", "ask", "may_confirm", "settle"]
@@ -57,7 +57,7 @@ async def ask(session: Session, *, refresh: bool = False) -> Answer:
     if _may_prove(session) and not refresh:
         try:
             await prove(session)
-        except ChecksumUnavailable as error:
+        except FileUnavailable as error:
             is_other = isinstance(error, TableDiffers)
             return Answer(reason=error.reason, is_silent=error.is_silent, is_other=is_other)
         return Answer(is_current=True)

@@ -16,11 +16,11 @@ from paramclient.model.values import Param
 from paramclient.model.wording import first_of
 from paramclient.protocol.checksum import is_moving
 from paramclient.protocol.digest import Answer, ask, settle
-from paramclient.protocol.file_download import FileUnavailable, download_file
+from paramclient.protocol.file_download import download_file
 from paramclient.protocol.ftp import SILENT_LOST
 from paramclient.protocol.list_download import ListResult, download_list
 from paramclient.protocol.reads import read_many
-from paramclient.protocol.session import Session
+from paramclient.protocol.session import FileUnavailable, Session
 
 __all__ = ["FetchResult", "FetchSource", "Policy", "Progress", "differing", "fetch_all", "result_of"]
 

@@ -13,9 +13,9 @@ from paramclient.protocol.ftp import BUSY, FTP_SILENT_TIME, FileCutOff, attempts
 from paramclient.protocol.identity import Identification
 from paramclient.protocol.param_pck import PACK_SIZE_MAX, PARAM_FILE, Pack, decode, decode_prefix
 from paramclient.protocol.reads import read
-from paramclient.protocol.session import Session
+from paramclient.protocol.session import FileUnavailable, Session
 
-__all__ = ["FileUnavailable", "download_file"]
+__all__ = ["download_file"]
 
 WITH_DEFAULTS: Final = "?withdefaults=1"
 """Requests the defaults too; a server that does not know it may report that there is no such file."""
@@ -23,20 +23,6 @@ ARDUPILOT_WITH_DEFAULTS: Final = 0x04040000
 """flight_sw_version of the first ArduPilot of which every build adds the defaults: 4.4."""
 DOWNLOADS_MAX: Final = 2
 """Downloads of the file: one can be a mixture, if the table changes meanwhile."""
-
-
-class FileUnavailable(Exception):
-    """The file cannot be had; the list can.
-
-    Attributes:
-        reason: why, as a sentence for the notes of a fetch.
-        is_silent: whether no request was answered.
-    """
-
-    def __init__(self, reason: str, *, is_silent: bool = False) -> None:
-        super().__init__(reason)
-        self.reason = reason
-        self.is_silent = is_silent
 
 
 async def download_file(session: Session) -> int:

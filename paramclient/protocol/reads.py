@@ -116,7 +116,7 @@ async def _ask(
         return min(most, FIRST_ATTEMPTS) if is_first else most
 
     def copies(attempt: int) -> int:
-        if is_certain or attempt < BACKOFF_FROM:
+        if is_certain or attempt < singles:
             return 1
         return max(1, min(int(requests_max() * timing.timeout(0) / PATIENCE_MIN), timing.copies))
 
@@ -126,10 +126,10 @@ async def _ask(
         if is_served is False:
             return 1
         most = requests_max()
-        return min(most, BACKOFF_FROM) + math.ceil(max(most - BACKOFF_FROM, 0) / copies(BACKOFF_FROM))
+        return min(most, singles) + math.ceil(max(most - singles, 0) / copies(singles))
 
     wait, timing = queue_time(session), channel.timing
-    is_certain = bool(is_served) and not requests
+    is_certain, singles = bool(is_served) and not requests, 1 if requests else BACKOFF_FROM
     is_first = is_served is None and (timing.round_trip is None) != (which == HASH_CHECK)
     if is_asked:
         answer: ReportedValue | None = await channel.wait_for(inbox, accept, anyio.current_time(), 0, wait)

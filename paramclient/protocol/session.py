@@ -18,7 +18,7 @@ from paramclient.protocol.identity import Identification
 from paramclient.protocol.table import Table
 from paramclient.wire.messages import NO_INDEX
 
-__all__ = ["ReplacedValue", "Session", "Shared", "Spawn"]
+__all__ = ["FileUnavailable", "ReplacedValue", "Session", "Shared", "Spawn"]
 
 T = TypeVar("T")
 
@@ -29,6 +29,20 @@ FOREIGN_SET_MEMORY: Final = 2.0
 """Seconds for which a PARAM_SET of another station explains a change."""
 FOREIGN_SETS_MAX: Final = 256
 """PARAM_SETs of other stations that are remembered; the oldest is dropped first."""
+
+
+class FileUnavailable(Exception):
+    """The parameter file, or its checksum, cannot be had; the list can.
+
+    Attributes:
+        reason: why, as a sentence for the notes of a fetch.
+        is_silent: whether no request was answered.
+    """
+
+    def __init__(self, reason: str, *, is_silent: bool = False) -> None:
+        super().__init__(reason)
+        self.reason = reason
+        self.is_silent = is_silent
 
 
 class Shared(Generic[T]):

@@ -454,8 +454,10 @@ async def _read_writable(session: Session, name: str) -> Param:
     param, began = await _known(session, name), anyio.current_time()
     if session.dialect.has_ack:  # its values need no encoding
         return param
-    with session.channel.gate.until_closed(or_failed=True):
-        await session.identification.encoding_certain()
+    is_shown = param.type is ParamType.REAL32 or session.table.encoding in session.table.evidence
+    if session.identification.autopilot is None or not is_shown:
+        with session.channel.gate.until_closed(or_failed=True):
+            await session.identification.encoding_certain()
     if session.channel.is_lost:
         raise NoReply(f"the encoding of {session.channel}", attempts=0, waited=anyio.current_time() - began)
     param = await _known(session, name)

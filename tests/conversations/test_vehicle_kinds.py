@@ -55,10 +55,10 @@ PARTS = [
 
 
 @pytest.mark.parametrize("parts", PARTS, ids="+".join)
-@pytest.mark.parametrize(("delay", "loss", "limit"), [(0.0, 0.0, 15.0), (0.05, 0.1, 15.0), (0.3, 0.0, 30.0)])
+@pytest.mark.parametrize(("delay", "loss"), [(0.0, 0.0), (0.05, 0.1), (0.3, 0.0)])
 @virtual
 async def test_what_a_vehicle_serves_is_enough_to_read_and_to_prove_a_set(
-    parts: tuple[str, ...], delay: float, loss: float, limit: float
+    parts: tuple[str, ...], delay: float, loss: float
 ) -> None:
     vehicle = Partial(serves=parts)
     async with converse(Air.symmetric([vehicle], delay=delay, loss=loss, seed=1)) as conversation:
@@ -69,7 +69,7 @@ async def test_what_a_vehicle_serves_is_enough_to_read_and_to_prove_a_set(
         result = await write(session, "MODE", 4)
         assert (result.status, result.actual) == ("accepted", 4)
         assert vehicle.values["MODE"] == struct.pack("<i", 4)
-        assert anyio.current_time() - began < limit
+        assert anyio.current_time() - began < 15.0
         assert vehicle.number_of(ParamSet) <= 12
         if "list" in parts or "names" in parts:
             await read(session, "OFFSET")
