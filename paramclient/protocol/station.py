@@ -159,7 +159,8 @@ class Station:
         """Request a value of a component that was not heard: it may send no heartbeat.
 
         By turns a plain and an extended parameter, and the list for firmware without reads; then a parameter
-        of all components of the system, as some answer under another id than they are asked under.
+        of all components of the system, as some answer under another id than they are asked under; and the
+        index 1, where some begin.
         """
         number = self._asked[system, component] = self._asked.get((system, component), -1) + 1
         target = (system, component)
@@ -168,6 +169,7 @@ class Station:
             EXTENDED.request_read(target, 0),
             PLAIN.request_list(target),
             PLAIN.request_read((system, messages.COMP_ID_ALL), 0),
+            PLAIN.request_read(target, 1),
         )
         version = next((node.version for node in self.nodes.values()), 2)
         self.transmit(ways[number % len(ways)], None, version)

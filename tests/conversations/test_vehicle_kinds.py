@@ -371,12 +371,13 @@ async def test_the_encoding_is_looked_for_once_and_within_a_round_trip(maker: ty
 # addresses
 
 
-@pytest.mark.parametrize("serves", [EVERYTHING, ("list",), ("names", "indices")], ids="+".join)
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("serves", [EVERYTHING, ("list",), ("names", "indices"), ("indices",)], ids="+".join)
 @virtual
 async def test_a_component_without_heartbeat_is_asked_where_it_is_named_in_full(
-    serves: tuple[str, ...],
+    serves: tuple[str, ...], first: int
 ) -> None:
-    bridge = Partial(serves=serves, heartbeat=None, component=240)
+    bridge = Partial(serves=serves, first=first, heartbeat=None, component=240)
     async with ParamClient(Air.symmetric([GenericVehicle({"A": 1}), bridge]), cache=False) as client:
         component = await client.component(1, 240)
         assert (await component.get("MODE")).value == 5
