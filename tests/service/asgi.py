@@ -5,23 +5,20 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import suppress
-from typing import Any, Final
+from typing import Final
 
+import anyio
 import httpx
-from starlette.types import ASGIApp, Message
+from starlette.types import ASGIApp, Message, Scope
 
-__all__ = ["ASGITransport", "a_browser"]
+__all__ = ["a_browser"]
 
-HIGH_WATER: Final = 65_536
-"""Bytes that an application may have sent, and no client has read, before `send` waits, as with uvicorn."""
+MESSAGES_MAX: Final = 64
+"""Messages that an application may have sent, and no client has read, before `send` waits."""
 
 
-class ASGITransport(httpx.AsyncBaseTransport):
-    """Calls an application in a task of its own for each request.
-
-    The application receives `http.disconnect` when the response is closed or the request is cancelled. What
-    it raises is raised by the request, unless it has responded with the status 500.
-    """
+class _Transport(httpx.AsyncBaseTransport):
+    """Calls an application in a task of its own for each request."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -30,104 +27,66 @@ class ASGITransport(httpx.AsyncBaseTransport):
         url = request.url
         scope = {
             "type": "http",
-            "asgi": {"version": "3.0", "spec_version": "2.4"},
             "http_version": "1.1",
             "method": request.method,
             "scheme": url.scheme,
             "path": url.path,
-            "raw_path": url.raw_path.partition(b"?")[0],
             "query_string": url.query,
-            "root_path": "",
             "headers": [(name.lower(), value) for name, value in request.headers.raw],
-            "server": (url.host, url.port or 80),
             "client": ("127.0.0.1", 50_000),
         }
-        exchange = _Exchange(await request.aread())
-        exchange.begin(self._app, scope)
+        exchange = _Exchange(self._app, scope, await request.aread())
         try:
-            await exchange.started.wait()
-        except asyncio.CancelledError:
+            start = await exchange.answers.receive()
+        except BaseException:
             await exchange.aclose()
             raise
-        if exchange.error is not None and exchange.status is None:
-            await exchange.aclose()
-            raise exchange.error
-        assert exchange.status is not None, "the application has not answered"
-        return httpx.Response(exchange.status, headers=exchange.headers, stream=exchange)
+        exchange.status = start["status"]
+        return httpx.Response(exchange.status, headers=start["headers"], stream=exchange)
 
 
 class _Exchange(httpx.AsyncByteStream):
-    """One request and what is answered to it."""
+    """One request and what is answered to it.
 
-    def __init__(self, body: bytes) -> None:
-        self.status: int | None = None
-        self.headers: list[tuple[bytes, bytes]] = []
-        self.started = asyncio.Event()
-        self.error: Exception | None = None
-        self._body: bytes | None = body
+    The application receives `http.disconnect` when the response is closed or the request is cancelled. What
+    it raises is raised there, unless it has responded with the status 500.
+    """
+
+    def __init__(self, app: ASGIApp, scope: Scope, body: bytes) -> None:
+        self._requests: list[Message] = [{"type": "http.request", "body": body}]
+        self.status = 0
         self._gone = asyncio.Event()
-        self._chunks: asyncio.Queue[bytes | None] = asyncio.Queue()
-        self._waiting = 0
-        self._has_room = asyncio.Event()
-        self._has_room.set()
-        self._task: asyncio.Task[None] | None = None
-
-    def begin(self, app: ASGIApp, scope: dict[str, Any]) -> None:
-        self._task = asyncio.create_task(self._run(app, scope), name=f"asgi {scope['path']}")
+        self._sent, self.answers = anyio.create_memory_object_stream[Message](MESSAGES_MAX)
+        self._task = asyncio.create_task(self._run(app, scope))
 
     async def __aiter__(self) -> AsyncIterator[bytes]:
-        while (chunk := await self._chunks.get()) is not None:
-            self._waiting -= len(chunk)
-            if self._waiting <= HIGH_WATER:
-                self._has_room.set()
-            yield chunk
-        if self.error is not None and self.status != 500:
-            raise self.error
+        async for message in self.answers:
+            yield message.get("body", b"")
 
     async def aclose(self) -> None:
         """The client leaves; the application has as long to notice as it takes."""
         self._gone.set()
-        self._has_room.set()
-        if self._task is not None:
-            with suppress(asyncio.CancelledError):
-                await asyncio.shield(self._task)
+        self.answers.close()
+        await asyncio.wait([self._task])
+        error = self._task.exception()
+        if error is not None and self.status != 500:
+            raise error
 
-    async def _run(self, app: ASGIApp, scope: dict[str, Any]) -> None:
-        try:
+    async def _run(self, app: ASGIApp, scope: Scope) -> None:
+        with self._sent:
             await app(scope, self._receive, self._send)
-        except Exception as error:
-            self.error = error
-        finally:
-            self._gone.set()
-            self._chunks.put_nowait(None)
-            self.started.set()
 
     async def _receive(self) -> Message:
-        if self._body is not None:
-            body, self._body = self._body, None
-            return {"type": "http.request", "body": body, "more_body": False}
+        if self._requests:
+            return self._requests.pop()
         await self._gone.wait()
         return {"type": "http.disconnect"}
 
     async def _send(self, message: Message) -> None:
-        if message["type"] == "http.response.start":
-            self.status = message["status"]
-            self.headers = list(message.get("headers", ()))
-        elif message["type"] == "http.response.body":
-            chunk = message.get("body", b"")
-            if chunk and not self._gone.is_set():
-                self._waiting += len(chunk)
-                self._chunks.put_nowait(chunk)
-                if self._waiting > HIGH_WATER:
-                    self._has_room.clear()
-            self.started.set()
-            if not message.get("more_body", False):
-                self._gone.set()
-                self._chunks.put_nowait(None)
-            await self._has_room.wait()
+        with suppress(anyio.BrokenResourceError):
+            await self._sent.send(message)
 
 
-def a_browser(app: ASGIApp, **options: Any) -> httpx.AsyncClient:
-    """A client of an application; the options are those of `httpx.AsyncClient`."""
-    defaults = {"base_url": "http://127.0.0.1:8765", "timeout": None}
-    return httpx.AsyncClient(transport=ASGITransport(app), **(defaults | options))
+def a_browser(app: ASGIApp) -> httpx.AsyncClient:
+    """A client of an application."""
+    return httpx.AsyncClient(transport=_Transport(app), base_url="http://127.0.0.1:8765", timeout=None)

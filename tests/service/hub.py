@@ -27,6 +27,14 @@ async def service(
         yield hub, browser
 
 
+@asynccontextmanager
+async def browsing(*links: Any, **options: Any) -> AsyncIterator[httpx.AsyncClient]:
+    """A client of a service whose first table is in sync; see `service`."""
+    async with service(*links, **options) as (_, browser):
+        await synced(browser)
+        yield browser
+
+
 async def synced(browser: httpx.AsyncClient, address: str = V) -> dict[str, Any]:
     """The vehicle, as soon as its table is complete."""
     return await until(browser, address, lambda found: found["state"] == "synced")

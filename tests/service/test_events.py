@@ -11,8 +11,8 @@ from typing import Any
 import httpx
 
 from paramclient.sim import ArduPilotVehicle
-from tests.service.hub import V, service, synced
-from tests.shell import Tap, generic, in_simulated_time
+from tests.service.hub import V, browsing, service, synced
+from tests.shell import Tap, generic
 
 
 class Stream:
@@ -48,19 +48,19 @@ async def events(browser: httpx.AsyncClient, last: str | None = None) -> AsyncIt
         yield stream
 
 
-@in_simulated_time
-async def test_a_write_is_an_event_with_its_author_and_both_values() -> None:
-    async with service(generic()) as (_, browser):
-        await synced(browser)
-        async with events(browser) as stream:
-            await browser.put(f"{V}/params/PARAM_04", json={"value": 9})
-            event = await stream.next("change")
-            assert (event["name"], event["kind"], event["by"]) == ("PARAM_04", "changed", "us for local")
-            assert (event["old"]["value"], event["new"]["value"]) == (4, 9)
-            assert stream.last == f"{event['run']}-{event['seq']}"
+async def test_a_write_is_an_event_with_its_author_and_both_values_and_an_apply_tells_its_progress() -> None:
+    async with browsing(generic()) as browser, events(browser) as stream:
+        await browser.put(f"{V}/params/PARAM_04", json={"value": 9})
+        event = await stream.next("change")
+        assert (event["name"], event["kind"], event["by"]) == ("PARAM_04", "changed", "us for local")
+        assert (event["old"]["value"], event["new"]["value"]) == (4, 9)
+        assert stream.last == f"{event['run']}-{event['seq']}"
+        applied = await browser.post(f"{V}/apply", json={"values": {"PARAM_04": 8, "PARAM_05": 9}})
+        assert applied.json()["complete"]
+        event = await stream.next("apply")
+        assert {"phase", "done", "total", "system", "component"} <= event.keys()
 
 
-@in_simulated_time
 async def test_a_vehicle_is_told_when_it_appears_is_fetched_lost_found_and_armed() -> None:
     vehicle = ArduPilotVehicle()
     tap = Tap(vehicle)
@@ -77,7 +77,6 @@ async def test_a_vehicle_is_told_when_it_appears_is_fetched_lost_found_and_armed
             pass
 
 
-@in_simulated_time
 async def test_a_fetch_tells_its_progress_and_its_end_but_not_each_first_value() -> None:
     async with service(generic()) as (hub, browser), events(browser) as stream:
         await synced(browser)
@@ -90,22 +89,8 @@ async def test_a_fetch_tells_its_progress_and_its_end_but_not_each_first_value()
         assert kinds.count("vehicle") >= 2
 
 
-@in_simulated_time
-async def test_the_progress_of_an_apply_is_told() -> None:
-    async with service(generic()) as (_, browser):
-        await synced(browser)
-        async with events(browser) as stream:
-            values = {"PARAM_04": 9, "PARAM_05": 9}
-            applied = await browser.post(f"{V}/apply", json={"values": values})
-            assert applied.json()["complete"]
-            event = await stream.next("apply")
-            assert {"phase", "done", "total", "system", "component"} <= event.keys()
-
-
-@in_simulated_time
 async def test_a_stream_resumes_after_the_last_event() -> None:
-    async with service(generic()) as (_, browser):
-        await synced(browser)
+    async with browsing(generic()) as browser:
         async with events(browser) as stream:
             assert stream.resumed is False
             await browser.put(f"{V}/params/PARAM_04", json={"value": 9})
@@ -121,10 +106,8 @@ async def test_a_stream_resumes_after_the_last_event() -> None:
                 assert stream.resumed is False
 
 
-@in_simulated_time
 async def test_a_table_has_the_number_of_the_last_event_that_it_includes() -> None:
-    async with service(generic()) as (_, browser):
-        await synced(browser)
+    async with browsing(generic()) as browser:
         before = (await browser.get(f"{V}/params")).json()
         async with events(browser, f"{before['run']}-{before['seq']}") as stream:
             await browser.put(f"{V}/params/PARAM_04", json={"value": 9})
@@ -135,7 +118,6 @@ async def test_a_table_has_the_number_of_the_last_event_that_it_includes() -> No
         assert after["params"]["PARAM_04"]["value"] == 9
 
 
-@in_simulated_time
 async def test_a_slow_reader_holds_up_no_other_and_its_stream_is_ended() -> None:
     async with service(generic()) as (hub, browser):
         await synced(browser)
@@ -151,7 +133,6 @@ async def test_a_slow_reader_holds_up_no_other_and_its_stream_is_ended() -> None
             assert 0 < len(received) < 3 * 6_000
 
 
-@in_simulated_time
 async def test_a_quiet_stream_has_comments_and_ends_with_the_service() -> None:
     async with service(generic(), fetches=False) as (hub, browser):
         await asyncio.sleep(2)
