@@ -294,13 +294,6 @@ class AddedFiles:
         return None
 
 
-def file_address(identity: Identity) -> str:
-    """Return the internet address of the metadata file of an ArduPilot, or of the folder of all files."""
-    kind = _kind_of(identity)
-    files = "https://autotest.ardupilot.org/Parameters/"
-    return f"{files}{ARDUPILOT[kind][0]}/apm.pdef.xml" if kind in ARDUPILOT else files
-
-
 def _replace(path: Path, content: bytes) -> None:
     """Replace a file atomically by one that only its owner can read; create the folder if needed.
 

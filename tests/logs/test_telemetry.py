@@ -197,19 +197,6 @@ def test_the_hash_in_a_log_is_stored_with_its_table(tmp_path: Path) -> None:
         assert len(found.volatile) == 58
 
 
-def test_a_repeated_import_changes_nothing(tmp_path: Path) -> None:
-    cache = tmp_path / "cache"
-    log = whole(A=1, B=2).wait(9.0).set("B", 5).wait(9.0).change("A", 3).write(tmp_path / "flight.tlog")
-    imported(log, cache=cache)
-    before = (kept_values(cache), lines(cache))
-    with ParamCache(cache) as kept:
-        table = repr(kept.component(KEY))
-    imported(log, log, cache=cache)
-    assert (kept_values(cache), lines(cache)) == before
-    with ParamCache(cache) as kept:
-        assert repr(kept.component(KEY)) == table
-
-
 @pytest.mark.parametrize("is_reversed", [False, True])
 def test_the_order_of_logs_does_not_matter(is_reversed: bool, tmp_path: Path) -> None:
     first = whole(A=1, B=2).wait(9.0).change("A", 3).wait(1.0).beat()

@@ -83,19 +83,6 @@ def test_a_slow_change() -> None:
     assert result(camera, set_mode(0)) == (0, ExtAckResult.ACCEPTED)
 
 
-def test_changes_on_board() -> None:
-    camera = Camera({"A": 1, "B": "text", "C": 0.5})
-    assert {name: param.type for name, param in camera.ext_params.items()} == {
-        "A": ParamType.INT32,
-        "B": ParamType.CUSTOM,
-        "C": ParamType.REAL32,
-    }
-    camera.set_ext_param("B", "other")
-    camera.remove_ext_param("A")
-    assert camera.ext_values == {"B": "other", "C": 0.5}
-    assert camera.ext_param("C").index == 1
-
-
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -90,13 +90,6 @@ class TestWhenListed:
 
 @EVERY_KIND
 class TestSwitchingOn:
-    def test_the_heartbeat_starts_with_the_vehicle(self, kind: Callable[..., Vehicle]) -> None:
-        vehicle = kind(table=TEN)
-        station = Station(vehicle, start=100.0).wait(2.5)
-        assert len(station.receive(messages.Heartbeat)) == 3
-        vehicle.reboot(station.now, down=0.7)
-        assert len(station.wait(2.0).receive(messages.Heartbeat)) == 2
-
     def test_the_heartbeat_has_the_boot_state(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN, boot_time=2.5)
         station = Station(vehicle).wait(4.5)
@@ -116,24 +109,6 @@ class TestClock:
         vehicle.reboot(station.now, down=0.7)
         times = station.wait(2.0).receive(messages.SystemTime)
         assert times == [messages.SystemTime(0, 0), messages.SystemTime(0, 1000)]
-
-    @pytest.mark.parametrize("kind", [GenericVehicle, ArduPilotVehicle])
-    def test_telemetry_has_the_time_since_boot(self, kind: Callable[..., Vehicle]) -> None:
-        vehicle = kind(table=TEN, telemetry=10.0)
-        vehicle.tick(5.0)
-        clock: list[int] = []
-        for step in range(1, 40):
-            if step == 25:
-                vehicle.reboot(5.0 + step / 10 + 0.01)
-            vehicle.tick(5.0 + step / 10 + 0.01)
-            for data in vehicle.data_to_send():
-                (frame,) = frames.Framer().receive(data)
-                if frame.message_id == 30:
-                    clock.append(int.from_bytes(frame.payload[:4], "little"))
-        assert clock[:3] == pytest.approx([110, 210, 310], abs=1)
-        falls = [at for at in range(1, len(clock)) if clock[at] < clock[at - 1]]
-        assert len(falls) == 1
-        assert clock[falls[0]] == pytest.approx(100, abs=1)
 
     @pytest.mark.parametrize(("kind", "requested"), [("copter", [True]), ("plane", []), ("rover", [])])
     def test_ardupilot_sends_system_time_when_its_main_loop_runs(

@@ -15,7 +15,6 @@ from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.model.px4_hash import hash_params
 from paramclient.model.values import TYPES_BY_NAME, Param, ParamType, WireValue
 from paramclient.sim import (
-    Air,
     ArduPilotVehicle,
     FaultyLink,
     GenericVehicle,
@@ -126,13 +125,6 @@ class TestEveryVehicle:
         assert names(listed) == list(vehicle.params)
         assert indices(listed) == list(range(len(listed)))
         assert {value.param_count for value in values} == {len(listed)}
-
-    def test_a_frame_in_pieces_is_joined_on_a_stream_only(self, kind: Callable[[], Vehicle]) -> None:
-        frame = messages.encode(read(index=0), system=255, component=190, sequence=0)
-        vehicle = kind()
-        vehicle.receive(frame[:10], 0.0)
-        vehicle.receive(frame[10:], 0.0)
-        assert not vehicle.requests
 
 
 _text = st.sampled_from(["", "A_FLOAT", "b_int", "_HASH_CHECK", "A" * 16, "\xff\x01"])
@@ -506,21 +498,3 @@ class TestFaultyLink:
     def test_invalid_arguments_are_rejected(self, arguments: dict[str, float]) -> None:
         with pytest.raises(UsageError):
             FaultyLink(**arguments)  # type: ignore[arg-type]  # arguments of several types in one dict
-
-
-class TestAir:
-    def test_a_delay_in_both_directions_makes_a_round_trip(self) -> None:
-        station = Station(Air.symmetric([GenericVehicle(SMALL)], delay=0.05)).wait(0.5)
-        station.send(read("B_INT")).wait(0.5)
-        assert station.times() == pytest.approx([0.6])
-
-    def test_faults_apply_in_each_direction(self) -> None:
-        vehicle = GenericVehicle(SMALL)
-        deaf = Station(Air([vehicle], uplink=FaultyLink(loss=1.0)))
-        assert deaf.wait(2.5).receive(messages.Heartbeat)
-        deaf.send(LIST)
-        assert not vehicle.requests
-        mute = Station(Air([vehicle], downlink=FaultyLink(loss=1.0)))
-        mute.send(LIST).wait(1.0)
-        assert vehicle.requests == {"PARAM_REQUEST_LIST": 1}
-        assert mute.log == []
