@@ -173,7 +173,8 @@ async def open_here(device: str, baud: int) -> _Port:
     if sys.platform == "win32":
         return await AsyncioPort.opened(device, baud)
     else:  # noqa: RET505 - with else, the type checker of each system skips the other branch
-        return await anyio.to_thread.run_sync(_Descriptor, device, baud)
+        # A driver may hang. A port that opens after the timeout is closed when its object is dropped.
+        return await anyio.to_thread.run_sync(_Descriptor, device, baud, abandon_on_cancel=True)
 
 
 class AsyncioPort:

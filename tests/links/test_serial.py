@@ -8,6 +8,7 @@ import fcntl
 import os
 import struct
 import sys
+import threading
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from functools import partial
@@ -21,7 +22,7 @@ import serialx
 
 from paramclient.client import link_task
 from paramclient.errors import LinkError, UsageError
-from paramclient.links import Link, Peer, create_link, serial
+from paramclient.links import Link, Peer, create_link, link, serial
 from paramclient.links.serial import AsyncioPort
 from paramclient.wire import messages
 from tests.cable import TIMEOUT, Cable
@@ -223,6 +224,28 @@ async def test_an_unsupported_baud_rate(cable: Cable, port: str, monkeypatch: py
     monkeypatch.setattr(serialx.Serial, "_reconfigure_port", refuse)
     with pytest.raises(UsageError, match="this system does not support 115200 baud"):
         await create_link(cable.link).open()
+
+
+@pytest.mark.asyncio
+async def test_opening_a_stalled_driver_times_out(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A port that opens later is closed again."""
+    monkeypatch.setattr(link, "OPEN_TIMEOUT", 0.05)
+    may_go_on, is_closed = threading.Event(), threading.Event()
+    open_it, close_it = serialx.Serial.open, serialx.Serial.close
+
+    def stalled(port: serialx.Serial) -> None:
+        assert may_go_on.wait(TIMEOUT)
+        open_it(port)
+
+    def closing(port: serialx.Serial) -> None:
+        close_it(port)
+        is_closed.set()
+
+    monkeypatch.setattr(serialx.Serial, "open", stalled)
+    monkeypatch.setattr(serialx.Serial, "close", closing)
+    assert f"{cable.device} did not open within " in str(await refusal(create_link(cable.link)))
+    may_go_on.set()
+    assert await anyio.to_thread.run_sync(is_closed.wait, TIMEOUT)
 
 
 # The extra
