@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import anyio
 import anyio.to_thread
@@ -35,7 +35,7 @@ from paramclient.errors import (
 from paramclient.files import ParamFile
 from paramclient.model.notation import typed
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import WireValue, format_value
+from paramclient.model.values import format_value
 from paramclient.model.wording import age_in_words, counted, first_of
 from paramclient.protocol.fetch import Progress
 from paramclient.provision import CATEGORIES, ApplyProgress, ApplyResult, ApplyRow, ApplyStatus, Plan, plan
@@ -350,6 +350,8 @@ class _Job:
         result: the result at the end.
     """
 
+    columns: ClassVar[Sequence[str]] = ("name", "before", "wanted", "now", "status", "reason")
+
     session: CommandSession
     state: State
     flags: ApplyFlags
@@ -416,23 +418,17 @@ class _Job:
         rows = rows_json(self._so_far)
         return {**self.session.ids, "complete": False, "params": rows, "error": "interrupted"}
 
-    @property
-    def columns(self) -> Sequence[str]:
-        """The headings; a plan has no values that the vehicle has now, besides those before."""
-        return "name", "before", "wanted", *([] if self.plan else ["now"]), "status", "reason"
-
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the cells of each row; those of a plan in the order of writing."""
         if self.plan is not None:
             yield from self._plan_rows(self.plan)
             return
         for row in self._so_far if self.result is None else self.result.shown_rows:
-            name, before, wanted, *more = _cells(row, row.why)
-            yield name, before, wanted, _text(row.actual, row), *more
+            yield _cells(row, row.why)
 
     def _plan_rows(self, made: Plan) -> Iterator[Sequence[object]]:
         reboots = self.flags.reboot and bool(made.reboot_for or made.awaiting_reboot)
-        restart = (None, None, None, Coloured("reboot", "yellow"), "the vehicle reboots")
+        restart = (None, None, None, None, Coloured("reboot", "yellow"), "the vehicle reboots")
         for stage in made.stages:
             for row in stage.rows:
                 purpose = stage.purpose + (", takes effect after a reboot" if row.needs_reboot else "")
@@ -524,9 +520,8 @@ class _Job:
 
 
 def _cells(row: ApplyRow, reason: str) -> list[object]:
-    status = Coloured(row.status, _STYLES.get(row.status, ""))
-    return [row.name, _text(row.before, row), _text(row.wanted.settable, row), status, reason]
-
-
-def _text(value: WireValue | None, row: ApplyRow) -> str | None:
-    return None if value is None else format_value(*typed(value, row.type))
+    values = (
+        None if value is None else format_value(*typed(value, row.type))
+        for value in (row.before, row.wanted.settable, row.actual)
+    )
+    return [row.name, *values, Coloured(row.status, _STYLES.get(row.status, "")), reason]

@@ -65,16 +65,15 @@ def show_summaries(
     *,
     json: bool = False,
 ) -> None:
-    """Print a line for each table, with the number of extended parameters if any table has some."""
+    """Print a line for each table, with the number of extended parameters."""
     rows, components = [], []
     for each in summaries:
         extended = sizes.get((each.key, each.component))
         components.append(_summary_json(each, extended))
         synced = None if each.synced_at is None else local_time(each.synced_at)
         row = [f"{each.system}/{each.component}", autopilot_name(each.autopilot), each.size]
-        rows.append([*row, *[extended] * bool(sizes), hash_text(each.hash), synced, each.key])
-    more = ["extended"] * bool(sizes)
-    columns = ["component", "autopilot", "params", *more, "hash", "synced", "key"]
+        rows.append([*row, extended, hash_text(each.hash), synced, each.key])
+    columns = ["component", "autopilot", "params", "extended", "hash", "synced", "key"]
     found = {"path": cache.place, "components": components}
     show(found, columns, rows, json=json, right="params extended", empty="no table is in the cache")
     if not json:

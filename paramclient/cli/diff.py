@@ -24,7 +24,6 @@ from paramclient.cli.sources import resolve_all
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.comparison import ChangedSide, Comparison, Difference, DifferenceStatus, compare
-from paramclient.model.notation import bits_written
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.provision.sources import collect_defaults, is_file, is_offline
 
@@ -120,26 +119,23 @@ def _print(outcome: Comparison, known: list[Metadata | None]) -> None:
     Two versions of a firmware may name a value differently. With a base, values that differ from it are
     coloured, else values that differ.
     """
-    has_base, has_units = outcome.base is not None, any(each is not None for each in known)
     rows = []
     for entry in outcome.entries:
         if not entry.is_shown:
             continue
         sides = entry.left, entry.right, entry.base
         left, right, base = (_shown(side, info) for side, info in zip(sides, known, strict=True))
-        if left == right and not entry.is_same:  # such as NaNs
-            left, right = (_with_bits(each) for each in sides[:2])
         style = "bold red" if entry.changed_side is ChangedSide.CONFLICT else _STYLES[entry.status]
-        row: list[object] = [entry.name]
-        for text, other in ((left, ChangedSide.RIGHT), (right, ChangedSide.LEFT)):
-            is_coloured = entry.changed_side not in (other, ChangedSide.NEITHER)
-            row.append(None if text is None else Coloured(text, style if is_coloured else ""))
+        cells = [
+            text and Coloured(text, "" if entry.changed_side in (other, ChangedSide.NEITHER) else style)
+            for text, other in ((left, ChangedSide.RIGHT), (right, ChangedSide.LEFT))
+        ]
         units = units_of(known[0], entry.name) or units_of(known[1], entry.name)
-        row += [base] * has_base + [units] * has_units + [Coloured(_comparison_text(entry), style)]
-        rows.append([*row, *[entry.changed_side or "unknown"] * has_base])
-    columns = ["name", "left", "right", *["base"] * has_base, *["units"] * has_units, "is"]
+        changed = None if outcome.base is None else entry.changed_side or "unknown"
+        rows.append([entry.name, *cells, base, units, Coloured(_comparison_text(entry), style), changed])
     if rows:
-        print_table([*columns, *["changed"] * has_base], rows, right="left right base")
+        columns = ["name", "left", "right", "base", "units", "is", "changed"]
+        print_table(columns, rows, right="left right base")
 
 
 def _shown(param: WrittenParam | None, metadata: Metadata | None) -> str | None:
@@ -150,14 +146,6 @@ def _shown(param: WrittenParam | None, metadata: Metadata | None) -> str | None:
     if len(meaning) > MEANING_LENGTH_MAX:
         meaning = f"{meaning[:MEANING_LENGTH_MAX]}..."
     return f"{value_text(param)} ({meaning})" if meaning else value_text(param)
-
-
-def _with_bits(param: WrittenParam | None) -> str | None:
-    """Return a value with its bits, for two values with the same text that differ."""
-    if param is None:
-        return None
-    bits = bits_written(param)
-    return value_text(param) if bits is None else f"{value_text(param)} = 0x{bits}"
 
 
 def _comparison_text(entry: Difference) -> str:
