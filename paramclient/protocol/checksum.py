@@ -171,10 +171,8 @@ class _Proof:
                     guesses |= {at: rows[at].bits for at in suspected}
                 elif guess := self._guess(place, difference):
                     guesses |= guess
-                elif ends := self._ends_of(moving, place) or self._ends_of(rare, place):
-                    numbers |= ends
-                    if self._is_slow:
-                        numbers |= self._ends_of(rare, place) | self._divide(place)
+                elif ends := self._ends_of(moving | rare, place):
+                    numbers |= ends | (self._divide(place) if self._is_slow else set())
                 elif place.stop == next(iter(self._found)) == len(whole) > len(place):
                     numbers.add(len(whole))  # it was the first one, and values may have moved since
                 elif len(place) > 1:
