@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict
 from statistics import median
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import anyio
 from cyclopts import Parameter
@@ -107,16 +107,14 @@ async def check(
             print_table(("severity", "slow or unusual"), rows)
         else:
             print_line("Nothing slow or unusual.")
-    listed = found["list"]
-    is_whole = listed is not None and listed["error"] is None and not listed["missing"]
-    return ExitCode.DONE if is_whole else ExitCode.INCOMPLETE
+    return ExitCode.INCOMPLETE if _list_problem(found["list"]) else ExitCode.DONE
 
 
 # Measurements
 
 
 async def _measure(client: ParamClient, component: Component, deadline: Deadline) -> JsonObject:
-    """Return all measurements; those for which no time is left are None.
+    """Return all measurements; those for which no time is left have an error.
 
     Sends no PARAM_SET, no command except MAV_CMD_REQUEST_MESSAGE, and writes no file.
 
@@ -125,18 +123,9 @@ async def _measure(client: ParamClient, component: Component, deadline: Deadline
     """
     began, identification = anyio.current_time(), component.node.identification
 
-    async def step(name: str, measure: Callable[[], Awaitable[Any]]) -> Any:
-        """Return the result of a measurement; None if no time is left for it."""
-        if not deadline.left():
-            return None
-        with Status(f"measuring: {name}"):
-            return await measure()
-
-    listened = client.traffic_report().seconds
-    await step("listening", lambda: anyio.sleep(max(0.0, CHECK_LISTENING_TIME - listened)))
-    await step(
-        "identification", lambda: component.wait_until_identified(deadline.left(MEASURE_TIMEOUT) or 0.0)
-    )
+    with Status("measuring: identification"):
+        await anyio.sleep(max(0.0, CHECK_LISTENING_TIME - client.traffic_report().seconds))
+        await component.wait_until_identified(deadline.left(MEASURE_TIMEOUT) or 0.0)
     kind = identification.vehicle_type
     found: JsonObject = {
         **taken(component, "system", "component", "autopilot"),
@@ -145,12 +134,14 @@ async def _measure(client: ParamClient, component: Component, deadline: Deadline
         "has_version": identification.capabilities is not None,
         **taken(component, "encoding", "encoding_reason", "is_armed"),
     }
-    trips = await step("round trip", lambda: _round_trips(component, deadline))
-    crc = await step("hash", lambda: _hash(client, component, deadline))
-    listed = await step("list download", lambda: _list(component, deadline))
-    files = await step("MAVFTP", lambda: _files(component, deadline))
-    found |= {"link": _link(client, component, trips or []), "list": listed}
-    return found | {"files": files, "hash": crc, "elapsed_s": round(anyio.current_time() - began, 3)}
+    with Status("measuring: round trip and hash"):
+        trips, crc = await _round_trips(component, deadline), await _hash(client, component, deadline)
+    with Status("measuring: list download"):
+        listed = await _list(component, deadline)
+    with Status("measuring: parameter file"):
+        files = await _files(component, deadline)
+    found |= {"link": _link(client, component, trips), "list": listed, "files": files, "hash": crc}
+    return found | {"elapsed_s": round(anyio.current_time() - began, 3)}
 
 
 async def _round_trips(component: Component, deadline: Deadline) -> list[float]:
@@ -267,7 +258,7 @@ def _link(client: ParamClient, component: Component, trips: list[float]) -> Json
 def _rows(found: JsonObject) -> Iterator[tuple[str, str]]:
     """Yield the measurements in words."""
     link, listed, files, crc = (found[name] for name in ("link", "list", "files", "hash"))
-    proof, no_time = "checksum" if found["autopilot"] == "ardupilot" else "hash", "not measured: no time left"
+    proof = "checksum" if found["autopilot"] == "ardupilot" else "hash"
     words = " ".join(dict.fromkeys(filter(None, (found["autopilot"], found["vehicle_type"]))))
     armed = {True: ", armed", False: ", disarmed", None: ""}[found["is_armed"]]
     yield "vehicle", f"{found['system']}/{found['component']} {words}{armed}"
@@ -284,14 +275,14 @@ def _rows(found: JsonObject) -> Iterator[tuple[str, str]]:
         yield "round trip", "no command was acknowledged"
     share = "unknown" if link["loss"] is None else f"{link['loss']:.1%}"
     yield "loss", f"{share} ({link['lost']:,} of the vehicle's frames in {link['seconds']:.1f} s)"
-    yield "list", no_time if listed is None else listed["error"] or ", ".join(_list_in_words(listed))
-    if files is None or files["error"]:
-        yield "parameter file", no_time if files is None else files["error"]
+    yield "list", listed["error"] or ", ".join(_list_in_words(listed))
+    if files["error"]:
+        yield "parameter file", files["error"]
     else:
         what = f"{files['parameters']} parameters, {files['size']:,} bytes in {files['elapsed_s']:.2f} s"
         yield "parameter file", f"{what}, {'with' if files['defaults'] else 'without'} defaults"
-    if crc is None or crc["error"]:
-        yield proof, no_time if crc is None else f"none: {crc['error']}"
+    if crc["error"]:
+        yield proof, f"none: {crc['error']}"
     else:
         yield proof, f"{crc['before']}, {crc['bytes']} bytes in {milliseconds(crc['elapsed_s'])}"
     yield "other autopilots", ", ".join(link["autopilots"]) or "none"
@@ -299,7 +290,7 @@ def _rows(found: JsonObject) -> Iterator[tuple[str, str]]:
 
 
 def _list_in_words(listed: JsonObject) -> Iterator[str]:
-    yield f"{listed['received']} of {listed['count']} in {listed['elapsed_s']:.2f} s"
+    yield f"{listed['received']} of {listed['count'] or '?'} in {listed['elapsed_s']:.2f} s"
     if listed["per_s"]:
         yield f"{listed['per_s']:,.0f} per second"
     if listed["lost"]:
@@ -308,18 +299,26 @@ def _list_in_words(listed: JsonObject) -> Iterator[str]:
         yield f"{listed['missing']} missing"
 
 
+def _list_problem(listed: JsonObject) -> str | None:
+    """Return why a list is not whole; None if it is."""
+    if listed["is_cut_short"]:
+        return f"the time limit ended it after {listed['elapsed_s']:.0f} s"
+    if listed["missing"]:
+        return f"{listed['missing']} of {listed['count']} parameters stayed missing"
+    return None if listed["error"] is None else str(listed["error"])
+
+
 def _findings(found: JsonObject) -> Iterator[tuple[str, str]]:
     """Yield what is slow or unusual: its severity, and sentences that end with what to do."""
     link, listed, files, crc = (found[name] for name in ("link", "list", "files", "hash"))
-    if listed is not None and (listed["error"] or listed["missing"]):
-        text = f"{listed['missing']} of {listed['count']} parameters stayed missing"
-        yield "problem", f"The list could not be downloaded: {listed['error'] or text}."
-    if listed is not None and listed["per_s"] and listed["per_s"] < LIST_RATE_SLOW:
+    if problem := _list_problem(listed):
+        yield "problem", f"The list could not be downloaded: {problem}."
+    if listed["per_s"] and listed["per_s"] < LIST_RATE_SLOW:
         text = f"The list is received at {listed['per_s']:.0f} values per second"
         yield "slow", f"{text}: a slow port, a radio, or a low-bandwidth mode. {FASTER_PORT}"
-    if crc is not None and crc["error"] and found["autopilot"] == "px4":
+    if crc["error"] and found["autopilot"] == "px4":
         yield "slow", f"{crc['error']}: each session downloads the table anew. Set MAV_HASH_CHK_EN to 1."
-    if files is not None and files["error"] and found["autopilot"] == "ardupilot":
+    if files["error"] and found["autopilot"] == "ardupilot":
         text = f"The packed parameter file cannot be read ({files['error']})"
         yield "slow", f"{text}, so tables are downloaded as lists, without defaults. {ENABLE_FTP}"
     if link["loss"] is not None and link["loss"] >= NOTABLE_LOSS:

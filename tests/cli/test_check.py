@@ -66,6 +66,8 @@ def test_without_time_a_list_is_cut_short(command: Command, put: Put) -> None:
     done = command("check", put(PX4Vehicle(burst=1, period=0.05)), "--json", "--timeout", 15)
     assert (done.code, done.json["list"]["is_cut_short"]) == (1, True)
     assert "The list is received at 20 values per second" in texts(done.json)
+    at_once = command("check", put(PX4Vehicle()), "--json", "--timeout", 2.3)
+    assert (at_once.code, "the time limit ended it" in texts(at_once.json)) == (1, True)
 
 
 def test_only_a_link_to_a_vehicle_can_be_measured(command: Command, put: Put) -> None:
