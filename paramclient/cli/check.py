@@ -15,7 +15,7 @@ from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_output import JsonObject, taken
 from paramclient.cli.options import Seconds, TrafficOptions
 from paramclient.cli.output import Coloured, Status, milliseconds, print_json, print_line, print_table
-from paramclient.cli.session import VEHICLE_TIMEOUT, ChosenVehicle, Deadline, listen, wait_for_vehicle
+from paramclient.cli.session import ChosenVehicle, Deadline, listen, wait_for_vehicle
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import LinkError, NoReply, ParamClientError, UsageError
@@ -87,12 +87,11 @@ async def check(
         timeout: Timeout for the whole measurement in seconds. Default: 60.
     """
     choice = ChosenVehicle.parse(vehicle, one="check measures one vehicle")
-    deadline = Deadline(CHECK_TIMEOUT if timeout is None else timeout)
+    deadline = Deadline(timeout, CHECK_TIMEOUT)
     async with listen(url, options) as client:
         if client.listens_only:
             raise UsageError(f"{client.link.name} is a log: check needs a link to a vehicle")
-        heartbeat_timeout = VEHICLE_TIMEOUT if timeout is None else deadline.left()
-        component = await wait_for_vehicle(client, choice, timeout=heartbeat_timeout)
+        component = await wait_for_vehicle(client, choice, deadline)
         found = await _measure(client, component, deadline)
     findings = [*_findings(found)]
     if options.json:

@@ -67,11 +67,18 @@ class Deadline:
     """The deadline of a command.
 
     Args:
-        seconds: from now; None for no deadline.
+        seconds: from now, the value of --timeout; None for the default.
+        default: seconds without --timeout; None for no deadline.
     """
 
-    def __init__(self, seconds: float | None) -> None:
-        self._at = None if seconds is None else anyio.current_time() + seconds
+    def __init__(self, seconds: float | None, default: float | None = None) -> None:
+        self._is_given, limit = seconds is not None, default if seconds is None else seconds
+        self._at = None if limit is None else anyio.current_time() + limit
+
+    @property
+    def heartbeat_timeout(self) -> float | None:
+        """Seconds to wait for the first heartbeat of a vehicle."""
+        return self.left() if self._is_given else self.left(VEHICLE_TIMEOUT)
 
     def left(self, at_most: float | None = None) -> float | None:
         """Return the seconds left, at most `at_most`; 0 after the deadline; `at_most` without a deadline."""
@@ -351,12 +358,11 @@ async def sessions(
         encoding=options.encoding,
         listen_only=options.listen_only,
     ) as client:
-        timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
         if choice.is_all:
             with _waiting(client, "vehicles"):
-                found = await client.find_autopilots(timeout=timeout)
+                found = await client.find_autopilots(timeout=deadline.heartbeat_timeout)
         else:
-            found = [await wait_for_vehicle(client, choice, timeout=timeout, only=writes)]
+            found = [await wait_for_vehicle(client, choice, deadline, only=writes)]
         if writes:
             await wait_for_firmware(found, deadline)
         for each in () if extended else found:
@@ -390,19 +396,20 @@ def _at_full_speed(url: str) -> str:
 
 
 async def wait_for_vehicle(
-    client: ParamClient, choice: ChosenVehicle, *, timeout: float | None, only: bool = False
+    client: ParamClient, choice: ChosenVehicle, deadline: Deadline, *, only: bool = False
 ) -> Component:
     """Wait for one vehicle; meanwhile, show on a terminal the awaited one and those that were heard.
 
     Args:
         client: an open client.
         choice: the vehicle.
-        timeout: seconds; None waits without limit.
+        deadline: of the command.
         only: as `writes` in `sessions`.
 
     Raises:
         ParamClientError: as from `ParamClient.component` and `ParamClient.only_component`.
     """
+    timeout = deadline.heartbeat_timeout
     if choice.uid is not None:
         return await _find_by_uid(client, choice.uid, timeout)
     address = (choice.system, choice.component)

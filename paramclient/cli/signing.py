@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import CONNECTION, KeyOptions, Seconds, Verbose
 from paramclient.cli.output import can_ask, confirm, print_json, print_line
-from paramclient.cli.session import VEHICLE_TIMEOUT, ChosenVehicle, Deadline, wait_for_vehicle
+from paramclient.cli.session import ChosenVehicle, Deadline, wait_for_vehicle
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.client.signing import Signing, read_key
@@ -96,8 +96,7 @@ async def _change(
             raise UsageError("nothing was sent")
     deadline, link = Deadline(options.timeout), create_link(url)
     async with _client(link, options, present) as client:
-        timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
-        vehicle = await wait_for_vehicle(client, choice, timeout=timeout, only=True)
+        vehicle = await wait_for_vehicle(client, choice, deadline, only=True)
         await vehicle.setup_signing(key, link_is_safe=True)
         address = vehicle.address
     async with _client(link, options, key) as client:
