@@ -1,7 +1,7 @@
 """PX4's hash of its parameters, `_HASH_CHECK`: what it covers, and the search for the excluded parameters.
 
 The hash is a CRC-32 over the name and the four value bytes of each parameter in use, in the order of the
-names (`hash_params`, `hash_bits`). Volatile parameters are excluded, and which ones are volatile depends on
+names (`hash_bits`). Volatile parameters are excluded, and which ones are volatile depends on
 PX4's version. The names below are only where the search begins (`find_volatile`); the set is *known* when the
 hash recomputed without it equals the one that the vehicle announced.
 """
@@ -15,8 +15,6 @@ from functools import lru_cache
 from itertools import combinations
 from operator import itemgetter
 from typing import Final
-
-from paramclient.model.values import Param
 
 HASHED_PARAMETERS_MAX: Final = 1_000_000
 """Parameters hashed while single names are tried, about 0.1 s: each attempt hashes the whole table."""
@@ -67,19 +65,14 @@ def crc32_px4_before(crc: int, size: int) -> int:
     return crc
 
 
-def hash_params(params: Iterable[Param], *, leave_out: Iterable[str] = ()) -> int:
+def hash_bits(bits: Mapping[str, int], *, leave_out: Iterable[str] = ()) -> int:
     """Return the value of PX4's `_HASH_CHECK` for a table.
 
     Args:
-        params: the parameters in use, in any order; PX4's types have 4 bytes each.
+        bits: the bits of the parameters in use (see `Param.bits`), by name; PX4's types have 4 bytes each.
         leave_out: names of volatile parameters, which PX4 excludes from the hash.
     """
-    return _hash(_hashed_bytes((param.name, param.bits) for param in params), frozenset(leave_out))
-
-
-def hash_bits(bits: Mapping[str, int], *, leave_out: frozenset[str]) -> int:
-    """Return the same as `hash_params` for parameters given by name and `Param.bits`."""
-    return _hash(_hashed_bytes(bits.items()), leave_out)
+    return _hash(_hashed_bytes(bits.items()), frozenset(leave_out))
 
 
 def find_volatile(

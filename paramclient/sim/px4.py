@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Final
 
 from paramclient.errors import CommandResult, ParamErrorCode
-from paramclient.model.px4_hash import crc32_px4, hash_params
+from paramclient.model.px4_hash import crc32_px4, hash_bits
 from paramclient.model.values import ParamType, bits_of
 from paramclient.sim.ftp import FileServer
 from paramclient.sim.metadata import GENERAL_FILE, metadata_files
@@ -162,7 +162,7 @@ class PX4Vehicle(Vehicle):
         if not self.hash_check or (switch is not None and switch.bits == 0):
             return None
         if self._hash is None:
-            self._hash = hash_params(entry.param for entry in self._listed if not entry.row.volatile)
+            self._hash = hash_bits({each.name: each.bits for each in self._listed if not each.row.volatile})
         return self._hash
 
     def use(self, *names: str) -> None:

@@ -15,7 +15,7 @@ from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.errors import CacheError, UsageError
 from paramclient.model.ext_values import ext_param
 from paramclient.model.identity import Identity
-from paramclient.model.px4_hash import hash_params
+from paramclient.model.px4_hash import hash_bits
 from paramclient.model.values import Param, ParamType, Trust, from_bits
 from tests.cache.conftest import Open
 from tests.caches import NOW, PX4, stored, update, values, whole_table
@@ -33,7 +33,13 @@ def params_of(*bits: int) -> list[Param]:
 def hashed_table(*bits: int, at: float = NOW) -> TableUpdate:
     """A whole table with the hash that a PX4 announces of it."""
     params = params_of(*bits)
-    state = TableState(hash_params(params), len(params), complete=True, volatile_known=True, synced_at=at)
+    state = TableState(
+        hash_bits({each.name: each.bits for each in params}),
+        len(params),
+        complete=True,
+        volatile_known=True,
+        synced_at=at,
+    )
     return update(
         *(StoredParam.of(each, at, False) for each in params),
         at=at,
@@ -287,7 +293,7 @@ def test_many_writers_at_once(open_cache: Open) -> None:
 def test_a_hash_stays_with_its_table(cache: ParamCache) -> None:
     cache.save(hashed_table(1, 2, 3))
     table = cache.component("1")
-    assert table.hash == hash_params(params_of(1, 2, 3))
+    assert table.hash == hash_bits({each.name: each.bits for each in params_of(1, 2, 3)})
     assert (table.complete, table.volatile_known, table.synced_at) == (True, True, NOW)
 
 
@@ -320,7 +326,12 @@ def test_a_hash_that_the_values_do_not_have_confirms_nothing(cache: ParamCache) 
     """Two programs write the changes that each has received, and the hash of what each holds."""
     cache.save(hashed_table(1, 2, 3))
     cache.save(update(stored("P_0", 9, at=NOW + 1), at=NOW + 1))
-    state = TableState(hash_params(params_of(1, 8, 3)), 3, complete=True, volatile_known=True)
+    state = TableState(
+        hash_bits({each.name: each.bits for each in params_of(1, 8, 3)}),
+        3,
+        complete=True,
+        volatile_known=True,
+    )
     cache.save(update(stored("P_1", 8, at=NOW + 2), at=NOW + 2, table=state))
     assert cache.component("1").hash is None
 
