@@ -34,8 +34,8 @@ SILENT_AFTER: Final = 60.0
 PROGRESS_INTERVAL: Final = 0.05
 """Seconds between two looks for values that a running fetch has brought."""
 FIRST_VALUE_TIME: Final = 1.0
-"""Seconds without a value of a running fetch, after which one is read beside it: MAVSDK repeats its list
-after 2 s and gives up at the sixth."""
+"""Seconds without a value of a running fetch, after which one is requested beside it, and again: MAVSDK
+repeats its list after 2 s and gives up at the sixth."""
 LOADING_WAIT: Final = 1.0
 """Seconds that a read by name waits for a fetch to bring the value before the vehicle is asked."""
 READ_TIMEOUT: Final = 3.0
@@ -301,14 +301,17 @@ class KeptTable(Stream[Change]):
             loaded.set()
 
     async def _send_progress(self) -> None:
-        """Send what the fetch has brought to the stations that wait; read one value if it brings none."""
-        late_at = anyio.current_time() + FIRST_VALUE_TIME
+        """Send what the fetch has brought to the stations that wait; request one value if it brings none.
+
+        Reading it would end with a list where the answer waits behind the file on a slow radio.
+        """
+        channel, late_at = self.session.channel, anyio.current_time() + FIRST_VALUE_TIME
         while True:
             await anyio.sleep(PROGRESS_INTERVAL)
             self._send_known()
             if anyio.current_time() >= late_at and not all(self._listing.values()):
-                late_at = math.inf
-                self.component.core.spawn(read, self.session, 0)
+                late_at += FIRST_VALUE_TIME
+                channel.send(self.session.dialect.request_read(channel.reads_from, 0))
 
     def _send_known(self) -> None:
         """Send the values of the list that the stations do not have; another count begins it again."""

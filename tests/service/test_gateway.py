@@ -398,6 +398,19 @@ async def test_rule_3_stations_during_a_long_fetch() -> None:
         assert not {each.param_index for each in vehicle.messages(ParamRequestRead)} & {*gaps}
 
 
+@pytest.mark.parametrize("seed", range(3))
+async def test_rule_3_no_list_is_requested_beside_a_file_that_fills_the_radio(seed: int) -> None:
+    """A station that is connected directly has the list after 18 to 21 s."""
+    vehicle = Tap(Air.symmetric([ArduPilotVehicle()], loss=0.05, delay=0.02, rate=5_760, seed=seed))
+    async with gateway_over(vehicle) as served:
+        await served.clients[0].component()
+        station = served.partner()
+        await anyio.sleep(2.0)
+        await station.ask(LIST, seconds=12.0)
+        assert len(by_name(station)) == 1382
+        assert not vehicle.messages(ParamRequestList)
+
+
 async def test_rule_3_an_old_proof_is_renewed_behind_the_answer_and_differences_are_announced() -> None:
     model = small_px4()
     async with in_sync(model, watch_interval=0) as (_, vehicle, station):
