@@ -153,10 +153,12 @@ class State:
         params: the values.
         again: the command that continues after an error; "" for the given one. A restore without a time is
             refused the second time, and an age is another time later.
+        left_out: number of parameters of a file that no vehicle can have.
     """
 
     params: ParamSet
     again: str = ""
+    left_out: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +195,7 @@ class _Files:
         is_named = session.choice.uid is not None or (own.uid is not None and own.uid in params.source)
         if is_named and own.uid is not None and (origin is None or origin.uid is None):
             params = replace(params, identity=own if origin is None else replace(origin, uid=own.uid))
-        return State(params)
+        return State(params, left_out=file.left_out)
 
 
 async def _earlier_state(session: CommandSession, url: str, moment: float | int | None) -> State:
@@ -320,7 +322,7 @@ async def run(
             raise
         code = found.show([*done, *failed])
         code = max([code, *(each.result.say_result() for each in done if each.result is not None)])
-        return max(code, ExitCode.INCOMPLETE) if file is not None and file.left_out else code
+        return max(code, ExitCode.INCOMPLETE) if any(job.state.left_out for job in jobs.values()) else code
 
 
 def _new(path: str) -> Path:
