@@ -78,16 +78,19 @@ class TcpOut(SocketLink):
                 await self._fail(opening, f"connection to {self._target} lost: {reason(error)}", error)
 
     async def _open(self, opening: int) -> None:
-        family, address = (await self._resolve(socket.SOCK_STREAM))[0]
-        sock = socket.socket(family, socket.SOCK_STREAM)
-        self._adopt(sock, opening)
-        _set_up(sock)
-        with suppress(BlockingIOError):
-            sock.connect(address)
-        await _writable(sock)
-        if status := sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
-            raise OSError(status, os.strerror(status))
-        self._peer = self._peer._replace(number=self._peer.number + 1)
+        status = 0
+        for family, address in await self._resolve(socket.SOCK_STREAM):
+            sock = socket.socket(family, socket.SOCK_STREAM)
+            self._adopt(sock, opening)
+            _set_up(sock)
+            status = sock.connect_ex(address)
+            if status in (errno.EINPROGRESS, errno.EWOULDBLOCK):
+                await _writable(sock)
+                status = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+            if not status:
+                self._peer = self._peer._replace(number=self._peer.number + 1)
+                return
+        raise OSError(status, os.strerror(status))
 
 
 class TcpIn(SocketLink):

@@ -226,6 +226,7 @@ async def test_lost_and_found() -> None:
             found = await anext(events)
             assert found.kind == "found"
             assert found.component is component
+            assert found.silence is not None
             assert found.silence > 5.0
             assert await anext(events) == resynced(component, (), vehicle)
         assert state(component) is SyncState.SYNCED

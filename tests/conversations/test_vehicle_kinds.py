@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 
 import anyio
 import pytest
@@ -107,7 +108,7 @@ async def test_an_acknowledgement_in_another_type_changes_neither_the_type_nor_t
             ]
 
 
-COUNTS = {
+COUNTS: dict[str, Callable[[int], int]] = {
     "right": lambda index: 40,
     "growing": lambda index: index + 1,
     "its index": lambda index: index,

@@ -713,6 +713,20 @@ async def test_closing_ends_an_open_in_progress(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.asyncio
+async def test_each_address_of_a_name_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def getaddrinfo(host: str, port: int, **_: object) -> list[Any]:
+        return [(socket.AF_INET, 0, 0, "", (each, port)) for each in ("127.0.0.9", "127.0.0.1")]
+
+    monkeypatch.setattr(anyio, "getaddrinfo", getaddrinfo)
+    with tcp_listener() as listener:
+        async with opened(f"tcp:some-vehicle:{listener.getsockname()[1]}") as link:
+            far, _ = listener.accept()
+            with far:
+                far.send(frame(1))
+                assert [data for _, data in await collect(link, 1)] == [frame(1)]
+
+
+@pytest.mark.asyncio
 async def test_a_dropped_tcp_connection_can_be_reopened() -> None:
     with tcp_listener() as listener:
         async with opened(f"tcp:127.0.0.1:{listener.getsockname()[1]}") as link:
