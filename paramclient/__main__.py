@@ -9,8 +9,6 @@ import sys
 from importlib.util import find_spec
 from typing import Final, NoReturn
 
-__all__ = ["main"]
-
 COMMAND_LIBRARIES: Final = ("cyclopts", "rich")
 """Libraries that the extra `cli` installs."""
 SIGPIPE: Final = 13

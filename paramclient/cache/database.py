@@ -25,9 +25,6 @@ from typing import Any, Final, TypeVar
 
 from paramclient.errors import CacheError, ParamClientError
 
-__all__ = ["IDENTITY", "SCHEMA_VERSION", "TABLES", "SqliteStore", "Store", "Transaction"]
-
-
 SCHEMA_VERSION: Final = 22
 """Version of the tables. Unreleased versions had lower numbers."""
 IDENTITY: Final = (

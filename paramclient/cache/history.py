@@ -22,16 +22,6 @@ from paramclient.cache.records import (
     stored_value,
 )
 
-__all__ = [
-    "HISTORY_ENTRIES_MAX",
-    "Line",
-    "add_lines",
-    "load_history",
-    "load_lines",
-    "merged_lines",
-    "values_at",
-]
-
 HISTORY_ENTRIES_MAX: Final = 10_000
 """Maximum number of history lines of each table, the newest: about 1 MB, and years of tuning by hand."""
 SAME_CHANGE_MAX: Final = 2.0

@@ -23,8 +23,6 @@ from paramclient.errors import AmbiguousVehicle, UnknownVehicle
 from paramclient.model.identity import autopilot_name, has_autopilot
 from paramclient.model.wording import counted
 
-__all__ = ["KINDS", "address_of", "find_vehicle", "is_vehicle_name"]
-
 KINDS: Final = ("px4", "ardupilot")
 """Autopilots that name a vehicle where only one has them."""
 

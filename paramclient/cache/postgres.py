@@ -13,8 +13,6 @@ from psycopg.conninfo import conninfo_to_dict
 from paramclient.cache.database import SCHEMA_VERSION, TABLES, Store, Transaction
 from paramclient.errors import CacheError, UsageError
 
-__all__ = ["PostgresStore"]
-
 CONNECT_WAIT_MAX: Final = 5
 """Seconds for which a call waits for a new connection."""
 SERVER_SILENCE_MAX: Final = 20

@@ -13,22 +13,6 @@ from paramclient.model.params import ParamMap
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import WIRE_SIZE, Param, Trust, bits_of, byte_length, from_bits, same_bits
 
-__all__ = [
-    "BY_US",
-    "BY_VEHICLE",
-    "CachedComponent",
-    "CachedSummary",
-    "CachedVehicle",
-    "HistoryEntry",
-    "SnapshotSummary",
-    "StoredParam",
-    "StoredTable",
-    "StoredValue",
-    "TableState",
-    "TableUpdate",
-    "check_author",
-]
-
 BY_VEHICLE: Final = "vehicle"
 """Author of a change by the vehicle, and of a change that a download has shown."""
 BY_US: Final = "us"

@@ -17,8 +17,6 @@ from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param
 
-__all__ = ["SNAPSHOTS", "end_operation", "load_snapshots", "load_state", "rows_of", "store_snapshot"]
-
 SNAPSHOTS: Final = 50
 """Maximum number of snapshots of each table, the newest: one is stored before each applied file, so they
 cover weeks of work on one vehicle."""

@@ -29,8 +29,6 @@ from paramclient.errors import NotInCache, UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 
-__all__ = ["ParamCache", "default_path", "is_database_url"]
-
 T = TypeVar("T")
 
 

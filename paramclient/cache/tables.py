@@ -34,22 +34,6 @@ from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
 from paramclient.model.px4_hash import hash_bits
 
-__all__ = [
-    "ensure_table",
-    "find_table",
-    "identity_cells",
-    "import_tables",
-    "load_component",
-    "load_rows",
-    "load_tables",
-    "load_vehicles",
-    "read_identity",
-    "remove_tables",
-    "save_table",
-    "time_cell",
-]
-
-
 YEAR_10000: Final = 253402300800.0
 """Unix seconds at the start of the year 10000, above every stored time."""
 

@@ -20,8 +20,6 @@ from paramclient.cli.output import STDIN, report, say
 from paramclient.errors import ParamClientError
 from paramclient.version import __version__
 
-__all__ = ["on_end_signal", "run"]
-
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 

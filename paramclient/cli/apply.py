@@ -46,8 +46,6 @@ from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.planning import Rows
 from paramclient.provision.sources import choose, is_file, read_source
 
-__all__ = ["State", "apply", "restore", "run"]
-
 APPLY_NAMES_MAX: Final = 10
 """Parameters that a line names, so that it stays short; it gives the number of further ones."""
 _STYLES: Final = {

@@ -21,15 +21,6 @@ from paramclient.model.values import Param, format_value
 from paramclient.model.wording import counted
 from paramclient.provision.sources import component_of, tables_in
 
-__all__ = [
-    "cache_list",
-    "cache_remove",
-    "extended_sizes",
-    "history",
-    "load_tables",
-    "show_summaries",
-]
-
 _DEFAULTS: Final = CacheOptions()
 
 

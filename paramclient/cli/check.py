@@ -30,8 +30,6 @@ from paramclient.version import __version__
 from paramclient.wire.frames import enum_word
 from paramclient.wire.messages import HASH_CHECK, AutopilotVersion
 
-__all__ = ["check"]
-
 CHECK_TIMEOUT: Final = 60.0
 """Seconds for the whole measurement without --timeout: a list at 57600 baud takes 35."""
 CHECK_LISTENING_TIME: Final = 2.2

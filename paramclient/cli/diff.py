@@ -27,8 +27,6 @@ from paramclient.model.comparison import ChangedSide, Comparison, Difference, Di
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.provision.sources import collect_defaults, is_file, is_offline
 
-__all__ = ["diff"]
-
 DEFAULTS: Final = "defaults"
 """The value of --base for the firmware's defaults; a file of this name is `./defaults`."""
 

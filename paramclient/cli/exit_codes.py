@@ -18,8 +18,6 @@ from paramclient.errors import (
     VehicleError,
 )
 
-__all__ = ["ExitCode", "code_of", "text_of"]
-
 
 class ExitCode(IntEnum):
     """The exit codes. If several apply, the highest one is used."""

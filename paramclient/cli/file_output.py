@@ -9,8 +9,6 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, WireValue, format_value
 from paramclient.model.wording import counted
 
-__all__ = ["described", "noun_of", "value_text"]
-
 
 def described(params: ParamSet) -> str:
     """Return a set in words: `903 parameters of 1/1 px4 from link sim:px4, 2026-11-20T18:00:00.000Z`."""

@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from paramclient.provision import ApplyResult, ApplyRow, Plan
     from paramclient.provision.planning import Rows
 
-__all__ = ["apply_json", "diff_json", "plan_json", "rows_json"]
-
-
 # Comparisons
 
 

@@ -33,26 +33,6 @@ if TYPE_CHECKING:
     from paramclient.protocol.fetch import FetchResult
     from paramclient.protocol.set_results import SetOutcome
 
-__all__ = [
-    "JsonObject",
-    "compared_json",
-    "fetch_json",
-    "history_json",
-    "info_json",
-    "known_members",
-    "origin_json",
-    "outcome_json",
-    "param_json",
-    "param_value",
-    "set_json",
-    "short_text",
-    "snapshot_json",
-    "table_param_json",
-    "taken",
-    "vehicle_json",
-    "written_json",
-]
-
 JsonObject: TypeAlias = dict[str, Any]
 """An object of JSON."""
 

@@ -24,8 +24,6 @@ from paramclient.model.notation import rounded
 from paramclient.protocol.channel import task_group
 from paramclient.wire.frames import enum_word, message_name
 
-__all__ = ["link"]
-
 LINK_LISTENING_TIME: Final = 5.0
 """Seconds to listen without --seconds, if the output is not a terminal."""
 REFRESH_INTERVAL: Final = 0.25

@@ -19,8 +19,6 @@ from paramclient.logs.telemetry import import_log
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import hash_text
 
-__all__ = ["import_"]
-
 KIND_BYTES: Final = 4096
 """Bytes at the beginning of a file that identify its format."""
 

@@ -36,27 +36,6 @@ from paramclient.model.values import WireValue, format_value
 from paramclient.model.wording import counted
 from paramclient.protocol.fetch import Progress
 
-__all__ = [
-    "METADATA_HINT",
-    "VEHICLE",
-    "MetadataChoice",
-    "defaults_in",
-    "from_file",
-    "info_of",
-    "known_of_session",
-    "known_of_sets",
-    "known_of_table",
-    "meaning_of",
-    "metadata_add",
-    "metadata_list",
-    "metadata_remove",
-    "print_descriptions",
-    "report_no_defaults",
-    "request_from_vehicle",
-    "say_sources",
-    "units_of",
-]
-
 MetadataChoice: TypeAlias = Annotated[str | None, Parameter(name="--metadata")]
 """A metadata file, or `vehicle`."""
 

@@ -17,17 +17,6 @@ from paramclient.errors import UsageError
 from paramclient.model.values import Encoding
 from paramclient.wire.signing import SigningKey
 
-__all__ = [
-    "CONNECTION",
-    "ApplyFlags",
-    "CacheOptions",
-    "KeyOptions",
-    "LinkOptions",
-    "Seconds",
-    "TrafficOptions",
-    "Verbose",
-]
-
 SOURCE_SYSTEM: Final = 255
 """The usual system id of ground stations, and the default of `ParamClient`."""
 

@@ -23,25 +23,6 @@ import anyio.to_thread
 from paramclient.model.values import Param
 from paramclient.protocol.fetch import Progress
 
-__all__ = [
-    "STDIN",
-    "Coloured",
-    "Status",
-    "by_index",
-    "can_ask",
-    "clear_screen",
-    "confirm",
-    "local_time",
-    "milliseconds",
-    "print_json",
-    "print_line",
-    "print_table",
-    "printable",
-    "report",
-    "say",
-    "show",
-]
-
 STDIN: Final = "stdin:"
 """What `-` among the arguments becomes, which cyclopts would take for an option: the standard input."""
 

@@ -15,13 +15,6 @@ from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice, did_you_mean, is_pattern, nearest_names
 from paramclient.model.values import check_name
 
-__all__ = [
-    "check_given",
-    "choose_names",
-    "spelling",
-    "suggest",
-]
-
 CACHED_TABLES_MAX: Final = 20
 """Tables of the cache whose names are suggested, those of the vehicles received last: few firmwares
 differ."""

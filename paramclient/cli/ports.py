@@ -8,8 +8,6 @@ from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.output import show
 from paramclient.links import list_ports
 
-__all__ = ["ports"]
-
 
 def ports(*, json: bool = False) -> ExitCode:
     """List the serial ports of this computer, autopilots first.

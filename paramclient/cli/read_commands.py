@@ -34,8 +34,6 @@ from paramclient.model.values import Param, Trust, format_value
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.fetch import FetchResult
 
-__all__ = ["fetch", "get", "get_chosen", "report_all"]
-
 AWAITED_NAMES_MAX: Final = 3
 """Parameters that the line about awaited values names."""
 INDICES_SHOWN_MAX: Final = 20

@@ -32,8 +32,6 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Param
 from paramclient.model.wording import counted, first_of
 
-__all__ = ["reset"]
-
 RESET_NAMES_MAX: Final = 10
 """Parameters that a line names, so that it stays short; it gives the number of further ones."""
 

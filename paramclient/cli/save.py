@@ -36,8 +36,6 @@ from paramclient.model.paramset import ParamSet
 from paramclient.model.wording import counted, first_of
 from paramclient.provision import sources
 
-__all__ = ["save"]
-
 _DEFAULTS: Final = LinkOptions()
 
 

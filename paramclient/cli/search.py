@@ -28,8 +28,6 @@ from paramclient.model.values import Param, check_name, format_value
 from paramclient.model.wording import counted
 from paramclient.provision.sources import tables_in
 
-__all__ = ["info", "search"]
-
 _DEFAULTS: Final = CacheOptions()
 
 

@@ -14,8 +14,6 @@ from paramclient.cli.options import KeyOptions, Verbose
 from paramclient.cli.output import print_line, say
 from paramclient.errors import UsageError
 
-__all__ = ["serve", "token"]
-
 SERVICE_LIBRARIES: Final = ("fastapi", "uvicorn")
 """Libraries that the extra `service` installs."""
 _UNSIGNED: Final = KeyOptions()

@@ -26,19 +26,6 @@ from paramclient.protocol.fetch import FetchResult
 from paramclient.protocol.identity import HEARTBEAT_WAIT, expects_extended
 from paramclient.protocol.selection import address_in_words, hint_of_link, node_in_words
 
-__all__ = [
-    "ChosenVehicle",
-    "CommandSession",
-    "Deadline",
-    "Done",
-    "Sessions",
-    "listen",
-    "received_in_words",
-    "sessions",
-    "wait_for_firmware",
-    "wait_for_vehicle",
-]
-
 VEHICLE_TIMEOUT: Final = 10.0
 """Seconds to wait for the first heartbeat of a vehicle, without --timeout."""
 RECHECK_TIMEOUT: Final = 2.5

@@ -24,8 +24,6 @@ from paramclient.metadata.info import ParamInfo, number_of
 from paramclient.model.ext_values import parse_ext_value
 from paramclient.model.values import WireValue, check_name, format_value
 
-__all__ = ["set_"]
-
 _DEFAULTS: Final = LinkOptions()
 
 

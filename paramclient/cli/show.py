@@ -34,8 +34,6 @@ from paramclient.model.names import NameChoice
 from paramclient.model.paramset import ParamSet
 from paramclient.provision.sources import link_of, read_source, resolve
 
-__all__ = ["show"]
-
 _DEFAULTS: Final = CacheOptions()
 
 

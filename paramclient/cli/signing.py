@@ -19,8 +19,6 @@ from paramclient.errors import NoReply, UsageError, VehicleError
 from paramclient.links import Link, create_link
 from paramclient.wire.signing import SigningKey, SigningPolicy
 
-__all__ = ["disable", "setup"]
-
 PROOF_TIMEOUT: Final = 10.0
 """Seconds to wait for a response with the new signing state, without --timeout."""
 

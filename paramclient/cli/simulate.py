@@ -16,8 +16,6 @@ from paramclient.links.sim import simulated
 from paramclient.links.tcp import TcpIn
 from paramclient.links.udp import UdpIn
 
-__all__ = ["sim"]
-
 
 async def sim(
     vehicle: str, /, *, link: str = "udpout:127.0.0.1:14550", signing_key: Path | None = None

@@ -17,16 +17,6 @@ from paramclient.model.paramset import ParamSet
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.sources import fetched_set, is_file, is_offline, link_of, resolve
 
-__all__ = [
-    "check_link",
-    "check_pattern",
-    "fill_pattern",
-    "filled",
-    "is_pattern_name",
-    "resolve_all",
-    "whole_table",
-]
-
 SOURCES: Final = f"""\
   FILE                a parameter file or a log (.bin, .ulg, .tlog) that exists; - for the standard input
   cache:VEHICLE       the cached table of a vehicle: 4 or 4/1, px4 or ardupilot, its hardware id (in full,

@@ -8,8 +8,6 @@ from typing import Final
 
 from paramclient.errors import UsageError
 
-__all__ = ["WHEN", "parse_time", "parse_when"]
-
 WHEN: Final = (
     "a time is written as 2026-11-20T14:00Z, '2026-11-20 14:00' (of this computer's time zone), 14:00, "
     "'yesterday 14:00', yesterday, or '2h 30min ago'"

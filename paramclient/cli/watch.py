@@ -23,8 +23,6 @@ from paramclient.model.wording import counted
 from paramclient.protocol.channel import task_group
 from paramclient.protocol.events import Change
 
-__all__ = ["watch"]
-
 _DEFAULTS: Final = LinkOptions()
 
 

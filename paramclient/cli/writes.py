@@ -23,8 +23,6 @@ from paramclient.model.wording import counted, first_of
 from paramclient.protocol.fetch import Progress
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 
-__all__ = ["WriteJob", "write_all"]
-
 WRITE_NAMES_MAX: Final = 10
 """Parameters that a line names, so that it stays short; it gives the number of further ones."""
 _STYLES: Final = {

@@ -24,8 +24,6 @@ from paramclient.protocol.node import Node
 from paramclient.protocol.selection import vehicle_of
 from paramclient.protocol.session import Session
 
-__all__ = ["CacheWriter", "choose_cache", "update_of"]
-
 FLUSH_INTERVAL: Final = 0.25
 """Seconds from a change to its commit: changes are collected for half of that time."""
 RETRY_INTERVAL: Final = 5.0

@@ -37,8 +37,6 @@ from paramclient.wire.signing import SigningKey, SigningReport
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint
 
-__all__ = ["COMPONENT_TIMEOUT", "ParamClient"]
-
 COMPONENT_TIMEOUT: Final = 10.0
 """Default timeout in seconds for the first component on a link."""
 VEHICLES_LISTENING_TIME: Final = 3.0

@@ -44,8 +44,6 @@ from paramclient.protocol.writes import write, write_many
 from paramclient.wire.messages import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, PARAMETERS_MAX, SetupSigning
 from paramclient.wire.signing import SigningKey
 
-__all__ = ["SETTLE_MAX", "Component", "ComponentState"]
-
 CACHE_TIMEOUT: Final = 5.0
 """Seconds to wait for the identity of a component, without which its cached table cannot be loaded: twice the
 longest round trip in use."""

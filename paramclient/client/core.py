@@ -20,8 +20,6 @@ from paramclient.errors import ClientClosed, ParamClientError, UsageError
 from paramclient.links import Link
 from paramclient.protocol.station import Station
 
-__all__ = ["ClientCore"]
-
 TASK_NAME: Final = "paramclient client"
 """Name of the task, in the debuggers of asyncio and trio."""
 

@@ -10,8 +10,6 @@ from paramclient.client.streams import Stream
 if TYPE_CHECKING:
     from paramclient.client.component import Component
 
-__all__ = ["Event", "Events"]
-
 EVENTS_MAX: Final = 1_000
 """Queued events for a consumer, at most."""
 

@@ -13,9 +13,6 @@ from paramclient.errors import CacheError, NoReply, ParamClientError
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.fetch import FetchResult
 
-__all__ = ["FetchedAll", "fetch_components"]
-
-
 SILENT_TIME: Final = 2.95
 """Seconds from the begin for a component that has never answered a request, where another one on the link
 answers: it costs no more than 3 s."""

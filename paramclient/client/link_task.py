@@ -14,9 +14,8 @@ import anyio.lowlevel
 from paramclient.client.taps import FrameCutter, Tap
 from paramclient.errors import ClientClosed, LinkError
 from paramclient.links import Link
-from paramclient.protocol.station import Peer, Station
-
-__all__ = ["LinkTask"]
+from paramclient.protocol.addresses import Peer
+from paramclient.protocol.station import Station
 
 READ_PAUSE: Final = 0.02
 """Seconds for which the reader pauses while no conversation waits, so that telemetry accumulates: one read of

@@ -18,8 +18,6 @@ from paramclient.errors import UsageError
 from paramclient.links.tlog import packed_time
 from paramclient.wire.frames import bears_key, unsign_frame
 
-__all__ = ["Capture"]
-
 RECORDING_FLUSH_INTERVAL: Final = 0.25
 """Seconds between two writes to the file: a killed process loses the frames of at most this time."""
 UNWRITTEN_BYTES_MAX: Final = 16 * 1024 * 1024

@@ -14,8 +14,6 @@ from typing import Final
 from paramclient.errors import UsageError
 from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, SigningReport, Verifier, timestamp_of
 
-__all__ = ["Signing", "key_from_environment", "read_key", "read_private", "refused_in_words", "timestamp_now"]
-
 KEY_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY"
 """Environment variable with the key in 64 hexadecimal digits or base64."""
 KEY_FILE_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY_FILE"

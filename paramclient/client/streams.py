@@ -12,8 +12,6 @@ import anyio
 from paramclient.errors import ParamClientError
 from paramclient.protocol.events import Change
 
-__all__ = ["Changes", "Stream", "Subscribers"]
-
 CHANGES_MAX: Final = 100_000
 """Queued changes for a consumer, one for each name, at most: more than a table holds."""
 

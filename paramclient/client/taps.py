@@ -13,8 +13,6 @@ from typing import Final, NamedTuple
 from paramclient.wire.frames import Frame, checksum
 from paramclient.wire.signing import SIGNATURE_LENGTH
 
-__all__ = ["FrameCutter", "SeenFrame", "Tap"]
-
 UNPROVEN_BYTES_MAX: Final = 4096
 """Bytes of a stream without a proven frame that are kept until the following ones arrive."""
 UNFINISHED_PEERS_MAX: Final = 256

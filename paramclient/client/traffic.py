@@ -16,8 +16,6 @@ from paramclient.protocol.addresses import Address
 from paramclient.wire.loss import SequenceCheck
 from paramclient.wire.messages import Heartbeat, decode
 
-__all__ = ["ComponentTraffic", "RadioStatus", "Traffic", "TrafficReport"]
-
 RATE_SLICES: Final = 10
 """Slices over which rates and losses are measured, 5 s: several heartbeats, and short enough to adjust an
 antenna."""

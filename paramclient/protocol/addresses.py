@@ -6,8 +6,6 @@ from collections.abc import Hashable
 from itertools import pairwise
 from typing import TypeAlias
 
-__all__ = ["Address", "Peer", "PeerAddress", "peer_in_words"]
-
 Address: TypeAlias = tuple[int, int]
 """System and component."""
 Peer: TypeAlias = Hashable

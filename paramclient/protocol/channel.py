@@ -20,8 +20,6 @@ from paramclient.protocol.presence import Presence
 from paramclient.wire import messages
 from paramclient.wire.messages import Message
 
-__all__ = ["PATIENCE_MIN", "Channel", "Gate", "Inbox", "Timing", "keys_of", "task_group"]
-
 T = TypeVar("T")
 
 Key: TypeAlias = object

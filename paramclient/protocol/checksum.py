@@ -30,8 +30,6 @@ from paramclient.protocol.reads import READS_PER_SLOT_ARDUPILOT, SLOT_ARDUPILOT,
 from paramclient.protocol.session import FileUnavailable, Session
 from paramclient.protocol.table import Table
 
-__all__ = ["CHECKED_READ_SIZE", "TableDiffers", "is_moving", "may_be_rounded", "prove"]
-
 CHECKED_READ_SIZE: Final = 64
 """Bytes that ArduPilot reads at a time for a checksum: the padding of the file depends on it (measured)."""
 AT_ONCE: Final = 4

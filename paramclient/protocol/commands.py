@@ -13,8 +13,6 @@ from paramclient.protocol.node import Node
 from paramclient.wire import messages
 from paramclient.wire.messages import Message, message_id
 
-__all__ = ["reboot", "request_message", "send_command"]
-
 M = TypeVar("M")
 
 REBOOT_SILENCE = 0.2

@@ -18,8 +18,6 @@ from paramclient.model.values import (
 from paramclient.wire import messages
 from paramclient.wire.messages import Message
 
-__all__ = ["EXTENDED", "PLAIN", "Dialect", "Digest", "ReportedValue"]
-
 ReportedValue: TypeAlias = messages.ParamValue | messages.ParamExtValue
 """The message with a value, in either protocol."""
 

@@ -16,8 +16,6 @@ from paramclient.protocol.reads import read
 from paramclient.protocol.session import FileUnavailable, Session
 from paramclient.wire.messages import HASH_CHECK
 
-__all__ = ["Answer", "ask", "may_confirm", "settle"]
-
 CHANGED_MEANWHILE: Final = "The parameters changed during the download: the table may be a mixture."
 UNPROVEN: Final = "The vehicle's hash could not be computed from the table; it was equal before and after."
 

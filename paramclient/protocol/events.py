@@ -7,8 +7,6 @@ from typing import Literal
 
 from paramclient.model.values import Param
 
-__all__ = ["Change"]
-
 
 @dataclass(frozen=True, slots=True)
 class Change:

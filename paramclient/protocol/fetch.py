@@ -22,8 +22,6 @@ from paramclient.protocol.list_download import ListResult, download_list
 from paramclient.protocol.reads import read_many
 from paramclient.protocol.session import FileUnavailable, Session
 
-__all__ = ["FetchResult", "FetchSource", "Policy", "Progress", "differing", "fetch_all", "result_of"]
-
 FetchSource: TypeAlias = Literal["cache", "ftp", "stream"]
 """Where a fetch has the values from: the cache, the packed file (MAVFTP) or the list."""
 

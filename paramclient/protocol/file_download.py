@@ -15,8 +15,6 @@ from paramclient.protocol.param_pck import PACK_SIZE_MAX, PARAM_FILE, Pack, deco
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import FileUnavailable, Session
 
-__all__ = ["download_file"]
-
 WITH_DEFAULTS: Final = "?withdefaults=1"
 """Requests the defaults too; a server that does not know it may report that there is no such file."""
 ARDUPILOT_WITH_DEFAULTS: Final = 0x04040000

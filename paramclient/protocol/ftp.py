@@ -19,19 +19,6 @@ from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoRe
 from paramclient.protocol.channel import Channel, Inbox, task_group
 from paramclient.wire.messages import FileTransfer, Message
 
-__all__ = [
-    "DATA_SIZE_MAX",
-    "BUSY",
-    "SILENT_LOST",
-    "FTP_SILENT_TIME",
-    "Opcode",
-    "Packet",
-    "attempts_unproven",
-    "checksum",
-    "is_free",
-    "read_file",
-]
-
 DATA_SIZE_MAX: Final = 239
 """Bytes of a file in one message, at most."""
 FILE_SIZE_MAX: Final = 64 * 1024 * 1024

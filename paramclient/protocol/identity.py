@@ -16,8 +16,6 @@ from paramclient.wire import messages
 from paramclient.wire.frames import enum_word
 from paramclient.wire.messages import Message, message_id
 
-__all__ = ["HEARTBEAT_WAIT", "Identification", "expects_extended", "judge_encoding", "kind_in_words"]
-
 HEARTBEAT_WAIT: Final = 1.2
 """Seconds in which a component's first heartbeat is awaited: its interval, and a fifth of it for jitter."""
 PX4_WITH_FILE: Final = 0x01120000

@@ -21,8 +21,6 @@ from paramclient.protocol.dialect import Digest
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK, Message, ParamError
 
-__all__ = ["ListResult", "download_list"]
-
 LIST_REQUESTS_MAX: Final = 12
 """Requests for a list that does not begin: an ArduPilot ignores them early after its start."""
 LIST_REQUESTS_ALONE: Final = 3

@@ -18,8 +18,6 @@ from paramclient.protocol.session import Session, Shared, Spawn
 from paramclient.wire import messages
 from paramclient.wire.messages import CommandLong, Message
 
-__all__ = ["RIVAL_TIME", "Node"]
-
 RIVAL_TIME: Final = 5.0
 """Seconds after its last message for which a peer counts as live: no other takes its ids meanwhile."""
 REBOOT_SILENCE_MIN: Final = 1.25

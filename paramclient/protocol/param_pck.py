@@ -18,19 +18,6 @@ from typing import Final, NamedTuple
 from paramclient.errors import PackError, UsageError
 from paramclient.model.values import NAME_LENGTH, ParamType, check_name
 
-__all__ = [
-    "MAGICS",
-    "PACKABLE",
-    "PARAM_FILE",
-    "Pack",
-    "PackedParam",
-    "decode",
-    "decode_prefix",
-    "encode",
-    "encode_entries",
-    "header",
-]
-
 PARAM_FILE: Final = "@PARAM/param.pck"
 """The path of the file in MAVFTP."""
 READ_SIZE_DEFAULT: Final = 239

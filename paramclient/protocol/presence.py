@@ -7,8 +7,6 @@ from typing import Final
 
 from paramclient.wire.messages import MAV_STATE_BOOT, Heartbeat, SystemTime, message_id
 
-__all__ = ["SYSTEM_TIME", "Presence"]
-
 LOST_AFTER: Final = 5.0
 """Seconds of silence after which a component with heartbeats counts as lost: five missed in a row."""
 LOST_INTERVALS: Final = 3.0

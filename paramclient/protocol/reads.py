@@ -27,8 +27,6 @@ from paramclient.protocol.list_download import download_list
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import HASH_CHECK, Message, ParamError
 
-__all__ = ["queue_time", "read", "read_many", "read_param", "refusal"]
-
 CONTROL_LOST: Final = 1e-4
 """Probability that all requests of the control read are lost, which decides whether a component answers
 reads at all."""

@@ -17,17 +17,6 @@ from paramclient.protocol.node import Node
 from paramclient.protocol.station import Station
 from paramclient.wire.messages import AUTOPILOT_COMPONENT, MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS
 
-__all__ = [
-    "address_in_words",
-    "autopilots_of",
-    "find",
-    "hint_of_link",
-    "hint_of_node",
-    "node_in_words",
-    "only_vehicle",
-    "vehicle_of",
-]
-
 LISTED_MAX: Final = 8
 """Components that a hint names, so that it stays readable; it gives the number of further ones."""
 _PERIPHERALS: Final = frozenset({18, 26, 27, *range(30, 35), *range(36, 43), 44, 48, 49})

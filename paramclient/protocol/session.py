@@ -18,8 +18,6 @@ from paramclient.protocol.identity import Identification
 from paramclient.protocol.table import Table
 from paramclient.wire.messages import NO_INDEX
 
-__all__ = ["FileUnavailable", "ReplacedValue", "Session", "Shared", "Spawn"]
-
 T = TypeVar("T")
 
 Spawn = Callable[..., object]

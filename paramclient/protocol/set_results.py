@@ -11,8 +11,6 @@ from typing import Literal
 from paramclient.errors import ParamClientError, ValueNotApplied
 from paramclient.model.values import Param, Value, WireValue, format_value
 
-__all__ = ["SetManyResult", "SetOutcome", "SetResult", "SetStatus"]
-
 
 class SetStatus(StrEnum):
     """The outcome of one value of a `set_many`."""

@@ -22,8 +22,6 @@ from paramclient.wire.frames import BOOT_CLOCK_OFFSETS, Frame, Framer, sign_fram
 from paramclient.wire.messages import Heartbeat, Message, ParamExtSet, ParamSet, decode, encode, message_id
 from paramclient.wire.signing import Signer, Verifier
 
-__all__ = ["Peer", "Station"]
-
 SEEK_INTERVAL: Final = 0.25
 """Seconds between two requests for the heartbeat of an unknown component."""
 SEEK_MAX: Final = 20

@@ -23,8 +23,6 @@ from paramclient.protocol.events import Change
 from paramclient.protocol.param_pck import PackedParam
 from paramclient.wire.messages import HASH_CHECK, PARAMETERS_MAX
 
-__all__ = ["Table"]
-
 NAMES_MAX: Final = 65_535
 """Names in one table: as many as there are indices, and as many again without an index (parameters not in
 use). No real component has more."""

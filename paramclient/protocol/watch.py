@@ -18,8 +18,6 @@ from paramclient.protocol.presence import Presence
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import MAV_MODE_FLAG_SAFETY_ARMED
 
-__all__ = ["SyncState", "Watch"]
-
 INTERVAL_MIN: Final = 1.0
 """Shortest interval in seconds that a user may choose."""
 INTERVAL_DEFAULT: Final = 30.0

@@ -35,8 +35,6 @@ from paramclient.protocol.session import ReplacedValue, Session
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
 from paramclient.wire.messages import Message, ParamError, ParamExtAck, StatusText
 
-__all__ = ["write", "write_many"]
-
 SILENT_SETS_MAX: Final = 3
 """Sets without an acknowledgement, after which a read shows the value: some firmware acknowledges none."""
 SETS_MIN: Final = 5

@@ -19,15 +19,6 @@ from paramclient.provision.execution import BEFORE_APPLY, BEFORE_RESTORE, ApplyO
 from paramclient.provision.inspection import Wanted, wait_for_identity, wanted_set
 from paramclient.provision.planning import Rows
 
-__all__ = [
-    "FleetResult",
-    "apply",
-    "for_each",
-    "load_restore_point",
-    "restore",
-    "restore_categories",
-]
-
 Outcome = TypeVar("Outcome", bound=Rows)
 
 OWN_STATE_CATEGORIES: Final = ("identity", "hardware", "calibration", OUT_OF_RANGE)

@@ -14,17 +14,6 @@ from typing import Any, Final
 from paramclient.errors import UsageError
 from paramclient.model.names import NameChoice, is_group_switch
 
-__all__ = [
-    "ACTION",
-    "CATEGORIES",
-    "OUT_OF_RANGE",
-    "READ_ONLY",
-    "ApplyRule",
-    "ApplyRules",
-    "Choice",
-    "rules_for",
-]
-
 READ_ONLY: Final = "read-only"
 """The category of parameters that the vehicle lets no client write."""
 OUT_OF_RANGE: Final = "out-of-range"

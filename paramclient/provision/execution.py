@@ -49,8 +49,6 @@ from paramclient.provision.planning import (
     plan_from,
 )
 
-__all__ = ["BEFORE_APPLY", "BEFORE_RESTORE", "ApplyOptions", "ApplyProgress", "ApplyResult", "run"]
-
 BEFORE_APPLY: Final = "before apply"
 """The reason of the snapshot that `apply` stores before its first write."""
 BEFORE_RESTORE: Final = "before restore"

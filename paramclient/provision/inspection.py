@@ -15,17 +15,6 @@ from paramclient.model.values import Param, ParamType, Settable, Trust
 from paramclient.provision.planning import Plan, PlanOptions, check_component, plan_from
 from paramclient.provision.sources import component_set
 
-__all__ = [
-    "POLL_INTERVAL",
-    "Inspection",
-    "Wanted",
-    "inspect",
-    "plan",
-    "reread",
-    "wait_for_identity",
-    "wanted_set",
-]
-
 READS_IN_PROGRESS_MAX: Final = 64
 """Reads by name that are in progress at once, each in a task. The component itself sends fewer at a time."""
 IDENTITY_TIMEOUT: Final = 10.0

@@ -29,19 +29,6 @@ from paramclient.model.values import (
 from paramclient.protocol.dialect import EXTENDED, PLAIN
 from paramclient.provision.apply_rules import ACTION, CATEGORIES, OUT_OF_RANGE, READ_ONLY, Choice, rules_for
 
-__all__ = [
-    "MISSING",
-    "WRONG",
-    "ApplyRow",
-    "ApplyStatus",
-    "Plan",
-    "PlanOptions",
-    "Rows",
-    "Stage",
-    "check_component",
-    "plan_from",
-]
-
 MISSING: Final = "missing"
 """The category of a parameter that the vehicle does not have."""
 WRONG: Final = "wrong"

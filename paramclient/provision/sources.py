@@ -29,24 +29,6 @@ from paramclient.model.values import Param
 from paramclient.model.wording import first_of
 from paramclient.protocol.fetch import FetchResult
 
-__all__ = [
-    "NAMES_SHOWN_MAX",
-    "NO_DEFAULTS",
-    "STANDARD_INPUT",
-    "choose",
-    "collect_defaults",
-    "component_of",
-    "component_set",
-    "fetched_set",
-    "is_file",
-    "is_offline",
-    "link_of",
-    "read_source",
-    "resolve",
-    "select_non_defaults",
-    "tables_in",
-]
-
 STANDARD_INPUT: Final = "-"
 """The word for the standard input."""
 NAMES_SHOWN_MAX: Final = 20

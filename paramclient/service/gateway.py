@@ -27,8 +27,6 @@ from paramclient.wire import messages
 from paramclient.wire.frames import TARGET_OFFSETS, Frame, bears_key
 from paramclient.wire.messages import COMP_ID_ALL, Message, decode, encode, message_id
 
-__all__ = ["GATEWAY_ADDRESS", "Gateway"]
-
 GATEWAY_ADDRESS: Final = (254, 191)
 """System and component id of the gateway (MAV_COMP_ID_ONBOARD_COMPUTER): not those of a ground station, so
 that vehicles notice when they lose all of these."""

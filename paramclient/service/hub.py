@@ -48,8 +48,6 @@ from paramclient.service.stations import MavlinkEndpoint, parse_endpoint
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint
 
-__all__ = ["Hub", "ServiceLink", "Target"]
-
 EVENTS_KEPT: Final = 4_096
 """Number of kept events, 0.5 kB each: more than two whole tables."""
 CHECK_INTERVAL: Final = 0.2

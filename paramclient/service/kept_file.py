@@ -19,8 +19,6 @@ from paramclient.protocol.session import Session
 from paramclient.service.kept_table import Asker, KeptTable
 from paramclient.wire.messages import FileTransfer
 
-__all__ = ["FileQuery", "KeptFile", "Rows", "answers_of", "rows_of"]
-
 ENTRY_SIZE: Final = 12
 """Bytes of an entry in param.pck, on average: the size in the answer to an open is an estimate."""
 FILE_WAIT: Final = 2.5

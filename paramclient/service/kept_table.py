@@ -24,8 +24,6 @@ from paramclient.service.stations import GroundStation
 from paramclient.wire import messages
 from paramclient.wire.messages import HASH_CHECK, NO_INDEX, Message
 
-__all__ = ["Asker", "KeptTable", "digest_of", "listed", "value_of"]
-
 PROOF_AGE_MAX: Final = 5.0
 """Seconds since the vehicle last confirmed the table, above which an answer has it checked in the
 background."""

@@ -18,8 +18,6 @@ from starlette.responses import Response
 from paramclient import errors
 from paramclient.errors import ParamClientError
 
-__all__ = ["ERRORS", "RESPONSES", "Problem", "ServiceError", "problem_response", "respond"]
-
 MEDIA_TYPE: Final = "application/problem+json"
 FAULTS_MAX: Final = 20
 """Maximum number of listed errors of one request."""

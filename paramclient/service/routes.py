@@ -43,8 +43,6 @@ from paramclient.service.hub import Hub, Target
 from paramclient.service.problems import ServiceError
 from paramclient.version import __version__
 
-__all__ = ["ROUTERS"]
-
 VEHICLE: Final = "/api/vehicles/{system}/{component}"
 HISTORY_ENTRIES: Final = 100
 """Default number of entries of a history."""

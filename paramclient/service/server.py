@@ -36,8 +36,6 @@ from paramclient.service.hub import Hub
 from paramclient.service.problems import ERRORS, RESPONSES, ServiceError, problem_response, respond
 from paramclient.version import __version__
 
-__all__ = ["Tokens", "add_token", "create_app", "read_tokens", "serve"]
-
 BODY_BYTES_MAX: Final = 4 * 2**20
 """Maximum size of a request body in bytes: a parameter file of 2 MB in base64, and some."""
 LOOPBACK_NAMES: Final = ("localhost", "127.0.0.1", "[::1]")

@@ -22,8 +22,6 @@ from paramclient.wire.frames import renumber_frame, sign_frame
 from paramclient.wire.messages import Message, encode, message_id
 from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier
 
-__all__ = ["GroundStation", "MavlinkEndpoint", "Numbering", "Source", "parse_endpoint"]
-
 FRAMES_PER_DATAGRAM: Final = 37
 """Frames in one datagram, at most: as many PARAM_VALUEs as fit in `DATAGRAM_SIZE`."""
 DATAGRAM_SIZE: Final = 1_400

@@ -26,8 +26,6 @@ from paramclient.client import component, events, streams
 from paramclient.errors import ClientClosed, ParamClientError, UsageError
 from paramclient.provision.apply_restore import FleetResult
 
-__all__ = ["Changes", "Component", "Events", "ParamClient", "blocking", "for_each"]
-
 THREAD_NAME: Final = "paramclient blocking client"
 """Name of the thread of a client, in debuggers."""
 WAIT_INTERVAL: Final = 0.1

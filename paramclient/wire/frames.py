@@ -16,21 +16,6 @@ from pymavlink.dialects.v20 import all as dialect
 
 from paramclient.wire.signing import SIGNATURE_LENGTH, Signer
 
-__all__ = [
-    "BOOT_CLOCK_OFFSETS",
-    "TARGET_OFFSETS",
-    "Frame",
-    "Framer",
-    "bears_key",
-    "build_frame",
-    "checksum",
-    "enum_word",
-    "message_name",
-    "renumber_frame",
-    "sign_frame",
-    "unsign_frame",
-]
-
 _MAGIC_V1 = 0xFE
 _MAGIC_V2 = 0xFD
 _SIGNED = 0x01

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-__all__ = ["SequenceCheck"]
-
 GAP_MAX: Final = 100
 """Frames lost in a row, at most: the numbers wrap at 256, so a longer jump may have any cause."""
 REORDER_DEPTH: Final = 16

@@ -19,17 +19,6 @@ from typing import Final, NoReturn
 
 from paramclient.errors import UsageError
 
-__all__ = [
-    "Refusal",
-    "Signer",
-    "SigningKey",
-    "SigningPolicy",
-    "SigningReport",
-    "SigningStream",
-    "Verifier",
-    "timestamp_of",
-]
-
 KEY_LENGTH: Final = 32
 """Bytes of a signing key."""
 SIGNATURE_LENGTH: Final = 13
