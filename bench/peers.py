@@ -137,7 +137,9 @@ class Case:
         return True
 
     def vehicle(self) -> Vehicle:
-        return PX4Vehicle() if self.kind == "PX4" else ArduPilotVehicle(ftp=self.way != "list")
+        return (
+            PX4Vehicle() if self.kind == "PX4" else ArduPilotVehicle(live_period=0.0, ftp=self.way != "list")
+        )
 
     def air(self, seed: int) -> Air:
         return Air.symmetric(

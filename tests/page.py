@@ -47,7 +47,7 @@ class Limited(ArduPilotVehicle):
     """One whose RTL_ALT cannot be more than HIGHEST, and whose RTL_SPEED cannot be set."""
 
     def __init__(self) -> None:
-        super().__init__(system=2, param_error=True, read_only=["RTL_SPEED"])
+        super().__init__(system=2, param_error=True, read_only=["RTL_SPEED"], live_period=0.0)
 
     def respond(self, message: Message, sender: Frame) -> None:
         super().respond(clamped(message, "RTL_ALT", 0, HIGHEST), sender)

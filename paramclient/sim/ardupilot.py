@@ -65,6 +65,7 @@ class ArduPilotVehicle(Vehicle):
     - After every start but the first, the vehicle measures gyroscopes and barometers again (INS_GYR*OFFS_*,
       INS_GYR2_CALTEMP, BARO*_GND_PRESS of existing sensors) when the main loop starts, and counts the start
       (STAT_BOOTCNT), without announcement.
+    - Some values change on their own and are sent unsolicited, index 65535.
 
     Args:
         table: the parameters (see `Table`), in the order of their indices; None for those of a real quad,
@@ -77,6 +78,9 @@ class ArduPilotVehicle(Vehicle):
         reboot_groups: names of switches that take effect only after a reboot.
         read_only: names that cannot be set. None: those that ArduPilot marks as internal, such as
             BARO1_GND_PRESS and BARO1_DEVID.
+        live: names of parameters that change on their own: whole numbers count seconds, others change their
+            last bit. Names that are not in the table are ignored.
+        live_period: seconds between two such changes; 0 for none.
         burst, period: by default UDP. On 57600 baud it is 1 every 0.025 s.
         ftp: whether MAVFTP is available.
         ftp_rate: bytes per second of a burst: a third of the link. By default UDP as measured; on 57600 baud
@@ -99,6 +103,8 @@ class ArduPilotVehicle(Vehicle):
     groups: Mapping[str, Table] | None = None
     reboot_groups: Iterable[str] = ()
     read_only: Iterable[str] | None = None
+    live: Iterable[str] = ("STAT_RUNTIME", "BARO1_GND_PRESS")
+    live_period: float = 30.0
     period: float = 0.00595
     ftp: bool = True
     ftp_rate: float = 48_500.0
@@ -124,6 +130,7 @@ class ArduPilotVehicle(Vehicle):
             if self.read_only is None
             else self.read_only
         )
+        self._live = frozenset(self.live)
         uid2 = (int.from_bytes(_UID2, "little") + self.system - 1).to_bytes(18, "little")
         uid2 = uid2 if self.uid2 is None else self.uid2.ljust(18, b"\0")
         self._stored: set[Entry] = set()
@@ -159,9 +166,17 @@ class ArduPilotVehicle(Vehicle):
         super()._switch_on(at)
         if not self._is_first_run:
             self._due[self._measure] = at + self._clock_delay
+        if self.live_period:
+            self._due[self._change_live] = at + self.live_period
 
     def _tasks(self) -> list[Callable[[float], None]]:
-        first = [self._change_system_id, self._measure, self._end_look_up, self._send_reads]
+        first = [
+            self._change_system_id,
+            self._measure,
+            self._change_live,
+            self._end_look_up,
+            self._send_reads,
+        ]
         return [*first, *super()._tasks(), self._open_window, self._answer_sets]
 
     def _next(self, period: float, *, after: float | None = None) -> float:
@@ -197,6 +212,17 @@ class ArduPilotVehicle(Vehicle):
                 and value not in (0.0, _NO_SENSOR)
             ):
                 entry.store(bits_of(1.001 * value, entry.type))
+
+    def _change_live(self, at: float) -> None:
+        self._due[self._change_live] = self._again(at, self.live_period)
+        for entry in self.entries:
+            if entry.name in self._live:
+                value = entry.value
+                if isinstance(value, int) and isinstance(entry.type, ParamType):
+                    later = value + max(1, int(self.live_period))
+                    self._write(entry, bits_of(later if later <= entry.type.bounds[1] else 0, entry.type))
+                else:
+                    self._write(entry, entry.bits ^ 1)
 
     def _change_system_id(self, at: float) -> None:
         self._take_system_id(_SYSTEM_ID)

@@ -52,7 +52,7 @@ def file(tmp_path: Path) -> File:
 
 
 def copter(**options: Any) -> ArduPilotVehicle:
-    return ArduPilotVehicle(table=TABLE, groups={"EK2_ENABLE": GROUP}, **options)
+    return ArduPilotVehicle(table=TABLE, groups={"EK2_ENABLE": GROUP}, live=(), **options)
 
 
 def restarted(vehicle: ArduPilotVehicle) -> ArduPilotVehicle:

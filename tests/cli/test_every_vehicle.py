@@ -21,7 +21,7 @@ SHARED: dict[str, int | float] = {"GAIN": 4.0, "MODE": 2}
 def vehicles() -> tuple[PX4Vehicle, ArduPilotVehicle]:
     return (
         PX4Vehicle(system=1, table=SHARED | {"OF_PX4": 1.5}),
-        ArduPilotVehicle(system=2, table=SHARED),
+        ArduPilotVehicle(system=2, live=(), table=SHARED),
     )
 
 

@@ -58,7 +58,7 @@ class Case:
 
 def copter(system: int = 1) -> ArduPilotVehicle:
     table = {"RTL_ALT": 1500, "WPNAV_SPEED": 500.0, "WPNAV_ACCEL": 100.0, "COMPASS_OFS_X": 5.0}
-    return ArduPilotVehicle(table=table, system=system)
+    return ArduPilotVehicle(table=table, live=(), system=system)
 
 
 def quad(system: int = 1) -> PX4Vehicle:
@@ -107,7 +107,7 @@ CASES: Final = {
         camera, ("set URL CAM_NAME Rear CAM_KEY hex:00 NO_SUCH 1 --vehicle 1/100 --extended --json",)
     ),
     "reset": Case(
-        lambda: ArduPilotVehicle(),
+        lambda: ArduPilotVehicle(live=()),
         (
             "reset URL RTL_ALT WPNAV_SPEED --dry-run --json",
             "set URL RTL_ALT 2000 --force",

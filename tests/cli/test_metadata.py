@@ -34,7 +34,7 @@ def copter(system: int = 1) -> ArduPilotVehicle:
         SimParam("TST_ALT", ParamType.REAL32, 100.0),
         SimParam("TST_LOG", ParamType.INT32, 1),
     ]
-    return ArduPilotVehicle(table=table, system=system)
+    return ArduPilotVehicle(table=table, system=system, live_period=0)
 
 
 # set

@@ -27,7 +27,7 @@ def px4(**options: Any) -> PX4Vehicle:
 def copter() -> ArduPilotVehicle:
     """An ArduPilot that shows two parameters after GRP_ENABLE."""
     table = [SimParam("GRP_ENABLE", 2, 0), *(SimParam(name, 9, value) for name, value in TABLE.items())]
-    return ArduPilotVehicle(table=table, groups={"GRP_ENABLE": GROUP}, ftp=False)
+    return ArduPilotVehicle(table=table, groups={"GRP_ENABLE": GROUP}, live=(), ftp=False)
 
 
 # get
@@ -173,4 +173,4 @@ def test_watch_follows_groups_that_appear(
 
 def growing() -> Growing:
     table = [SimParam("GRP_ENABLE", 2, 0), SimParam("MC_ROLL_P", 9, 4.0)]
-    return Growing(table=table, groups={"GRP_ENABLE": GROUP}, ftp=False)
+    return Growing(table=table, groups={"GRP_ENABLE": GROUP}, live=(), ftp=False)

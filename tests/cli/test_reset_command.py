@@ -164,7 +164,7 @@ def test_a_vehicle_that_falls_silent_has_an_outcome_for_each_value(command: Comm
                 super().respond(message, sender)
 
     table = [SimParam(f"P_{number}", ParamType.INT16, 3, default=1) for number in range(6)]
-    done = command("reset", put(Ending(table=table)), "P_*", "--json")
+    done = command("reset", put(Ending(table=table, live=())), "P_*", "--json")
     assert done.code == 3
     assert {each["status"] for each in done.json["params"].values()} <= {"unproven", "unknown", "not tried"}
     assert len(done.json["params"]) == len(table)

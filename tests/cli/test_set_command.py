@@ -58,7 +58,7 @@ def test_many_pairs_are_in_flight_at_a_time(command: Command, put: Put, kind: An
 def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put) -> None:
     small = (ParamType.INT8, 0)
     table: dict[str, Any] = {"A": 1.0, "COUNT": 3, "FIXED": 2.0, "SMALL": small}
-    vehicle = ArduPilotVehicle(table=table, read_only=["FIXED"], ftp=False, param_error=True)
+    vehicle = ArduPilotVehicle(table=table, read_only=["FIXED"], live=(), ftp=False, param_error=True)
     words = ["NO_SUCH=1", "COUNT", 7.6, "SMALL=300", "FIXED", 9, "A", 6]
     done = command("set", put(vehicle), *words, "--force")
     assert done.code == 2

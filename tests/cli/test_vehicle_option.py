@@ -22,7 +22,7 @@ def px4(system: int = 1, **options: Any) -> PX4Vehicle:
 
 
 def copter(system: int = 4, **options: Any) -> ArduPilotVehicle:
-    return ArduPilotVehicle(system=system, **{"table": TABLE} | options)
+    return ArduPilotVehicle(system=system, live=(), **{"table": TABLE} | options)
 
 
 @pytest.mark.parametrize("name", ["4", "4/1", f"uid:{UID}", "UID:0A0A0A"])

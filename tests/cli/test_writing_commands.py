@@ -86,7 +86,7 @@ def px4(system: int = 1, **options: Any) -> PX4Vehicle:
 
 
 def copter(system: int = 2, **options: Any) -> ArduPilotVehicle:
-    return ArduPilotVehicle(system=system, **{"table": TABLE} | options)
+    return ArduPilotVehicle(system=system, live=(), **{"table": TABLE} | options)
 
 
 def untouched(*vehicles: Vehicle) -> bool:

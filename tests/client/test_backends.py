@@ -198,7 +198,7 @@ async def test_a_table_is_downloaded_by_list_and_then_taken_from_the_cache(tmp_p
 
 
 async def test_a_table_is_served_as_a_file_and_files_are_read() -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0)
     async with beside(), a_client(vehicle) as client:
         component = await client.component()
         result = await component.fetch_all()
@@ -325,7 +325,7 @@ async def test_a_client_that_is_cancelled_writes_what_it_has_learnt(tmp_path: Pa
 
 
 async def test_a_scope_around_a_client_has_the_file_closed_before_it_ends() -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0)
     tap = Tap(Air.symmetric([vehicle], delay=0.02))
 
     def cancel_in_the_file(progress: Progress) -> None:

@@ -233,7 +233,7 @@ async def test_a_table_that_the_client_has_synced_by_itself_is_cached_whole(path
 
 @in_simulated_time
 async def test_a_vehicle_without_a_hash_is_shown_from_the_cache_and_downloaded(path: Path) -> None:
-    vehicle = ArduPilotVehicle(ftp=False)
+    vehicle = ArduPilotVehicle(ftp=False, live=())
     await session(vehicle, path)
     tap = Tap(vehicle)
     async with ParamClient(tap, cache=path) as client:
@@ -677,7 +677,7 @@ def said(path: Path) -> tuple[int, bool | None]:
 
 @in_simulated_time
 async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Path) -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0)
     result = await session(vehicle, path)
     defaults = {name: param.default for name, param in result.params.items()}
     assert said(path) == (1382, True)
@@ -700,7 +700,7 @@ async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Pa
 @in_simulated_time
 async def test_a_value_before_the_first_heartbeat_is_right_and_keeps_its_default(path: Path) -> None:
     """An ArduPilot shows its encoding by its heartbeat alone."""
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0)
     await session(vehicle, path)
     vehicle.set_param("RTL_ALT", 1234)
     async with ParamClient(Air.symmetric([vehicle], delay=0.1), cache=path) as client:
@@ -712,7 +712,7 @@ async def test_a_value_before_the_first_heartbeat_is_right_and_keeps_its_default
 
 @in_simulated_time
 async def test_names_that_change_by_themselves_are_learnt_for_later_sessions(path: Path) -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0)
     await session(vehicle, path)
     vehicle.load({"RTL_ALT": 2100, "STAT_RUNTIME": 60})
     assert (await session(vehicle, path)).changed == ("RTL_ALT",)
@@ -727,7 +727,7 @@ async def test_names_that_change_by_themselves_are_learnt_for_later_sessions(pat
 async def test_a_vehicle_without_the_parameter_file_is_remembered_for_its_firmware(
     path: Path, kind: str
 ) -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0)
     server = vehicle.file_server
     assert server is not None
     rows = server.params

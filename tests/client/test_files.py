@@ -22,7 +22,7 @@ FILES = {"/APM/LOGS/1.BIN": LOG, "/APM/a.txt": b"hello", "/APM/empty": b""}
 
 
 def with_files(**options: Any) -> ArduPilotVehicle:
-    vehicle = ArduPilotVehicle(**options)
+    vehicle = ArduPilotVehicle(live_period=0, **options)
     vehicle.files.update(FILES)
     return vehicle
 
@@ -70,7 +70,7 @@ async def test_a_time_limit_ends_a_read_and_closes_the_file() -> None:
 async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str) -> None:
     requests = 0
     for step in range(1, 40):
-        vehicle = ArduPilotVehicle()
+        vehicle = ArduPilotVehicle(live_period=0)
 
         async def session(vehicle: ArduPilotVehicle, seconds: float) -> None:
             async with a_client(Air.symmetric([vehicle], delay=0.02)) as client:
@@ -223,7 +223,7 @@ async def test_a_link_that_stays_disconnected_ends_it() -> None:
 @in_simulated_time
 async def test_a_neighbour_of_a_large_integer_can_be_set() -> None:
     big = (1 << 24) + 1
-    vehicle = ArduPilotVehicle(table=[SimParam("BIG", ParamType.INT32, big)])
+    vehicle = ArduPilotVehicle(table=[SimParam("BIG", ParamType.INT32, big)], live_period=0)
     async with a_client(vehicle) as client:
         component = await client.component()
         await component.fetch_all()

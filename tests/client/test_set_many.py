@@ -39,6 +39,7 @@ async def test_each_value_has_an_outcome_of_its_own() -> None:
     vehicle = ArduPilotVehicle(
         table={**{name: float(value) for name, value in VALUES.items()}, "COUNT": 3},
         read_only=["PARAM_03"],
+        live=(),
         ftp=False,
         param_error=True,
     )

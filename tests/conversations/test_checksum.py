@@ -75,7 +75,7 @@ async def test_an_unchanged_table_costs_one_request_and_opens_nothing() -> None:
 @pytest.mark.parametrize("passed", [0, 30])
 @virtual
 async def test_seconds_that_were_counted_need_no_read(delay: float, seconds: float, passed: int) -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0.0)
     cached = vehicle.params
     async with converse(Air.symmetric([vehicle], delay=delay)) as conversation:
         node = await with_cached_table(conversation, cached)
@@ -91,7 +91,7 @@ async def test_seconds_that_were_counted_need_no_read(delay: float, seconds: flo
 
 @virtual
 async def test_pressure_that_a_rover_measures_all_the_time_needs_no_read() -> None:
-    vehicle = ArduPilotVehicle(kind="rover")
+    vehicle = ArduPilotVehicle(kind="rover", live_period=0.0)
     async with converse(Air.symmetric([vehicle], delay=0.004)) as conversation:
         node = await with_cached_table(conversation, vehicle.params)
         for step, reads in ((0.5, 0), (1.25, 0), (-3.5, 0), (4000.0, 2)):
@@ -110,7 +110,7 @@ async def test_pressure_that_a_rover_measures_all_the_time_needs_no_read() -> No
 
 @virtual
 async def test_a_value_that_moves_between_two_requests_starts_no_search() -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0.0)
     cached = vehicle.params
 
     def passes(message: Message) -> bool:
@@ -142,7 +142,7 @@ async def test_values_that_move_are_read_by_their_checksum_and_learnt() -> None:
 
 @virtual
 async def test_an_announcement_before_the_cached_table_takes_no_index_away() -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0.0)
     async with converse(vehicle) as conversation:
         node = await conversation.node()
         value = struct.pack("<f", 31.0)
@@ -198,7 +198,7 @@ async def test_changed_values_are_found_in_less_time_than_the_file_takes() -> No
         (ArduPilotVehicle().params, {"ATC_RAT_RLL_P": 0.25, "FORMAT_VERSION": 121}),
         (ArduPilotVehicle().params, {"ATC_RAT_RLL_P": 0.2512345}),
     ):
-        vehicle = ArduPilotVehicle()
+        vehicle = ArduPilotVehicle(live_period=0.0)
         vehicle.load(values)
         async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
             node = await with_cached_table(conversation, cached, count=len(cached) or None)
@@ -230,7 +230,7 @@ async def test_a_search_ends_where_the_file_is_quicker(delay: float, is_simple: 
 async def test_a_changed_count_costs_one_round_trip() -> None:
     elapsed = []
     for cached in ({}, ArduPilotVehicle().params):
-        vehicle = ArduPilotVehicle()
+        vehicle = ArduPilotVehicle(live_period=0.0)
         vehicle.load({"EK2_ENABLE": 1})
         async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
             node = await with_cached_table(conversation, cached, count=len(cached) or None)
@@ -243,7 +243,7 @@ async def test_a_changed_count_costs_one_round_trip() -> None:
 
 @virtual
 async def test_a_download_in_place_of_a_search_names_the_changes() -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0.0)
     async with converse(vehicle) as conversation:
         node = await with_cached_table(conversation, vehicle.params)
         names = NAMES[300:700:20]
@@ -256,7 +256,7 @@ async def test_a_download_in_place_of_a_search_names_the_changes() -> None:
 
 @virtual
 async def test_a_value_that_is_another_at_each_read_ends_the_search() -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0.0)
 
     def passes(message: Message) -> bool:
         if isinstance(message, ParamRequestRead):
@@ -374,7 +374,7 @@ CHANGES = st.dictionaries(st.sampled_from(NAMES), st.integers(1, 2**32 - 1), min
 @given(changes=CHANGES, kind=st.sampled_from(["values", "type", "name", "count"]), place=st.integers(0, 1381))
 def test_no_difference_is_ever_taken_for_equal(changes: dict[str, int], kind: str, place: int) -> None:
     async def main() -> None:
-        vehicle = ArduPilotVehicle()
+        vehicle = ArduPilotVehicle(live_period=0.0)
         cached = vehicle.params
         for name, difference in changes.items():
             param = cached[name]
@@ -430,7 +430,7 @@ async def test_a_value_makes_up_for_no_other_name_or_type(
     change: Callable[..., None], names: list[str]
 ) -> None:
     """The checksum is linear: some value of 4 bytes has it, whatever stands before."""
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0.0)
     cached = vehicle.params
     change(cached, *names)
     async with converse(vehicle) as conversation:
@@ -442,7 +442,7 @@ async def test_a_value_makes_up_for_no_other_name_or_type(
 
 @virtual
 async def test_a_change_in_the_middle_of_a_proof_is_not_proven() -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0.0)
     async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
         node = await with_cached_table(conversation, vehicle.params)
         async with anyio.create_task_group() as tasks:
@@ -463,7 +463,7 @@ async def test_a_change_in_the_middle_of_a_proof_is_not_proven() -> None:
 @virtual
 async def test_an_acknowledgement_as_real32_changes_no_type() -> None:
     """ArduPilot acknowledges the set of a default as REAL32, whatever the type is."""
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0.0)
     async with converse(vehicle) as conversation:
         node = await with_cached_table(conversation, vehicle.params)
         await fetch_all(node.plain)
@@ -478,7 +478,7 @@ async def test_an_acknowledgement_as_real32_changes_no_type() -> None:
 
 @virtual
 async def test_a_list_with_a_gap_in_its_names_is_no_question_for_a_checksum() -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0.0)
     cached = vehicle.params
     cached["WP_NAVALT_MIN_"] = replace(cached["WP_NAVALT_MIN"], name="WP_NAVALT_MIN_")
     async with converse(vehicle) as conversation:
@@ -492,7 +492,7 @@ async def test_a_list_with_a_gap_in_its_names_is_no_question_for_a_checksum() ->
 @pytest.mark.parametrize("is_cached", [True, False], ids=["cached", "downloaded"])
 @virtual_on_both
 async def test_a_watch_finds_a_lost_announcement_for_one_request(is_cached: bool) -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0.0)
     async with converse(vehicle) as conversation:
         table = vehicle.params if is_cached else {}
         node = await with_cached_table(conversation, table, count=len(vehicle.params))

@@ -397,7 +397,7 @@ async def test_a_lost_opening_of_the_file_is_repeated_before_the_list_is_taken()
 
 @virtual
 async def test_a_file_of_a_table_that_changes_meanwhile_is_right_in_the_end() -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0.0)
     async with converse(Air.symmetric([vehicle], delay=0.02)) as conversation:
         session = (await conversation.node()).plain
         async with anyio.create_task_group() as tasks:

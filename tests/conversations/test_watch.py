@@ -132,7 +132,7 @@ async def test_an_armed_vehicle_is_asked_only_after_a_sign_of_change() -> None:
 @virtual_on_both
 @pytest.mark.parametrize("ftp", [True, False])
 async def test_a_group_that_is_shown_or_hidden_is_found_by_the_count(ftp: bool) -> None:
-    vehicle = ArduPilotVehicle(ftp=ftp)
+    vehicle = ArduPilotVehicle(ftp=ftp, live_period=0.0)
     async with watched(Air.symmetric([vehicle], delay=0.02), interval=0.0) as found:
         count = found.session.table.count or 0
         for value, change in ((1, 52), (0, 0)):

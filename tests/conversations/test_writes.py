@@ -335,7 +335,7 @@ async def test_an_old_value_in_passing_proves_nothing_and_another_ones_is_no_adj
 @virtual
 async def test_a_late_answer_with_an_old_value_undoes_no_acknowledged_write() -> None:
     """ArduPilot takes the value of a read when it queues it, and answers up to 100 ms later."""
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0.0)
     async with converse(Air.symmetric([vehicle], delay=0.005)) as conversation:
         session = (await conversation.node()).plain
         await fetch_all(session)
@@ -419,7 +419,7 @@ async def test_values_of_one_parameter_are_set_in_the_order_of_the_call() -> Non
 @virtual
 async def test_an_acknowledgement_to_another_station_changes_no_type() -> None:
     """ArduPilot acknowledges the set of a default as REAL32, whatever the type is."""
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0.0)
     async with converse(vehicle) as conversation:
         session = (await conversation.node()).plain
         await fetch_all(session)

@@ -406,7 +406,7 @@ async def test_restore_skips_measured_and_read_only_parameters() -> None:
     own: dict[str, WireValue | tuple[ParamType, WireValue]]
     own = {"BARO1_GND_PRESS": 94500.0, "BARO1_DEVID": 65540, "INS_GYROFFS_X": 0.25, "LOCKED": 1.0}
     vehicle = ArduPilotVehicle(
-        table=SETTINGS | OTHERS | own, read_only=["BARO1_GND_PRESS", "BARO1_DEVID", "LOCKED"]
+        table=SETTINGS | OTHERS | own, read_only=["BARO1_GND_PRESS", "BARO1_DEVID", "LOCKED"], live_period=0.0
     )
     tap = Tap(vehicle)
     async with a_client(tap) as client:
@@ -617,7 +617,7 @@ async def test_a_system_id_of_another_vehicle_is_not_set() -> None:
 @in_simulated_time
 async def test_another_vehicle_at_the_same_address_ends_the_run(sent: int) -> None:
     """Before the first value, or before the values are read again."""
-    vehicle, other = ardupilot(), ardupilot(uid2=b"another")
+    vehicle, other = ardupilot(live_period=0.0), ardupilot(uid2=b"another")
     tap = Tap(vehicle)
 
     async def exchange() -> None:
@@ -797,7 +797,7 @@ def on_a_radio(vehicle: ArduPilotVehicle | PX4Vehicle) -> Tap:
 
 
 def ardupilot_on_a_serial_port(**options: Any) -> ArduPilotVehicle:
-    return ArduPilotVehicle(burst=1, period=0.025, ftp_rate=5760.0, **options)
+    return ArduPilotVehicle(live=(), burst=1, period=0.025, ftp_rate=5760.0, **options)
 
 
 def tuned(vehicle: ArduPilotVehicle, count: int) -> ParamSet:

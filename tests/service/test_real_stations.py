@@ -8,6 +8,7 @@ import struct
 import subprocess
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,7 @@ async def stations_of(vehicle: Vehicle, stations: int, **faults: Any) -> AsyncIt
 
 
 @pytest.mark.asyncio
-@pytest.mark.parametrize("kind", [PX4Vehicle, ArduPilotVehicle])
+@pytest.mark.parametrize("kind", [PX4Vehicle, partial(ArduPilotVehicle, live_period=0.0)])
 async def test_stations_get_every_value_and_the_radio_carries_none(kind: Callable[[], Vehicle]) -> None:
     vehicle = kind()
     found: list[dict[str, float]] = []

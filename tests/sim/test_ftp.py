@@ -124,7 +124,7 @@ def test_param_pck_with_start_and_count() -> None:
 
 
 def test_param_pck_has_the_current_values() -> None:
-    pilot = Pilot(ArduPilotVehicle())
+    pilot = Pilot(ArduPilotVehicle(live_period=0.0))
     before = {each.name: each for each in content_of(pilot, b"?withdefaults=1").entries}
     pilot.vehicle.set_param("RTL_ALT", 1234.0)
     pilot.vehicle.set_param("COMPASS_DEC", 0.0)

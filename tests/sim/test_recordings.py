@@ -179,7 +179,7 @@ def px4_of(name: str) -> PX4Vehicle:
 
 def ardupilot_of(name: str) -> ArduPilotVehicle:
     """Return an ArduPilot with the values of a list."""
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(live_period=0.0)
     for value in last_list(name):
         take(vehicle, value)
     return vehicle
@@ -211,7 +211,7 @@ def ardupilot_of_file(name: str) -> ArduPilotVehicle:
         rows.append(
             shipped[entry.name] if is_shipped else SimParam(entry.name, entry.type, value, default=default)
         )
-    return ArduPilotVehicle(table=rows)
+    return ArduPilotVehicle(table=rows, live_period=0.0)
 
 
 def with_groups(name: str) -> ArduPilotVehicle:
@@ -224,7 +224,7 @@ def with_groups(name: str) -> ArduPilotVehicle:
             kind = ParamType(value.param_type)
             group = groups[f"{value.param_id.split('_')[0]}_ENABLE"]
             group.append(SimParam(value.param_id, kind, number if kind == ParamType.REAL32 else int(number)))
-    vehicle = ArduPilotVehicle(groups=groups)
+    vehicle = ArduPilotVehicle(live_period=0.0, groups=groups)
     for value in last_list(name):
         if not value.param_id.endswith("_ENABLE"):
             take(vehicle, value)
@@ -246,7 +246,7 @@ def without_pushes(name: str, recorded: Messages, start: float) -> Messages:
 
 
 def quiet(name: str) -> ArduPilotVehicle:
-    return ArduPilotVehicle()
+    return ArduPilotVehicle(live_period=0.0)
 
 
 def px4(name: str) -> PX4Vehicle:
@@ -383,14 +383,14 @@ class TestReplay:
             and message.param_id in ("BARO1_GND_PRESS", "BARO2_GND_PRESS")
         ]
         assert len(events) == 2
-        sent = compared(replay(ArduPilotVehicle(), name, phase=0.005, on_board=events))
+        sent = compared(replay(ArduPilotVehicle(live_period=0.0), name, phase=0.005, on_board=events))
         assert differences(name, recorded, sent, burst=10) == []
 
     def test_ardupilot_ftp_download(self) -> None:
         """Both files, with every block, and the end of each."""
         name = "ardupilot_ftp_download"
         recorded = compared(from_vehicle(name))
-        sent = compared(replay(ArduPilotVehicle(), name, phase=0.003))
+        sent = compared(replay(ArduPilotVehicle(live_period=0.0), name, phase=0.003))
         assert differences(name, recorded, sent, burst=10) == []
         answers = [message for _, message in sent if isinstance(message, messages.FileTransfer)]
         assert len(answers) == 2 * (2 + 64 + 1 + 1)

@@ -419,8 +419,20 @@ class TestArduPilot:
         assert vehicle.param("EK2_GPS_TYPE").index is None
         assert vehicle.param("EK3_ENABLE").index == switch + 1
 
+    def test_live_values_are_sent_unsolicited(self) -> None:
+        vehicle = ArduPilotVehicle(live_period=10.0)
+        before = vehicle.values
+        station = Station(vehicle).wait(35.0)
+        assert station.times() == pytest.approx([t for t in (10, 20, 30) for _ in "ab"], abs=0.007)
+        values = station.values()
+        assert names(values) == ["BARO1_GND_PRESS", "STAT_RUNTIME"] * 3
+        assert set(indices(values)) == {NO_INDEX}
+        assert vehicle.values["STAT_RUNTIME"] == before["STAT_RUNTIME"] + 30  # type: ignore[operator]  # both are int
+        assert vehicle.values["BARO1_GND_PRESS"] == pytest.approx(before["BARO1_GND_PRESS"])
+        assert values[0].raw != values[2].raw
+
     def test_a_restart_changes_ten_values(self) -> None:
-        vehicle = ArduPilotVehicle()
+        vehicle = ArduPilotVehicle(live_period=0.0)
         before = vehicle.values
         station = Station(vehicle).wait(3.0)
         assert vehicle.values == before
