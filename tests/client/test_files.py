@@ -10,7 +10,7 @@ import anyio
 import pytest
 
 from paramclient import ClientClosed, NoReply
-from paramclient.errors import FileTransferError, LinkError
+from paramclient.errors import LinkError
 from paramclient.links import SimLink
 from paramclient.model.values import ParamType
 from paramclient.sim import Air, ArduPilotVehicle, SimParam
@@ -25,31 +25,6 @@ def with_files(**options: Any) -> ArduPilotVehicle:
     vehicle = ArduPilotVehicle(live_period=0, **options)
     vehicle.files.update(FILES)
     return vehicle
-
-
-@in_simulated_time
-async def test_the_progress_of_a_read_is_reported() -> None:
-    reported: list[tuple[int, int | None]] = []
-    async with a_client(with_files()) as client:
-        component = await client.component()
-        await component.read_file("/APM/LOGS/1.BIN", progress=lambda *state: reported.append(state))
-    received = [state[0] for state in reported]
-    assert received == sorted(received)
-    assert received[-1] == len(LOG)
-    assert len(reported) > 5
-    assert {state[1] for state in reported} <= {None, len(LOG)}
-
-
-@in_simulated_time
-async def test_a_file_that_is_too_long_is_not_taken() -> None:
-    vehicle = with_files()
-    async with a_client(vehicle) as client:
-        component = await client.component()
-        with pytest.raises(FileTransferError, match="longer than 1000 bytes"):
-            await component.read_file("/APM/LOGS/1.BIN", size_max=1000)
-        await anyio.sleep(2.0)
-        assert not vehicle.open_files
-        assert await component.read_file("/APM/a.txt", size_max=5) == b"hello"
 
 
 @in_simulated_time
@@ -183,20 +158,6 @@ async def test_tasks_that_are_cancelled_each_for_itself_leave_no_file_open() -> 
 
 
 @in_simulated_time
-async def test_the_file_is_closed_when_its_content_is_given() -> None:
-    vehicle = with_files()
-    async with a_client(Air.symmetric([vehicle], delay=0.02)) as client:
-        component = await client.component()
-        for _ in range(3):
-            began = anyio.current_time()
-            assert (await component.fetch_all(refresh=True)).source == "ftp"
-            assert not vehicle.open_files
-            assert anyio.current_time() - began < 0.55
-        assert await component.read_file("/APM/a.txt") == b"hello"
-        assert not vehicle.open_files
-
-
-@in_simulated_time
 async def test_a_read_goes_on_when_the_link_is_back() -> None:
     link = FlakyLink(with_files())
     async with a_client(link) as client:
@@ -205,19 +166,6 @@ async def test_a_read_goes_on_when_the_link_is_back() -> None:
         await anyio.sleep(0.3)
         await link.drop()
         assert await reading == LOG
-
-
-@in_simulated_time
-async def test_a_link_that_stays_disconnected_ends_it() -> None:
-    link = FlakyLink(with_files())
-    async with a_client(link) as client:
-        component = await client.component()
-        reading = asyncio.ensure_future(outcome(component.read_file("/APM/LOGS/1.BIN")))
-        await anyio.sleep(0.3)
-        await link.drop(stays_offline=True)
-        assert isinstance(await reading, LinkError)
-        with pytest.raises(LinkError):
-            await component.read_file("/APM/a.txt")
 
 
 @in_simulated_time

@@ -75,7 +75,10 @@ async def test_values_of_every_type_are_set(loss: float) -> None:
             result = await write(session, kind.name, value)
             assert (result.status, result.actual, result.param.type) == ("accepted", value, kind)
             assert session.table.params[kind.name].value == vehicle.param(kind.name).value == value
-        assert vehicle.requests["PARAM_REQUEST_READ"] >= len(EVERY_TYPE)  # each type is learnt first
+        reads = vehicle.requests["PARAM_REQUEST_READ"]
+        assert reads >= len(EVERY_TYPE)  # each type is learnt first
+        await write(session, "INT32", 5)
+        assert loss or vehicle.requests["PARAM_REQUEST_READ"] == reads  # and is known from then on
 
 
 @virtual
