@@ -8,7 +8,7 @@ import random
 import resource
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
@@ -186,24 +186,3 @@ def start(program: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
             yield process
         finally:
             process.kill()
-
-
-def kill_when(program: str, path: Path, condition: Callable[[Mapping[str, Param]], bool]) -> None:
-    """Run a program that prints a line after each change of its table, and kill it when the condition is met.
-
-    Args:
-        path: of the program's cache, its only argument.
-        condition: of the table on disk. The table in memory may be ahead of it.
-    """
-    with start(program, path) as process:
-        assert process.stdout is not None
-        for _ in process.stdout:
-            if condition(params_on_disk(path)):
-                return
-    raise AssertionError("the program ended before the condition was met")
-
-
-def params_on_disk(path: Path) -> Mapping[str, Param]:
-    """Return the parameters of the only table; none when there is no table."""
-    with ParamCache(path) as cache:
-        return cache.component().params if cache.components() else {}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,16 +12,14 @@ from pathlib import Path
 import anyio
 import pytest
 
-from paramclient import ParamCache, ParamClient, Trust, UnknownVehicle
+from paramclient import ParamCache, ParamClient, Trust
 from paramclient.cache import TableUpdate
 from paramclient.client import cache_writer
-from tests.caches import PX4, full_disk, rubbish, set_aside, stored, update
+from tests.caches import PX4, rubbish, stored, update
 from tests.shell import Tap, bits, in_simulated_time, simulated_time_loop, small_px4
-from tests.test_design import MODULES
 
 HOUR = 3600.0
 DAY = 24 * HOUR
-CLOCKS = re.compile(r"\btime\.(time|time_ns|gmtime|localtime)\(|\b(now|utcnow|today)\(\)|\.now\(")
 
 
 @pytest.fixture
@@ -48,18 +45,6 @@ def wall() -> Wall:
 
 
 # The clock is set
-
-
-def test_only_the_keeping_of_things_knows_the_time_of_day() -> None:
-    """Times of a vehicle use a monotonic clock."""
-    asking = {module for module, path in MODULES.items() if CLOCKS.search(path.read_text(encoding="utf-8"))}
-    library = {module for module in asking if module.split(".")[1:2] not in (["cli"], ["service"])}
-    keeping = {
-        *("client.cache_writer", "client.recording", "cache.store", "cache.database"),
-        *("provision.apply_restore", "provision.sources"),
-    }
-    signing = {"client.signing"}  # whose timestamps are times of day by definition
-    assert library == {f"paramclient.{module}" for module in keeping | signing}
 
 
 @pytest.mark.parametrize("step", [-HOUR, -DAY, HOUR, 400 * DAY])
@@ -207,64 +192,3 @@ async def test_half_a_table_removes_nothing_from_a_file_that_others_made(path: P
         await anyio.sleep(3.0)
     with ParamCache(path) as cache:
         assert len(cache.component(system=1).params) == len(vehicle.params)
-
-
-@in_simulated_time
-async def test_a_disk_that_is_full_for_a_while(path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    vehicle = small_px4()
-    async with ParamClient(vehicle, cache=path) as client:
-        component = await client.component()
-        await component.get("PARAM_02")
-        await anyio.sleep(2.0)
-        with full_disk(at=100):
-            await component.fetch_all()
-            await component.set("PARAM_01", 55)
-            await anyio.sleep(2.0)
-        await anyio.sleep(cache_writer.RETRY_INTERVAL + 2.0)
-    [warning] = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
-    assert warning.startswith("continuing without the cache: ")
-    with ParamCache(path) as cache:
-        assert bits(cache.component(system=1).params) == bits(vehicle.params)
-        assert cache.component(system=1).complete
-    assert set_aside(path) == []
-
-
-@in_simulated_time
-async def test_the_cache_has_the_times_of_arrival_although_it_is_written_later(
-    path: Path, wall: Wall
-) -> None:
-    vehicle = small_px4()
-    async with ParamClient(vehicle, cache=path) as client:
-        component = await client.component()
-        await component.get("PARAM_02")
-        await anyio.sleep(2.0)
-        with full_disk(at=100):
-            await component.fetch_all()
-            fetched_at = wall.now
-            await anyio.sleep(3.0)
-            await component.set("PARAM_01", 55)
-            changed_at = wall.now
-            await anyio.sleep(3.0)
-        await anyio.sleep(cache_writer.RETRY_INTERVAL + 2.0)
-    with ParamCache(path) as cache:
-        table = cache.component(system=1)
-        heard_at = dict(table.heard_at)
-        assert heard_at.pop("PARAM_01") == pytest.approx(changed_at, abs=0.1)
-        assert fetched_at - 1.0 < min(heard_at.values()) <= max(heard_at.values()) <= fetched_at
-        [line] = cache.history(table.key, name="PARAM_01")
-        assert line.at == pytest.approx(changed_at, abs=0.1)
-
-
-def test_replacements_counts_how_often_the_cache_file_was_replaced(path: Path) -> None:
-    with ParamCache(path) as cache:
-        assert cache.replacements == 0
-        cache.save(of_another_vehicle())
-        first = cache.replacements
-        cache.save(of_another_vehicle())
-        cache.components()
-        assert cache.replacements == first
-        delete(path)
-        with pytest.raises(UnknownVehicle):
-            cache.component("beef")
-        cache.save(of_another_vehicle())
-        assert cache.replacements > first

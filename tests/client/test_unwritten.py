@@ -5,22 +5,20 @@ from __future__ import annotations
 import logging
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
-from functools import partial
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import anyio
 import pytest
 
-from paramclient import CacheError, Component, ParamCache, ParamClient
+from paramclient import CacheError, ParamCache, ParamClient
 from paramclient.cache import database
-from paramclient.client.cache_writer import FLUSH_INTERVAL, PENDING_MAX, RETRY_INTERVAL
-from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.client import cache_writer
 from paramclient.provision import apply
 from paramclient.sim import PX4Vehicle
-from tests.caches import full_disk, whole_table
-from tests.commands import in_process
-from tests.shell import in_simulated_time, small_px4, until
+from tests.caches import full_disk, set_aside
+from tests.shell import bits, in_simulated_time, small_px4
 
 NAME = "PARAM_01"
 
@@ -50,24 +48,8 @@ def full(path: Path) -> Iterator[None]:
         yield
 
 
-def fails_at_first(save: Callable[..., None]) -> Callable[..., None]:
-    """A write that succeeds only the tenth time."""
-    failures = iter([CacheError("the database is starting")] * 9)
-
-    def write(*args: object, **kwargs: object) -> None:
-        if (error := next(failures, None)) is not None:
-            raise error
-        save(*args, **kwargs)
-
-    return write
-
-
 Holding = Callable[[Path], AbstractContextManager[None]]
 UNWRITABLE = pytest.mark.parametrize("unwritable", [locked, full], ids=["locked", "full"])
-
-
-def is_received(component: Component, value: float) -> bool:
-    return component.params[NAME].value == value
 
 
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -82,19 +64,24 @@ async def test_values_written_late_keep_their_times_and_the_whole_history(
     vehicle = PX4Vehicle(table={NAME: 1.0, "PARAM_02": 2.0})
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.only_component()
-        await component.fetch_all()
+        await component.get(NAME)
         await anyio.sleep(2.0)
         began_at = anyio.current_time()
         with unwritable(path):
-            received = []
+            await component.fetch_all()
+            changes, received = component.changes(), []
             for value in (5.0, 6.0, 7.0):
                 vehicle.set_param(NAME, value)
-                await until(partial(is_received, component, value))
+                await anext(changes)
                 received.append(anyio.current_time() - began_at)
                 await anyio.sleep(10)
-        await anyio.sleep(2 * RETRY_INTERVAL + FLUSH_INTERVAL)
+        await anyio.sleep(2 * cache_writer.RETRY_INTERVAL + cache_writer.FLUSH_INTERVAL)
         with ParamCache(path) as cache:
-            lines = cache.history(cache.vehicles()[0].key)
+            table = cache.component()
+            lines = cache.history(table.key)
+    assert table.complete
+    assert bits(table.params) == bits(vehicle.params)
+    assert not set_aside(path)
     assert [(line.old.value, line.new and line.new.value) for line in lines] == [(1, 5), (5, 6), (6, 7)]
     ahead = lines[0].at - received[0]
     assert [line.at - ahead for line in lines] == pytest.approx(received, abs=0.01)
@@ -107,13 +94,15 @@ async def test_a_cause_has_one_warning_from_open_to_close(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Also where nothing is to be written for a time: that is no success."""
-    async with ParamClient(small_px4(), cache=f"postgresql://me@/fleet?host={tmp_path}") as client:
+    vehicle = small_px4()
+    async with ParamClient(vehicle, cache=f"postgresql://me@/fleet?host={tmp_path}") as client:
         component = await client.only_component()
         await client.core.cache_writer.write_all()
         await component.fetch_all()
-        await anyio.sleep(2 * RETRY_INTERVAL)
+        await anyio.sleep(2 * cache_writer.RETRY_INTERVAL)
         with pytest.raises(CacheError, match=r"nothing was sent, .*--no-cache"):
-            await apply(component, ParamSet({NAME: WrittenParam(NAME, 5.0)}))
+            await apply(component, {NAME: 5.0})
+        assert not vehicle.requests["PARAM_SET"]
         assert (await component.set(NAME, 5.0)).actual == 5.0
     [warning] = warnings(caplog)
     assert warning.startswith("continuing without the cache: ")
@@ -121,19 +110,22 @@ async def test_a_cause_has_one_warning_from_open_to_close(
 
 
 @in_simulated_time
-async def test_after_very_many_changes_the_whole_table_is_written(path: Path) -> None:
+async def test_after_very_many_changes_the_whole_table_is_written(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cache_writer, "PENDING_MAX", 20)
     vehicle = small_px4()
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.only_component()
         await component.fetch_all()
         await anyio.sleep(2.0)
         with locked(path):
-            for value in range(PENDING_MAX + 20):
+            for value in range(40):
                 vehicle.set_param(NAME, float(value))
-                await anyio.sleep(FLUSH_INTERVAL)
-        await anyio.sleep(2 * RETRY_INTERVAL)
+                await anyio.sleep(cache_writer.FLUSH_INTERVAL)
+        await anyio.sleep(2 * cache_writer.RETRY_INTERVAL)
         with ParamCache(path) as cache:
-            assert cache.component().params[NAME].value == vehicle.values[NAME] == PENDING_MAX + 19
+            assert cache.component().params[NAME].value == vehicle.values[NAME] == 39
             assert cache.component().complete
 
 
@@ -142,58 +134,33 @@ async def test_after_very_many_changes_the_whole_table_is_written(path: Path) ->
 async def test_a_client_that_ends_says_what_is_lost(
     unwritable: Holding, path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async with ParamClient(small_px4(), cache=path) as client:
-        component = await client.only_component()
-        await component.fetch_all()
-        await anyio.sleep(2.0)
-        key = component.identity.key
-        holding = unwritable(path)
-        holding.__enter__()
-        await component.set(NAME, 5.0)
-    try:
+    with ExitStack() as held:
+        async with ParamClient(small_px4(), cache=path) as client:
+            component = await client.only_component()
+            await component.fetch_all()
+            await anyio.sleep(2.0)
+            key = component.identity.key
+            held.enter_context(unwritable(path))
+            await component.set(NAME, 5.0)
         [lost] = warnings(caplog)
-    finally:
-        holding.__exit__(None, None, None)
     assert lost.startswith(f"the last values of 1/1 ({key}) are not in the cache, and lost: ")
 
 
 @in_simulated_time
 async def test_a_client_that_ends_waits_for_the_cache(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A database that is restarting refuses connections for a time."""
+    failures = iter([CacheError("the database is starting")] * 9)
+
+    def save_at_last(*args: Any, **options: Any) -> None:
+        if error := next(failures, None):
+            raise error
+        ParamCache.save(cache, *args, **options)
+
     with ParamCache(path) as cache:
         async with ParamClient(small_px4(), cache=cache) as client:
             component = await client.only_component()
             await component.fetch_all()
             await anyio.sleep(2.0)
             await component.set(NAME, 5.0)
-            monkeypatch.setattr(cache, "save", fails_at_first(cache.save))
+            monkeypatch.setattr(cache, "save", save_at_last)
         assert cache.component().params[NAME].value == 5.0
-
-
-@in_simulated_time
-async def test_nothing_is_applied_where_the_state_before_cannot_be_kept(path: Path) -> None:
-    vehicle = small_px4()
-    async with ParamClient(vehicle, cache=path) as client:
-        component = await client.only_component()
-        await component.fetch_all()
-        await anyio.sleep(2.0)
-        with locked(path), pytest.raises(CacheError, match=r"nothing was sent, .*locked"):
-            await apply(component, ParamSet({NAME: WrittenParam(NAME, 5.0)}))
-        assert vehicle.values[NAME] != 5.0
-
-
-@pytest.mark.parametrize("words", [("history", "1"), ("show", "1"), ("cache", "list")], ids=" ".join)
-def test_the_command_ends_with_5_where_the_cache_cannot_be_read(
-    words: tuple[str, ...], path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = in_process(capsys, "--cache", str(path))
-    with ParamCache(path) as cache:
-        cache.save(whole_table(3))
-    with closing(sqlite3.connect(path, isolation_level=None)) as other:
-        other.execute("PRAGMA locking_mode = EXCLUSIVE")
-        other.execute("BEGIN EXCLUSIVE")
-        other.execute("UPDATE vehicle SET system = system")
-        ended = command(*words)
-    assert (ended.code, ended.out) == (5, "")
-    assert "cannot be used: database is locked" in ended.err
-    assert command(*words).code == 0
