@@ -79,8 +79,5 @@ def test_the_command_logs_its_steps(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["get", "sim:px4", "MC_ROLL_P", "--no-cache"]) == 0
     assert capsys.readouterr().err == ""
     assert logging.getLogger(WATCHED).level == level
-
-
-def test_control_characters_are_not_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["get", "sim:px4", "BAD\x1b[31m", "-v", "--no-cache"]) == 2
     assert "\x1b" not in capsys.readouterr().err

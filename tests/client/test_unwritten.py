@@ -18,7 +18,7 @@ from paramclient.client import cache_writer
 from paramclient.provision import apply
 from paramclient.sim import PX4Vehicle
 from tests.caches import full_disk, set_aside
-from tests.shell import bits, in_simulated_time, small_px4
+from tests.shell import bits, in_simulated_time, simulated_time_loop, small_px4
 
 NAME = "PARAM_01"
 
@@ -52,6 +52,11 @@ Holding = Callable[[Path], AbstractContextManager[None]]
 UNWRITABLE = pytest.mark.parametrize("unwritable", [locked, full], ids=["locked", "full"])
 
 
+def time_of_day() -> float:
+    """The time by which the cache keeps values."""
+    return simulated_time_loop().now + simulated_time_loop().ahead
+
+
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.message for record in caplog.records if record.levelno >= logging.WARNING]
 
@@ -64,16 +69,18 @@ async def test_values_written_late_keep_their_times_and_the_whole_history(
     vehicle = PX4Vehicle(table={NAME: 1.0, "PARAM_02": 2.0})
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.only_component()
-        await component.get(NAME)
+        for name in vehicle.params:
+            await component.get(name)
         await anyio.sleep(2.0)
-        began_at = anyio.current_time()
         with unwritable(path):
+            await anyio.sleep(5.0)
             await component.fetch_all()
+            fetched_at = time_of_day()
             changes, received = component.changes(), []
             for value in (5.0, 6.0, 7.0):
                 vehicle.set_param(NAME, value)
                 await anext(changes)
-                received.append(anyio.current_time() - began_at)
+                received.append(time_of_day())
                 await anyio.sleep(10)
         await anyio.sleep(2 * cache_writer.RETRY_INTERVAL + cache_writer.FLUSH_INTERVAL)
         with ParamCache(path) as cache:
@@ -81,10 +88,10 @@ async def test_values_written_late_keep_their_times_and_the_whole_history(
             lines = cache.history(table.key)
     assert table.complete
     assert bits(table.params) == bits(vehicle.params)
+    assert table.heard_at["PARAM_02"] == pytest.approx(fetched_at, abs=0.1)
     assert not set_aside(path)
     assert [(line.old.value, line.new and line.new.value) for line in lines] == [(1, 5), (5, 6), (6, 7)]
-    ahead = lines[0].at - received[0]
-    assert [line.at - ahead for line in lines] == pytest.approx(received, abs=0.01)
+    assert [line.at for line in lines] == pytest.approx(received, abs=0.01)
     [warning] = warnings(caplog)
     assert warning.startswith("continuing without the cache: ")
 
