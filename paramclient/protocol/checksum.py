@@ -59,6 +59,9 @@ PRESSURE_DRIFT: Final = 0.001
 """Share by which these change in between."""
 SECONDS_SLACK: Final = 60.0
 """By how much these may grow more than time passes: they are stored every 30 s."""
+PASSED_MAX: Final = 3600.0
+"""Seconds passed up to which a count of them needs no read: in a longer time, it may be others by chance that
+explain a difference, as any of 2**32 values would."""
 MEASURED_ONCE: Final = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|ARSPD\d?_OFFSET|COMPASS_DEC")
 MEASURED: Final = re.compile(f"{MEASURED_ONCE.pattern}|{PRESSURE.pattern}")
 """Names that each start of the vehicle measures again (measured)."""
@@ -237,7 +240,7 @@ class _Proof:
         moments, now = self._session.table.moments, anyio.current_time()
         for at, bits in self._explanations(place, difference):
             row = self._rows[at]
-            if _has_just_moved(row, bits, now - moments.get(row.name, now)):
+            if _has_just_moved(row, bits, min(now - moments.get(row.name, now), PASSED_MAX)):
                 return at, bits
         return None
 

@@ -12,10 +12,13 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from paramclient.errors import FileErrorCode
+from paramclient.model.px4_hash import crc32_px4, crc32_px4_before
 from paramclient.model.values import Param, ParamType, Trust, from_bits
+from paramclient.protocol.checksum import CHECKED_READ_SIZE
 from paramclient.protocol.fetch import FetchResult, fetch_all
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.node import Node
+from paramclient.protocol.param_pck import PackedParam, encode_entries
 from paramclient.protocol.watch import Watch
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle
@@ -524,3 +527,30 @@ async def test_a_listed_name_that_no_file_can_contain_is_no_proof_and_no_error()
         result = await fetch_all(node.plain)
         assert result.source == "ftp"
         assert "no file can contain" in result.notes[0]
+
+
+@virtual
+async def test_a_run_time_of_an_old_table_is_no_guess_that_hides_another_change() -> None:
+    """The bits of one value that make the same difference as a run time of two days more."""
+    vehicle = ArduPilotVehicle(live_period=0)
+    cached = dict(vehicle.params)
+    entries = [PackedParam(each.name, ParamType(each.type), each.bits) for each in vehicle.listed]
+    run_time = next(at for at, each in enumerate(entries) if each.name == "STAT_RUNTIME")
+    other = max(at for at in range(run_time - 40) if entries[at].type is ParamType.INT32)
+
+    def packed(rows: list[PackedParam]) -> list[bytes]:
+        return list(encode_entries(rows, with_defaults=False, read_size=CHECKED_READ_SIZE))
+
+    later = [*entries]
+    later[run_time] = later[run_time]._replace(bits=later[run_time].bits + 200_000)
+    now, then = packed(entries), packed(later)
+    difference = crc32_px4(b"".join(now)) ^ crc32_px4(b"".join(then))
+    change = crc32_px4_before(difference, sum(map(len, now[other + 1 :])) + 4)
+    name = entries[other].name
+    vehicle.load({name: int(from_bits(entries[other].bits ^ change, ParamType.INT32))})
+    async with converse(vehicle) as conversation:
+        moments = dict.fromkeys(cached, -365 * 86_400.0)
+        node = await with_cached_table(conversation, cached, moments=moments)
+        result = await fetch_all(node.plain)
+        assert (result.source, result.changed) == ("cache", (name,))
+        check(vehicle, node, result)
