@@ -9,7 +9,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import anyio
 import anyio.abc
@@ -34,20 +33,6 @@ def nothing_remains() -> Iterator[None]:
     yield
     assert not core.running
     assert [thread.name for thread in threading.enumerate() if "paramclient" in thread.name] == []
-
-
-async def in_a_task(tasks: anyio.abc.TaskGroup, call: Callable[[], Any]) -> Any:
-    """What a call in a task of its own returns. The task has ended then."""
-    results: list[Any] = []
-    ended = anyio.Event()
-
-    async def work() -> None:
-        results.append(await call())
-        ended.set()
-
-    tasks.start_soon(work)
-    await ended.wait()
-    return results[0]
 
 
 class SlowLink(SimLink):
@@ -91,11 +76,13 @@ class FaultyLink(SimLink):
 
 async def test_opened_used_and_closed_in_different_tasks() -> None:
     client = a_client(generic())
-    async with beside() as tasks:
-        await in_a_task(tasks, client.open)
-        component = await in_a_task(tasks, client.component)
-        assert (await component.get("PARAM_01")).value == 1
-        await in_a_task(tasks, client.aclose)
+    async with beside():
+        async with anyio.create_task_group() as opening:
+            opening.start_soon(client.open)
+        assert (await (await client.component()).get("PARAM_01")).value == 1
+        async with anyio.create_task_group() as closing:
+            for _ in range(3):
+                closing.start_soon(client.aclose)
         assert " closed, " in repr(client)
 
 
@@ -109,41 +96,26 @@ async def test_a_cancel_scope_around_open_does_not_reach_the_client() -> None:
         await client.aclose()
 
 
-async def test_opened_and_closed_twice() -> None:
+@pytest.mark.parametrize("by", ["open", "async with"])
+async def test_a_client_is_opened_only_once(by: str) -> None:
     client = a_client(generic())
+    await client.aclose()  # of a client that is not open
     async with beside():
-        await client.aclose()  # of a client that is not open
-        await client.open()
-        with pytest.raises(UsageError, match="opened only once"):
+        if by == "open":
             await client.open()
-        with pytest.raises(UsageError, match="opened only once"):
+        else:
             await client.__aenter__()
+        for again in (client.open, client.__aenter__):
+            with pytest.raises(UsageError, match="opened only once"):
+                await again()
         assert (await (await client.component()).get("PARAM_01")).value == 1
+        if by == "async with":
+            await client.__aexit__(None, None, None)
+            assert " closed, " in repr(client)
         await client.aclose()
         await client.aclose()
         with pytest.raises(UsageError, match="opened only once"):
             await client.open()
-
-
-async def test_several_tasks_close_at_once() -> None:
-    client = a_client(generic())
-    await client.open()
-    async with beside():
-        async with anyio.create_task_group() as tasks:
-            for _ in range(3):
-                tasks.start_soon(client.aclose)
-        assert " closed, " in repr(client)
-
-
-async def test_async_with_closes_what_it_opens() -> None:
-    client = a_client(generic())
-    async with beside():
-        async with client:
-            with pytest.raises(UsageError, match="opened only once"):
-                await client.open()
-            assert (await (await client.component()).get("PARAM_01")).value == 1
-        assert " closed, " in repr(client)
-        await client.aclose()
 
 
 @pytest.mark.parametrize("how", ["cancelled", "aclose"])

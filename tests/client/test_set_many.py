@@ -24,7 +24,7 @@ from paramclient import (
 from paramclient.client.cache_writer import CacheWriter
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire import messages
-from tests.shell import VALUES, Tap, a_client, generic, in_simulated_time, residue, small_px4
+from tests.shell import VALUES, Tap, a_client, in_simulated_time, residue, small_px4
 
 MANY: dict[str, int | float] = {f"MANY_{number:03}": float(number) for number in range(200)}
 NEW: dict[str, int | float] = {name: value + 0.5 for name, value in MANY.items()}
@@ -69,23 +69,6 @@ async def test_each_value_has_an_outcome_of_its_own() -> None:
         assert sorted(map(str, seen)) == sorted(map(str, result.outcomes))
         with pytest.raises(KeyError):
             result["PARAM_02"]
-
-
-@in_simulated_time
-async def test_values_of_one_name_are_set_in_order() -> None:
-    tap = Tap(generic())
-    async with a_client(tap) as client:
-        component = await client.component()
-        await component.fetch_all()
-        result = await component.set_many(
-            [("PARAM_01", 5), ("PARAM_02", 1), ("PARAM_01", 6), ("PARAM_01", 4)]
-        )
-        assert result.is_complete
-        assert [each.requested for each in result.outcomes] == [5, 1, 6, 4]
-        assert result["PARAM_01"].requested == 4
-        assert component.params["PARAM_01"].value == 4
-        sent = [each.raw[0] for each in tap.messages(messages.ParamSet) if each.param_id == "PARAM_01"]
-        assert sent == [5, 6, 4]
 
 
 @in_simulated_time
