@@ -219,22 +219,6 @@ async def test_a_table_that_the_client_has_synced_by_itself_is_cached_whole(path
 
 
 @in_simulated_time
-async def test_a_vehicle_without_a_hash_is_shown_from_the_cache_and_downloaded(path: Path) -> None:
-    vehicle = ArduPilotVehicle(ftp=False, live=())
-    await session(vehicle, path)
-    tap = Tap(vehicle)
-    async with ParamClient(tap, cache=path) as client:
-        component = await client.component()
-        assert bits(component.params) == bits(vehicle.params)
-        assert trusts(component) == {Trust.CACHED}
-        assert (await component.fetch_all()).source == "stream"
-        assert trusts(component) == {Trust.LIVE}
-    assert not [
-        each for each in tap.messages(messages.ParamRequestRead) if each.param_id == messages.HASH_CHECK
-    ]
-
-
-@in_simulated_time
 async def test_everyone_on_the_link_starts_from_the_cache(path: Path) -> None:
     vehicles = [small_px4(system=system) for system in (1, 2, 3)]
     camera = generic(system=1, component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)

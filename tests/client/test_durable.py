@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import anyio
 import pytest
 
 from paramclient import CacheError, NotDurable, ParamCache, ParamClient, UsageError
@@ -45,22 +44,6 @@ async def test_a_durable_set_is_on_the_disk_with_its_line_when_it_returns(tmp_pa
                 assert other.execute("SELECT count(*) FROM history").fetchone() == (min(number + 1, 2),)
             with ParamCache(path) as cache:
                 assert cache.component().params[NAME].value == value
-
-
-@in_simulated_time
-async def test_durable_sets_at_the_same_time_share_the_work(tmp_path: Path) -> None:
-    with ParamCache(tmp_path / "cache") as cache:
-        async with ParamClient(small_px4(), cache=cache) as client:
-            component = await client.only_component()
-            await component.fetch_all()
-            with mock.patch.object(cache, "save", side_effect=cache.save) as save:
-                async with anyio.create_task_group() as tasks:
-                    for number in range(10, 20):
-                        tasks.start_soon(lambda name: component.set(name, 7, durable=True), f"PARAM_{number}")
-                synced = [call for call in save.call_args_list if call.kwargs["durable"]]
-                assert 1 <= len(synced) <= 5
-            values = cache.component().params
-            assert {values[f"PARAM_{number}"].value for number in range(10, 20)} == {7}
 
 
 @in_simulated_time

@@ -66,27 +66,6 @@ async def test_a_removed_parameter_leaves_the_cache(tmp_path: Path) -> None:
     assert history(path) == [("CAM_NAME", "Front", None, "vehicle")]
 
 
-@in_simulated_time
-async def test_plain_and_extended_tables_are_kept_apart(tmp_path: Path) -> None:
-    path = tmp_path / "cache"
-    async with ParamClient(Camera(TABLE, plain={"CAM_MODE": 0.5}), cache=path) as client:
-        component = await client.component(1, 100)
-        await component.fetch_all()
-        await component.ext.fetch_all()
-    assert kept(path)["CAM_MODE"] == 1
-    with ParamCache(path) as cache:
-        assert cache.component(component=100).params["CAM_MODE"].value == 0.5
-
-
-@in_simulated_time
-async def test_a_parameter_whose_index_another_one_has_leaves_the_cache(tmp_path: Path) -> None:
-    path = tmp_path / "cache"
-    for table in (TABLE, {"CAM_MODE": 1, "CAM_WB": 5, "CAM_ISO": 100}):
-        async with ParamClient(Camera(table), cache=path) as client:
-            await (await client.component(1, 100)).ext.fetch_all()
-        assert kept(path) == table
-
-
 @pytest.mark.parametrize("is_first", [True, False], ids=["before its autopilot", "after its autopilot"])
 @in_simulated_time
 async def test_a_camera_is_cached_with_its_vehicle(tmp_path: Path, is_first: bool) -> None:

@@ -78,55 +78,53 @@ async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str)
 
 
 @pytest.mark.parametrize(
-    ("fault", "longest"),
+    ("make", "closes_after", "longest"),
     [
-        ("none", 0.1),
-        ("deaf", 2.0),
-        ("dropped", 0),
-        ("failed", 0),
-        ("drops", 0.1),
-        ("fails", 0.1),
+        pytest.param(SimLink, None, 0.1, id="none"),
+        pytest.param(SimLink, None, 2.0, id="deaf"),
+        pytest.param(FlakyLink, 0.0, 0.0, id="dropped"),
+        pytest.param(SimLink, 0.0, 0.0, id="failed"),
+        pytest.param(FlakyLink, 0.1, 0.1, id="drops"),
+        pytest.param(SimLink, 0.1, 0.1, id="fails"),
     ],
-    ids=lambda value: value if isinstance(value, str) else "",
 )
 @in_simulated_time
-async def test_a_scope_around_a_client_ends_it_whatever_the_link_does(fault: str, longest: float) -> None:
+async def test_a_scope_around_a_client_ends_it_whatever_the_link_does(
+    make: Any, closes_after: float | None, longest: float
+) -> None:
     vehicle = with_files()
     tap = Tap(Air.symmetric([vehicle], delay=0.05))
-    link = FlakyLink(tap) if fault in ("dropped", "drops") else SimLink(tap)
+    link, is_deaf = make(tap), longest > 1.0
 
-    async def close_later() -> None:
-        await anyio.sleep(0.1)
+    async def close_link(after: float) -> None:
+        await anyio.sleep(after)
         await link.close()
 
-    with anyio.CancelScope() as scope:
-        async with a_client(link) as client:
-            component = await client.component()
-            reading = asyncio.ensure_future(outcome(component.read_file("/APM/LOGS/1.BIN")))
-            await anyio.sleep(0.3)
-            assert vehicle.open_files
-            tap.is_deaf = fault == "deaf"
-            if fault in ("dropped", "failed"):
-                await link.close()
-                await anyio.sleep(0.01)
-            if fault in ("drops", "fails"):
-                closing = asyncio.ensure_future(close_later())
-            scope.cancel()
-            cancelled_at = anyio.current_time()
-            await anyio.sleep_forever()
-    assert scope.cancelled_caught
-    took = anyio.current_time() - cancelled_at
-    assert took <= longest + 0.01
-    if fault in ("drops", "fails"):
-        await closing
+    async with anyio.create_task_group() as beside:
+        with anyio.CancelScope() as scope:
+            async with a_client(link) as client:
+                component = await client.component()
+                reading = asyncio.ensure_future(outcome(component.read_file("/APM/LOGS/1.BIN")))
+                await anyio.sleep(0.3)
+                assert vehicle.open_files
+                tap.is_deaf = is_deaf
+                if closes_after is not None:
+                    beside.start_soon(close_link, closes_after)
+                if closes_after == 0.0:
+                    await anyio.sleep(0.01)
+                scope.cancel()
+                cancelled_at = anyio.current_time()
+                await anyio.sleep_forever()
+        assert scope.cancelled_caught
+        assert anyio.current_time() - cancelled_at <= longest + 0.01
     ending = await reading
     assert isinstance(ending, LinkError)
-    assert isinstance(ending, ClientClosed) == (fault != "failed")
+    assert isinstance(ending, ClientClosed) == (make is FlakyLink or closes_after != 0.0)
     for _ in range(120):  # a burst of a second, which the vehicle ends first
         await anyio.sleep(0.01)
         tap.tick(anyio.current_time())
         tap.data_to_send()
-    assert bool(vehicle.open_files) == (fault in ("deaf", "dropped", "failed"))
+    assert bool(vehicle.open_files) == (is_deaf or closes_after == 0.0)
     assert not tasks_beside()
     assert isinstance(await outcome(component.file_checksum("/x")), ClientClosed)
 

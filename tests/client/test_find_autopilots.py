@@ -46,15 +46,10 @@ async def test_without_a_number_all_that_are_heard_in_3_s_are_returned() -> None
 
 
 @in_simulated_time
-async def test_no_vehicle_is_an_error() -> None:
+async def test_no_vehicle_is_an_error_and_none_cannot_be_expected() -> None:
     async with a_client(Air([])) as client:
         for expect in (None, 2):
             with pytest.raises(NoReply):
                 await client.find_autopilots(expect=expect, timeout=0.5)
-
-
-@in_simulated_time
-async def test_less_than_one_vehicle_cannot_be_expected() -> None:
-    async with a_client(fleet()) as client:
         with pytest.raises(UsageError, match="from 1 up, not 0"):
             await client.find_autopilots(expect=0)

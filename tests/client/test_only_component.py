@@ -36,8 +36,8 @@ async def test_the_only_vehicle_is_given_when_it_is_certain_and_at_once_from_the
         assert found.address == (1, 1)
         assert 0.5 + HEARTBEAT_WAIT <= simulated_time_loop().now - began < 0.5 + HEARTBEAT_WAIT + 0.1
         before = simulated_time_loop().now
-        for named in ({}, {"system": 1}, {"system": 1, "component": 1}, {"component": 1}):
-            assert await client.only_component(**named) is found
+        for named in ((None, None), (1, None), (1, 1), (None, 1)):
+            assert await client.only_component(*named) is found
         assert simulated_time_loop().now - before < 0.05
 
 

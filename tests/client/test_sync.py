@@ -22,7 +22,7 @@ from paramclient import (
     Trust,
     UsageError,
 )
-from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire import frames
 from paramclient.wire.messages import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet
 from tests.shell import (
@@ -72,15 +72,6 @@ def hashes(tap: Tap) -> int:
     return sum(each.param_id == HASH_CHECK for each in tap.messages(ParamRequestRead))
 
 
-async def change_silently(tap: Tap, vehicle: PX4Vehicle | ArduPilotVehicle, **values: float) -> None:
-    """Values change on board, and the messages that report it are lost."""
-    tap.is_mute = True
-    for name, value in values.items():
-        vehicle.set_param(name, value)
-    await asyncio.sleep(1.2)  # it does nothing before its next heartbeat
-    tap.is_mute = False
-
-
 async def away(tap: Tap, seconds: float) -> None:
     tap.is_mute = tap.is_deaf = True
     await asyncio.sleep(seconds)
@@ -99,7 +90,7 @@ async def test_an_update_that_was_lost_is_reported_within_one_interval() -> None
         await component.fetch_all()
         await asyncio.sleep(1.0)
         events, changes = client.events(), component.changes()
-        await change_silently(tap, vehicle, PARAM_01=1001, PARAM_02=1002)
+        vehicle.load({"PARAM_01": 1001, "PARAM_02": 1002})  # without a message
         began = anyio.current_time()
         assert component.params["PARAM_01"].value == 1
         with anyio.fail_after(11.0):
@@ -111,7 +102,6 @@ async def test_an_update_that_was_lost_is_reported_within_one_interval() -> None
         assert event == resynced(component, ("PARAM_01", "PARAM_02"), vehicle)
         assert anyio.current_time() - began <= 10.5
         assert component.sync_state is SyncState.SYNCED
-        assert component.state == "synced"
         assert component.state is ComponentState.SYNCED
         assert bits(component.params) == bits(vehicle.params)
         assert not residue(component)
@@ -260,19 +250,12 @@ async def test_a_watch_survives_a_link_that_drops_during_a_check() -> None:
         tap.is_deaf = link.is_offline = False
         await asyncio.sleep(15.0)
         assert component.sync_state is SyncState.SYNCED
-        await change_silently(tap, vehicle, PARAM_01=1001)
+        vehicle.load({"PARAM_01": 1001})  # without a message
         await asyncio.sleep(6.0)
         assert component.params["PARAM_01"].value == 1001
 
 
 # another vehicle in its place, and the cache
-
-
-class Berth(Tap):
-    """An address that one vehicle takes after the other."""
-
-    def moor(self, vehicle: Endpoint) -> None:
-        self.endpoint = vehicle
 
 
 def kept(path: Path) -> dict[tuple[str, int], object]:
@@ -285,7 +268,7 @@ def kept(path: Path) -> dict[tuple[str, int], object]:
 @pytest.mark.parametrize("answers", [True, False], ids=["says who it is late", "never says who it is"])
 @in_simulated_time
 async def test_a_strangers_values_never_reach_the_other_ones_cache(path: Path, answers: bool) -> None:
-    berth, camera = Berth(small_px4(uid=1)), Berth(generic(component=100, uid=1))
+    berth, camera = Tap(small_px4(uid=1)), Tap(generic(component=100, uid=1))
     async with a_client(Air([berth, camera]), cache=path) as client:
         component = await client.component()
         await client.fetch_all()
@@ -294,8 +277,8 @@ async def test_a_strangers_values_never_reach_the_other_ones_cache(path: Path, a
         stranger = small_px4(uid=2)
         stranger.set_param("PARAM_01", 1001)
         late = LateVersion(stranger), LateVersion(generic(component=100, uid=2, table={"PARAM_01": 1001}))
-        berth.moor(late[0])
-        camera.moor(late[1])
+        berth.endpoint = late[0]
+        camera.endpoint = late[1]
         await until(lambda: component.state != "lost")
         eye = client.components[1, 100]
         assert (await component.get("PARAM_01")).value == 1001
@@ -391,7 +374,7 @@ async def test_hash_only_requests_the_hash_alone(path: Path) -> None:
             assert param.trust is (Trust.CACHED if name in VOLATILE else Trust.VERIFIED)
         await asyncio.sleep(100.0)
         assert requested(tap) == hashes(tap) == 1
-        await change_silently(tap, vehicle, PARAM_02=1002)
+        vehicle.load({"PARAM_02": 1002})  # without a message
         result = await component.fetch_all()
         assert (result.hash, result.source) == (None, "cache")
         assert "hash-only" in result.notes[0]
@@ -456,13 +439,13 @@ async def test_several_listeners_hear_the_same() -> None:
 
 @in_simulated_time
 async def test_a_durable_write_to_a_vehicle_that_does_not_say_who_it_is_is_not_sent(path: Path) -> None:
-    berth = Berth(small_px4(uid=1))
+    berth = Tap(small_px4(uid=1))
     async with a_client(berth, cache=path) as client:
         component = await client.component()
         await component.fetch_all()
         await away(berth, 9.0)
         stranger = small_px4(uid=2)
-        berth.moor(LateVersion(stranger))
+        berth.endpoint = LateVersion(stranger)
         await until(lambda: component.state != "lost")
         with pytest.raises(CacheError, match="which vehicle"):
             await component.set("PARAM_01", 1001, durable=True)
