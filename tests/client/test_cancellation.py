@@ -133,67 +133,49 @@ async def a_session() -> AsyncIterator[tuple[ParamClient, Component]]:
         yield client, await client.component()
 
 
-def registered(client: ParamClient) -> list[object]:
-    """What is registered in any component."""
-    found: list[object] = []
-    for component in client.components.values():
-        found += residue(component)
-    return found
+def is_idle(client: ParamClient) -> bool:
+    """Whether nothing is registered in any component."""
+    return not any(residue(each) for each in client.components.values())
 
 
 async def check_after(call: Call, client: ParamClient, component: Component) -> None:
     """A call was cancelled: nothing is left, and it can be made again."""
-    assert not registered(client)
+    assert is_idle(client)
     await call(client, component)
     await settled()
-    assert not registered(client)
+    assert is_idle(client)
     await asyncio.sleep(0.5)
-    assert not any(residue(each) for each in client.components.values())
+    assert is_idle(client)
 
 
 @EVERY_CALL
-@pytest.mark.parametrize("late", [False, True], ids=["before", "after"])
+@pytest.mark.parametrize("how", ["before", "after", "task", "scope"])
 @in_simulated_time
-async def test_cancelled_at_each_suspension(call: Call, late: bool) -> None:
-    for number in range(1, POINTS_MAX):
-        async with a_session() as (client, component):
-            before = tasks_beside()
-            struck = Struck(call(client, component), number, late=late)
-            task = asyncio.create_task(struck)
-            await asyncio.wait([task])
-            assert task.cancelled() == struck.is_struck
-            await settled()
-            assert tasks_beside() == before
-            await check_after(call, client, component)
-        assert not tasks_beside()
-        if not struck.is_struck:
-            break
-    assert 1 < number < POINTS_MAX - 1
-
-
-@EVERY_CALL
-@pytest.mark.parametrize("by", ["task", "scope"])
-@in_simulated_time
-async def test_cancelled_after_each_round(call: Call, by: str) -> None:
+async def test_cancelled_at_each_point(call: Call, how: str) -> None:
     loop = simulated_time_loop()
+    in_rounds = how in ("task", "scope")
     for number in range(1, POINTS_MAX):
         async with a_session() as (client, component):
-            scope = anyio.CancelScope()
+            before, scope = tasks_beside(), anyio.CancelScope()
 
             async def scoped() -> None:
                 with scope:  # noqa: B023 - it has ended before the next one is made
                     await call(client, component)
 
-            task = asyncio.create_task(scoped())
-            loop.run_between_rounds(task, task.cancel if by == "task" else scope.cancel, after=number)
+            struck = Struck(scoped(), 0 if in_rounds else number, late=how == "after")
+            task = asyncio.create_task(struck)
+            if in_rounds:
+                loop.run_between_rounds(task, scope.cancel if how == "scope" else task.cancel, after=number)
             await asyncio.wait([task])
+            is_struck = struck.is_struck or loop.has_run_action
             # a task that goes on already leaves its scope without another look at it
             was_cancelled = task.cancelled() or scope.cancelled_caught
-            assert was_cancelled == loop.has_run_action or (by == "scope" and not was_cancelled)
+            assert was_cancelled == is_struck or (how == "scope" and not was_cancelled)
             await settled()
+            assert tasks_beside() == before
             await check_after(call, client, component)
         assert not tasks_beside()
-        if not loop.has_run_action:
+        if not is_struck:
             break
     assert 1 < number < POINTS_MAX - 1
 
@@ -209,7 +191,7 @@ async def test_cancelled_while_the_link_is_disconnected(call: Call) -> None:
         await asyncio.sleep(1.0)
         task.cancel()
         await asyncio.wait([task])
-        assert not registered(client)
+        assert is_idle(client)
         link.is_offline = False
         await asyncio.sleep(1.0)
         await check_after(call, client, component)
