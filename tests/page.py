@@ -21,7 +21,7 @@ from paramclient.service import Hub, Tokens, serve
 from paramclient.sim import ArduPilotVehicle, Camera, PX4Vehicle, Vehicle
 from paramclient.wire.frames import Frame
 from paramclient.wire.messages import Message
-from tests.simulation import clamped
+from tests.shell import clamped
 
 __all__ = ["BROWSER", "BROWSER_OPTIONS", "HIGHEST", "HOSTILE", "Bench", "at_work"]
 

@@ -6,8 +6,10 @@ import asyncio
 import functools
 import math
 import selectors
+import struct
 import time
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, ParamSpec, TypeVar
 from unittest import mock
@@ -170,6 +172,14 @@ def small_px4(*, volatile: Collection[str] = ("CAL_ACC0_XOFF", "PARAM_03"), **op
         for name, value in {**VALUES, "CAL_ACC0_XOFF": 0.5}.items()
     ]
     return PX4Vehicle(**{"table": rows} | options)
+
+
+def clamped(message: messages.Message, name: str, low: float, high: float) -> messages.Message:
+    """A set of this parameter of an ArduPilot with its value in this range; any other message as it is."""
+    if not isinstance(message, messages.ParamSet) or message.param_id != name:
+        return message
+    (value,) = struct.unpack("<f", message.raw)
+    return replace(message, raw=struct.pack("<f", min(max(value, low), high)))
 
 
 def generic(**options: Any) -> GenericVehicle:

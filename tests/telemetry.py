@@ -8,7 +8,6 @@ from typing import Self
 from paramclient.links.tlog import packed_time
 from paramclient.model.values import Encoding, ParamType, encode_value
 from paramclient.wire import messages
-from tests.simulation import param_value
 
 NOW = 1_700_000_000.0
 UID = "00000000deadbeef"
@@ -52,9 +51,8 @@ class Log:
 
     def report(self, name: str, index: int = 65535, **values: int) -> Self:
         self.values |= values
-        count = len(self.values)
-        kind = ParamType.INT32
-        return self.say(param_value(name, self.values[name], index=index, count=count, kind=kind))
+        raw = encode_value(self.values[name], ParamType.INT32, Encoding.BYTEWISE)
+        return self.say(messages.ParamValue(name, raw, ParamType.INT32, len(self.values), index))
 
     def change(self, name: str, value: int) -> Self:
         return self.report(name, **{name: value})

@@ -23,10 +23,10 @@ from paramclient.links.replay import PAUSE_MAX
 from paramclient.logs.logged_params import ImportedTable
 from paramclient.logs.telemetry import import_log
 from paramclient.model.identity import Identity
-from paramclient.model.values import Param
+from paramclient.model.paramset import WrittenParam
+from paramclient.model.values import ParamType
 from tests.recordings import DATA, from_vehicle, param_values, read
 from tests.shell import in_simulated_time
-from tests.simulation import known
 from tests.telemetry import KEY, NOW, UID, Log
 
 
@@ -215,16 +215,17 @@ def test_the_order_of_logs_does_not_matter(is_reversed: bool, tmp_path: Path) ->
         assert round(vehicle.last_seen - NOW) == 1011
 
 
-def save(cache: Path, at: float, *params: Param, by: str = BY_US, firmware: int = 8) -> None:
-    identity = Identity(1, "udp", UID, firmware=firmware)
-    stored = [StoredParam.of(each, at, by=by) for each in params]
+def save(cache: Path, at: float, **values: int) -> None:
+    identity = Identity(1, "udp", UID, firmware=8)
+    params = [WrittenParam(name, value, ParamType.INT32) for name, value in values.items()]
+    stored = [StoredParam.of(each, at, by=BY_US) for each in params]
     with ParamCache(cache) as kept:
         kept.save(TableUpdate(identity=identity, component=1, autopilot=12, at=at, params=stored))
 
 
 def test_later_observations_in_the_cache_stay(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
-    save(cache, NOW + 5000.0, known("A", 77))
+    save(cache, NOW + 5000.0, A=77)
     imported(whole(A=1, B=2).write(tmp_path / "flight.tlog"), cache=cache)
     assert kept_values(cache) == {"A": 77, "B": 2}
     assert lines(cache) == [("A", 1, 77, "vehicle", 5000.0)]
@@ -237,8 +238,8 @@ def test_later_observations_in_the_cache_stay(tmp_path: Path) -> None:
 
 def test_a_change_that_was_also_received_live_has_one_line(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
-    save(cache, NOW + 0.2, known("A", 1))
-    save(cache, NOW + 10.25, known("A", 3))
+    save(cache, NOW + 0.2, A=1)
+    save(cache, NOW + 10.25, A=3)
     assert len(lines(cache)) == 1
     log = whole(A=1).wait(9.0).change("A", 3).wait(1.0).beat()
     imported(log.write(tmp_path / "flight.tlog"), cache=cache)
@@ -249,7 +250,7 @@ def test_a_name_removed_later_is_not_restored(tmp_path: Path) -> None:
     """Also from an incomplete table: the removal is the later observation."""
     cache = tmp_path / "cache"
     log = whole(A=1, OLD=2).write(tmp_path / "flight.tlog")
-    save(cache, NOW + 100.0, known("A", 1), known("OLD", 2))
+    save(cache, NOW + 100.0, A=1, OLD=2)
     who = Identity(1, "udp", UID)
     at = NOW + 200.0
     gone = TableUpdate(identity=who, component=1, autopilot=12, at=at, params=[StoredParam.gone("OLD", at)])

@@ -37,8 +37,7 @@ from paramclient.provision import (
 )
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, SimParam
 from paramclient.wire import frames, messages
-from tests.shell import FlakyLink, Tap, a_client, in_simulated_time, residue
-from tests.simulation import clamped
+from tests.shell import FlakyLink, Tap, a_client, clamped, in_simulated_time, residue
 
 SETTINGS: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     f"TUNE_{number:02}": number / 4 if number % 3 else number for number in range(30)
