@@ -40,7 +40,6 @@ from tests.shell import (
     Radio,
     Tap,
     bits,
-    generic,
     in_simulated_time,
     outcome,
     settled,
@@ -68,15 +67,6 @@ async def session(
         if work is not None:
             await work(component)
         return result
-
-
-async def set_while_disconnected(vehicle: PX4Vehicle, **values: float) -> None:
-    """Change values on board while no client is connected."""
-    for name, value in values.items():
-        vehicle.set_param(name, value)
-    await asyncio.sleep(5.0)
-    vehicle.tick(anyio.current_time())
-    vehicle.data_to_send()
 
 
 def kept(path: Path, system: int = 1) -> dict[str, int]:
@@ -179,7 +169,7 @@ async def test_a_fetch_waits_for_the_cached_table(path: Path) -> None:
 async def test_a_change_between_two_sessions_is_a_cache_miss(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
-    await set_while_disconnected(vehicle, PARAM_01=1000, PARAM_05=5000)
+    vehicle.load({"PARAM_01": 1000, "PARAM_05": 5000})
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.component()
         changes = component.changes()
@@ -218,24 +208,6 @@ async def test_a_table_that_the_client_has_synced_by_itself_is_cached_whole(path
     assert (await session(smaller, path)).source == "cache"
 
 
-@in_simulated_time
-async def test_everyone_on_the_link_starts_from_the_cache(path: Path) -> None:
-    vehicles = [small_px4(system=system) for system in (1, 2, 3)]
-    camera = generic(system=1, component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
-    for source in ("stream", "cache"):
-        async with ParamClient(Air([*vehicles, camera]), cache=path) as client:
-            everything = await client.fetch_all()
-            assert {result.source for address, result in everything.results.items() if address[1] == 1} == {
-                source
-            }
-            assert everything.results.keys() == {(1, 1), (2, 1), (3, 1), (1, 100)}
-            assert not everything.silent
-    assert [vehicle.requests["PARAM_REQUEST_LIST"] for vehicle in vehicles] == [1, 1, 1]
-    with ParamCache(path) as cache:
-        assert len(cache.components()) == 4
-        assert bits(cache.component(system=1, component=100).params) == bits(camera.params)
-
-
 class Reticent(PX4Vehicle):
     """It can ignore messages of some kinds."""
 
@@ -266,20 +238,6 @@ async def test_a_silent_component_with_a_cached_table_delays_no_other_component(
 
 
 # Who it is
-
-
-@in_simulated_time
-async def test_two_vehicles_with_one_system_id_keep_two_tables(path: Path) -> None:
-    vehicles = small_px4(uid=0xA), small_px4(uid=0xB)
-    vehicles[1].set_param("PARAM_01", 77)
-    for source in ("stream", "cache"):
-        for vehicle in vehicles:
-            result = await session(vehicle, path)
-            assert result.source == source
-            assert bits(result.params) == bits(vehicle.params)
-    with ParamCache(path) as cache:
-        assert len(cache.vehicles()) == 2
-        assert not any(cache.history(each.key) for each in cache.vehicles())
 
 
 @pytest.mark.parametrize("known", [False, True])

@@ -12,7 +12,6 @@ from unittest import mock
 import pytest
 
 from paramclient import CacheError, NotDurable, ParamCache, ParamClient, UsageError
-from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.provision import apply
 from tests.shell import in_simulated_time, small_px4
 
@@ -54,7 +53,7 @@ async def test_without_a_disk_nothing_is_sent_or_it_is_said_what_the_vehicle_has
         with pytest.raises(UsageError, match="durable needs a cache"):
             await component.set(NAME, 5.0, durable=True)
         with pytest.raises(UsageError, match="durable needs a cache"):
-            await apply(component, ParamSet({NAME: WrittenParam(NAME, 5.0)}), durable=True)
+            await apply(component, {NAME: 5.0}, durable=True)
     assert vehicle.values[NAME] != 5.0
     async with ParamClient(vehicle, cache=tmp_path / "cache") as client:
         component = await client.only_component()
@@ -71,10 +70,8 @@ async def test_without_a_disk_nothing_is_sent_or_it_is_said_what_the_vehicle_has
 async def test_a_durable_apply_ends_on_the_disk(tmp_path: Path) -> None:
     async with ParamClient(vehicle := small_px4(), cache=tmp_path / "cache") as client:
         component = await client.only_component()
-        wanted = ParamSet({NAME: WrittenParam(NAME, 5.0)})
-        assert (await apply(component, wanted, durable=True)).complete
+        assert (await apply(component, {NAME: 5.0}, durable=True)).complete
         with no_disk():
-            wanted = ParamSet({NAME: WrittenParam(NAME, 6.0)})
-            result = await apply(component, wanted, durable=True)
+            result = await apply(component, {NAME: 6.0}, durable=True)
         assert isinstance(result.error, CacheError)
         assert vehicle.values[NAME] == 6.0

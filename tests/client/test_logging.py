@@ -7,11 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import anyio
 import pytest
 
 from paramclient.cli import run
-from tests.shell import FlakyLink, a_client, generic, in_simulated_time, small_px4
+from tests.shell import a_client, in_simulated_time, small_px4
 
 WATCHED = "paramclient"
 
@@ -35,18 +34,6 @@ async def test_each_step_is_one_line(caplog: pytest.LogCaptureFixture, tmp_path:
     ):
         assert any(words in each for each in steps), words
     assert len(steps) < 20, "values of a list are not reported one by one"
-
-
-@in_simulated_time
-async def test_a_link_that_drops_and_returns_is_reported(caplog: pytest.LogCaptureFixture) -> None:
-    link = FlakyLink(generic())
-    with caplog.at_level(logging.DEBUG, WATCHED):
-        async with a_client(link) as client:
-            await client.component()
-            await link.drop()
-            await anyio.sleep(3.0)
-    levels = {each.levelname for each in caplog.records if each.name == "paramclient.client.link_task"}
-    assert levels == {"WARNING", "INFO"}
 
 
 def test_nothing_is_printed_unless_requested() -> None:

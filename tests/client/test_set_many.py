@@ -101,17 +101,9 @@ async def test_nothing_is_sent_if_an_argument_is_wrong(values: dict[str, int], m
             await component.set_many(values)
         with pytest.raises(UsageError, match="settle"):
             await component.set_many({"PARAM_01": 1}, settle=-1)
+        assert (await component.set_many({})).is_complete
         await asyncio.sleep(1.0)
         assert not tap.messages(messages.ParamSet)
-
-
-@in_simulated_time
-async def test_no_values_are_no_writes() -> None:
-    async with a_client(small_px4()) as client:
-        component = await client.component()
-        result = await component.set_many({})
-        assert result.outcomes == ()
-        assert result.is_complete
 
 
 @in_simulated_time
