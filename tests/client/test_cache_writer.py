@@ -52,11 +52,6 @@ ODD = ("CAL_ACC0_XOFF", "PARAM_03", "PARAM_07")
 """Volatile parameters that cannot be determined from the hash alone: two are of no group that usually is."""
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "cache" / "parameters.sqlite3"
-
-
 async def session(
     endpoint: Endpoint, path: Path | ParamCache, work: Callable[[Component], Any] | None = None
 ) -> FetchResult:

@@ -44,11 +44,6 @@ VOLATILE = {"CAL_ACC0_XOFF", "PARAM_03"}
 MISSES = (ParamRequestRead, ParamRequestList, ParamSet)
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "parameters.sqlite3"
-
-
 async def drained(events: Events) -> list[Event]:
     """Take the events that wait for a listener."""
     taken: list[Event] = []

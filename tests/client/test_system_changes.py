@@ -22,11 +22,6 @@ HOUR = 3600.0
 DAY = 24 * HOUR
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "cache" / "parameters.sqlite3"
-
-
 class Wall:
     """The time of day that the cache uses: it goes on with the clock of the loop, and can be set."""
 

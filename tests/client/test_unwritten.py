@@ -28,11 +28,6 @@ def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(database, "LOCK_WAIT_MAX", 0.05)
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "cache.sqlite3"
-
-
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
     """Another program holds the file for itself alone."""
