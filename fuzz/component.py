@@ -22,7 +22,7 @@ import anyio.lowlevel
 
 from fuzz.draw import Draw
 from paramclient.errors import LinkError, ParamClientError
-from paramclient.model.values import Encoding, Param, ParamType, Trust, WireValue, is_portable_name
+from paramclient.model.values import Encoding, Param, ParamType, Trust, Value, is_portable_name
 from paramclient.protocol import session as session_module
 from paramclient.protocol import station as station_module
 from paramclient.protocol import table as table_module
@@ -57,7 +57,7 @@ COMPONENTS: Final = (1, 1, 100, 190)
 COUNTS: Final = (8, 8, 8, 9, 3, 0, 1, 65534, 65535)
 KINDS: Final = (9, 6, 1, 4, 5, 2, 3, 7, 8, 10, 0, 11, 255)
 AUTOPILOTS: Final = (12, 3, 0, 8)
-VALUES: Final[tuple[WireValue, ...]] = (0.0, 1, -1.5, 300, 1e39, math.nan, b"\1\2\3\4", -0.0)
+VALUES: Final[tuple[Value, ...]] = (0.0, 1, -1.5, 300, 1e39, math.nan, b"\1\2\3\4", -0.0)
 PAUSES: Final = (0.0, 0.001, 0.02, 0.1, 0.3, 1.0, 2.5, 5.1, 20.0, 70.0, 120.0)
 CALLS_MAX: Final = 12
 """Conversations at once."""

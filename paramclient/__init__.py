@@ -49,8 +49,7 @@ from paramclient.errors import (
 from paramclient.files import ParamFile, read_file, write_file
 from paramclient.model.comparison import Comparison, compare
 from paramclient.model.identity import Identity
-from paramclient.model.params import ParamMap
-from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.paramset import ParamMap, ParamSet, WrittenParam
 from paramclient.model.values import Encoding, Param, ParamType, Settable, Trust, Value
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.events import Change

@@ -6,13 +6,13 @@ import struct
 from collections.abc import Sequence
 from typing import TypeVar
 
-from paramclient.model.values import Encoding, ParamType, WireValue, encode_value
+from paramclient.model.values import Encoding, ParamType, Value, encode_value
 from paramclient.sim import Endpoint
 from paramclient.wire import frames, messages
 
 __all__ = ["LIST", "PERIODIC_MESSAGES", "SMALL", "Station", "cast", "indices", "names", "read", "write"]
 
-SMALL: dict[str, WireValue | tuple[ParamType | int, WireValue]] = {
+SMALL: dict[str, Value | tuple[ParamType | int, Value]] = {
     "A_FLOAT": 1.5,
     "B_INT": 7,
     "C_BYTE": (ParamType.UINT8, 200),

@@ -16,7 +16,7 @@ import anyio.abc
 import anyio.from_thread
 
 from paramclient.links import SimLink
-from paramclient.model.values import ParamType, WireValue
+from paramclient.model.values import ParamType, Value
 from paramclient.service import Hub, Tokens, serve
 from paramclient.sim import ArduPilotVehicle, Camera, PX4Vehicle, Vehicle
 from paramclient.wire.frames import Frame
@@ -31,7 +31,7 @@ BROWSER_OPTIONS = [
     *("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
 ]
-HOSTILE: dict[str, WireValue | tuple[ParamType, WireValue]] = {
+HOSTILE: dict[str, Value | tuple[ParamType, Value]] = {
     "<b>BOLD</b>": 1.0,
     "<iframe/>": (ParamType.INT32, 2),
     "'\"></script>": (ParamType.INT32, 3),

@@ -39,7 +39,7 @@ from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 from paramclient.model.identity import Identity, commit_text, hardware_id
-from paramclient.model.values import WireValue
+from paramclient.model.values import Value
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.sim import Vehicle
 from paramclient.wire import frames, messages
@@ -141,7 +141,7 @@ def replay(
     name: str,
     *,
     phase: float = 0.0,
-    on_board: Iterable[tuple[float, str, WireValue]] = (),
+    on_board: Iterable[tuple[float, str, Value]] = (),
 ) -> Messages:
     """Send the vehicle the ground station's frames of a log; return its messages that `wire` decodes.
 
@@ -150,7 +150,7 @@ def replay(
             are due. The vehicle has then been on for a second.
         on_board: changes on board: time, parameter, and new value.
     """
-    inputs: list[tuple[float, bytes | tuple[str, WireValue]]] = [
+    inputs: list[tuple[float, bytes | tuple[str, Value]]] = [
         *((record.time, record.data) for record in from_ground(name)),
         *((time, (param, value)) for time, param, value in on_board),
         (read(name)[-1].time + 0.05, b""),

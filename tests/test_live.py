@@ -14,7 +14,7 @@ import anyio.from_thread
 import anyio.lowlevel
 import pytest
 
-from paramclient.model.values import ParamType, WireValue
+from paramclient.model.values import ParamType, Value
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from tests.live import __main__ as suite
 from tests.live.checks import checks
@@ -23,7 +23,7 @@ from tests.simulated_on_udp import flying
 
 pytestmark = pytest.mark.slow
 
-CHANNELS: dict[str, WireValue] = {
+CHANNELS: dict[str, Value] = {
     f"RC{channel}_{what}": value
     for channel in range(1, 17)
     for what, value in {"DZ": 0.0, "TRIM": 1500.0, "MIN": 1000.0, "MAX": 2000.0}.items()
@@ -39,7 +39,7 @@ ARDUPILOT_TABLE = {
     "RC16_OPTION": (ParamType.INT16, 300),
     "RC15_OPTION": (ParamType.INT16, 0),
 }
-GROUP: dict[str, dict[str, WireValue | tuple[ParamType, WireValue]]]
+GROUP: dict[str, dict[str, Value | tuple[ParamType, Value]]]
 GROUP = {"GRIP_ENABLE": {"GRIP_GRAB": (ParamType.INT16, 1900), "GRIP_REGRAB": 1.5}}
 
 

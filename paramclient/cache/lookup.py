@@ -21,7 +21,7 @@ from typing import Final
 from paramclient.cache.records import CachedVehicle
 from paramclient.errors import AmbiguousVehicle, UnknownVehicle
 from paramclient.model.identity import autopilot_name, has_autopilot
-from paramclient.model.wording import counted
+from paramclient.model.names import counted
 
 KINDS: Final = ("px4", "ardupilot")
 """Autopilots that name a vehicle where only one has them."""

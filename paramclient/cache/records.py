@@ -9,8 +9,7 @@ from typing import Any, Final, NamedTuple
 
 from paramclient.errors import UsageError
 from paramclient.model.identity import Identity, autopilot_name
-from paramclient.model.params import ParamMap
-from paramclient.model.paramset import WrittenParam
+from paramclient.model.paramset import ParamMap, WrittenParam
 from paramclient.model.values import WIRE_SIZE, Param, Trust, bits_of, byte_length, from_bits, same_bits
 
 BY_VEHICLE: Final = "vehicle"

@@ -31,7 +31,7 @@ from paramclient.cache.records import (
 )
 from paramclient.errors import UsageError
 from paramclient.model.identity import Identity
-from paramclient.model.params import ParamMap
+from paramclient.model.paramset import ParamMap
 from paramclient.model.px4_hash import hash_bits
 
 YEAR_10000: Final = 253402300800.0

@@ -33,10 +33,10 @@ from paramclient.errors import (
     UsageError,
 )
 from paramclient.files import ParamFile
+from paramclient.model.names import age_in_words, counted, first_of
 from paramclient.model.notation import typed
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import format_value
-from paramclient.model.wording import age_in_words, counted, first_of
 from paramclient.protocol.fetch import Progress
 from paramclient.provision import CATEGORIES, ApplyProgress, ApplyResult, ApplyRow, ApplyStatus, Plan, plan
 from paramclient.provision import apply as apply_to_vehicle

@@ -15,10 +15,9 @@ from paramclient.cli.param_names import check_given
 from paramclient.cli.time_arguments import parse_time
 from paramclient.errors import UsageError
 from paramclient.model.identity import autopilot_name
-from paramclient.model.names import NameChoice
+from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import hash_text, time_or_none
 from paramclient.model.values import Param, format_value
-from paramclient.model.wording import counted
 from paramclient.provision.sources import component_of, tables_in
 
 _DEFAULTS: Final = CacheOptions()

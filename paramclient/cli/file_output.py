@@ -5,9 +5,9 @@ from __future__ import annotations
 from paramclient.cli.output import local_time
 from paramclient.files.formats import address
 from paramclient.model.identity import autopilot_name
+from paramclient.model.names import counted
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, WireValue, format_value
-from paramclient.model.wording import counted
+from paramclient.model.values import ParamType, Value, format_value
 
 
 def described(params: ParamSet) -> str:
@@ -31,5 +31,5 @@ def value_text(param: WrittenParam) -> str:
     return _text(param.settable, param)
 
 
-def _text(value: WireValue, param: WrittenParam) -> str:
+def _text(value: Value, param: WrittenParam) -> str:
     return format_value(value, ParamType.REAL32 if param.type is None else param.type)

@@ -15,10 +15,10 @@ from paramclient.cli.json_output import (
     vehicle_json,
 )
 from paramclient.model.comparison import ChangedSide, DifferenceStatus
-from paramclient.model.defaults import DefaultSource
 from paramclient.model.identity import version_text
 from paramclient.model.notation import Scalar, typed, value_json
-from paramclient.model.values import ParamType, WireValue
+from paramclient.model.paramset import DefaultSource
+from paramclient.model.values import ParamType, Value
 from paramclient.provision.planning import ApplyStatus
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def rows_json(rows: Iterable[ApplyRow]) -> JsonObject:
     """Return what is planned for parameters, or what became of them, by name in the file."""
 
     def row_json(row: ApplyRow) -> JsonObject:
-        def value(given: WireValue | None) -> Scalar | None:
+        def value(given: Value | None) -> Scalar | None:
             return None if given is None else value_json(*typed(given, row.type))
 
         return {

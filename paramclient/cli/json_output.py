@@ -9,7 +9,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from paramclient.model.defaults import add_default, default_of
 from paramclient.model.identity import autopilot_name, version_text
 from paramclient.model.notation import (
     Scalar,
@@ -22,6 +21,7 @@ from paramclient.model.notation import (
     value_json,
     value_written,
 )
+from paramclient.model.paramset import add_default, default_of
 from paramclient.model.values import Param, ParamType, format_value
 from paramclient.protocol.identity import kind_in_words
 

@@ -30,10 +30,9 @@ from paramclient.metadata import (
     read_metadata,
 )
 from paramclient.metadata.store import AddedFiles
-from paramclient.model.defaults import Default, DefaultSource
-from paramclient.model.paramset import ParamSet
-from paramclient.model.values import WireValue, format_value
-from paramclient.model.wording import counted
+from paramclient.model.names import counted
+from paramclient.model.paramset import Default, DefaultSource, ParamSet
+from paramclient.model.values import Value, format_value
 from paramclient.protocol.fetch import Progress
 
 MetadataChoice: TypeAlias = Annotated[str | None, Parameter(name="--metadata")]
@@ -165,7 +164,7 @@ def report_no_defaults() -> None:
 # Output
 
 
-def meaning_of(metadata: Metadata | None, name: str, value: WireValue) -> str | None:
+def meaning_of(metadata: Metadata | None, name: str, value: Value) -> str | None:
     """Return the meaning of a value in a word, or None."""
     info = info_of(metadata, name)
     return None if info is None else info.text(value) or None

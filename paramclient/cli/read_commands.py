@@ -27,11 +27,10 @@ from paramclient.cli.param_names import check_given, choose_names, suggest
 from paramclient.cli.session import CommandSession, sessions
 from paramclient.errors import ParamClientError
 from paramclient.metadata import Metadata
-from paramclient.model.defaults import Default, add_default, default_of
-from paramclient.model.names import NameChoice, is_pattern
+from paramclient.model.names import NameChoice, counted, first_of, is_pattern
 from paramclient.model.notation import hash_text
+from paramclient.model.paramset import Default, add_default, default_of
 from paramclient.model.values import Param, Trust, format_value
-from paramclient.model.wording import counted, first_of
 from paramclient.protocol.fetch import FetchResult
 
 AWAITED_NAMES_MAX: Final = 3

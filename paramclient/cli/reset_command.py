@@ -26,11 +26,9 @@ from paramclient.cli.read_commands import get_chosen
 from paramclient.cli.session import CommandSession
 from paramclient.errors import NoReply, UsageError, VehicleError
 from paramclient.metadata import Metadata
-from paramclient.model.defaults import default_of
-from paramclient.model.names import is_pattern
-from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.names import counted, first_of, is_pattern
+from paramclient.model.paramset import ParamSet, WrittenParam, default_of
 from paramclient.model.values import Param
-from paramclient.model.wording import counted, first_of
 
 RESET_NAMES_MAX: Final = 10
 """Parameters that a line names, so that it stays short; it gives the number of further ones."""

@@ -30,10 +30,8 @@ from paramclient.errors import UsageError, VehicleError
 from paramclient.files import FileFormat, writable, write_file
 from paramclient.files.formats import address, format_of_name
 from paramclient.metadata import Metadata
-from paramclient.model.defaults import default_of
-from paramclient.model.names import NameChoice
-from paramclient.model.paramset import ParamSet
-from paramclient.model.wording import counted, first_of
+from paramclient.model.names import NameChoice, counted, first_of
+from paramclient.model.paramset import ParamSet, default_of
 from paramclient.provision import sources
 
 _DEFAULTS: Final = LinkOptions()

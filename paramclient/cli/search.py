@@ -20,12 +20,11 @@ from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import local_time, print_json, print_line, print_table, report, say
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata, ParamInfo
-from paramclient.model.defaults import default_of
 from paramclient.model.identity import autopilot_name, has_autopilot
-from paramclient.model.names import NameChoice
+from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import time_text
+from paramclient.model.paramset import default_of
 from paramclient.model.values import Param, check_name, format_value
-from paramclient.model.wording import counted
 from paramclient.provision.sources import tables_in
 
 _DEFAULTS: Final = CacheOptions()

@@ -20,8 +20,8 @@ from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, NoReply, ParamClientError, UsageError
 from paramclient.links import LinkKind, ReplayLink
 from paramclient.model.identity import version_text
+from paramclient.model.names import first_of
 from paramclient.model.values import Trust
-from paramclient.model.wording import first_of
 from paramclient.protocol.fetch import FetchResult
 from paramclient.protocol.identity import HEARTBEAT_WAIT, expects_extended
 from paramclient.protocol.selection import address_in_words, hint_of_link, node_in_words

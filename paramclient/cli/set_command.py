@@ -21,8 +21,7 @@ from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.metadata.info import ParamInfo, number_of
-from paramclient.model.ext_values import parse_ext_value
-from paramclient.model.values import WireValue, check_name, format_value
+from paramclient.model.values import Value, check_name, format_value, parse_ext_value
 
 _DEFAULTS: Final = LinkOptions()
 
@@ -114,13 +113,13 @@ async def _prepare(
     return WriteJob(session, _values(texts, described), described)
 
 
-def _values(texts: Mapping[str, str], described: Metadata | None) -> dict[str, WireValue]:
+def _values(texts: Mapping[str, str], described: Metadata | None) -> dict[str, Value]:
     """Return the values of texts, which are numbers or names in the metadata.
 
     Raises:
         UsageError: a text is neither.
     """
-    values: dict[str, WireValue] = {}
+    values: dict[str, Value] = {}
     for name, text in texts.items():
         info = info_of(described, name)
         if info is None and not _is_number(text):
@@ -147,7 +146,7 @@ async def _prepare_extended(session: CommandSession, wanted: dict[str, str], *_:
     for error in errors.values():
         if not isinstance(error, UnknownParameter):  # the write reports that
             raise error
-    types, writes = {param.name: param.type for param in params}, dict[str, WireValue]()
+    types, writes = {param.name: param.type for param in params}, dict[str, Value]()
     for given, text in wanted.items():
         name = spelling(given, component)
         writes[name] = parse_ext_value(name, text, types[name]) if name in types else text

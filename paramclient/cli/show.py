@@ -29,9 +29,8 @@ from paramclient.cli.sources import check_link
 from paramclient.files.formats import address
 from paramclient.metadata import Metadata, MetadataStore
 from paramclient.model.comparison import non_defaults
-from paramclient.model.defaults import Default, add_default, default_of
 from paramclient.model.names import NameChoice
-from paramclient.model.paramset import ParamSet
+from paramclient.model.paramset import Default, ParamSet, add_default, default_of
 from paramclient.provision.sources import link_of, read_source, resolve
 
 _DEFAULTS: Final = CacheOptions()

@@ -16,10 +16,9 @@ from paramclient.cli.param_names import check_given
 from paramclient.cli.read_commands import get_chosen, report_all
 from paramclient.cli.session import CommandSession, Sessions, sessions
 from paramclient.client.events import Event
-from paramclient.model.names import NameChoice
+from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import hash_text, rounded, time_text
 from paramclient.model.values import format_value
-from paramclient.model.wording import counted
 from paramclient.protocol.channel import task_group
 from paramclient.protocol.events import Change
 

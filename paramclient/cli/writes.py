@@ -18,8 +18,8 @@ from paramclient.cli.param_names import suggest
 from paramclient.cli.session import CommandSession, Done, Sessions
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
-from paramclient.model.values import ParamType, WireValue, format_value
-from paramclient.model.wording import counted, first_of
+from paramclient.model.names import counted, first_of
+from paramclient.model.values import ParamType, Value, format_value
 from paramclient.protocol.fetch import Progress
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 
@@ -49,7 +49,7 @@ class WriteJob:
     columns: ClassVar[Sequence[str]] = ("name", "requested", "actual", "status")
 
     session: CommandSession
-    writes: Mapping[str, WireValue]
+    writes: Mapping[str, Value]
     described: Metadata | None
     arrived: dict[str, SetOutcome] = field(default_factory=dict)
 

@@ -23,8 +23,8 @@ from paramclient.client.streams import Subscribers
 from paramclient.client.traffic import Traffic, TrafficReport
 from paramclient.errors import AnotherVehicle, ClientClosed, NoReply, ParamClientError, UsageError
 from paramclient.links import Link, ReplayLink, SimLink, create_link
+from paramclient.model.names import counted
 from paramclient.model.values import Encoding
-from paramclient.model.wording import counted
 from paramclient.protocol import selection
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.fetch import Policy

@@ -17,15 +17,15 @@ from paramclient.client.signing import timestamp_now
 from paramclient.client.streams import Changes, Subscribers
 from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, NotDurable, ParamClientError, UsageError
 from paramclient.links.replay import ReplayLink
-from paramclient.model.ext_values import check_ext_value
 from paramclient.model.identity import Identity, autopilot_name
-from paramclient.model.params import ParamMap
+from paramclient.model.paramset import ParamMap
 from paramclient.model.values import (
     Encoding,
     Param,
     Settable,
     Trust,
-    WireValue,
+    Value,
+    check_ext_value,
     check_portable_name,
     check_value,
 )
@@ -623,7 +623,7 @@ class Component:
 
     async def _check_writes(
         self, values: Mapping[str, Settable] | Iterable[tuple[str, Settable]], settle: float, *, durable: bool
-    ) -> list[tuple[str, WireValue]]:
+    ) -> list[tuple[str, Value]]:
         """Check that values may be written, and return them with their names.
 
         Raises:

@@ -17,9 +17,9 @@ from paramclient.files.formats import AUTOPILOT, ENDINGS, FileFormat, ParamFile,
 from paramclient.files.other_files import kind_of
 from paramclient.files.reading import Reading, time_of
 from paramclient.model.identity import autopilot_name, version_text
+from paramclient.model.names import counted, first_of
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, bits_of, check_name, from_bits, same_bits
-from paramclient.model.wording import counted, first_of
 from paramclient.protocol import param_pck
 
 LEFT_OUT_SHOWN_MAX: Final = 20

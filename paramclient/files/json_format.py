@@ -27,7 +27,6 @@ from typing import Any, Final, NoReturn, TypeAlias
 from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import FileFormat, ParamFile
 from paramclient.files.reading import Reading, as_type, excerpt, is_plain, time_of, undecoded_byte
-from paramclient.model.ext_values import check_ext_value
 from paramclient.model.identity import Identity
 from paramclient.model.notation import bits_written, value_written
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -36,8 +35,9 @@ from paramclient.model.values import (
     TYPES_BY_NAME,
     WIRE_SIZE,
     ParamType,
-    WireValue,
+    Value,
     bits_of,
+    check_ext_value,
     check_name,
     from_bits,
 )
@@ -257,7 +257,7 @@ def _type(content: object) -> ParamType | int:
     raise UsageError(f"unknown type {text!r}; the types are {', '.join(TYPES_BY_NAME)}")
 
 
-def _number(content: object) -> WireValue:
+def _number(content: object) -> Value:
     if isinstance(content, str):
         if content in _WORDS:
             return _WORDS[content]
@@ -270,7 +270,7 @@ def _number(content: object) -> WireValue:
     raise UsageError(f"{_NUMBER_EXPECTED}{_found(content)}")
 
 
-def _custom(content: object) -> WireValue:
+def _custom(content: object) -> Value:
     """Return a CUSTOM value: text, or bytes after `hex:`."""
     text = _text(content)
     try:
@@ -280,7 +280,7 @@ def _custom(content: object) -> WireValue:
     return from_bits(bits_of(value, _CUSTOM), _CUSTOM)
 
 
-def _with_bits(value: WireValue, kind: ParamType | int | None, text: str) -> WireValue:
+def _with_bits(value: Value, kind: ParamType | int | None, text: str) -> Value:
     """Return the value of the bits, if it agrees with the given value; else raise UsageError."""
     if kind is None:
         raise UsageError("bits need a type")

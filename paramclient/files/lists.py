@@ -34,7 +34,7 @@ from paramclient.files.reading import (
     value_text,
 )
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, WireValue, check_portable_name, is_portable_name
+from paramclient.model.values import ParamType, Value, check_portable_name, is_portable_name
 
 FILES_MAX: Final = 64
 """Files that one file may include in total, nested or not. Two lines in each of a few files could include
@@ -265,7 +265,7 @@ def _qgc_value(text: str) -> int | float:
     return number
 
 
-def _fitting(value: int | float, kind: ParamType) -> WireValue:
+def _fitting(value: int | float, kind: ParamType) -> Value:
     try:
         return as_type(value, kind)
     except UsageError as error:

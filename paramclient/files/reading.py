@@ -13,10 +13,10 @@ from typing import Final, NamedTuple
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import FileFormat, ParamFile
+from paramclient.model.names import first_of
 from paramclient.model.notation import value_written
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, WireValue, bits_of, format_value, from_bits
-from paramclient.model.wording import first_of
+from paramclient.model.values import ParamType, Value, bits_of, format_value, from_bits
 
 FAULTS_MAX: Final = 20
 """Bad lines that an error lists: in a file of another kind, every line is bad."""
@@ -267,7 +267,7 @@ def parse_number(text: str) -> int | float | None:
     return value if found.lastgroup == "word" or math.isfinite(value) else None
 
 
-def as_type(value: WireValue, kind: ParamType | int) -> WireValue:
+def as_type(value: Value, kind: ParamType | int) -> Value:
     """Return the value in a parameter's type: a float32 for REAL32, an int for 6.0 as INT32.
 
     Raises:

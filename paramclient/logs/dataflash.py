@@ -20,7 +20,7 @@ from paramclient.logs.logged_params import OnboardLog, log_link
 from paramclient.metadata.store import ARDUPILOT, OLD_NAMES
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam
-from paramclient.model.values import WireValue, check_name, shortest_float
+from paramclient.model.values import Value, check_name, shortest_float
 from paramclient.wire.messages import MAV_AUTOPILOT_ARDUPILOTMEGA
 
 VEHICLE_TYPES: Final = {name: types[0] for name, types in ARDUPILOT.values()}
@@ -163,6 +163,6 @@ def _boot_time(fields: dict[str, Any]) -> float | None:
     return float(GPS_EPOCH + week * 604800 + time / 1e3 - GPS_LEAP_SECONDS - micros / 1e6)
 
 
-def _number(value: float) -> WireValue:
+def _number(value: float) -> Value:
     """Return a float32 as the number that a person would write."""
     return int(value) if value.is_integer() else shortest_float(value)

@@ -14,8 +14,8 @@ from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
 from paramclient.errors import UsageError
-from paramclient.model.values import ParamType, WireValue, format_value, shortest_float
-from paramclient.model.wording import counted
+from paramclient.model.names import counted
+from paramclient.model.values import ParamType, Value, format_value, shortest_float
 
 CHOICES_LISTED_MAX: Final = 12
 """Names that an error lists; of more names it lists the closest ones, so that the error stays readable."""
@@ -69,7 +69,7 @@ class ParamInfo:
     category: str = ""
     group: str = ""
 
-    def text(self, value: WireValue) -> str | None:
+    def text(self, value: Value) -> str | None:
         """Return the name of a value: `Loiter`, or for a mask `GPS|Baro`. None without a name.
 
         Bits without a name, or with a number as name, are appended as one hexadecimal number. `parse`
@@ -110,7 +110,7 @@ class ParamInfo:
             raise UsageError(f"{self.name}: {text!r} is not a number{self._suggestion(text)}")
         return value
 
-    def problem(self, value: WireValue) -> str | None:
+    def problem(self, value: Value) -> str | None:
         """Return why a value is invalid: it is outside the range. None for a valid value.
 
         Fractions are compared as float32, the precision of vehicles.

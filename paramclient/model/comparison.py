@@ -13,7 +13,7 @@ from enum import StrEnum
 from paramclient.errors import UsageError
 from paramclient.model.names import NameChoice
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, Value, WireValue, bits_of, from_bits, same_bits
+from paramclient.model.values import ParamType, Value, bits_of, from_bits, same_bits
 
 
 class DifferenceStatus(StrEnum):
@@ -234,7 +234,7 @@ def _common_type(left: WrittenParam, right: WrittenParam) -> ParamType | int | N
     return None if isinstance(left.value, int) and isinstance(right.value, int) else ParamType.REAL32
 
 
-def _bits(value: WireValue, number: ParamType | int) -> int | None:
+def _bits(value: Value, number: ParamType | int) -> int | None:
     """Return the bits of a value in a type, or None if the value does not fit."""
     try:
         return bits_of(value, number)

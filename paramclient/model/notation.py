@@ -8,13 +8,13 @@ from typing import TypeAlias
 
 from paramclient.errors import UsageError
 from paramclient.model.paramset import WrittenParam
-from paramclient.model.values import Param, ParamType, WireValue, format_value, shortest_float
+from paramclient.model.values import Param, ParamType, Value, format_value, shortest_float
 
 Scalar: TypeAlias = int | float | str
 """A value in strict JSON."""
 
 
-def value_json(value: WireValue, number: ParamType | int) -> Scalar:
+def value_json(value: Value, number: ParamType | int) -> Scalar:
     """Return a value in strict JSON: NaN and infinities as text, raw bytes as hexadecimal text.
 
     A REAL32 becomes the shortest number that rounds to the same float32.
@@ -28,12 +28,12 @@ def value_json(value: WireValue, number: ParamType | int) -> Scalar:
     return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
 
 
-def value_written(value: WireValue, param: WrittenParam) -> Scalar:
+def value_written(value: Value, param: WrittenParam) -> Scalar:
     """Return a written value in strict JSON; without a type, as the number that was written."""
     return value_json(value, ParamType.REAL64 if param.type is None else param.type)
 
 
-def typed(value: WireValue, number: ParamType | int | None) -> tuple[WireValue, ParamType | int]:
+def typed(value: Value, number: ParamType | int | None) -> tuple[Value, ParamType | int]:
     """Return a written value and the type in which to show it.
 
     A whole number for a REAL32 or REAL64 becomes a float. A value without a type is shown as a REAL32.

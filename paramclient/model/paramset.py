@@ -1,28 +1,30 @@
-"""Parameter sets without a vehicle: the contents of a file, a snapshot or a cached table."""
+"""Parameters by name: sets without a vehicle, such as files; a view of a table; the firmware's defaults."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from enum import StrEnum
+from types import MappingProxyType
+from typing import TypeVar
 
 from paramclient.errors import UsageError
-from paramclient.model.ext_values import check_ext_value
 from paramclient.model.identity import Identity
-from paramclient.model.names import ByName, NameChoice
+from paramclient.model.names import ByName, NameChoice, counted
 from paramclient.model.values import (
     WIRE_SIZE,
     Param,
     ParamType,
     Settable,
     Value,
-    WireValue,
     bits_of,
     byte_length,
+    check_ext_value,
     check_value,
     format_value,
+    from_bits,
     same_bits,
 )
-from paramclient.model.wording import counted
 
 
 @dataclass(frozen=True, slots=True, init=False)
@@ -57,9 +59,9 @@ class WrittenParam:
     def __init__(
         self,
         name: str,
-        value: WireValue,
+        value: Value,
         type: ParamType | int | None = None,  # noqa: A002 - the name of the field
-        default: WireValue | None = None,
+        default: Value | None = None,
         comment: str = "",
         line: int | None = None,
         is_raw: bool = False,
@@ -73,7 +75,7 @@ class WrittenParam:
             object.__setattr__(self, attribute.name, each)
 
     @property
-    def settable(self) -> WireValue:
+    def settable(self) -> Value:
         """The value as `set` takes it: the number, or the four raw bytes where `is_raw`."""
         if not self.is_raw:
             return self.value
@@ -199,3 +201,102 @@ class RestorePoint:
     at: float
     state: ParamSet
     changes: Mapping[str, float]
+
+
+AnyParam = TypeVar("AnyParam", Param, WrittenParam)
+
+
+class DefaultSource(StrEnum):
+    """The origin of a default.
+
+    Attributes:
+        VEHICLE: the vehicle, or the file or log that a parameter set is from, gives it with the value.
+        METADATA: the metadata of the firmware. It does not have the defaults of an airframe, which PX4 sets
+            by `param set-default`.
+    """
+
+    VEHICLE = "vehicle"
+    METADATA = "metadata"
+
+
+@dataclass(frozen=True, slots=True)
+class Default:
+    """The firmware's default of a parameter, as a number of the parameter's type, and its origin."""
+
+    value: Value
+    source: DefaultSource
+
+
+def default_of(param: Param | WrittenParam, described: Value | None = None) -> Default | None:
+    """Return the default of a parameter, or None if it is not known.
+
+    Every command, the service and the page use this rule: the default that the vehicle has given, else that
+    of the metadata as far as the type of the parameter can hold it.
+
+    Args:
+        param: the parameter.
+        described: the default in the metadata (`ParamInfo.default`), or None.
+    """
+    if param.default is not None:
+        return Default(param.default, DefaultSource.VEHICLE)
+    if described is None or isinstance(described, bytes):
+        return None
+    if param.type is None:
+        return Default(described, DefaultSource.METADATA)
+    try:
+        value = from_bits(bits_of(described, param.type), param.type)
+    except UsageError:  # not in the range of the type
+        return None
+    return None if isinstance(value, bytes) else Default(value, DefaultSource.METADATA)
+
+
+def add_default(param: AnyParam, described: Value | None) -> AnyParam:
+    """Return a parameter with its default; see `default_of`."""
+    if param.default is not None or described is None:
+        return param
+    default = default_of(param, described)
+    return param if default is None else replace(param, default=default.value)
+
+
+def add_defaults(params: ParamSet, described: Mapping[str, int | float]) -> ParamSet:
+    """Return a parameter set with its defaults; see `default_of`.
+
+    Args:
+        params: the set.
+        described: the defaults in the metadata by name, such as `Metadata.defaults_of`.
+    """
+    if not described:
+        return params
+    known = {name: add_default(each, described.get(name)) for name, each in params.items()}
+    return replace(params, params=known)
+
+
+class ParamMap(ByName[Param]):
+    """Parameters by name: a read-only view of a table that may still change.
+
+    An iteration is over the names at its start.
+
+    Args:
+        params: the table. It is not copied; its order is kept.
+    """
+
+    __slots__ = ("params",)
+
+    def __init__(self, params: Mapping[str, Param]) -> None:
+        self.params = MappingProxyType(params)
+
+    def changed(self, defaults: Mapping[str, Value] | None = None) -> dict[str, Param]:
+        """Return a copy of the parameters whose value differs from the firmware's default.
+
+        Parameters without a known default are left out.
+
+        Args:
+            defaults: defaults of parameters whose default the vehicle has not given (see `Param.default`), by
+                name, such as `Metadata.defaults_of`. They become the `default` of the returned parameters.
+        """
+        described = defaults or {}
+        known = (add_default(param, described.get(name)) for name, param in tuple(self.params.items()))
+        return {param.name: param for param in known if param.is_changed}
+
+    def __repr__(self) -> str:
+        return f"<ParamMap {counted(len(self), 'param')}>"

@@ -1,4 +1,4 @@
-"""Parameter types, the two wire encodings, and float32 comparison.
+"""Values of parameters: types, the two wire encodings, float32 comparison, values of extended parameters.
 
 A PARAM_VALUE has four bytes for the value, whatever its type. Two encodings are in use (MAVLink guide,
 "Parameter Protocol"). *Byte-wise*, the standard, copies the value's own bytes into the field. *C-cast*,
@@ -19,11 +19,9 @@ from typing import Final, SupportsFloat, SupportsIndex, TypeAlias
 from paramclient.errors import UsageError
 
 Value: TypeAlias = int | float | str | bytes
-"""The value of a parameter: a number; text or bytes for an extended parameter of the type CUSTOM."""
-
-WireValue: TypeAlias = int | float | str | bytes
-"""A value to write: a number, text, or bytes: the four bytes of the message where they cannot be decoded as a
-number of the type (see `Param.is_raw`)."""
+"""The value of a parameter: a number, text or bytes. Text and bytes are those of an extended parameter of the
+type CUSTOM; four bytes are those of a message that cannot be decoded as a number of the type (see
+`Param.is_raw`)."""
 
 Settable: TypeAlias = SupportsIndex | SupportsFloat | str | bytes
 """A value that can be set: a number, also of another library, or the four wire bytes."""
@@ -146,12 +144,12 @@ class Param:
     def __init__(
         self,
         name: str,
-        value: WireValue,
+        value: Value,
         type: ParamType | int,  # noqa: A002 - the name of the field
         index: int | None,
         bits: int,
         trust: Trust = Trust.LIVE,
-        default: WireValue | None = None,
+        default: Value | None = None,
         is_raw: bool = False,
     ) -> None:
         # The generated __init__ takes twice as long, and every PARAM_VALUE makes a Param.
@@ -167,7 +165,7 @@ class Param:
         _set_is_raw(self, is_raw or not 0 < type <= _CUSTOM)
 
     @property
-    def settable(self) -> WireValue:
+    def settable(self) -> Value:
         """The value as `set` takes it to write it to another vehicle: the four wire bytes where `is_raw`."""
         if not self.is_raw:
             return self.value
@@ -258,7 +256,7 @@ def check_portable_name(name: str) -> str:
     return name
 
 
-def check_value(value: Settable) -> WireValue:
+def check_value(value: Settable) -> Value:
     """Convert a caller's value to an int, a float or four raw bytes; else raise UsageError.
 
     Numbers of other libraries (numpy's, Decimal) are converted with `__index__` or `__float__`. Text is
@@ -292,7 +290,7 @@ def check_number(value: object, wanted: str = "a parameter value is a number") -
     raise UsageError(f"{wanted}, not {type(value).__name__}")
 
 
-def decode_value(raw: bytes, number: int, encoding: Encoding) -> tuple[WireValue, int]:
+def decode_value(raw: bytes, number: int, encoding: Encoding) -> tuple[Value, int]:
     """Decode the four wire bytes of a value.
 
     Args:
@@ -342,7 +340,7 @@ def encoding_of(raw: bytes, number: int) -> Encoding | None:
     return Encoding.C_CAST if is_cast else Encoding.BYTEWISE
 
 
-def encode_value(value: WireValue, number: int, encoding: Encoding) -> bytes:
+def encode_value(value: Value, number: int, encoding: Encoding) -> bytes:
     """Encode a value in the four wire bytes.
 
     Raises:
@@ -389,7 +387,7 @@ def as_reported(bits: int, number: int, encoding: Encoding) -> bytes:
     return (bits & 0xFFFFFFFF).to_bytes(4, "little")
 
 
-def from_bits(bits: int, number: int, *, is_raw: bool = False) -> WireValue:
+def from_bits(bits: int, number: int, *, is_raw: bool = False) -> Value:
     """Return the value with these bits: the inverse of `Param.bits`, for values kept on disk.
 
     Args:
@@ -429,7 +427,7 @@ def _text_or_bytes(bits: int) -> str | bytes:
     return text if all(each.isprintable() or each in "\t\r\n" for each in text) else raw
 
 
-def bits_of(value: WireValue, number: int) -> int:
+def bits_of(value: Value, number: int) -> int:
     """Return the value's own bytes in its type, as a little-endian unsigned number.
 
     Raises:
@@ -458,7 +456,7 @@ def bits_of(value: WireValue, number: int) -> int:
     return int(value) & (high - low)  # high - low has as many ones as the type has bits
 
 
-def _number_of(value: WireValue, number: int) -> tuple[int | float, ParamType]:
+def _number_of(value: Value, number: int) -> tuple[int | float, ParamType]:
     """Return a number and its type; UsageError for a value or a type that is no number."""
     if isinstance(value, str | bytes):
         raise UsageError(f"{value!r} is text, and the parameter is a number")
@@ -476,7 +474,7 @@ def same_bits(number: int, a: int, b: int) -> bool:
     return number == ParamType.REAL64 and a | b == 0x8000000000000000
 
 
-def format_value(value: WireValue, number: int = ParamType.REAL32) -> str:
+def format_value(value: Value, number: int = ParamType.REAL32) -> str:
     """Return the shortest text that parses to the same value: floats as float32, raw bytes as hexadecimal,
     bytes of a CUSTOM value as `hex:ff00fe`."""
     if isinstance(value, bytes):
@@ -514,3 +512,81 @@ def _to_float32(value: int | float, kind: ParamType) -> bytes:
         return _FLOAT32.pack(float(value))
     except OverflowError:
         raise UsageError(f"{value} is beyond the range of a float32, in which {kind.name} is sent") from None
+
+
+EXT_VALUE_SIZE: Final = 128
+"""Bytes of `param_value` in PARAM_EXT_VALUE, PARAM_EXT_SET and PARAM_EXT_ACK (MAVLink common message set)."""
+
+_SIZES: Final = {int(kind): kind.size for kind in TYPES_BY_NAME.values()}
+"""Bytes of a number, by its type."""
+
+
+def own_bytes(data: bytes, number: int) -> bytes:
+    """Return the bytes of a message's value that count for its type: all but zeros at the end, as the message
+    carries no length, for a type that is no number."""
+    size = _SIZES.get(number)
+    return data[:EXT_VALUE_SIZE].rstrip(b"\0") if size is None else data[:size].ljust(size, b"\0")
+
+
+def ext_param(
+    name: str, data: bytes, number: int, index: int | None = None, trust: Trust = Trust.LIVE
+) -> Param:
+    """Return the extended parameter whose value has these bytes, those of a message or of `ext_bytes`."""
+    bits = int.from_bytes(own_bytes(data, number), "little")
+    return Param(name, from_bits(bits, number), number, index, bits, trust)
+
+
+def ext_bytes(param: Param) -> bytes:
+    """Return the bytes of the value of an extended parameter, without zeros at the end of text and bytes."""
+    return param.bits.to_bytes(_SIZES.get(param.type, byte_length(param.bits)), "little")
+
+
+def check_ext_value(value: Settable) -> Value:
+    """Convert a caller's value to an int, a float, a str or bytes; else raise UsageError."""
+    if not isinstance(value, bytes | str):
+        return check_number(value, "an extended parameter is a number, text or bytes; a number")
+    data = value if isinstance(value, bytes) else value.encode(errors="surrogatepass")
+    if len(data) > EXT_VALUE_SIZE:
+        raise UsageError(f"the value has {len(data)} bytes; an extended parameter holds {EXT_VALUE_SIZE}")
+    if isinstance(value, str) and ("\0" in value or data != value.encode(errors="replace")):
+        raise UsageError("text for an extended parameter is UTF-8 without NUL; give bytes for anything else")
+    return value
+
+
+def encode_ext_value(value: Value, number: int) -> bytes:
+    """Return the bytes of a value in a type, as `own_bytes` does.
+
+    Raises:
+        UsageError: the value does not fit the type: a number only fits a numeric type, text and bytes only
+            CUSTOM, and bytes a type that MAVLink does not define.
+    """
+    name, is_custom = ParamType(number).name, number == ParamType.CUSTOM
+    if number in _SIZES:
+        if isinstance(value, str | bytes):
+            raise UsageError(f"{value!r} is not a number, and the parameter is {name}")
+        return bits_of(value, number).to_bytes(_SIZES[number], "little")
+    if isinstance(value, str) and is_custom:
+        value = value.encode()
+    if isinstance(value, bytes):
+        return own_bytes(value, number)
+    wanted = "text or bytes" if is_custom else "bytes"
+    raise UsageError(f"{value!r} is not {wanted}, and the parameter is {name}")
+
+
+def parse_ext_value(name: str, text: str, number: int) -> Value:
+    """Return the value that a text gives in a type: a number, text, or bytes after `hex:`.
+
+    Raises:
+        UsageError: the text is no value of this type.
+    """
+    try:
+        value: Value = bytes.fromhex(text.removeprefix(HEX)) if text.startswith(HEX) else text
+        if isinstance(value, str) and number in _SIZES:
+            value = float(text) if number >= ParamType.REAL32 else int(text, 0)
+    except ValueError:
+        raise UsageError(f"{name}: {text!r} is not a value of type {ParamType(number).name}") from None
+    try:
+        encode_ext_value(check_ext_value(value), number)
+    except UsageError as error:
+        raise UsageError(f"{name}: {error}") from None
+    return value

@@ -6,13 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from paramclient.model.ext_values import encode_ext_value, ext_param
 from paramclient.model.values import (
     Encoding,
     Param,
-    WireValue,
+    Value,
     bits_of_wire,
+    encode_ext_value,
     encode_value,
+    ext_param,
     from_bits,
 )
 from paramclient.wire import messages
@@ -58,7 +59,7 @@ class Dialect:
     read_request: type[messages.ParamRequestRead | messages.ParamExtRequestRead]
     set_request: type[messages.ParamSet | messages.ParamExtSet]
     has_ack: bool
-    encode: Callable[[WireValue, int, Encoding], bytes]
+    encode: Callable[[Value, int, Encoding], bytes]
     param: Callable[[str, bytes, int, int | None, Encoding], Param]
 
     def request_list(self, target: tuple[int, int]) -> Message:

@@ -11,9 +11,9 @@ from typing import Final, Literal, TypeAlias
 import anyio
 
 from paramclient.errors import NoReply
-from paramclient.model.params import ParamMap
+from paramclient.model.names import first_of
+from paramclient.model.paramset import ParamMap
 from paramclient.model.values import Param
-from paramclient.model.wording import first_of
 from paramclient.protocol.checksum import is_moving
 from paramclient.protocol.digest import Answer, ask, settle
 from paramclient.protocol.file_download import download_file

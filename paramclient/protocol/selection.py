@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from paramclient.errors import AmbiguousVehicle
-from paramclient.model.wording import counted, first_of
+from paramclient.model.names import counted, first_of
 from paramclient.protocol.addresses import peer_in_words
 from paramclient.protocol.identity import HEARTBEAT_WAIT, kind_in_words
 from paramclient.protocol.node import Node

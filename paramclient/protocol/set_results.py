@@ -9,7 +9,7 @@ from enum import StrEnum
 from typing import Literal
 
 from paramclient.errors import ParamClientError, ValueNotApplied
-from paramclient.model.values import Param, Value, WireValue, format_value
+from paramclient.model.values import Param, Value, format_value
 
 
 class SetStatus(StrEnum):
@@ -44,7 +44,7 @@ class SetResult:
 
     name: str
     status: Literal["accepted", "adjusted"]
-    requested: WireValue
+    requested: Value
     param: Param
     attempts: int
     note: str = ""
@@ -81,7 +81,7 @@ class SetOutcome:
     """
 
     name: str
-    requested: WireValue
+    requested: Value
     status: SetStatus
     result: SetResult | None = None
     error: ParamClientError | None = None
@@ -92,7 +92,7 @@ class SetOutcome:
         return self.status in (SetStatus.ACCEPTED, SetStatus.ADJUSTED)
 
     @property
-    def reported(self) -> WireValue | None:
+    def reported(self) -> Value | None:
         """The value that the vehicle has reported after the write, as `Param.settable`; None if none."""
         if self.result is not None:
             return self.result.param.settable

@@ -28,7 +28,7 @@ from paramclient.errors import (
 )
 from paramclient.model.identity import autopilot_name, reason_against_non_finite
 from paramclient.model.names import is_group_switch
-from paramclient.model.values import Param, ParamType, Trust, WireValue, format_value
+from paramclient.model.values import Param, ParamType, Trust, Value, format_value
 from paramclient.protocol.channel import Inbox, task_group
 from paramclient.protocol.reads import queue_time, read, read_param, refusal
 from paramclient.protocol.session import ReplacedValue, Session
@@ -63,7 +63,7 @@ DENIED: Final = "Param write denied ("
 async def write(
     session: Session,
     name: str,
-    value: WireValue,
+    value: Value,
     *,
     settle: float = 0.0,
     force: bool = False,
@@ -131,7 +131,7 @@ async def write(
 
 async def write_many(
     session: Session,
-    pairs: Sequence[tuple[str, WireValue]],
+    pairs: Sequence[tuple[str, Value]],
     *,
     progress: Callable[[SetOutcome], None] | None = None,
     timeout: float | None = None,
@@ -236,7 +236,7 @@ class _Write:
         session: Session,
         vehicles: int,
         before: Param,
-        value: WireValue,
+        value: Value,
         report: Callable[[SetResult | None], None],
     ) -> None:
         self.session = session
@@ -496,7 +496,7 @@ async def _ignore_late_answers(session: Session, late: ReplacedValue) -> None:
             await read(session, name)
 
 
-def _check_finite(session: Session, name: str, value: WireValue, *, force: bool) -> None:
+def _check_finite(session: Session, name: str, value: Value, *, force: bool) -> None:
     if force or not isinstance(value, float) or math.isfinite(value):
         return
     why = reason_against_non_finite(autopilot_name(session.identification.autopilot or 0))

@@ -12,8 +12,8 @@ import anyio
 from paramclient.cache import ParamCache
 from paramclient.client.component import Component
 from paramclient.errors import AlreadyRestored, NotInCache, ParamClientError, UnknownVehicle, UsageError
+from paramclient.model.names import age_in_words
 from paramclient.model.paramset import ParamSet, RestorePoint
-from paramclient.model.wording import age_in_words
 from paramclient.provision.apply_rules import OUT_OF_RANGE
 from paramclient.provision.execution import BEFORE_APPLY, BEFORE_RESTORE, ApplyOptions, ApplyResult, run
 from paramclient.provision.inspection import Wanted, wait_for_identity, wanted_set

@@ -23,7 +23,7 @@ from paramclient.model.values import (
     Encoding,
     Param,
     ParamType,
-    WireValue,
+    Value,
     format_value,
 )
 from paramclient.protocol.dialect import EXTENDED, PLAIN
@@ -99,8 +99,8 @@ class ApplyRow:
 
     wanted: WrittenParam
     status: ApplyStatus
-    before: WireValue | None = None
-    actual: WireValue | None = None
+    before: Value | None = None
+    actual: Value | None = None
     type: ParamType | int | None = None
     category: str = ""
     reason: str = ""
@@ -474,7 +474,7 @@ class _Planner:
         return lambda name: name.startswith(tuple(groups))
 
     def _find_fault(
-        self, target: WrittenParam, before: WireValue, kind: ParamType | int | None
+        self, target: WrittenParam, before: Value, kind: ParamType | int | None
     ) -> tuple[str, str] | None:
         """Return why a value is invalid, as category and sentence, or None."""
         value, info = target.settable, self.described.get(target.name)
@@ -508,13 +508,13 @@ class _Planner:
         reason = reason_against_non_finite(self.autopilot or usual)
         return (WRONG, reason) if reason else (OUT_OF_RANGE, f"{value} is not a finite number")
 
-    def _value_to_be(self, name: str) -> WireValue | None:
+    def _value_to_be(self, name: str) -> Value | None:
         """Return the wanted value of a parameter, or else its present value."""
         param: Param | WrittenParam | None = self.wanted.get(name) or self.current.get(name)
         return None if param is None else param.settable
 
 
-def _is_same(wanted: WireValue, current: WireValue, kind: ParamType | int | None) -> bool:
+def _is_same(wanted: Value, current: Value, kind: ParamType | int | None) -> bool:
     """Return whether two values are equal in the vehicle's type; as float32 if the type is unknown."""
     return same_value(*(WrittenParam("", value, kind) for value in (wanted, current)))
 

@@ -23,10 +23,9 @@ from paramclient.files import LARGEST_FILE, FileFormat, ParamFile, loads, read_f
 from paramclient.files.formats import AUTOPILOT
 from paramclient.logs.onboard import is_onboard_log, read_onboard_log
 from paramclient.model.comparison import defaults_of, non_defaults
-from paramclient.model.defaults import add_defaults
-from paramclient.model.paramset import ParamSet
+from paramclient.model.names import first_of
+from paramclient.model.paramset import ParamSet, add_defaults
 from paramclient.model.values import Param
-from paramclient.model.wording import first_of
 from paramclient.protocol.fetch import FetchResult
 
 STANDARD_INPUT: Final = "-"

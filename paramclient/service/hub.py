@@ -30,11 +30,10 @@ from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo, metadata_of
 from paramclient.metadata.info import number_of
-from paramclient.model.ext_values import parse_ext_value
 from paramclient.model.identity import Identity
 from paramclient.model.notation import Scalar, hash_text, rounded
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param, ParamType, WireValue
+from paramclient.model.values import Param, ParamType, Value, parse_ext_value
 from paramclient.protocol.channel import task_group
 from paramclient.protocol.fetch import FetchResult, Progress
 from paramclient.protocol.identity import expects_extended
@@ -287,7 +286,7 @@ class Target:
         kind = ParamType.REAL64 if known is None else known.type
         return outcome_json(found, kind, self.info(found.name))
 
-    async def values(self, given: Mapping[str, Scalar], *, force: bool = True) -> dict[str, WireValue]:
+    async def values(self, given: Mapping[str, Scalar], *, force: bool = True) -> dict[str, Value]:
         """Return the values of a request; with `force`, they may be outside the range in the metadata.
 
         Text for a number is the number: JavaScript rounds 64-bit integers.
@@ -297,12 +296,12 @@ class Target:
             ServiceError: 422, values are out of range.
             ParamClientError: the component did not send the type of an extended parameter.
         """
-        found: dict[str, WireValue] = {}
+        found: dict[str, Value] = {}
         faults: dict[str, str] = {}
         component = self.component
         for name, each in given.items():
             info = self.info(name)
-            value: WireValue | None = each
+            value: Value | None = each
             if isinstance(each, str) and component.is_extended:
                 known = component.params.get(name) or await component.get(name)
                 value = parse_ext_value(name, each, known.type)

@@ -13,8 +13,16 @@ from paramclient import errors
 from paramclient.client.component import Component
 from paramclient.client.streams import Stream
 from paramclient.errors import ExtAckResult, ParamClientError, ParamErrorCode
-from paramclient.model.ext_values import EXT_VALUE_SIZE, ext_bytes
-from paramclient.model.values import WIRE_SIZE, Encoding, Param, ParamType, Trust, as_reported
+from paramclient.model.values import (
+    EXT_VALUE_SIZE,
+    WIRE_SIZE,
+    Encoding,
+    Param,
+    ParamType,
+    Trust,
+    as_reported,
+    ext_bytes,
+)
 from paramclient.protocol.dialect import ReportedValue
 from paramclient.protocol.events import Change
 from paramclient.protocol.reads import read

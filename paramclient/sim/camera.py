@@ -8,8 +8,16 @@ from dataclasses import dataclass, field, replace
 from typing import Final, TypeAlias
 
 from paramclient.errors import ExtAckResult, UsageError
-from paramclient.model.ext_values import check_ext_value, encode_ext_value, ext_bytes, ext_param
-from paramclient.model.values import Param, ParamType, WireValue, check_name
+from paramclient.model.values import (
+    Param,
+    ParamType,
+    Value,
+    check_ext_value,
+    check_name,
+    encode_ext_value,
+    ext_bytes,
+    ext_param,
+)
 from paramclient.sim.param_table import Table, as_table, typed
 from paramclient.sim.vehicle import Vehicle
 from paramclient.wire import frames, messages
@@ -18,7 +26,7 @@ MAV_TYPE_CAMERA: Final = 30
 CAMERA_COMPONENT: Final = 100
 """MAV_COMP_ID_CAMERA."""
 
-ExtEntries: TypeAlias = Mapping[str, WireValue | tuple[ParamType | int, WireValue]]
+ExtEntries: TypeAlias = Mapping[str, Value | tuple[ParamType | int, Value]]
 """The extended parameters of a `Camera`: values by name, where an int becomes an INT32, a float a REAL32,
 text and bytes CUSTOM, and `(type, value)` gives another type."""
 
@@ -72,7 +80,7 @@ class Camera(Vehicle):
 
     table: ExtEntries | None = field(default=None, kw_only=False)
     component: int = CAMERA_COMPONENT
-    supported: Mapping[str, Collection[WireValue]] = field(default_factory=dict)
+    supported: Mapping[str, Collection[Value]] = field(default_factory=dict)
     failing: Iterable[str] = ()
     slow: Mapping[str, float] = field(default_factory=dict)
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -103,7 +111,7 @@ class Camera(Vehicle):
         return dict(self._ext)
 
     @property
-    def ext_values(self) -> dict[str, WireValue]:
+    def ext_values(self) -> dict[str, Value]:
         """The extended values by name, like `ext_params`."""
         return {name: param.value for name, param in self._ext.items()}
 
@@ -118,7 +126,7 @@ class Camera(Vehicle):
             raise UsageError(f"this camera has no extended parameter {name!r}")
         return param
 
-    def set_ext_param(self, name: str, value: WireValue) -> None:
+    def set_ext_param(self, name: str, value: Value) -> None:
         """Change an extended value as if on board: no message reports it.
 
         Raises:
@@ -127,7 +135,7 @@ class Camera(Vehicle):
         """
         self._change(name, encode_ext_value(value, self.ext_param(name).type))
 
-    def add_ext_param(self, name: str, entry: WireValue | tuple[ParamType | int, WireValue]) -> None:
+    def add_ext_param(self, name: str, entry: Value | tuple[ParamType | int, Value]) -> None:
         """Add an extended parameter behind the others; an entry is one of `ExtEntries`.
 
         Raises:

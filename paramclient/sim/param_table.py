@@ -16,7 +16,7 @@ from paramclient.model.values import (
     Encoding,
     Param,
     ParamType,
-    WireValue,
+    Value,
     as_reported,
     bits_of,
     check_name,
@@ -46,7 +46,7 @@ class SimParam:
 
     name: str
     type: ParamType | int
-    value: WireValue = field(compare=False)
+    value: Value = field(compare=False)
     volatile: bool = False
     default: float | None = None
     bits: int = field(init=False)
@@ -57,7 +57,7 @@ class SimParam:
         object.__setattr__(self, "bits", bits_of(self.value, self.type))
 
 
-Table: TypeAlias = Iterable[SimParam] | Mapping[str, WireValue | tuple[ParamType | int, WireValue]]
+Table: TypeAlias = Iterable[SimParam] | Mapping[str, Value | tuple[ParamType | int, Value]]
 """A table: `SimParam`s, or a mapping from names to values, where an int becomes an INT32, a float a REAL32,
 and `(type, value)` gives another type."""
 
@@ -86,7 +86,7 @@ class Entry:
         self.store(row.bits)
 
     @property
-    def value(self) -> WireValue:
+    def value(self) -> Value:
         return from_bits(self.bits, self.type)
 
     @property
@@ -130,7 +130,7 @@ def as_table(table: Table) -> tuple[SimParam, ...]:
     return tuple(SimParam(name, *typed(entry)) for name, entry in table.items())
 
 
-def typed(entry: WireValue | tuple[ParamType | int, WireValue]) -> tuple[ParamType | int, WireValue]:
+def typed(entry: Value | tuple[ParamType | int, Value]) -> tuple[ParamType | int, Value]:
     """Return the type and the value of an entry of a mapping."""
     if isinstance(entry, tuple):
         return entry

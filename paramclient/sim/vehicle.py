@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
 from paramclient.errors import ParamErrorCode, UsageError
-from paramclient.model.values import Encoding, Param, ParamType, WireValue, bits_of
+from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of
 from paramclient.protocol.param_pck import PackedParam
 from paramclient.sim.device import Device
 from paramclient.sim.ftp import FileServer
@@ -108,7 +108,7 @@ class Vehicle(Device):
         return {param.name: param for param in self.listed}
 
     @property
-    def values(self) -> dict[str, WireValue]:
+    def values(self) -> dict[str, Value]:
         """The listed values by name, like `params`."""
         return {param.name: param.settable for param in self.listed}
 
@@ -137,7 +137,7 @@ class Vehicle(Device):
         """The paths of the files that are open in a MAVFTP session."""
         return [] if self.file_server is None else self.file_server.open_files(self._now)
 
-    def set_param(self, name: str, value: WireValue) -> None:
+    def set_param(self, name: str, value: Value) -> None:
         """Change a value as if on board or by another station; announced as this kind of vehicle does.
 
         Raises:
@@ -146,7 +146,7 @@ class Vehicle(Device):
         entry = self._entry(name)
         self._write(entry, bits_of(value, entry.type))
 
-    def load(self, values: Mapping[str, WireValue]) -> None:
+    def load(self, values: Mapping[str, Value]) -> None:
         """Change values as code on board does that announces nothing, such as PX4's `param load`.
 
         Raises:

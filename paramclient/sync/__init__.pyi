@@ -15,8 +15,7 @@ from paramclient.links import Link
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.store import MetadataStore
 from paramclient.model.identity import Identity
-from paramclient.model.params import ParamMap
-from paramclient.model.paramset import ParamSet
+from paramclient.model.paramset import ParamMap, ParamSet
 from paramclient.model.values import Encoding, Param, Settable
 from paramclient.protocol import ftp
 from paramclient.protocol.addresses import Address

@@ -8,9 +8,8 @@ import pytest
 
 from paramclient.cache import SNAPSHOTS, ParamCache, StoredParam, TableState, history
 from paramclient.errors import CacheError, UnknownVehicle, UsageError
-from paramclient.model.ext_values import ext_param
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import Param, ParamType
+from paramclient.model.values import Param, ParamType, ext_param
 from tests.cache.conftest import Open
 from tests.caches import NOW, PX4, stored, update, values, whole_table
 

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 
 from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.errors import CacheError, UsageError
-from paramclient.model.ext_values import ext_param
 from paramclient.model.identity import Identity
 from paramclient.model.px4_hash import hash_bits
-from paramclient.model.values import Param, ParamType, Trust, from_bits
+from paramclient.model.values import Param, ParamType, Trust, ext_param, from_bits
 from tests.cache.conftest import Open
 from tests.caches import NOW, PX4, stored, update, values, whole_table
 

@@ -12,13 +12,13 @@ from typing import Any, TypeAlias
 import pytest
 
 from paramclient import Encoding, ParamType, read_file
-from paramclient.model.values import WireValue
+from paramclient.model.values import Value
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle
 from paramclient.wire import frames, messages
 from tests.commands import Command, Put
 from tests.conversations.partial import Partial
 
-TABLE: dict[str, WireValue | tuple[ParamType, WireValue]] = {
+TABLE: dict[str, Value | tuple[ParamType, Value]] = {
     "RTL_ALT": 1500,
     "WPNAV_SPEED": 500.0,
     "WPNAV_ACCEL": 100.0,
@@ -26,7 +26,7 @@ TABLE: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "EK2_ENABLE": (ParamType.INT8, 0),
     "BARO1_GND_PRESS": 94500.0,
 }
-GROUP: dict[str, WireValue | tuple[ParamType, WireValue]] = {"EK2_GPS_TYPE": (ParamType.INT8, 0)}
+GROUP: dict[str, Value | tuple[ParamType, Value]] = {"EK2_GPS_TYPE": (ParamType.INT8, 0)}
 File: TypeAlias = Callable[..., Path]
 """Writes a parameter file; returns its path."""
 

@@ -15,7 +15,7 @@ from paramclient.cache import StoredParam, TableState
 from paramclient.cli import session as cli_session
 from paramclient.links import SimLink
 from paramclient.model.identity import Identity
-from paramclient.model.values import Param, WireValue, bits_of
+from paramclient.model.values import Param, Value, bits_of
 from paramclient.sim import GenericVehicle, Vehicle
 from tests.caches import NOW, PX4, update
 from tests.commands import Command, in_process
@@ -28,7 +28,7 @@ SECOND = replace(PX4, system=2, uid="bb00000000000002")
 THIRD = replace(PX4, system=3, uid="cc00000000000003")
 
 Write: TypeAlias = Callable[..., str]
-Content = dict[str, tuple[WireValue, int] | tuple[WireValue, int, WireValue]]
+Content = dict[str, tuple[Value, int] | tuple[Value, int, Value]]
 
 
 @pytest.fixture

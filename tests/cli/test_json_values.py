@@ -12,12 +12,12 @@ from paramclient.cli.json_output import info_json, param_json, table_param_json
 from paramclient.metadata import ParamInfo
 from paramclient.model.notation import bits_written, typed, value_json
 from paramclient.model.paramset import WrittenParam
-from paramclient.model.values import Param, ParamType, Trust, WireValue, bits_of
+from paramclient.model.values import Param, ParamType, Trust, Value, bits_of
 
 THIRD = struct.unpack("<f", struct.pack("<f", 1 / 3))[0]
 
 
-def param(value: WireValue, kind: ParamType | int = ParamType.REAL32) -> Param:
+def param(value: Value, kind: ParamType | int = ParamType.REAL32) -> Param:
     bits = int.from_bytes(value, "little") if isinstance(value, bytes) else bits_of(value, kind)
     return Param("P", value, kind, None, bits)
 
@@ -37,7 +37,7 @@ def param(value: WireValue, kind: ParamType | int = ParamType.REAL32) -> Param:
         (b"\x01\x02\x03\x04", 99, "0x04030201"),
     ],
 )
-def test_values_are_exact(value: WireValue, kind: ParamType | int, shown: object) -> None:
+def test_values_are_exact(value: Value, kind: ParamType | int, shown: object) -> None:
     member = value_json(value, kind)
     assert (type(member), repr(member)) == (type(shown), repr(shown))
     text = json.dumps(param_json(param(value, kind)), allow_nan=False)

@@ -13,7 +13,7 @@ from paramclient.errors import (
     UsageError,
     ValueUnsupported,
 )
-from paramclient.model.values import WireValue
+from paramclient.model.values import Value
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read
 from paramclient.protocol.set_results import SetResult, SetStatus
@@ -41,7 +41,7 @@ async def test_values_of_every_type_are_fetched_read_and_set(loss: float) -> Non
         result = await fetch_all(session)
         assert (result.source, result.missing) == ("stream", ())
         assert dict(result.params) == dict(camera.ext_params.items())
-        new: dict[str, WireValue] = {
+        new: dict[str, Value] = {
             "CAM_MODE": 2**32 - 1,
             "CAM_TILT": -128,
             "CAM_STORAGE": 2**64 - 1,
@@ -184,7 +184,7 @@ async def test_many_are_set_and_a_lost_camera_ends_it() -> None:
     async with converse(endpoint) as conversation:
         session = (await conversation.node(*CAMERA)).extended
         await fetch_all(session)
-        pairs: list[tuple[str, WireValue]] = [(f"P{number:02}", number + 100) for number in range(60)]
+        pairs: list[tuple[str, Value]] = [(f"P{number:02}", number + 100) for number in range(60)]
         result = await write_many(session, pairs)
         assert {each.status for each in result.outcomes} == {SetStatus.ACCEPTED}
         assert list(camera.ext_values.values()) == [value for _, value in pairs]

@@ -22,7 +22,7 @@ from paramclient.errors import (
     UsageError,
     ValueNotApplied,
 )
-from paramclient.model.values import ParamType, Trust, WireValue
+from paramclient.model.values import ParamType, Trust, Value
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read, read_many, read_param
 from paramclient.protocol.session import Session
@@ -53,7 +53,7 @@ EVERY_TYPE = {
 }
 
 
-async def many(session: Session, pairs: Iterable[tuple[str, WireValue]]) -> list[SetOutcome]:
+async def many(session: Session, pairs: Iterable[tuple[str, Value]]) -> list[SetOutcome]:
     """Set several values; return the outcomes, after checking that each was reported once."""
     done: list[SetOutcome] = []
     result = await write_many(session, list(pairs), progress=done.append)
@@ -603,7 +603,7 @@ async def test_many_values_are_set_each_with_its_outcome(maker: type[PX4Vehicle]
             for each in vehicle.listed
             if each.type is ParamType.REAL32 and not each.name.startswith(("MPC", "BARO", "MIS_", "STAT"))
         ][:150]
-        pairs: list[tuple[str, WireValue]] = [(each.name, 0.5 + n) for n, each in enumerate(floats)]
+        pairs: list[tuple[str, Value]] = [(each.name, 0.5 + n) for n, each in enumerate(floats)]
         pairs.insert(70, ("NO_SUCH", 1))
         began = anyio.current_time()
         outcomes = await many(session, pairs)
@@ -666,7 +666,7 @@ async def test_a_link_that_fails_ends_a_batch_and_the_others_are_not_tried() -> 
     async with converse(Air.symmetric([vehicle], delay=0.3)) as conversation:
         session = (await conversation.node()).plain
         names = [each.name for each in vehicle.listed if each.type is ParamType.REAL32][:60]
-        pairs: list[tuple[str, WireValue]] = [(name, 0.25) for name in names]
+        pairs: list[tuple[str, Value]] = [(name, 0.25) for name in names]
         results: list[SetManyResult] = []
 
         async def set_all() -> None:

@@ -11,9 +11,8 @@ import pytest
 
 from paramclient.errors import FileError
 from paramclient.files import loads, read_file, write_file
-from paramclient.model.ext_values import ext_param
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType
+from paramclient.model.values import ParamType, ext_param
 from paramclient.sim import Camera
 
 KINDS = ParamType

@@ -14,7 +14,7 @@ from pymavlink.mavparm import MAVParmDict
 from paramclient import FileError, Identity, ParamFile, ParamSet, ParamType, WrittenParam
 from paramclient.errors import UsageError
 from paramclient.files import FileFormat, dumps, loads
-from paramclient.model.values import WireValue, bits_of, from_bits
+from paramclient.model.values import Value, bits_of, from_bits
 
 DATA = Path(__file__).parents[1] / "data"
 TYPED = [FileFormat.QGC, FileFormat.JSON]
@@ -27,7 +27,7 @@ def params_of(*params: WrittenParam, system: int | None = 1, component: int | No
     return ParamSet({param.name: param for param in params}, component, system)
 
 
-def numbered(values: list[WireValue], kind: ParamType) -> ParamSet:
+def numbered(values: list[Value], kind: ParamType) -> ParamSet:
     return params_of(*(WrittenParam(f"P{at}", value, kind) for at, value in enumerate(values)))
 
 
@@ -55,7 +55,7 @@ def failed(data: bytes | str, **options: object) -> FileError:
 @given(written=st.lists(finite_bits, min_size=1, max_size=60))
 @settings(max_examples=25, deadline=None)
 def test_finite_floats_round_trip(form: FileFormat, written: list[int]) -> None:
-    floats: list[WireValue] = [from_bits(each, ParamType.REAL32) for each in written]
+    floats: list[Value] = [from_bits(each, ParamType.REAL32) for each in written]
     assert bits(back(numbered(floats, ParamType.REAL32), form), ParamType.REAL32) == written
 
 
@@ -70,7 +70,7 @@ def test_integers_round_trip(form: FileFormat, kind: ParamType, data: st.DataObj
         return
     low, high = kind.bounds
     whole: list[int] = data.draw(st.lists(st.integers(low, high), max_size=40))
-    values: list[WireValue] = [low, high, *whole]
+    values: list[Value] = [low, high, *whole]
     read = back(numbered(values, kind), form)
     assert [param.value for param in read.values()] == values
     assert all(type(param.value) is int for param in read.values())
@@ -96,9 +96,7 @@ def test_nan_and_infinities_round_trip(form: FileFormat, value: float) -> None:
     ("value", "kind"),
     [(b"\x01\0\0\0", ParamType.INT32), (from_bits(0x7FC12345, ParamType.REAL32), ParamType.REAL32)],
 )
-def test_other_formats_reject_raw_bytes_and_payloads(
-    form: FileFormat, value: WireValue, kind: ParamType
-) -> None:
+def test_other_formats_reject_raw_bytes_and_payloads(form: FileFormat, value: Value, kind: ParamType) -> None:
     if form is FileFormat.PCK and kind is ParamType.REAL32:
         assert bits(back(numbered([value], kind), form), kind) == [0x7FC12345]
         return

@@ -14,7 +14,7 @@ import anyio
 
 from paramclient import Component, ParamSet, write_file
 from paramclient.errors import ParamClientError, VehicleArmed
-from paramclient.model.values import Param, WireValue, format_value
+from paramclient.model.values import Param, Value, format_value
 from paramclient.protocol.set_results import SetResult
 from paramclient.provision.apply_rules import rules_for
 
@@ -72,7 +72,7 @@ class Journal:
         )
         write_file(self.file, state)
 
-    async def set(self, vehicle: Component, name: str, value: WireValue) -> SetResult:
+    async def set(self, vehicle: Component, name: str, value: Value) -> SetResult:
         """Set a parameter as `Component.set` does; what it was before is noted first.
 
         Raises:

@@ -18,7 +18,7 @@ from paramclient.model.comparison import (
     same_value,
 )
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, WireValue, from_bits
+from paramclient.model.values import ParamType, Value, from_bits
 
 INT32, REAL32, REAL64 = ParamType.INT32, ParamType.REAL32, ParamType.REAL64
 NAN, OTHER_NAN = from_bits(0x7FC00000, REAL32), from_bits(0x7FC00001, REAL32)
@@ -43,11 +43,11 @@ STATUS_MIRRORED = {
 CHANGED_SIDE_MIRRORED = {ChangedSide.LEFT: ChangedSide.RIGHT, ChangedSide.RIGHT: ChangedSide.LEFT}
 
 
-def written(value: WireValue, number: int | None = None) -> WrittenParam:
+def written(value: Value, number: int | None = None) -> WrittenParam:
     return WrittenParam("P", value, number)
 
 
-def of(**values: WireValue) -> ParamSet:
+def of(**values: Value) -> ParamSet:
     return ParamSet({name: WrittenParam(name, value) for name, value in values.items()})
 
 

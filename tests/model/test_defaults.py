@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import pytest
 
-from paramclient.model.defaults import DefaultSource, add_default, add_defaults, default_of
-from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import Param, ParamType, WireValue, bits_of
+from paramclient.model.paramset import (
+    DefaultSource,
+    ParamSet,
+    WrittenParam,
+    add_default,
+    add_defaults,
+    default_of,
+)
+from paramclient.model.values import Param, ParamType, Value, bits_of
 
 
 def param(
     name: str,
-    value: WireValue,
+    value: Value,
     kind: ParamType | int = ParamType.REAL32,
     default: int | float | None = None,
 ) -> Param:

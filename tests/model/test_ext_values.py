@@ -11,14 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from paramclient.errors import UsageError
-from paramclient.model.ext_values import (
+from paramclient.model.values import (
     EXT_VALUE_SIZE,
+    Param,
+    ParamType,
+    Settable,
+    Value,
     check_ext_value,
     encode_ext_value,
     ext_bytes,
     ext_param,
 )
-from paramclient.model.values import Param, ParamType, Settable, Value
 
 KINDS = ParamType
 NAN = struct.pack("<f", math.nan)

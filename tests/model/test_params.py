@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from paramclient.model.params import ParamMap
+from paramclient.model.paramset import ParamMap
 from paramclient.model.values import Param, ParamType
 
 

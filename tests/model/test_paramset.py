@@ -7,10 +7,10 @@ import struct
 import pytest
 
 from paramclient.model.paramset import WrittenParam
-from paramclient.model.values import Param, ParamType, WireValue, bits_of
+from paramclient.model.values import Param, ParamType, Value, bits_of
 
 
-def held(value: WireValue, number: int, name: str = "P") -> Param:
+def held(value: Value, number: int, name: str = "P") -> Param:
     return Param(name, value, number, 0, bits_of(value, number))
 
 
@@ -29,7 +29,7 @@ def held(value: WireValue, number: int, name: str = "P") -> Param:
     ],
 )
 def test_a_written_value_is_compared_in_the_vehicles_type(
-    written: WireValue, value: WireValue, number: int, same: bool
+    written: Value, value: Value, number: int, same: bool
 ) -> None:
     assert WrittenParam("P", written).is_held_by(held(value, number)) is same
 

@@ -19,7 +19,7 @@ from paramclient.model.values import (
     Param,
     ParamType,
     Trust,
-    WireValue,
+    Value,
     bits_of,
     check_name,
     check_value,
@@ -67,7 +67,7 @@ def as_float32(value: float) -> float:
     return number
 
 
-def param(bits: int = 0x3F800000, value: WireValue = 1.0, kind: int = ParamType.REAL32, **more: Any) -> Param:
+def param(bits: int = 0x3F800000, value: Value = 1.0, kind: int = ParamType.REAL32, **more: Any) -> Param:
     return Param(**{"name": "P", "value": value, "type": kind, "index": 0, "bits": bits, **more})
 
 
@@ -356,5 +356,5 @@ def test_format_value_is_the_shortest_round_trip(pattern: int) -> None:
         (b"\x01\x00\x80\x7f", ParamType.INT64, "0x7f800001"),
     ],
 )
-def test_format_value(value: WireValue, kind: ParamType, text: str) -> None:
+def test_format_value(value: Value, kind: ParamType, text: str) -> None:
     assert format_value(value, kind) == text

@@ -24,7 +24,7 @@ from paramclient.errors import (
     VehicleArmed,
 )
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, WireValue
+from paramclient.model.values import ParamType, Value
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.provision import (
     MISSING,
@@ -39,11 +39,11 @@ from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, SimPa
 from paramclient.wire import frames, messages
 from tests.shell import FlakyLink, Tap, a_client, clamped, in_simulated_time, residue
 
-SETTINGS: dict[str, WireValue | tuple[ParamType, WireValue]] = {
+SETTINGS: dict[str, Value | tuple[ParamType, Value]] = {
     f"TUNE_{number:02}": number / 4 if number % 3 else number for number in range(30)
 }
 """Parameters that most of these tests set."""
-OTHERS: dict[str, WireValue | tuple[ParamType, WireValue]] = {
+OTHERS: dict[str, Value | tuple[ParamType, Value]] = {
     "STAT_RUNTIME": 5,
     "MAV_SYS_ID": 1,
     "SYSID_THISMAV": (ParamType.INT16, 1),
@@ -56,7 +56,7 @@ OTHERS: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "EK2_ENABLE": (ParamType.INT8, 0),
     "SMALL": (ParamType.INT8, 1),
 }
-GROUP: dict[str, WireValue | tuple[ParamType, WireValue]] = {
+GROUP: dict[str, Value | tuple[ParamType, Value]] = {
     "EK2_ALT_M_NSE": 3.0,
     "EK2_GPS_TYPE": (ParamType.INT8, 0),
 }
@@ -78,7 +78,7 @@ class ClampingVehicle(ArduPilotVehicle):
         super().respond(clamped(message, "TUNE_01", 0.0, 10.0), sender)
 
 
-CLAMPED: dict[str, WireValue | tuple[ParamType, WireValue]] = {
+CLAMPED: dict[str, Value | tuple[ParamType, Value]] = {
     "MPC_TILTMAX_AIR": 45.0,
     "MPC_TILTMAX_LND": 12.0,
     "MPC_XY_VEL_MAX": 12.0,
@@ -112,13 +112,13 @@ def px4(kind: type[PX4Vehicle] = PX4Vehicle, **options: Any) -> PX4Vehicle:
 EVERY_KIND = pytest.mark.parametrize("make", [ardupilot, px4], ids=["ardupilot", "px4"])
 
 
-def written(values: Mapping[str, WireValue], **options: Any) -> ParamSet:
+def written(values: Mapping[str, Value], **options: Any) -> ParamSet:
     return ParamSet({name: WrittenParam(name, value) for name, value in values.items()}, **options)
 
 
-def another(*names: str) -> dict[str, WireValue]:
+def another(*names: str) -> dict[str, Value]:
     """Return values that differ from those of SETTINGS."""
-    wanted: dict[str, WireValue] = {}
+    wanted: dict[str, Value] = {}
     for name in names or SETTINGS:
         value = SETTINGS[name]
         assert isinstance(value, int | float)
@@ -402,7 +402,7 @@ async def test_restore_writes_an_earlier_state_of_the_vehicle() -> None:
 
 @in_simulated_time
 async def test_restore_skips_measured_and_read_only_parameters() -> None:
-    own: dict[str, WireValue | tuple[ParamType, WireValue]]
+    own: dict[str, Value | tuple[ParamType, Value]]
     own = {"BARO1_GND_PRESS": 94500.0, "BARO1_DEVID": 65540, "INS_GYROFFS_X": 0.25, "LOCKED": 1.0}
     vehicle = ArduPilotVehicle(
         table=SETTINGS | OTHERS | own, read_only=["BARO1_GND_PRESS", "BARO1_DEVID", "LOCKED"], live_period=0.0
@@ -453,7 +453,7 @@ async def test_the_state_of_another_vehicle_is_refused() -> None:
 @in_simulated_time
 async def test_several_vehicles_are_set_and_restored_concurrently() -> None:
     vehicles = [ardupilot(), px4(system=2), ardupilot(system=3)]
-    own: dict[int, dict[str, WireValue]] = {1: {}, 2: {"TUNE_02": 42.0}, 3: {"SMALL": 1000}}
+    own: dict[int, dict[str, Value]] = {1: {}, 2: {"TUNE_02": 42.0}, 3: {"SMALL": 1000}}
     async with a_client(Air(vehicles)) as client:
         await client.fetch_all()
         components = [client.components[vehicle.system, 1] for vehicle in vehicles]
@@ -685,7 +685,7 @@ class Scenario:
             self.options = {"reboot": True, "include": "identity"}
         self.wanted = written(wanted)
 
-    def truth(self) -> dict[str, WireValue]:
+    def truth(self) -> dict[str, Value]:
         """Return all values of the vehicle, hidden ones included."""
         return {entry.name: entry.value for entry in self.vehicle.entries}
 

@@ -11,7 +11,7 @@ from paramclient.errors import UsageError
 from paramclient.metadata import ParamInfo
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import Encoding, Param, ParamType, WireValue, bits_of, from_bits
+from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, from_bits
 from paramclient.provision import CATEGORIES, MISSING, WRONG, ApplyStatus, Plan, plan_from
 from paramclient.provision.apply_rules import OUT_OF_RANGE, READ_ONLY
 from paramclient.sim.param_table import SimParam, ardupilot_table, px4_table
@@ -19,7 +19,7 @@ from paramclient.sim.param_table import SimParam, ardupilot_table, px4_table
 Info = partial(ParamInfo, "NAME")
 
 
-def held(**values: WireValue | tuple[ParamType | int, WireValue]) -> dict[str, Param]:
+def held(**values: Value | tuple[ParamType | int, Value]) -> dict[str, Param]:
     """Return a vehicle's table: an int is an INT32, a float a REAL32, other types are given."""
     table: dict[str, Param] = {}
     for name, entry in values.items():
@@ -30,7 +30,7 @@ def held(**values: WireValue | tuple[ParamType | int, WireValue]) -> dict[str, P
     return table
 
 
-def written(**values: WireValue) -> ParamSet:
+def written(**values: Value) -> ParamSet:
     return ParamSet({name: WrittenParam(name, value) for name, value in values.items()}, source="a file")
 
 
@@ -155,7 +155,7 @@ def test_parameters_that_are_no_settings_are_left_out_unless_included(
 def test_a_measured_value_is_a_calibration_if_the_vehicle_does_not_measure_it(
     autopilot: str, name: str, switch: str, value: int
 ) -> None:
-    def category(held_value: int, **wanted: WireValue) -> str:
+    def category(held_value: int, **wanted: Value) -> str:
         table = held(**{name: 1, switch: held_value})
         return plan_from(table, written(**{name: 2}, **wanted), autopilot=autopilot).rows[name].category
 
@@ -205,7 +205,7 @@ BYTEWISE, C_CAST = Encoding.BYTEWISE, Encoding.C_CAST
     ],
 )
 def test_a_value_that_the_parameter_cannot_take_is_invalid(
-    name: str, kind: ParamType, value: WireValue, encoding: Encoding, says: str
+    name: str, kind: ParamType, value: Value, encoding: Encoding, says: str
 ) -> None:
     table = held(**{name: (kind, 1)})
     made = plan_from(table, written(**{name: value}), encoding=encoding, include=CATEGORIES)

@@ -13,7 +13,7 @@ from paramclient.model.values import (
     Encoding,
     Param,
     ParamType,
-    WireValue,
+    Value,
     decode_value,
     encode_value,
     from_bits,
@@ -376,7 +376,7 @@ class TestReplay:
         recorded values."""
         name = "ardupilot_get_set"
         recorded = compared(from_vehicle(name))
-        events: list[tuple[float, str, WireValue]] = [
+        events: list[tuple[float, str, Value]] = [
             (time - 0.005, message.param_id, struct.unpack("<f", message.raw)[0])
             for time, message in recorded
             if isinstance(message, messages.ParamValue)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.model.px4_hash import hash_bits
-from paramclient.model.values import TYPES_BY_NAME, Param, ParamType, WireValue
+from paramclient.model.values import TYPES_BY_NAME, Param, ParamType, Value
 from paramclient.sim import (
     ArduPilotVehicle,
     FaultyLink,
@@ -177,9 +177,7 @@ class TestOptions:
 
 class TestGeneric:
     def test_every_type_byte_wise(self) -> None:
-        kinds: dict[str, tuple[int, WireValue]] = {
-            f"T{int(kind)}": (kind, 1) for kind in TYPES_BY_NAME.values()
-        }
+        kinds: dict[str, tuple[int, Value]] = {f"T{int(kind)}": (kind, 1) for kind in TYPES_BY_NAME.values()}
         vehicle = GenericVehicle(kinds | {"T77": (77, b"abcd")})
         station = Station(vehicle)
         by_name = {value.param_id: value for value in station.ask(LIST)}
