@@ -19,7 +19,7 @@ def main() -> NoReturn:
     """Run the command line with the arguments of the process, and exit with its exit code.
 
     Exits with 130 after Ctrl-C, 143 after SIGTERM and 141 when the output's reader has closed it, like
-    programs killed by these signals; `paramclient.cli.exit_codes` lists the other codes.
+    programs killed by these signals; `paramclient.cli.output` lists the other codes.
     """
     if missing := [name for name in COMMAND_LIBRARIES if find_spec(name) is None]:
         print(

@@ -9,9 +9,8 @@
 - `sources`: the parameters that an argument names: of a file, a link or the cache. `time_arguments`: times.
 - `param_names`: names and patterns of parameters, and suggestions.
 - `metadata`: descriptions and defaults that a subcommand uses.
-- `output`: tables, lines, the status line. `file_output`: sets of parameters in words.
+- `output`: tables, lines, the status line, exit codes. `file_output`: sets of parameters in words.
 - `json_output`, `json_apply`: JSON.
-- `exit_codes`: exit codes.
 """
 
 from __future__ import annotations

@@ -15,8 +15,7 @@ from typing import Final
 import anyio
 from cyclopts import App, CycloptsError, MissingArgumentError, Parameter
 
-from paramclient.cli.exit_codes import ExitCode, code_of, text_of
-from paramclient.cli.output import STDIN, report, say
+from paramclient.cli.output import STDIN, ExitCode, code_of, report, say, text_of
 from paramclient.errors import ParamClientError
 from paramclient.version import __version__
 

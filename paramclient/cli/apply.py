@@ -14,13 +14,22 @@ from typing import Any, ClassVar, Final
 import anyio
 import anyio.to_thread
 
-from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.file_output import described
 from paramclient.cli.json_apply import apply_json, plan_json, rows_json
 from paramclient.cli.json_output import JsonObject
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
 from paramclient.cli.options import ApplyFlags
-from paramclient.cli.output import Coloured, Status, can_ask, confirm, local_time, report, say
+from paramclient.cli.output import (
+    Coloured,
+    ExitCode,
+    Status,
+    can_ask,
+    code_of,
+    confirm,
+    local_time,
+    report,
+    say,
+)
 from paramclient.cli.session import ChosenVehicle, CommandSession, Done, Sessions, sessions
 from paramclient.cli.sources import check_pattern, fill_pattern, is_pattern_name, resolve_all
 from paramclient.cli.time_arguments import parse_when
@@ -91,7 +100,7 @@ async def apply(
     """
     source = _Files.open(file)
     if source is None:
-        (params,) = await resolve_all([file], options, writes=True, extended=options.extended)
+        (params,) = await resolve_all([file], options, writes=True)
 
     async def load(session: CommandSession) -> State:
         return State(params) if source is None else await source.state_of(session)
@@ -275,8 +284,8 @@ async def run(
     """
     check_pattern("the file of --backup", flags.backup, flags)
     given, file = from_file(metadata), None if source is None else source.file
-    extended = flags.extended or (file is not None and file.is_extended)
-    async with sessions(url, flags, writes=True, extended=extended) as found:
+    flags = replace(flags, extended=flags.extended or (file is not None and file.is_extended))
+    async with sessions(url, flags, writes=True) as found:
 
         async def job(session: CommandSession) -> _Job:
             state = await load(session)

@@ -7,10 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache, SnapshotSummary
-from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_output import history_json, snapshot_json
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import local_time, print_json, print_line, say, show
+from paramclient.cli.output import ExitCode, local_time, print_json, print_line, say, show
 from paramclient.cli.param_names import check_given
 from paramclient.cli.time_arguments import parse_time
 from paramclient.errors import UsageError

@@ -11,10 +11,17 @@ from typing import Annotated, Final
 import anyio
 from cyclopts import Parameter
 
-from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_output import JsonObject, taken
 from paramclient.cli.options import Seconds, TrafficOptions
-from paramclient.cli.output import Coloured, Status, milliseconds, print_json, print_line, print_table
+from paramclient.cli.output import (
+    Coloured,
+    ExitCode,
+    Status,
+    milliseconds,
+    print_json,
+    print_line,
+    print_table,
+)
 from paramclient.cli.session import ChosenVehicle, Deadline, listen, wait_for_vehicle
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component

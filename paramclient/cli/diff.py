@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
-from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.file_output import described, value_text
 from paramclient.cli.json_apply import diff_json
 from paramclient.cli.metadata import (
@@ -19,7 +18,7 @@ from paramclient.cli.metadata import (
     units_of,
 )
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import Coloured, print_json, print_table, say
+from paramclient.cli.output import Coloured, ExitCode, print_json, print_table, say
 from paramclient.cli.sources import resolve_all
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata
@@ -53,7 +52,6 @@ async def diff(
     only: tuple[str, ...] = (),
     partial: bool = False,
     metadata: MetadataChoice = None,
-    extended: bool = False,
     options: LinkOptions = _OPTIONS,
 ) -> ExitCode:
     """Compare the parameters of two files, links or vehicles in the cache.
@@ -69,7 +67,6 @@ async def diff(
         partial: Leave out parameters that only the right side has; if the right side is a file and the left
             one is not, those that only the left side has.
         metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
-        extended: Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them.
     """
     chosen = from_file(metadata, offline=True)
     if left == right and not is_offline(left):
@@ -78,7 +75,7 @@ async def diff(
             f"`paramclient fetch {left} --vehicle all`, then `paramclient diff 1 2`"
         )
     given = [left, right, *([] if base in (None, DEFAULTS) else [base or ""])]
-    first, second, *third = await resolve_all(given, options, extended=extended)
+    first, second, *third = await resolve_all(given, options)
     if partial and is_file(right) and not is_file(left):
         first = _limited(first, second)
     elif partial:

@@ -10,10 +10,9 @@ from typing import Final
 
 import anyio
 
-from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_output import JsonObject, taken
 from paramclient.cli.options import Seconds, TrafficOptions
-from paramclient.cli.output import clear_screen, milliseconds, print_json, print_line, print_table
+from paramclient.cli.output import ExitCode, clear_screen, milliseconds, print_json, print_line, print_table
 from paramclient.cli.session import Deadline, listen, received_in_words
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component

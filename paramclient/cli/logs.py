@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Final
 
 from paramclient.cache import ParamCache
-from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import print_json, print_table, report
+from paramclient.cli.output import ExitCode, code_of, print_json, print_table, report
 from paramclient.errors import FileError, LinkError, ParamClientError
 from paramclient.files.other_files import kind_of
 from paramclient.logs.logged_params import ImportedTable

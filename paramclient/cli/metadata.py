@@ -14,10 +14,9 @@ import anyio.to_thread
 from cyclopts import Parameter
 
 from paramclient.cache import CachedComponent, ParamCache
-from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_output import JsonObject
 from paramclient.cli.options import CacheOptions, LinkOptions
-from paramclient.cli.output import Status, print_json, print_line, report, say, show
+from paramclient.cli.output import ExitCode, Status, print_json, print_line, report, say, show
 from paramclient.cli.session import CommandSession, wait_for_firmware
 from paramclient.errors import UsageError
 from paramclient.metadata import (

@@ -106,6 +106,9 @@ class LinkOptions(TrafficOptions):
     no_cache: bool = False
     """Neither read nor write a cache."""
 
+    extended: bool = False
+    """Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them."""
+
     encoding: Annotated[Encoding | None, CONNECTION] = None
     """Encoding of values, if the component reports a wrong one."""
 
@@ -143,9 +146,6 @@ class ApplyFlags(LinkOptions):
 
     dry_run: bool = False
     """Print the values that would be sent, and send none of them."""
-
-    extended: bool = False
-    """Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them."""
 
     yes: bool = False
     """Do not ask for confirmation."""

@@ -15,17 +15,32 @@ import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from enum import IntEnum
 from typing import ClassVar, Final, Self, TextIO
 
 import anyio
 import anyio.to_thread
 
+from paramclient.errors import (
+    AmbiguousVehicle,
+    CacheError,
+    InvalidParameters,
+    LinkError,
+    NoReply,
+    PackError,
+    ParamClientError,
+    UnknownParameter,
+    UsageError,
+    VehicleError,
+)
 from paramclient.model.values import Param
 from paramclient.protocol.fetch import Progress
 
 STDIN: Final = "stdin:"
 """What `-` among the arguments becomes, which cyclopts would take for an option: the standard input."""
 
+LINE_NAMES_MAX: Final = 10
+"""Parameters or vehicles that a line names, so that it stays short; it gives the number of further ones."""
 NOTICE_INTERVAL: Final = 0.5
 """Seconds until a terminal shows the awaited response, as most arrive earlier, and between two updates."""
 DRAW_INTERVAL: Final = 0.1
@@ -283,3 +298,62 @@ class Status:
         left = "" if state.seconds_left is None else f", {state.seconds_left:.0f} s left"
         total = "?" if state.total is None else state.total
         return f"{self._title} {state.received}/{total} {state.rate:.0f}/s{left}"
+
+
+# Errors
+
+
+class ExitCode(IntEnum):
+    """The exit codes. If several apply, the highest one is used."""
+
+    DONE = 0
+    """The command succeeded."""
+    INCOMPLETE = 1
+    """The vehicle refused something, or some parameters are missing."""
+    DIFFERENT = 1
+    """The compared parameters differ."""
+    USAGE = 2
+    """The arguments are invalid."""
+    NO_ANSWER = 3
+    """No vehicle was heard, or it did not answer."""
+    LINK = 4
+    """The link failed."""
+    CACHE = 5
+    """The cache failed, or does not have the requested data."""
+
+
+def code_of(error: ParamClientError) -> ExitCode:
+    """Return the exit code for an error."""
+    return next(code for kind, code in _CODES.items() if isinstance(error, kind))
+
+
+def text_of(error: ParamClientError, *, takes_all: bool) -> str:
+    """Return the message of an error for the command line, with options in place of Python arguments."""
+    if isinstance(error, AmbiguousVehicle) and error.choose_by:
+        address = error.vehicles[0].partition(" ")[0] if error.vehicles else "1/1"
+        all_too = ", or all with --vehicle all" if takes_all and error.choose_by == "system" else ""
+        return f"{error.summary} Choose one with --vehicle {address}{all_too}."
+    if isinstance(error, InvalidParameters):
+        return f"{error}\n--partial skips these, and writes the others"
+    return str(error)
+
+
+_CODES: Final = {
+    UnknownParameter: ExitCode.USAGE,  # as everywhere for a name that does not exist
+    VehicleError: ExitCode.INCOMPLETE,
+    PackError: ExitCode.INCOMPLETE,
+    UsageError: ExitCode.USAGE,
+    NoReply: ExitCode.NO_ANSWER,
+    LinkError: ExitCode.LINK,
+    CacheError: ExitCode.CACHE,
+}
+"""Exit codes by class of error; the first class that matches applies."""
+
+
+def report_all(errors: Iterable[ParamClientError], prefix: str = "") -> int:
+    """Print every error; return the exit code for all of them."""
+    worst = ExitCode.DONE
+    for error in errors:
+        report(f"{prefix}{error}")
+        worst = max(worst, code_of(error))
+    return worst

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.output import show
+from paramclient.cli.output import ExitCode, show
 from paramclient.links import list_ports
 
 

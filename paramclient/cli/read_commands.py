@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
 import anyio
 
-from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.json_output import JsonObject, fetch_json, param_json
 from paramclient.cli.metadata import (
     MetadataChoice,
@@ -22,7 +21,16 @@ from paramclient.cli.metadata import (
     units_of,
 )
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import Status, by_index, milliseconds, report, say
+from paramclient.cli.output import (
+    LINE_NAMES_MAX,
+    ExitCode,
+    Status,
+    by_index,
+    milliseconds,
+    report,
+    report_all,
+    say,
+)
 from paramclient.cli.param_names import check_given, choose_names, suggest
 from paramclient.cli.session import CommandSession, sessions
 from paramclient.errors import ParamClientError
@@ -35,8 +43,6 @@ from paramclient.protocol.fetch import FetchResult
 
 AWAITED_NAMES_MAX: Final = 3
 """Parameters that the line about awaited values names."""
-INDICES_SHOWN_MAX: Final = 20
-"""Missing indices that a message names, so that it stays readable; it gives the number of further ones."""
 
 _DEFAULTS: Final = LinkOptions()
 
@@ -48,7 +54,6 @@ async def fetch(
     refresh: bool = False,
     changed: bool = False,
     metadata: MetadataChoice = None,
-    extended: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Fetch all parameters. Uses the cache if the vehicle confirms it, otherwise downloads.
@@ -59,10 +64,9 @@ async def fetch(
         refresh: Download even if the cache is up to date.
         changed: Print only values that differ from the firmware's defaults.
         metadata: A file with defaults; or vehicle, to download them from it.
-        extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
     chosen, given = check_given(names), from_file(metadata)
-    async with sessions(url, options, extended=extended) as found:
+    async with sessions(url, options) as found:
 
         async def work(session: CommandSession) -> _Fetched:
             result = await session.fetch(refresh=refresh)
@@ -74,7 +78,6 @@ async def fetch(
             return _Fetched(session, result, params, described, shows_defaults=changed)
 
         done = await found.work(work)
-        found.report_others()
     fetched = [each.result for each in done if each.result is not None]
     lacks_defaults = changed and not any(each.defaults for each in fetched)
     if chosen and fetched:
@@ -95,7 +98,7 @@ async def fetch(
         if missing := each.result.missing:
             report(
                 f"incomplete: {each.session.label} did not send {counted(len(missing), 'parameter')}, "
-                f"index {first_of(missing, INDICES_SHOWN_MAX)}; run the command again to request them"
+                f"index {first_of(missing, LINE_NAMES_MAX)}; run the command again to request them"
             )
             code = max(code, ExitCode.INCOMPLETE)
     if lacks_defaults:
@@ -110,7 +113,6 @@ async def get(
     /,
     *names: str,
     metadata: MetadataChoice = None,
-    extended: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Read parameters from the vehicle.
@@ -121,10 +123,9 @@ async def get(
             fetched, from the cache if the vehicle confirms it.
         names: Further parameters and patterns.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
-        extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
     chosen, given = check_given((name, *names)), from_file(metadata)
-    async with sessions(url, options, extended=extended) as found:
+    async with sessions(url, options) as found:
 
         async def work(session: CommandSession) -> _Read:
             params, errors = await get_chosen(session, chosen)
@@ -132,7 +133,6 @@ async def get(
             return _Read(session, params, errors, known)
 
         done = await found.work(work)
-        found.report_others()
     read = [each.result for each in done if each.result is not None]
     code = found.show(done)
     for each in read:
@@ -257,12 +257,3 @@ async def get_chosen(
                 tasks.start_soon(read, name)
     in_order = {name: errors[name] for name in requested if name in errors}
     return [found[name] for name in names if name in found], await suggest(session, in_order | unmatched)
-
-
-def report_all(errors: Iterable[ParamClientError], prefix: str = "") -> int:
-    """Print every error; return the exit code for all of them."""
-    worst = ExitCode.DONE
-    for error in errors:
-        report(f"{prefix}{error}")
-        worst = max(worst, code_of(error))
-    return worst

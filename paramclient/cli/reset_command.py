@@ -9,7 +9,6 @@ from typing import Annotated, Final
 from cyclopts import Parameter
 
 from paramclient.cli.apply import State, run
-from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.metadata import (
     MetadataChoice,
     defaults_in,
@@ -20,7 +19,7 @@ from paramclient.cli.metadata import (
     say_sources,
 )
 from paramclient.cli.options import ApplyFlags
-from paramclient.cli.output import report, say
+from paramclient.cli.output import LINE_NAMES_MAX, ExitCode, report, say
 from paramclient.cli.param_names import check_given
 from paramclient.cli.read_commands import get_chosen
 from paramclient.cli.session import CommandSession
@@ -29,9 +28,6 @@ from paramclient.metadata import Metadata
 from paramclient.model.names import counted, first_of, is_pattern
 from paramclient.model.paramset import ParamSet, WrittenParam, default_of
 from paramclient.model.values import Param
-
-RESET_NAMES_MAX: Final = 10
-"""Parameters that a line names, so that it stays short; it gives the number of further ones."""
 
 _OPTIONS: Final = ApplyFlags()
 
@@ -82,7 +78,7 @@ async def reset(
             report_no_defaults()
         elif without and not changed:
             is_part = True
-            listed = first_of(without, RESET_NAMES_MAX)
+            listed = first_of(without, LINE_NAMES_MAX)
             report(f"{session.prefix}not written, as their default is not known: {listed}")
         say_sources(session.label, found.values())
         wanted = {

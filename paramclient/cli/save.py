@@ -12,7 +12,6 @@ from typing import Annotated, Final
 import anyio.to_thread
 from cyclopts import Parameter
 
-from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.file_output import noun_of
 from paramclient.cli.metadata import (
     METADATA_HINT,
@@ -23,7 +22,7 @@ from paramclient.cli.metadata import (
     say_sources,
 )
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import print_json, report, say
+from paramclient.cli.output import ExitCode, print_json, report, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
 from paramclient.cli.sources import check_link, filled, whole_table
 from paramclient.errors import UsageError, VehicleError
@@ -47,7 +46,6 @@ async def save(
     only: tuple[str, ...] = (),
     incomplete: bool = False,
     metadata: MetadataChoice = None,
-    extended: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Write the parameters of a vehicle to a file, in the file format of any ground station.
@@ -69,7 +67,6 @@ async def save(
         incomplete: Write the parameters that were received where others were not; the file names these.
         metadata: With --changed, a file with the firmware's defaults. Default: the stored metadata of the
             firmware.
-        extended: Extended parameters (PARAM_EXT_*), such as a camera's. Not needed with a file of them.
     """
     if metadata is not None and not changed:
         raise UsageError("--metadata gives the defaults for --changed")
@@ -82,7 +79,7 @@ async def save(
                 where,
                 component=choice.component,
                 every=choice.is_all,
-                extended=extended,
+                extended=options.extended,
                 incomplete=incomplete,
                 cache=options.place,
             )
@@ -96,7 +93,7 @@ async def save(
             with _hint_at_incomplete():
                 return await whole_table(session, partial=incomplete)
 
-        async with sessions(link, options, extended=extended) as opened:
+        async with sessions(link, options) as opened:
             done = await opened.work(fetch)
             opened.report_others()
         sets = [each.result for each in done if each.result is not None]

@@ -7,7 +7,6 @@ from typing import Final
 
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.cached import load_tables
-from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_output import JsonObject, info_json, table_param_json, taken
 from paramclient.cli.metadata import (
     METADATA_HINT,
@@ -17,7 +16,7 @@ from paramclient.cli.metadata import (
     print_descriptions,
 )
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import local_time, print_json, print_line, print_table, report, say
+from paramclient.cli.output import ExitCode, local_time, print_json, print_line, print_table, report, say
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata, ParamInfo
 from paramclient.model.identity import autopilot_name, has_autopilot

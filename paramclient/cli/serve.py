@@ -9,9 +9,8 @@ from typing import Final
 import anyio
 
 from paramclient.cli.app import on_end_signal
-from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import KeyOptions, Verbose
-from paramclient.cli.output import print_line, say
+from paramclient.cli.output import ExitCode, print_line, say
 from paramclient.errors import UsageError
 
 SERVICE_LIBRARIES: Final = ("fastapi", "uvicorn")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
@@ -11,14 +10,22 @@ from typing import Any, Final, Generic, Protocol, TypeVar
 
 import anyio
 
-from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.json_output import JsonObject
 from paramclient.cli.options import LinkOptions, TrafficOptions
-from paramclient.cli.output import Status, print_json, print_table, report, say
+from paramclient.cli.output import (
+    LINE_NAMES_MAX,
+    ExitCode,
+    Status,
+    print_json,
+    print_table,
+    report,
+    report_all,
+    say,
+)
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, NoReply, ParamClientError, UsageError
-from paramclient.links import LinkKind, ReplayLink
+from paramclient.links import LinkKind
 from paramclient.model.identity import version_text
 from paramclient.model.names import first_of
 from paramclient.model.values import Trust
@@ -31,12 +38,8 @@ VEHICLE_TIMEOUT: Final = 10.0
 RECHECK_TIMEOUT: Final = 2.5
 """Seconds to check that the vehicle is still the only one: no wait is needed unless the vehicle or the link
 was lost in between."""
-OTHERS_SHOWN_MAX: Final = 5
-"""Other vehicles that a line names, so that it stays readable; it gives the number of further ones."""
 FIRMWARE_TIMEOUT: Final = 0.5
 """Seconds to wait for the firmware version of the vehicle, to name it to the user or to find its metadata."""
-UID_POLL_INTERVAL: Final = 0.05
-"""Seconds between two checks whether a vehicle with a hardware id was heard."""
 
 NUMBERS: Final = "value index default before wanted requested actual now stage"
 """Right-aligned columns of tables."""
@@ -111,11 +114,6 @@ class ChosenVehicle:
             raise UsageError(f"--vehicle {text}: system ids are 1 to 255, component ids 0 to 255")
         return cls(system, component, found["uid"] and found["uid"].lower(), bool(found["all"]))
 
-    @property
-    def is_named(self) -> bool:
-        """Whether the user has chosen the vehicle."""
-        return self != ChosenVehicle()
-
 
 @dataclass(frozen=True, slots=True)
 class CommandSession:
@@ -126,13 +124,6 @@ class CommandSession:
     deadline: Deadline
     options: LinkOptions
     choice: ChosenVehicle
-
-    @property
-    def now(self) -> float:
-        """The current unix time in seconds; for a log, the time of the last frame read from it."""
-        link = self.client.link
-        at = link.at if isinstance(link, ReplayLink) else None
-        return time.time() if at is None else at
 
     @property
     def address(self) -> str:
@@ -201,16 +192,12 @@ class CommandSession:
         choice, own = self.choice, self.component
         if choice.is_all:
             return
-        address = own.address if choice.uid is not None else (choice.system, choice.component)
+        address = (choice.system, choice.component) if choice.uid is None else own.address
         found = await self.client.only_component(*address, timeout=self.deadline.left(RECHECK_TIMEOUT))
         if found.node is not own.node:
-            other = f"{found.system}/{found.component} {found.autopilot}"
-            raise AmbiguousVehicle(
-                f"{self.label} was chosen and is no longer heard; {other} is heard instead. Nothing was "
-                "written.",
-                vehicles=(self.label, other),
-                choose_by="system" if found.system != own.system else "component",
-            )
+            other = node_in_words(found.node)
+            message = f"{self.label} is no longer heard; {other} is heard instead. Nothing was written."
+            raise AmbiguousVehicle(message, vehicles=(self.label, other), choose_by="component")
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,17 +255,17 @@ class Sessions(list[CommandSession]):
     def show(self, done: Sequence[Done[Shown]], *, errors: bool = True) -> int:
         """Print the results as one table or as JSON, then the failures; return the exit code for these.
 
-        A table says which vehicle it shows if several are heard, and none was named.
+        If several vehicles are heard, and none was named, the table says which one it shows.
 
         Args:
             done: the outcomes.
             errors: whether JSON of all vehicles has the failures; else each outcome has its own error.
         """
-        first = self[0]
+        self.report_others()
         found = [(each.session, each.result) for each in done if each.result is not None]
         failed = [(each.session, each.error) for each in done if each.error is not None]
-        if not first.options.json:
-            is_named = self.is_all or (not first.choice.is_named and len(first.client.autopilots) > 1)
+        if not self[0].options.json:
+            is_named = self.is_all or bool(self.others)
             rows = [
                 (session.address if is_named else None, *cells)
                 for session, result in found
@@ -292,43 +279,43 @@ class Sessions(list[CommandSession]):
             print_json({"vehicles": vehicles} | ({"errors": failures} if errors else {}))
         else:
             print_json(found[0][1].as_json())
-        for session, error in failed:
-            report(f"{session.label}: {error}")
-        return max((code_of(error) for _, error in failed), default=ExitCode.DONE)
+        return max([ExitCode.DONE, *(report_all([error], f"{session.label}: ") for session, error in failed)])
+
+    @property
+    def others(self) -> list[str]:
+        """Other vehicles of the link in words, if --vehicle did not choose the one that is used."""
+        first = self[0]
+        if first.options.vehicle is not None:
+            return []
+        return [
+            node_in_words(each.node)
+            for each in first.client.autopilots
+            if each.node is not first.component.node
+        ]
 
     def report_others(self) -> None:
         """Report other vehicles of the link, if --vehicle did not choose the one that was used.
 
         For subcommands that only read: they use the first vehicle heard, which may be another one next time.
         """
-        first = self[0]
-        others = [each.node for each in first.client.autopilots if each.node is not first.component.node]
-        words = [*map(node_in_words, others)]
-        if words and not first.choice.is_named:
-            listed = first_of(words, OTHERS_SHOWN_MAX)
+        if self.others:
             report(
-                f"{first.label} was used, the first vehicle heard. Also on this link: {listed}. "
-                "--vehicle chooses one"
+                f"{self[0].label} was used, the first vehicle heard. Also on this link: "
+                f"{first_of(self.others, LINE_NAMES_MAX)}. --vehicle chooses one"
             )
 
 
 @asynccontextmanager
 async def sessions(
-    url: str,
-    options: LinkOptions,
-    *,
-    writes: bool = False,
-    is_live: bool = False,
-    extended: bool = False,
+    url: str, options: LinkOptions, *, writes: bool = False, is_live: bool = False
 ) -> AsyncIterator[Sessions]:
     """Open a link, and yield a session for each vehicle that --vehicle names.
 
     Args:
         url: the link.
-        options: the vehicle, and the options of the link.
+        options: the vehicle, its extended parameters or the plain ones, and the options of the link.
         writes: whether several vehicles are an error, unless --vehicle names one or all.
         is_live: read a log in real time; otherwise it is read at full speed, unless its name gives a speed.
-        extended: use the extended parameters. Otherwise --extended is suggested for a camera.
 
     Raises:
         UsageError: no such link, or options that exclude each other.
@@ -336,10 +323,10 @@ async def sessions(
         NoReply: the vehicle was not heard.
         LinkError: the link cannot be opened, or failed.
     """
-    one = "--extended works on one vehicle" if extended else ""
-    choice, deadline = ChosenVehicle.parse(options.vehicle, one=one), Deadline(options.timeout)
+    choice, deadline = ChosenVehicle.parse(options.vehicle), Deadline(options.timeout)
+    is_log = url.lower().startswith(f"{LinkKind.REPLAY}:")
     async with _client(
-        url if is_live else _at_full_speed(url),
+        f"{url}?speed=0" if is_log and not is_live and "?speed=" not in url else url,
         options,
         cache=None if options.place is True else options.place,
         encoding=options.encoding,
@@ -352,11 +339,12 @@ async def sessions(
             found = [await wait_for_vehicle(client, choice, deadline, only=writes)]
         if writes:
             await wait_for_firmware(found, deadline)
-        for each in () if extended else found:
-            if expects_extended(each.identity.vehicle_type, each.component):
+        if options.extended:
+            found = [each.ext for each in found]
+        for each in found:
+            if not each.is_extended and expects_extended(each.identity.vehicle_type, each.component):
                 say(f"{each.system}/{each.component} usually has extended parameters: --extended uses them")
-        chosen = [each.ext for each in found] if extended else found
-        yield Sessions(CommandSession(client, each, deadline, options, choice) for each in chosen)
+        yield Sessions(CommandSession(client, each, deadline, options, choice) for each in found)
 
 
 def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> ParamClient:
@@ -371,12 +359,6 @@ def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> P
 def _client(url: str, options: TrafficOptions, **more: Any) -> ParamClient:
     system, signing = options.source_system, options.signing
     return ParamClient(url, tlog=options.tlog, signing=signing, system=system, **more)
-
-
-def _at_full_speed(url: str) -> str:
-    """Return the link name; for a log without a speed, with the option for full speed."""
-    is_log = url.lower().startswith(f"{LinkKind.REPLAY}:")
-    return f"{url}?speed=0" if is_log and "?speed=" not in url else url
 
 
 # Vehicles
@@ -425,21 +407,16 @@ async def _find_by_uid(client: ParamClient, uid: str, timeout: float | None) -> 
 
     began, awaited = anyio.current_time(), f"a vehicle with hardware id {uid}"
     with _waiting(client, awaited), anyio.move_on_after(timeout):
-        while not (found := fitting()):
-            client.core.station.gate.check()
-            await anyio.sleep(UID_POLL_INTERVAL)
-        if found[0].identity.uid != uid:
+        while not fitting():
+            await client.core.link_task.wait_for_activity()
+        if fitting()[0].identity.uid != uid:
             await anyio.sleep(HEARTBEAT_WAIT)
-            found = fitting()
-        if len(found) > 1:
-            words = [node_in_words(each.node) for each in found]
-            raise AmbiguousVehicle(
-                f"{len(found)} vehicles on this link have hardware ids that begin with {uid}: "
-                f"{', '.join(words)}.",
-                vehicles=words,
-                choose_by="system",
-            )
-        return found[0]
+        found, *others = fitting()
+        if others:
+            words = [node_in_words(each.node) for each in fitting()]
+            what = f"{len(words)} vehicles on this link have hardware ids that begin with {uid}"
+            raise AmbiguousVehicle(f"{what}: {', '.join(words)}.", vehicles=words, choose_by="system")
+        return found
     waited = anyio.current_time() - began
     raise NoReply(awaited, attempts=0, waited=waited, hint=received_in_words(client))
 

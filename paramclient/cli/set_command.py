@@ -33,7 +33,6 @@ async def set_(
     settle: Annotated[float, Parameter(validator=Number(gte=0, lte=SETTLE_MAX))] = 0.0,
     force: bool = False,
     metadata: MetadataChoice = None,
-    extended: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Write parameters in the order given, and verify each by the value that the vehicle reports.
@@ -54,13 +53,12 @@ async def set_(
             truncates. Send NaN and infinity also to PX4, which cannot save them and may stop, and to
             ArduPilot.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
-        extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
     described, wanted = from_file(metadata), _parse_pairs(pairs)
-    if described is not None and not extended:
+    if described is not None and not options.extended:
         _values(wanted, described)
-    async with sessions(url, options, writes=True, extended=extended) as found:
-        prepare = _prepare_extended if extended else _prepare
+    async with sessions(url, options, writes=True) as found:
+        prepare = _prepare_extended if options.extended else _prepare
         jobs = [await prepare(each, wanted, described, metadata) for each in found]
         doubts = dict.fromkeys([doubt for job in jobs for doubt in await _doubts(job)])
         for doubt in doubts:

@@ -8,7 +8,6 @@ from typing import Final
 
 from paramclient.cache import ParamCache
 from paramclient.cli.cached import extended_sizes, show_summaries
-from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.file_output import described, value_text
 from paramclient.cli.json_output import JsonObject, info_json, known_members, set_json
 from paramclient.cli.metadata import (
@@ -23,7 +22,7 @@ from paramclient.cli.metadata import (
     units_of,
 )
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import print_json, print_table, say
+from paramclient.cli.output import ExitCode, print_json, print_table, say
 from paramclient.cli.param_names import check_given
 from paramclient.cli.sources import check_link
 from paramclient.files.formats import address

@@ -8,9 +8,8 @@ from typing import Annotated, Final
 
 from cyclopts import Parameter
 
-from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import CONNECTION, KeyOptions, Seconds, Verbose
-from paramclient.cli.output import can_ask, confirm, print_json, print_line
+from paramclient.cli.output import ExitCode, can_ask, confirm, print_json, print_line
 from paramclient.cli.session import ChosenVehicle, Deadline, wait_for_vehicle
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component

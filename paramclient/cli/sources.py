@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Final
 
@@ -30,9 +31,7 @@ _ENDINGS: Final = frozenset({*ENDINGS, ".bin", ".ulg", ".txt", ".csv"})
 meant as a file, and no link name has one."""
 
 
-async def resolve_all(
-    texts: Sequence[str], options: LinkOptions, *, writes: bool = False, extended: bool = False
-) -> list[ParamSet]:
+async def resolve_all(texts: Sequence[str], options: LinkOptions, *, writes: bool = False) -> list[ParamSet]:
     """Return the parameters of each source: files first, then cached vehicles, then links.
 
     A text that is given twice is resolved once. If one of the files has extended parameters, those of the
@@ -42,15 +41,14 @@ async def resolve_all(
         texts: the arguments.
         options: --vehicle selects the vehicle of a link, and the component of a file or of the cache.
         writes: whether the values will be written; see `sessions`.
-        extended: the extended parameters of vehicles.
 
     Raises:
         ParamClientError: as from `resolve`.
     """
-    choice = ChosenVehicle.parse(options.vehicle)
+    choice, extended = ChosenVehicle.parse(options.vehicle), options.extended
 
     async def fetch(url: str) -> ParamSet:
-        async with sessions(url, options, writes=writes, extended=extended) as opened:
+        async with sessions(url, replace(options, extended=extended), writes=writes) as opened:
             table = await whole_table(opened[0])
             if not writes:
                 opened.report_others()

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
 import anyio
 
-from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.json_output import JsonObject, known_members, param_value
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import local_time, print_json, print_line, say
+from paramclient.cli.output import ExitCode, local_time, print_json, print_line, report_all, say
 from paramclient.cli.param_names import check_given
-from paramclient.cli.read_commands import get_chosen, report_all
+from paramclient.cli.read_commands import get_chosen
 from paramclient.cli.session import CommandSession, Sessions, sessions
 from paramclient.client.events import Event
+from paramclient.links import ReplayLink
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import hash_text, rounded, time_text
 from paramclient.model.values import format_value
@@ -25,7 +26,7 @@ from paramclient.protocol.events import Change
 _DEFAULTS: Final = LinkOptions()
 
 
-async def watch(url: str, /, *names: str, extended: bool = False, options: LinkOptions = _DEFAULTS) -> int:
+async def watch(url: str, /, *names: str, options: LinkOptions = _DEFAULTS) -> int:
     """Print changes of values by any source, as they happen, until Ctrl-C or --timeout.
 
     Updates the table first, and also prints values that have changed since the cache was written. Also prints
@@ -35,10 +36,9 @@ async def watch(url: str, /, *names: str, extended: bool = False, options: LinkO
     Args:
         url: The link.
         names: The parameters to watch, or patterns such as "MC_*". Default: all.
-        extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
     given = check_given(names)
-    async with sessions(url, options, is_live=True, extended=extended) as found:
+    async with sessions(url, options, is_live=True) as found:
         codes = [each.result for each in await found.work(partial(_watch, given=given, found=found))]
     return max(code or ExitCode.DONE for code in codes)
 
@@ -77,11 +77,13 @@ async def _watch(session: CommandSession, given: Sequence[str], found: Sessions)
 
 
 def _print(session: CommandSession, item: JsonObject, text: str) -> None:
+    """Print with the current time; in a log, that of the last frame read from it."""
+    link = session.client.link
+    now = (link.at if isinstance(link, ReplayLink) else None) or time.time()
     if session.options.json:
-        ids = session.ids if session.choice.is_all else {}
-        print_json({"time": time_text(session.now)} | ids | item)
+        print_json({"time": time_text(now)} | (session.ids if session.choice.is_all else {}) | item)
     else:
-        print_line(f"{local_time(session.now)}  {text}")
+        print_line(f"{local_time(now)}  {text}")
 
 
 def _change_json(change: Change) -> JsonObject:

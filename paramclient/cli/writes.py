@@ -10,10 +10,9 @@ from typing import ClassVar, Final
 
 import anyio
 
-from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.json_output import JsonObject, outcome_json, vehicle_json
 from paramclient.cli.metadata import info_of, meaning_of
-from paramclient.cli.output import Coloured, Status, report, say
+from paramclient.cli.output import LINE_NAMES_MAX, Coloured, ExitCode, Status, code_of, report, say
 from paramclient.cli.param_names import suggest
 from paramclient.cli.session import CommandSession, Done, Sessions
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
@@ -23,8 +22,6 @@ from paramclient.model.values import ParamType, Value, format_value
 from paramclient.protocol.fetch import Progress
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 
-WRITE_NAMES_MAX: Final = 10
-"""Parameters that a line names, so that it stays short; it gives the number of further ones."""
 _STYLES: Final = {
     SetStatus.ACCEPTED: "green",
     SetStatus.ADJUSTED: "yellow",
@@ -144,7 +141,7 @@ class WriteJob:
         for group in errors.values():
             names, text = [each.name for each in group], str(group[0].error)
             is_named = len(names) == 1 and names[0] in re.split(r"[ ,:;]", text)
-            report(f"{prefix}{'' if is_named else first_of(names, WRITE_NAMES_MAX) + ': '}{text}")
+            report(f"{prefix}{'' if is_named else first_of(names, LINE_NAMES_MAX) + ': '}{text}")
 
     def _type_of(self, outcome: SetOutcome) -> ParamType | int:
         """Return the vehicle's type of a parameter; REAL32 if it is not known."""

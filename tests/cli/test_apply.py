@@ -434,7 +434,6 @@ def test_one_state_is_not_restored_to_all_vehicles(command: Command, put: Put, f
     assert (number.code, "snapshot 1 is of one vehicle" in number.err) == (2, True)
     assert command("restore", put(air), "--vehicle", "all", "--backup", "same.json").code == 2
     assert command("restore", put(air), "--vehicle", "all", "--no-cache").code == 2
-    assert command("restore", put(air), "--vehicle", "all", "--extended").code == 2
     missing = command("restore", put(air), file().parent / "none-{system}.param", "--vehicle", "all")
     assert (missing.code, "no such file" in missing.err) == (2, True)
     assert not any(vehicle.requests["PARAM_SET"] for vehicle in vehicles)

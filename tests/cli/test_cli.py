@@ -26,7 +26,7 @@ import pytest
 import paramclient
 from paramclient import LinkError, ParamCache, ParamType
 from paramclient.cli import run
-from paramclient.cli.exit_codes import ExitCode, code_of
+from paramclient.cli.output import ExitCode, code_of
 from paramclient.errors import ClientClosed, ParamClientError
 from paramclient.links import Peer, SimLink
 from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, px4_table

