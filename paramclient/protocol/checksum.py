@@ -6,8 +6,9 @@ the difference of two of them depends only on the bytes that differ. So two of t
 between their ends differ. Where one value does, its new bits follow from each row in which it may be, and the
 row in which these are a simple value is probably the one.
 
-Such a value can also make up for another name or type, and no checksum would show it. So each is read by its
-index too. Nothing is taken over until the checksum of the whole file agrees.
+Such a value can also make up for other changes, and no checksum would show it. So each is read by its index
+too, but for those that always move: these are searched in a few rows. Nothing is taken over until the
+checksum of the whole file agrees.
 """
 
 from __future__ import annotations
@@ -45,23 +46,21 @@ FILE_RATE: Final = 48_500
 FLOAT32_EXACT: Final = 2**24
 """The largest integer up to which float32 holds all."""
 BOOT_COUNT: Final = "STAT_BOOTCNT"
-RUN_TIME: Final = "STAT_RUNTIME"
-"""Name of the value that has moved at almost every connection."""
-SECONDS: Final = re.compile(f"{RUN_TIME}|STAT_FLTTIME")
+SECONDS: Final = re.compile("STAT_RUNTIME|STAT_FLTTIME")
 """Names of values that count seconds."""
-RARE: Final = re.compile(f"{BOOT_COUNT}|STAT_FLTTIME")
-"""Names of values that move with each start, and with each flight."""
 PRESSURE: Final = re.compile(r"BARO\d_GND_PRESS")
 """Names of values that a disarmed Plane or Rover measures all the time (measured)."""
 PLANES_AND_ROVERS: Final = frozenset({1, 10, 11})
 """MAV_TYPE of these, boats included."""
 PRESSURE_DRIFT: Final = 0.001
 """Share by which these change in between."""
-SECONDS_SLACK: Final = 60.0
-"""By how much these may grow more than time passes: they are stored every 30 s."""
-PASSED_MAX: Final = 3600.0
-"""Seconds passed up to which a count of them needs no read: in a longer time, it may be others by chance that
-explain a difference, as any of 2**32 values would."""
+SECONDS_SLACK: Final = 40.0
+"""By how much these may differ from the time that has passed: they are stored every 30 s."""
+PASSED_MAX: Final = 86_400.0
+"""Seconds passed up to which fewer may have been counted: of a year, one in a hundred of any values would fit.
+"""
+NEAR: Final = 8
+"""Rows in which a value within wide limits explains a difference: by chance, it would explain others too."""
 MEASURED_ONCE: Final = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|ARSPD\d?_OFFSET|COMPASS_DEC")
 MEASURED: Final = re.compile(f"{MEASURED_ONCE.pattern}|{PRESSURE.pattern}")
 """Names that each start of the vehicle measures again (measured)."""
@@ -148,22 +147,24 @@ class _Proof:
         rows, volatile = self._rows, self._session.table.volatile
         whole = range(len(rows))
         measures_pressure = self._session.identification.vehicle_type in PLANES_AND_ROVERS
-        moving = {
+        always = {
             at
             for at, row in enumerate(rows)
-            if row.name == RUN_TIME
-            or row.name in volatile
-            or (measures_pressure and row.bits and PRESSURE.fullmatch(row.name))
+            if measures_pressure and row.bits and PRESSURE.fullmatch(row.name)
         }
-        rare = {at for at, row in enumerate(rows) if RARE.fullmatch(row.name) or may_be_rounded(row)}
+        seconds = {at for at, row in enumerate(rows) if SECONDS.fullmatch(row.name)}
+        often = {at for at, row in enumerate(rows) if row.name in volatile} - always - seconds
+        rare = {at for at, row in enumerate(rows) if row.name == BOOT_COUNT or may_be_rounded(row)}
         suspects: set[int] = set()
-        early = {1} if self._is_slow else set()  # shows another number of parameters by its header
-        await self._request({len(whole), *early, *(at + 1 for at in sorted(moving)[:-1])})
+        numbers = self._ends_of(always, whole)
+        if self._is_slow:
+            numbers |= {1} | self._ends_of(often, whole)  # 1 shows another number of parameters by its header
+        await self._request({len(whole), *numbers})
         while places := self._places():
             if any(len(place) == 1 and rows[place.start].name == BOOT_COUNT for place in places):
                 suspects = {at for at in whole if MEASURED.fullmatch(rows[at].name) and rows[at].bits}
             guesses: dict[int, int] = {}
-            numbers: set[int] = set()
+            numbers = set()
             divided: list[range] = []
             for place, difference in places.items():
                 if moved := self._guess_moved(place, difference):
@@ -172,7 +173,7 @@ class _Proof:
                     guesses |= {at: rows[at].bits for at in suspected}
                 elif guess := self._guess(place, difference):
                     guesses |= guess
-                elif ends := self._ends_of(moving | rare, place):
+                elif ends := self._ends_of(always | often | seconds | rare, place):
                     numbers |= ends | (self._divide(place) if self._is_slow else set())
                 elif place.stop == next(iter(self._found)) == len(whole) > len(place):
                     numbers.add(len(whole))  # it was the first one, and values may have moved since
@@ -200,8 +201,10 @@ class _Proof:
 
     def _ends_of(self, indices: Collection[int], place: range) -> set[int]:
         """Return the numbers of rows whose checksums show these values, as far as they are in a range and not
-        known."""
-        return {end for at in indices if at in place for end in (at, at + 1)} - {0, *self._found}
+        known: behind each, and before those without another one near."""
+        ends = {at + 1 for at in indices if at in place}
+        starts = {end - 1 for end in ends if ends.isdisjoint(range(end - NEAR, end))}
+        return (ends | starts) - {0, *self._found}
 
     @property
     def _parts(self) -> int:
@@ -240,7 +243,8 @@ class _Proof:
         moments, now = self._session.table.moments, anyio.current_time()
         for at, bits in self._explanations(place, difference):
             row = self._rows[at]
-            if _has_just_moved(row, bits, min(now - moments.get(row.name, now), PASSED_MAX)):
+            passed = now - moments.get(row.name, now)
+            if _has_just_moved(row, bits, passed, is_near=len(place) <= NEAR):
                 return at, bits
         return None
 
@@ -361,13 +365,15 @@ class _Proof:
         return True
 
 
-def _has_just_moved(row: PackedParam, bits: int, passed: float) -> bool:
-    """Return whether a value has grown by the seconds that have passed, or is the same day's pressure."""
+def _has_just_moved(row: PackedParam, bits: int, passed: float, *, is_near: bool) -> bool:
+    """Return whether a value has grown by the seconds that have passed; or, where it is one of a few rows, by
+    fewer of them, as the vehicle was off meanwhile, or is the same day's pressure."""
     old, new = float(from_bits(row.bits, row.type)), float(from_bits(bits, row.type))
     if SECONDS.fullmatch(row.name) and row.type is ParamType.INT32:
-        return 0 < new - old <= passed + SECONDS_SLACK
+        fewest = 1 if is_near and passed <= PASSED_MAX else passed - SECONDS_SLACK
+        return new > old and fewest <= new - old <= passed + SECONDS_SLACK
     is_pressure = PRESSURE.fullmatch(row.name) and row.type is ParamType.REAL32
-    return bool(is_pressure) and 0 < abs(new - old) <= PRESSURE_DRIFT * old
+    return bool(is_pressure) and is_near and 0 < abs(new - old) <= PRESSURE_DRIFT * old
 
 
 def _bits_to_write(bits: int, kind: ParamType) -> float:
