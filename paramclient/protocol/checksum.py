@@ -57,8 +57,7 @@ PRESSURE_DRIFT: Final = 0.001
 SECONDS_SLACK: Final = 40.0
 """By how much these may differ from the time that has passed: they are stored every 30 s."""
 PASSED_MAX: Final = 86_400.0
-"""Seconds passed up to which fewer may have been counted: of a year, one in a hundred of any values would fit.
-"""
+"""Seconds passed up to which fewer may have been counted: of a year, one in a hundred values fits."""
 NEAR: Final = 8
 """Rows in which a value within wide limits explains a difference: by chance, it would explain others too."""
 MEASURED_ONCE: Final = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|ARSPD\d?_OFFSET|COMPASS_DEC")
