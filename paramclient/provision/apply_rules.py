@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import fnmatch
-import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache
 from importlib import resources
 from typing import Any, Final
 
@@ -31,31 +29,20 @@ class ApplyRule:
 
     Attributes:
         autopilot: "px4" or "ardupilot".
-        names: globs, in the case of param_id.
+        names: the parameters.
         reason: the predicate of a sentence whose subject is the parameter, such as "is counted by the
             vehicle".
         category: `ACTION` or one of `CATEGORIES` for a parameter that is left out; else "".
         unless: values of other parameters; the entry does not apply while one of them has its value.
-        elsewhere: by glob, the vehicles or settings that have the parameter, for globs that match nothing in
-            the tables of the simulated vehicles.
         vehicle_types: the MAV_TYPEs to which the entry applies; empty for all.
     """
 
     autopilot: str
-    names: Sequence[str]
+    names: NameChoice
     reason: str
     category: str = ""
     unless: Mapping[str, int] = field(default_factory=dict)
-    elsewhere: Mapping[str, str] = field(default_factory=dict)
     vehicle_types: Sequence[int] = ()
-
-    def fits(self, name: str) -> bool:
-        """Return whether the entry is about a parameter."""
-        return self._pattern.match(name) is not None
-
-    @cached_property
-    def _pattern(self) -> re.Pattern[str]:
-        return re.compile("|".join(map(fnmatch.translate, self.names)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +67,7 @@ class ApplyRules:
                 parameter has a value.
         """
         for rule in self.sections["left_out"]:
-            if rule.fits(name) and all(value_of(other) != value for other, value in rule.unless.items()):
+            if rule.names.has(name) and all(value_of(other) != value for other, value in rule.unless.items()):
                 return rule
         return None
 
@@ -91,7 +78,7 @@ class ApplyRules:
         `brings_any` (may reveal parameters with any name), `last` (may end the connection, and is written
         last), and `system_id`.
         """
-        return any(rule.fits(name) for rule in self.sections[section])
+        return any(rule.names.has(name) for rule in self.sections[section])
 
     def reveals(self, name: str) -> bool:
         """Return whether a change of the parameter may show or hide other parameters."""
@@ -107,7 +94,7 @@ class ApplyRules:
             vehicle_type: MAV_TYPE of the vehicle; None if unknown.
         """
         return any(
-            rule.fits(name) and (not rule.vehicle_types or vehicle_type in rule.vehicle_types)
+            rule.names.has(name) and (not rule.vehicle_types or vehicle_type in rule.vehicle_types)
             for rule in self.sections["reboot"]
         )
 
@@ -151,7 +138,11 @@ def rules_for(autopilot: str, *, is_extended: bool = False) -> ApplyRules:
     fitting = () if is_extended else known
     return ApplyRules(
         {
-            section: [ApplyRule(**entry) for entry in found if entry["autopilot"] in fitting]
+            section: [
+                ApplyRule(**entry | {"names": NameChoice(entry["names"])})
+                for entry in found
+                if entry["autopilot"] in fitting
+            ]
             for section, found in entries.items()
         },
         autopilot,

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, cast
+from typing import Final
 
 import anyio
 
@@ -28,13 +28,13 @@ from paramclient.errors import (
 )
 from paramclient.files import write_file
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision.apply_rules import READ_ONLY, ApplyRules, rules_for
 from paramclient.provision.inspection import (
     POLL_INTERVAL,
     Inspection,
     inspect,
+    plan_for,
     reread,
     wait_for_identity,
 )
@@ -46,13 +46,14 @@ from paramclient.provision.planning import (
     PlanOptions,
     Rows,
     Stage,
-    plan_from,
 )
 
 BEFORE_APPLY: Final = "before apply"
 """The reason of the snapshot that `apply` stores before its first write."""
 BEFORE_RESTORE: Final = "before restore"
 """The reason of the snapshot that `restore` stores before its first write."""
+UNREAD: Final = "acknowledged, and not read back"
+"""The reason of a row whose value is not proven."""
 WRITE_ATTEMPTS_MAX: Final = 2
 """Times that a value is written if the vehicle acknowledges it and later holds another value: a write of
 another parameter may have changed it."""
@@ -197,8 +198,8 @@ class _Run:
         check_author(options.get("author"))
         self.component, self.wanted, self.options = component, wanted, options
         self.is_restore, self._reboots_allowed = is_restore, options.get("reboot", False)
-        self._planned = cast(
-            PlanOptions, {name: each for name, each in options.items() if name in PlanOptions.__annotations__}
+        self._planned = PlanOptions(
+            include=options.get("include", ()), info=options.get("info"), force=options.get("force", False)
         )
         self.sent: set[str] = set()
         self._before: ParamSet | None = None  # the state before the first write
@@ -219,7 +220,7 @@ class _Run:
         component = self.component
         if self.options.get("durable") and component.core.cache is None:
             raise UsageError("durable needs a cache, and the client keeps none")
-        self._replan({})  # its errors are raised before the vehicle is read
+        plan_for(component, self.wanted, None, self._planned)  # errors before the vehicle is read
         await wait_for_identity(component)
         self._identity = component.identity
         with component.watch.held():
@@ -368,18 +369,9 @@ class _Run:
         began = anyio.current_time()
         self._inspection = await reading
         self._check_same_vehicle()
-        self._replan(self._inspection.table)
+        self._plan = plan_for(self.component, self.wanted, self._inspection, self._planned)
         if verifies:
             self._inspected_at = began
-
-    def _replan(self, table: ParamSet | Mapping[str, Param]) -> None:
-        self._plan = plan_from(
-            table,
-            self.wanted,
-            autopilot=self.component.autopilot,
-            encoding=self.component.encoding,
-            **self._planned,
-        )
 
     def _check_same_vehicle(self) -> None:
         """Raise `AnotherVehicle` if the identity is not that of the first inspection."""
@@ -432,20 +424,17 @@ class _Run:
 
     def _take(self, row: ApplyRow, outcome: SetOutcome) -> None:
         """Record the outcome of a write."""
-        done, error = outcome.result, outcome.error
-        if done is not None:
-            if done.adjusted:
-                self._count_write(row)
-                self._settle(row, ApplyStatus.ADJUSTED, "the vehicle changed the value")
-            else:
-                self._accept(row, done.note)
-        elif self.is_restore and _is_read_only(error):
+        done, error, status = outcome.result, outcome.error, ApplyStatus(outcome.status)
+        if status is ApplyStatus.ACCEPTED and done is not None:
+            self._accept(row, done.note)
+        elif status is ApplyStatus.ADJUSTED:
+            self._count_write(row)
+            self._settle(row, status, "the vehicle changed the value")
+        elif self.is_restore and isinstance(error, Refused) and error.code == ParamErrorCode.READ_ONLY:
             reason = "left out: the vehicle reports that it is read-only"
             self._settle(row, ApplyStatus.SKIPPED, reason, READ_ONLY)
-        elif outcome.status is SetStatus.REFUSED:
-            self._settle(row, ApplyStatus.REFUSED, str(error))
-        elif outcome.status is SetStatus.UNKNOWN:
-            self._settle(row, ApplyStatus.UNKNOWN, str(error))
+        elif status is not ApplyStatus.NOT_TRIED:
+            self._settle(row, status, str(error))
 
     async def _write_system_id(self, row: ApplyRow) -> None:
         """Set the system id, and continue with the vehicle under its new one."""
@@ -536,7 +525,7 @@ class _Run:
     def _accept(self, row: ApplyRow, note: str = "") -> None:
         self._count_write(row)
         self._notes[row.name] = note
-        self._report("writing", self._outcome(row, ApplyStatus.ACCEPTED, note))
+        self._report("writing", self._outcome(row, ApplyStatus.UNPROVEN, UNREAD))
 
     def _settle(self, row: ApplyRow, status: ApplyStatus, reason: str, category: str = "") -> None:
         """Record an outcome that only the verification may still change, and report it."""
@@ -583,7 +572,3 @@ class _Run:
         if self._inspected_at < self._written_at:
             return row(unread, f"{answered}, and not read back")
         return row(ApplyStatus.ADJUSTED, "the vehicle acknowledged it, and changed it afterwards")
-
-
-def _is_read_only(error: ParamClientError | None) -> bool:
-    return isinstance(error, Refused) and error.code == ParamErrorCode.READ_ONLY

@@ -12,7 +12,7 @@ from paramclient.client.component import Component
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, ParamType, Settable, Trust
-from paramclient.provision.planning import Plan, PlanOptions, check_component, plan_from
+from paramclient.provision.planning import Plan, PlanOptions, plan_from
 from paramclient.provision.sources import component_set
 
 READS_IN_PROGRESS_MAX: Final = 64
@@ -49,28 +49,29 @@ async def plan(component: Component, wanted: Wanted, **options: Unpack[PlanOptio
         LinkError: the link failed, or the client was closed.
     """
     wanted = wanted_set(component, wanted)
-    plan_from({}, wanted, autopilot=component.autopilot, **options)  # errors before the vehicle is read
+    plan_for(component, wanted, None, options)
     await wait_for_identity(component)
-    inspection = await inspect(component, wanted)
-    return plan_from(
-        inspection.table,
-        wanted,
-        autopilot=component.autopilot,
-        encoding=component.encoding,
-        **options,
-    )
+    return plan_for(component, wanted, await inspect(component, wanted), options)
 
 
 def wanted_set(component: Component, wanted: Wanted) -> ParamSet:
     """Return wanted parameters as a set for a component.
 
     Raises:
-        UsageError: they are of another component, or a plain value is not valid.
+        UsageError: a plain value is not valid.
     """
-    if not isinstance(wanted, ParamSet):
-        wanted = ParamSet(wanted, is_extended=component.is_extended)
-    check_component(wanted, component.component, is_extended=component.is_extended)
-    return wanted
+    return wanted if isinstance(wanted, ParamSet) else ParamSet(wanted, is_extended=component.is_extended)
+
+
+def plan_for(component: Component, wanted: ParamSet, found: Inspection | None, options: PlanOptions) -> Plan:
+    """Return the plan for a vehicle; before it is read, only the errors of `plan_from` matter."""
+    return plan_from(
+        component_set(component, (), "") if found is None else found.table,
+        wanted,
+        autopilot=component.autopilot,
+        encoding=component.encoding,
+        **options,
+    )
 
 
 async def wait_for_identity(component: Component) -> None:

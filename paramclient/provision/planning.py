@@ -5,10 +5,10 @@ The parameters that no `apply` writes are in `apply_rules.toml`.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from ctypes import c_float
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final, TypedDict, Unpack
@@ -175,7 +175,7 @@ class Rows:
 
     @property
     def counts(self) -> Mapping[ApplyStatus, int]:
-        """The number of rows with each status."""
+        """The number of rows with each status, 0 for those that do not occur."""
         return Counter(row.status for row in self.rows.values())
 
     @property
@@ -277,69 +277,56 @@ def plan_from(
         UsageError: an element of `include` is neither a category nor a glob; `current` and `wanted` are of
             different components or autopilots, or one has plain and the other extended parameters.
     """
-    identity = None
-    if isinstance(current, ParamSet):
-        identity = current.identity
-        if autopilot is None and identity is not None:
-            autopilot = autopilot_name(identity.autopilot)
-        check_component(wanted, current.component, is_extended=current.is_extended)
-    _check_autopilot(wanted, autopilot)
-    if encoding is None:
-        encoding = Encoding.C_CAST if autopilot == "ardupilot" else Encoding.BYTEWISE
-    return _Planner(current, wanted, autopilot or "", encoding, identity, **options).plan()
+    return _Planner(current, wanted, autopilot, encoding, options).plan()
 
 
-def check_component(wanted: ParamSet, component: int | None, *, is_extended: bool) -> None:
-    """Check that parameters are meant for this component, and for its plain or its extended parameters.
+def _check_origin(wanted: ParamSet, current: Mapping[str, object], autopilot: str | None) -> None:
+    """Check that parameters are meant for a vehicle: shared names of two autopilots have different meanings.
 
     Raises:
-        UsageError: they name another component, or are of the other kind.
-    """
-    of = f" of {wanted.source}" if wanted.source else ""
-    if wanted.is_extended != is_extended:
-        kinds = ("extended", "plain") if wanted.is_extended else ("plain", "extended")
-        raise UsageError(f"the parameters{of} are {kinds[0]} ones, and {kinds[1]} ones are needed")
-    if wanted.component is not None and component is not None and wanted.component != component:
-        raise UsageError(
-            f"the parameters{of} are those of component {wanted.component}, not of component {component}"
-        )
-
-
-def _check_autopilot(wanted: ParamSet, autopilot: str | None) -> None:
-    """Check that parameters are not those of another autopilot: shared names have different meanings.
-
-    Raises:
-        UsageError: the parameters name another autopilot.
+        UsageError: they are of another component or autopilot, or extended ones instead of plain ones.
     """
     meant = None if wanted.identity is None else autopilot_name(wanted.identity.autopilot)
+    of = f" of {wanted.source}" if wanted.source else ""
+    if isinstance(current, ParamSet):
+        if wanted.is_extended != current.is_extended:
+            kinds = ("extended", "plain") if wanted.is_extended else ("plain", "extended")
+            raise UsageError(f"the parameters{of} are {kinds[0]} ones, and {kinds[1]} ones are needed")
+        own = wanted.component, current.component
+        if None not in own and own[0] != own[1]:
+            raise UsageError(f"the parameters{of} are those of component {own[0]}, not of component {own[1]}")
     if {meant, autopilot} == {"px4", "ardupilot"}:
-        of = f" of {wanted.source}" if wanted.source else ""
         raise UsageError(f"the parameters{of} are those of a vehicle with {meant}, not with {autopilot}")
 
 
-@dataclass
 class _Planner:
-    """Makes the rows and stages of one plan; the arguments are those of `plan_from`, resolved."""
+    """Makes the rows and stages of one plan; the arguments are those of `plan_from`."""
 
-    current: ParamSet | Mapping[str, Param]
-    wanted: ParamSet
-    autopilot: str
-    encoding: Encoding
-    identity: Identity | None
-    include: str | Iterable[str] = ()
-    info: Mapping[str, ParamInfo] | None = None
-    force: bool = False
-
-    def __post_init__(self) -> None:
-        self.described = self.info or {}
-        self.choice = Choice(self.include)
-        self.rules = rules_for(self.autopilot, is_extended=self.wanted.is_extended)
+    def __init__(
+        self,
+        current: ParamSet | Mapping[str, Param],
+        wanted: ParamSet,
+        autopilot: str | None,
+        encoding: Encoding | None,
+        options: PlanOptions,
+    ) -> None:
+        self.current, self.wanted = current, wanted
+        self.identity = current.identity if isinstance(current, ParamSet) else None
+        if autopilot is None and self.identity is not None:
+            autopilot = autopilot_name(self.identity.autopilot)
+        _check_origin(wanted, current, autopilot)
+        usual = Encoding.C_CAST if autopilot == "ardupilot" else Encoding.BYTEWISE
+        self.autopilot, self.encoding = autopilot or "", encoding or usual
+        self.described, self.choice = options.get("info") or {}, Choice(options.get("include", ()))
+        self.force = options.get("force", False)
+        self.rules = rules_for(self.autopilot, is_extended=wanted.is_extended)
 
     def plan(self) -> Plan:
         """Return the plan."""
-        rows = self.settle_missing({each.name: self.row(each) for each in self.wanted.values()})
+        rows = {each.name: self.row(each) for each in self.wanted.values()}
+        self.settle_missing(rows)
         awaiting_reboot = self.awaiting_reboot(rows)
-        may_be_hidden = self.belongs_to(awaiting_reboot)
+        hidden = tuple(map(_group_of, awaiting_reboot))
         file, own = self.wanted.identity, self.identity
         return Plan(
             rows,
@@ -348,7 +335,11 @@ class _Planner:
                 name: row.why
                 for name, row in rows.items()
                 if row.status is ApplyStatus.INVALID
-                or (row.status is ApplyStatus.SKIPPED and row.category == MISSING and not may_be_hidden(name))
+                or (
+                    row.status is ApplyStatus.SKIPPED
+                    and row.category == MISSING
+                    and not name.startswith(hidden)
+                )
             },
             extra=tuple(name for name in self.current if name not in self.wanted),
             unchecked=tuple(name for name, row in rows.items() if self.is_unchecked(row)),
@@ -380,7 +371,7 @@ class _Planner:
         if rule is not None and (rule.category == ACTION or not self.choice.has(name, rule.category)):
             return verdict(ApplyStatus.SKIPPED, rule.category, f"left out: it {rule.reason}")
         if before is None:
-            return verdict(ApplyStatus.LATER, MISSING)
+            return verdict(ApplyStatus.SKIPPED, MISSING, "not on this vehicle")
         if _is_same(wanted.settable, before, kind):
             return verdict(ApplyStatus.UNCHANGED)
         if info is not None and info.is_read_only and not self.choice.has(name, READ_ONLY):
@@ -391,37 +382,28 @@ class _Planner:
         return verdict(ApplyStatus.INVALID, *wrong)
 
     def stages(self, rows: Mapping[str, ApplyRow]) -> tuple[Stage, ...]:
-        """Return the stages, in order."""
-        left = [row for row in rows.values() if row.status is ApplyStatus.SET]
+        """Return the stages, in order; in the last one, the system id is last."""
+        may_appear = any(row.status is ApplyStatus.LATER for row in rows.values())
+        to_set = [row for row in rows.values() if row.status is ApplyStatus.SET]
+        to_set.sort(key=lambda row: (self.place(row), self.rules.has("system_id", row.name)))
+        stages = []
+        for place, group in itertools.groupby(to_set, self.place):
+            chosen, reveals = tuple(group), place < _OTHERS
+            reboot_first = reveals and any(
+                (may_appear and row.needs_reboot) or self.rules.has("resets", row.name) for row in chosen
+            )
+            stages.append(Stage(_PURPOSES[place], chosen, reveals, reboot_first, is_last=place == _LAST))
+        return tuple(stages)
 
-        def pop(fits: Callable[[str], bool]) -> tuple[ApplyRow, ...]:
-            taken = tuple(row for row in left if fits(row.name))
-            left[:] = [row for row in left if not fits(row.name)]
-            return taken
-
-        last = pop(lambda name: self.rules.has("last", name))
-        frame = pop(lambda name: self.rules.has("frame", name))
-        turned_off = pop(lambda name: self.rules.reveals(name) and self.wanted[name].settable == 0)
-        switches = pop(self.rules.reveals)
-        is_any_missing = any(row.status is ApplyStatus.LATER for row in rows.values())
-        waits = [
-            is_any_missing and any(row.needs_reboot for row in revealing) for revealing in (frame, switches)
-        ]
-        resets = any(self.rules.has("resets", row.name) for row in frame)
-        last = tuple(sorted(last, key=lambda row: self.rules.has("system_id", row.name)))
-        stages = (
-            Stage("frame parameters", frame, reveals=True, reboot_first=resets or waits[0]),
-            Stage("switches that reveal parameters", switches, reveals=True, reboot_first=waits[1]),
-            Stage("all other parameters", tuple(left)),
-            Stage("switches that are turned off", turned_off),
-            Stage("parameters that may end the connection", last, is_last=True),
-        )
-        return tuple(stage for stage in stages if stage.rows)
-
-    def belongs_to(self, switches: Iterable[str]) -> Callable[[str], bool]:
-        """Return a function that decides whether a wanted name is of a switch's group."""
-        groups = tuple(switch.rpartition("_")[0] + "_" for switch in switches)
-        return lambda name: name.startswith(groups)
+    def place(self, row: ApplyRow) -> int:
+        """Return the place of a value's stage in `_PURPOSES`."""
+        if self.rules.has("last", row.name):
+            return _LAST
+        if self.rules.has("frame", row.name):
+            return _FRAME
+        if not self.rules.reveals(row.name):
+            return _OTHERS
+        return _TURNED_OFF if row.wanted.settable == 0 else _SWITCHES
 
     def awaiting_reboot(self, rows: Mapping[str, ApplyRow]) -> tuple[str, ...]:
         """Return switches whose missing group may appear after a reboot."""
@@ -433,25 +415,20 @@ class _Planner:
             and row.before != 0
             and row.needs_reboot
             and (self.rules.reveals(name) or self.rules.has("frame", name))
-            and any(map(self.belongs_to([name]), missing))
+            and any(each.startswith(_group_of(name)) for each in missing)
         )
 
-    def settle_missing(self, rows: Mapping[str, ApplyRow]) -> dict[str, ApplyRow]:
-        """Return the rows with missing parameters as later, if a step may reveal them, or skipped.
-
-        Adds the similar names that the vehicle has.
-        """
-        names = [name for name, row in rows.items() if row.status is ApplyStatus.LATER]
+    def settle_missing(self, rows: dict[str, ApplyRow]) -> None:
+        """Mark missing parameters that a step may reveal, and add the similar names that the vehicle has."""
+        names = [name for name, row in rows.items() if row.category == MISSING]
         unnamed = self.current.keys() - self.wanted.keys()
         spelled = {name.upper(): name for name in self.current} if names else {}
-        settled, may_be_revealed = dict(rows), self._revealed_names(rows)
+        may_be_revealed = self._revealed_names(rows)
         for name in names:
-            nearest: tuple[str, ...] = ()
+            row = rows[name]
             if len(names) <= SUGGESTIONS_MAX:
-                nearest = nearest_names(name, unnamed | {spelled.get(name.upper(), name)})
-            status = ApplyStatus.LATER if may_be_revealed(name) else ApplyStatus.SKIPPED
-            settled[name] = replace(rows[name], status=status, reason="not on this vehicle", nearest=nearest)
-        return settled
+                row = replace(row, nearest=nearest_names(name, unnamed | {spelled.get(name.upper(), name)}))
+            rows[name] = replace(row, status=ApplyStatus.LATER) if may_be_revealed(name) else row
 
     def _revealed_names(self, rows: Mapping[str, ApplyRow]) -> Callable[[str], bool]:
         """Return a function that decides whether a step may reveal a name that the vehicle does not have.
@@ -462,12 +439,11 @@ class _Planner:
         """
         groups: list[str] = []
         for name, row in rows.items():
-            if row.status is not ApplyStatus.SET or self.rules.has("last", name):
-                continue
             is_switch = self.rules.reveals(name)
-            if is_switch and row.wanted.settable == 0:
+            is_off = is_switch and row.wanted.settable == 0
+            if row.status is not ApplyStatus.SET or is_off or self.rules.has("last", name):
                 continue
-            if self.rules.has("brings_any", name) or (not is_switch and self.rules.has("frame", name)):
+            if self.rules.has("brings_any" if is_switch else "frame", name):
                 return lambda _: True
             if is_switch:
                 groups.append(name.partition("_")[0])
@@ -494,19 +470,15 @@ class _Planner:
         if isinstance(value, bytes | str):
             return None
         if not math.isfinite(value):
-            return None if self.force else self._fault_of_non_finite(value)
-        sent = _float32(value) if kind == ParamType.REAL32 else value
-        if info is not None and info.minimum is not None and sent < _float32(info.minimum):
-            return OUT_OF_RANGE, f"{format_value(value)} is below its minimum, {info.minimum:g}"
-        if info is not None and info.maximum is not None and sent > _float32(info.maximum):
-            return OUT_OF_RANGE, f"{format_value(value)} is above its maximum, {info.maximum:g}"
-        return None
-
-    def _fault_of_non_finite(self, value: float) -> tuple[str, str]:
-        # only ArduPilot sends integers as float32
-        usual = "ardupilot" if self.encoding is Encoding.C_CAST else ""
-        reason = reason_against_non_finite(self.autopilot or usual)
-        return (WRONG, reason) if reason else (OUT_OF_RANGE, f"{value} is not a finite number")
+            if self.force:
+                return None
+            # only ArduPilot sends integers as float32
+            usual = "ardupilot" if self.encoding is Encoding.C_CAST else ""
+            reason = reason_against_non_finite(self.autopilot or usual)
+            return (WRONG, reason) if reason else (OUT_OF_RANGE, f"{value} is not a finite number")
+        if info is None or (problem := info.problem(value)) is None:
+            return None
+        return OUT_OF_RANGE, problem.removeprefix(f"{info.name}: ")
 
     def _value_to_be(self, name: str) -> Value | None:
         """Return the wanted value of a parameter, or else its present value."""
@@ -514,15 +486,24 @@ class _Planner:
         return None if param is None else param.settable
 
 
+def _group_of(switch: str) -> str:
+    """Return how the names of a switch's group begin."""
+    return switch.rpartition("_")[0] + "_"
+
+
 def _is_same(wanted: Value, current: Value, kind: ParamType | int | None) -> bool:
     """Return whether two values are equal in the vehicle's type; as float32 if the type is unknown."""
     return same_value(*(WrittenParam("", value, kind) for value in (wanted, current)))
 
 
-def _float32(value: float) -> float:
-    """Return the nearest float32; infinity for values beyond its range."""
-    return c_float(value).value
-
-
 _INTENDED_CATEGORIES: Final = frozenset({*CATEGORIES, ACTION}) - {OUT_OF_RANGE}
 """Categories of parameters that are left out on purpose: a skipped row of one is no failure."""
+_PURPOSES: Final = (
+    "frame parameters",
+    "switches that reveal parameters",
+    "all other parameters",
+    "switches that are turned off",
+    "parameters that may end the connection",
+)
+"""Purposes of the stages, in their order. After the first two, further parameters may appear."""
+_FRAME, _SWITCHES, _OTHERS, _TURNED_OFF, _LAST = range(len(_PURPOSES))

@@ -504,7 +504,7 @@ def test_metadata_gives_ranges_and_reboots(command: Command, put: Put, file: Fil
     metadata = file(json.dumps({"version": 1, "parameters": described}), "parameters.json")
     outcome = command("apply", put(vehicle), file(), "--metadata", metadata)
     assert outcome.code == 2
-    assert "RTL_ALT: 2500 is above its maximum, 2000" in outcome.err
+    assert "RTL_ALT: 2500 is above the maximum of 2000" in outcome.err
     assert vehicle.requests["PARAM_SET"] == 0
     options = ("--metadata", metadata, "--include", "out-of-range")
     outcome = command("apply", put(vehicle), file(), *options)

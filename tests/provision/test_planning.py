@@ -218,7 +218,7 @@ def test_a_value_that_the_parameter_cannot_take_is_invalid(
 def test_a_value_outside_of_the_metadata_range_is_invalid() -> None:
     table = held(P=1.0, Q=7.0)
     info = {"P": Info(minimum=0.1, maximum=2.0), "Q": Info(maximum=2.0)}
-    for value, says in ((0.05, "0.05 is below its minimum, 0.1"), (2.5, "2.5 is above its maximum, 2")):
+    for value, says in ((0.05, "0.05 is below the minimum of 0.1"), (2.5, "2.5 is above the maximum of 2.0")):
         status, category, reason = only_row(plan_from(table, written(P=value), info=info))
         assert (status, category, reason) == (ApplyStatus.INVALID, OUT_OF_RANGE, says)
         assert plan_from(table, written(P=value), info=info, include=OUT_OF_RANGE).to_write
