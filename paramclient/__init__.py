@@ -16,9 +16,8 @@ To find the module of a rule, see "Find the code" in `docs/internals/design.md`.
 from __future__ import annotations
 
 from paramclient.cache import CachedComponent, ParamCache
-from paramclient.client.client import ParamClient
+from paramclient.client.client import Event, Events, ParamClient
 from paramclient.client.component import Component, ComponentState
-from paramclient.client.events import Event, Events
 from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.signing import Signing, read_key
 from paramclient.client.streams import Changes
@@ -52,9 +51,9 @@ from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamMap, ParamSet, WrittenParam
 from paramclient.model.values import Encoding, Param, ParamType, Settable, Trust, Value
 from paramclient.protocol.addresses import Address
-from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
+from paramclient.protocol.table import Change
 from paramclient.protocol.watch import SyncState
 from paramclient.version import __version__
 from paramclient.wire.signing import SigningKey, SigningPolicy

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import ModuleType
 
 from paramclient import metadata, provision
-from paramclient.client import client, component, events, streams
+from paramclient.client import client, component, streams
 from paramclient.provision import inspection
 
 STUB = Path(__file__).parent.parent / "paramclient" / "sync" / "__init__.pyi"
@@ -20,8 +20,7 @@ CLASSES: dict[ModuleType, list[str]] = {
     component: ["Component"],
     inspection: ["Wanted"],
     streams: ["Changes"],
-    events: ["Event", "Events"],
-    client: ["ParamClient"],
+    client: ["Event", "Events", "ParamClient"],
 }
 FUNCTIONS: list[Callable[..., object]] = [
     *(provision.plan, provision.apply, provision.restore, provision.for_each),

@@ -15,13 +15,13 @@ from paramclient.cli.output import ExitCode, local_time, print_json, print_line,
 from paramclient.cli.param_names import check_given
 from paramclient.cli.read_commands import get_chosen
 from paramclient.cli.session import CommandSession, Sessions, sessions
-from paramclient.client.events import Event
+from paramclient.client.client import Event
 from paramclient.links import ReplayLink
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import hash_text, rounded, time_text
 from paramclient.model.values import format_value
 from paramclient.protocol.channel import task_group
-from paramclient.protocol.events import Change
+from paramclient.protocol.table import Change
 
 _DEFAULTS: Final = LinkOptions()
 

@@ -19,10 +19,10 @@ from paramclient.cache import BY_VEHICLE, ParamCache, StoredParam, TableState, T
 from paramclient.errors import CacheError, UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param
-from paramclient.protocol.events import Change
 from paramclient.protocol.node import Node
 from paramclient.protocol.selection import vehicle_of
 from paramclient.protocol.session import Session
+from paramclient.protocol.table import Change
 
 FLUSH_INTERVAL: Final = 0.25
 """Seconds from a change to its commit: changes are collected for half of that time."""

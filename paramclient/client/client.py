@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 import anyio
 
@@ -15,11 +16,10 @@ from paramclient.cache import ParamCache
 from paramclient.client.cache_writer import CacheWriter, choose_cache
 from paramclient.client.component import Component
 from paramclient.client.core import ClientCore
-from paramclient.client.events import Event, Events
 from paramclient.client.fleet_fetch import FetchedAll, fetch_components
 from paramclient.client.recording import Capture
 from paramclient.client.signing import Signing, refused_in_words
-from paramclient.client.streams import Subscribers
+from paramclient.client.streams import Stream, Subscribers
 from paramclient.client.traffic import Traffic, TrafficReport
 from paramclient.errors import AnotherVehicle, ClientClosed, NoReply, ParamClientError, UsageError
 from paramclient.links import Link, ReplayLink, SimLink, create_link
@@ -47,6 +47,37 @@ PROBE_INTERVAL: Final = 0.5
 `HEARTBEAT_WAIT`, in which a component with heartbeats is heard."""
 LISTENING_TIME: Final = HEARTBEAT_WAIT
 """Seconds after the client was opened in which components are waited for, by a fetch of all."""
+EVENTS_MAX: Final = 1_000
+"""Queued events for a consumer, at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """What has happened to a component.
+
+    Attributes:
+        component: the component.
+        kind: "discovered": its first message has arrived. "lost": it has sent heartbeats before, and no
+            message for the heartbeat timeout: 5 s, longer for slow heartbeats and in high-latency mode.
+            "found": a lost component sends again; the client requests its identity and checks its table.
+            "rebooted": its clock has jumped back, or its heartbeat reports MAV_STATE_BOOT. "resynced": a
+            table that was stale, or possibly stale, matches the vehicle again.
+        silence: seconds without a message, of "lost" and "found"; None of others.
+        changed: of "resynced", the names of the parameters that had changed.
+        hash: of "resynced", PX4's hash or ArduPilot's checksum that confirms the table; None without one.
+    """
+
+    component: Component
+    kind: Literal["discovered", "lost", "found", "rebooted", "resynced"]
+    silence: float | None = None
+    changed: tuple[str, ...] = ()
+    hash: int | None = None
+
+
+class Events(Stream[Event]):
+    """Stream of the component events since its creation; see `ParamClient.events`."""
+
+    most = EVENTS_MAX
 
 
 class ParamClient:

@@ -31,7 +31,6 @@ from paramclient.model.values import (
 )
 from paramclient.protocol import commands, ftp
 from paramclient.protocol.addresses import Address, peer_in_words
-from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, FetchSource, Policy, Progress, fetch_all, result_of
 from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.protocol.node import Node
@@ -39,6 +38,7 @@ from paramclient.protocol.reads import read_param
 from paramclient.protocol.selection import hint_of_node, node_in_words, vehicle_of
 from paramclient.protocol.session import Session
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
+from paramclient.protocol.table import Change
 from paramclient.protocol.watch import SyncState, Watch
 from paramclient.protocol.writes import write, write_many
 from paramclient.wire.messages import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, PARAMETERS_MAX, SetupSigning

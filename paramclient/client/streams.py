@@ -10,7 +10,7 @@ from typing import ClassVar, Final, Generic, Self, TypeVar
 import anyio
 
 from paramclient.errors import ParamClientError
-from paramclient.protocol.events import Change
+from paramclient.protocol.table import Change
 
 CHANGES_MAX: Final = 100_000
 """Queued changes for a consumer, one for each name, at most: more than a table holds."""

@@ -20,11 +20,11 @@ from paramclient.links.tlog import Record, open_log, read_records
 from paramclient.logs.logged_params import ImportedTable
 from paramclient.model.identity import Identity
 from paramclient.protocol.addresses import Address
-from paramclient.protocol.events import Change
 from paramclient.protocol.node import Node
 from paramclient.protocol.selection import vehicle_of
 from paramclient.protocol.session import Session
 from paramclient.protocol.station import Station
+from paramclient.protocol.table import Change
 from paramclient.wire.frames import Framer
 from paramclient.wire.messages import AutopilotVersion, Heartbeat, message_id
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Container, Iterable, Mapping
-from dataclasses import replace
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Final, Literal
 
 from paramclient.model.px4_hash import find_volatile, hash_bits
 from paramclient.model.values import (
@@ -19,7 +19,6 @@ from paramclient.model.values import (
     is_portable_name,
 )
 from paramclient.protocol.dialect import PLAIN, Dialect, Digest, ReportedValue
-from paramclient.protocol.events import Change
 from paramclient.protocol.param_pck import PackedParam
 from paramclient.wire.messages import HASH_CHECK, PARAMETERS_MAX
 
@@ -32,6 +31,27 @@ BEYOND_MAX: Final = 64
 Values further beyond are stored without their index."""
 LEFT_OUT_MAX: Final = 10
 """Names that are not stored, of which the notes tell; so that they stay readable."""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One parameter that appeared, changed its value or type, or was removed.
+
+    Attributes:
+        name: param_id.
+        old: the parameter before, or None for a new one.
+        new: the parameter now, or None when the vehicle no longer has it.
+        by: the author: "us" (a `set` of this client), "us for NAME" (a `set` on behalf of NAME), "vehicle",
+            or the system and component of another station whose PARAM_SET was seen.
+        kind: "changed"; "first" for a value of a table that was never complete; "added" for a parameter that
+            a complete table lacked; "removed".
+    """
+
+    name: str
+    old: Param | None
+    new: Param | None
+    by: str
+    kind: Literal["changed", "first", "added", "removed"]
 
 
 class Table:

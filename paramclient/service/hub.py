@@ -23,9 +23,8 @@ from fastapi.sse import ServerSentEvent
 from paramclient.cache import ParamCache
 from paramclient.cli.json_output import JsonObject, outcome_json, table_param_json, vehicle_json
 from paramclient.client.cache_writer import choose_cache
-from paramclient.client.client import ParamClient
+from paramclient.client.client import Event, ParamClient
 from paramclient.client.component import Component
-from paramclient.client.events import Event
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo, metadata_of

@@ -24,9 +24,9 @@ from paramclient.model.values import (
     ext_bytes,
 )
 from paramclient.protocol.dialect import ReportedValue
-from paramclient.protocol.events import Change
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
+from paramclient.protocol.table import Change
 from paramclient.protocol.watch import SyncState
 from paramclient.service.stations import GroundStation
 from paramclient.wire import messages

@@ -18,7 +18,7 @@ The functions have the arguments and the results of those in `paramclient.provis
 from __future__ import annotations
 
 from paramclient import metadata, provision
-from paramclient.client.events import Event
+from paramclient.client.client import Event
 from paramclient.provision.inspection import Wanted
 from paramclient.sync.proxy import Changes, Component, Events, ParamClient, blocking, for_each
 

@@ -19,9 +19,9 @@ from paramclient.model.paramset import ParamMap, ParamSet
 from paramclient.model.values import Encoding, Param, Settable
 from paramclient.protocol import ftp
 from paramclient.protocol.addresses import Address
-from paramclient.protocol.events import Change
 from paramclient.protocol.fetch import FetchResult, Policy, Progress
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult
+from paramclient.protocol.table import Change
 from paramclient.protocol.watch import SyncState
 from paramclient.provision.apply_restore import FleetResult, Outcome
 from paramclient.provision.execution import ApplyOptions, ApplyResult

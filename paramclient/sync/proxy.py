@@ -22,7 +22,7 @@ import anyio
 from anyio.from_thread import BlockingPortal, start_blocking_portal
 
 import paramclient.client.client as asynchronous
-from paramclient.client import component, events, streams
+from paramclient.client import component, streams
 from paramclient.errors import ClientClosed, ParamClientError, UsageError
 from paramclient.provision.apply_restore import FleetResult
 
@@ -124,7 +124,7 @@ class _Session:
             return [self.shown(each) for each in value]
         if isinstance(value, MappingProxyType):
             return {key: self.shown(each) for key, each in value.items()}
-        if isinstance(value, events.Event):
+        if isinstance(value, asynchronous.Event):
             return replace(value, component=self.shown(value.component))
         return value
 
@@ -247,7 +247,7 @@ class Changes(Stream, of=streams.Changes):
     """See `paramclient.Changes`."""
 
 
-class Events(Stream, of=events.Events):
+class Events(Stream, of=asynchronous.Events):
     """See `paramclient.Events`."""
 
 

@@ -8,9 +8,9 @@ import anyio
 from pymavlink.dialects.v20 import common as mavlink
 
 from paramclient.model.values import ParamType
-from paramclient.protocol.events import Change
 from paramclient.protocol.node import Node
 from paramclient.protocol.station import Station
+from paramclient.protocol.table import Change
 from paramclient.wire import messages
 from paramclient.wire.frames import Framer
 from paramclient.wire.messages import Heartbeat, Message, ParamValue

@@ -19,9 +19,9 @@ from trio.testing import MockClock
 
 from paramclient.errors import ParamClientError
 from paramclient.links.sim import SimLink
-from paramclient.protocol.events import Change
 from paramclient.protocol.node import Node
 from paramclient.protocol.station import Station
+from paramclient.protocol.table import Change
 from paramclient.sim import Endpoint
 from paramclient.wire.frames import Framer
 from paramclient.wire.messages import DECODED_IDS, Heartbeat, Message, decode, encode

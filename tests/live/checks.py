@@ -18,7 +18,7 @@ from paramclient import (
     FetchResult,
     ParamClient,
 )
-from paramclient.client.events import Events
+from paramclient.client.client import Events
 from paramclient.errors import (
     ParamClientError,
     Refused,
