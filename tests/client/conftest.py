@@ -1,16 +1,19 @@
-"""Both event loops, a cache, and tasks beside a test."""
+"""Both event loops, a cache, clients that have found a vehicle, and tasks beside a test."""
 
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 import anyio
 import anyio.abc
 import pytest
 
+from paramclient import Component, ParamClient
 from tests.cable import TIMEOUT
+from tests.shell import a_client
 
 
 @pytest.fixture(params=["asyncio", "trio"])
@@ -31,3 +34,18 @@ async def beside() -> AsyncIterator[anyio.abc.TaskGroup]:
         async with anyio.create_task_group() as tasks:
             yield tasks
             tasks.cancel_scope.cancel()
+
+
+@asynccontextmanager
+async def connected(link: Any, **options: Any) -> AsyncIterator[tuple[ParamClient, Component]]:
+    """A client, without a cache unless one is given, and the first autopilot."""
+    async with a_client(link, **options) as client:
+        yield client, await client.component()
+
+
+@asynccontextmanager
+async def fetched(link: Any, **options: Any) -> AsyncIterator[tuple[ParamClient, Component]]:
+    """A client, and the first autopilot with its whole table; see `connected`."""
+    async with connected(link, **options) as (client, component):
+        await component.fetch_all()
+        yield client, component

@@ -35,6 +35,7 @@ from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle
 from paramclient.wire import frames, messages
 from tests.caches import changes as history_of
 from tests.caches import read_only
+from tests.client.conftest import connected, fetched
 from tests.shell import (
     VALUES,
     Radio,
@@ -56,8 +57,7 @@ async def session(
     endpoint: Endpoint, path: Path | ParamCache, work: Callable[[Component], Any] | None = None
 ) -> FetchResult:
     """One session with the first autopilot: a fetch, and what else there is to do."""
-    async with ParamClient(endpoint, cache=path) as client:
-        component = await client.component()
+    async with connected(endpoint, cache=path) as (_, component):
         result = await component.fetch_all()
         if work is not None:
             await work(component)
@@ -139,8 +139,7 @@ async def test_changes_are_on_the_disk_within_the_flush_interval_whatever_a_comm
             ages.extend(loop.now - sent.pop(value) for value in begun_with)
             return result
 
-        async with ParamClient(small_px4(), cache=cache) as client:
-            component = await client.component()
+        async with connected(small_px4(), cache=cache) as (_, component):
             await component.set("PARAM_01", 1)
             with mock.patch.object(cache, "save", slow):
                 for value in range(100, 300):
@@ -165,8 +164,7 @@ async def test_a_change_between_two_sessions_is_a_cache_miss(path: Path) -> None
     vehicle = small_px4()
     await session(vehicle, path)
     vehicle.load({"PARAM_01": 1000, "PARAM_05": 5000})
-    async with ParamClient(vehicle, cache=path) as client:
-        component = await client.component()
+    async with connected(vehicle, cache=path) as (_, component):
         changes = component.changes()
         result = await component.fetch_all()
         assert result.source == "stream"
@@ -244,9 +242,7 @@ async def test_another_vehicle_takes_the_place_within_a_session(path: Path, know
         await session(second, path)
     first.tick(simulated_time_loop().time())
     second.reboot(simulated_time_loop().time(), down=math.inf)
-    async with ParamClient(Air([first, second]), cache=path) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(Air([first, second]), cache=path) as (_, component):
         first.reboot(anyio.current_time(), down=math.inf)
         second.reboot(anyio.current_time(), down=10.0)
         await asyncio.sleep(10.5)
@@ -302,8 +298,7 @@ async def test_an_identity_that_arrives_long_after_the_values(path: Path, fetche
     changed = Reticent(table={**VALUES, "PARAM_01": 99}, not_in_use=["PARAM_02"])
     changed.unanswered = (messages.CommandLong,)
     tap = Tap(changed)
-    async with ParamClient(tap, cache=path) as client:
-        component = await client.component()
+    async with connected(tap, cache=path) as (_, component):
         if fetched:
             assert (await component.fetch_all()).complete
         else:
@@ -344,8 +339,7 @@ async def test_after_our_own_set_the_next_session_hits_where_the_hash_is_compute
     vehicle = small_px4(volatile=volatile)
     await session(vehicle, path)
     for name, value in (("PARAM_01", 100), ("PARAM_04", 400), ("PARAM_01", 101)):
-        async with ParamClient(vehicle, cache=path) as client:
-            component = await client.component()
+        async with connected(vehicle, cache=path) as (_, component):
             if fetched:
                 assert (await component.fetch_all()).source == "cache"
             await component.set(name, value)
@@ -358,8 +352,7 @@ async def test_after_our_own_set_the_next_session_hits_where_the_hash_is_compute
 async def test_every_own_write_is_in_the_history_however_briefly_it_was_valid(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
-    async with ParamClient(vehicle, cache=path) as client:
-        component = await client.component()
+    async with connected(vehicle, cache=path) as (_, component):
         before = (await component.get("PARAM_01")).value
         changes = component.changes()
         async with anyio.create_task_group() as tasks:
@@ -381,9 +374,7 @@ async def test_every_own_write_is_in_the_history_however_briefly_it_was_valid(pa
 async def test_a_write_without_a_waiting_caller_is_reported_as_ours(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
-    async with ParamClient(Air.symmetric([vehicle], delay=0.2), cache=path) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(Air.symmetric([vehicle], delay=0.2), cache=path) as (_, component):
         await component.get("PARAM_01")
         with anyio.move_on_after(0.1):
             await component.set("PARAM_01", 100, author="anna")
@@ -400,8 +391,7 @@ async def test_a_write_without_a_waiting_caller_is_reported_as_ours(path: Path) 
 async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_before(path: Path) -> None:
     vehicle = small_px4()
     before, vehicle_had = (vehicle.param(name).value for name in ("PARAM_01", "PARAM_02"))
-    async with ParamClient(vehicle, cache=path) as client:
-        component = await client.component()
+    async with connected(vehicle, cache=path) as (_, component):
         await component.set("PARAM_01", 100, author="anna")
         await component.fetch_all()
         await component.set("PARAM_02", 200)
@@ -415,8 +405,7 @@ async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_befor
 @in_simulated_time
 async def test_an_author_must_be_printable_ascii(path: Path, author: str) -> None:
     vehicle = small_px4()
-    async with ParamClient(vehicle, cache=path) as client:
-        component = await client.component()
+    async with connected(vehicle, cache=path) as (_, component):
         with pytest.raises(UsageError, match="author must have 1 to 128 printable ASCII"):
             await component.set("PARAM_01", 100, author=author)
         with pytest.raises(UsageError, match="author must have"):
@@ -427,9 +416,7 @@ async def test_an_author_must_be_printable_ascii(path: Path, author: str) -> Non
 async def test_a_change_by_another_station_is_in_the_history_with_its_address(path: Path) -> None:
     vehicle = small_px4()
     radio = Radio(vehicle)
-    async with ParamClient(radio, cache=path) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(radio, cache=path) as (_, component):
         await asyncio.sleep(1.0)
         message = messages.ParamSet(1, 1, "PARAM_01", (55).to_bytes(4, "little"), 6)
         radio.other = [messages.encode(message, system=254, component=190, sequence=0)]
@@ -450,8 +437,7 @@ async def test_a_change_by_another_station_is_in_the_history_with_its_address(pa
 @in_simulated_time
 async def test_a_table_is_never_called_whole_that_is_not(path: Path) -> None:
     vehicle = PX4Vehicle(burst=1, period=0.05, table=VALUES)
-    async with ParamClient(vehicle, cache=path) as client:
-        component = await client.component()
+    async with connected(vehicle, cache=path) as (_, component):
         assert not (await component.fetch_all(timeout=0.6)).complete
     with ParamCache(path) as cache:
         cached = cache.component()
@@ -504,9 +490,7 @@ def test_a_folder_that_can_only_be_read(path: Path, caplog: pytest.LogCaptureFix
 
     @in_simulated_time
     async def use() -> None:  # in threads of its own, which have no powers of root
-        async with ParamClient(small_px4(), cache=path) as client:
-            component = await client.component()
-            await component.fetch_all()
+        async with fetched(small_px4(), cache=path) as (_, component):
             await component.set("PARAM_01", 5)
             await asyncio.sleep(20.0)
             assert (await component.get("PARAM_01")).value == 5
@@ -535,13 +519,11 @@ async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Pa
     result = await session(vehicle, path)
     defaults = {name: param.default for name, param in result.params.items()}
     assert said(path) == (1382, True)
-    async with ParamClient(vehicle, cache=path) as client:
-        component = await client.component()
+    async with connected(vehicle, cache=path) as (_, component):
         assert {name: param.default for name, param in component.params.items()} == defaults
         assert len(component.params.changed()) == 41
     vehicle.version = replace(vehicle.version, git_hash=b"01234567")
-    async with ParamClient(vehicle, cache=path) as client:
-        component = await client.component()
+    async with connected(vehicle, cache=path) as (_, component):
         assert component.params.changed() == {}
         before = component.params["STAT_RUNTIME"].value
         await component.set("STAT_RUNTIME", int(before) + 5)  # something is written, and no fetch
@@ -557,8 +539,7 @@ async def test_names_that_change_by_themselves_are_learnt_for_later_sessions(pat
     await session(vehicle, path)
     vehicle.load({"RTL_ALT": 2100, "STAT_RUNTIME": 60})
     assert (await session(vehicle, path)).changed == ("RTL_ALT",)
-    async with ParamClient(vehicle, cache=path) as client:
-        component = await client.component()
+    async with connected(vehicle, cache=path) as (_, component):
         assert component.session.table.volatile == {"RTL_ALT", "STAT_RUNTIME"}
         assert (await component.fetch_all()).source == "cache"
 

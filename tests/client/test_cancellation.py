@@ -23,6 +23,7 @@ from paramclient import Component, ParamCache, ParamClient
 from paramclient.sim import Air, PX4Vehicle
 from paramclient.wire import messages
 from tests.caches import set_aside
+from tests.client.conftest import connected, fetched
 from tests.shell import (
     VALUES,
     FlakyLink,
@@ -184,8 +185,7 @@ async def test_cancelled_at_each_point(call: Call, how: str) -> None:
 @in_simulated_time
 async def test_cancelled_while_the_link_is_disconnected(call: Call) -> None:
     link = FlakyLink(Air([small_px4(), generic(system=2)]))
-    async with a_client(link) as client:
-        component = await client.component()
+    async with connected(link) as (client, component):
         await link.drop(stays_offline=True)
         task = asyncio.create_task(call(client, component))
         await asyncio.sleep(1.0)
@@ -205,9 +205,7 @@ async def test_a_whole_session_cancelled_at_each_point(tmp_path: Path, point: st
     loop = simulated_time_loop()
 
     async def session() -> None:
-        async with ParamClient(vehicle, cache=path) as client:
-            component = await client.component()
-            await component.fetch_all()
+        async with fetched(vehicle, cache=path) as (_, component):
             await component.set("PARAM_01", number)
             await asyncio.sleep(0.3)
 

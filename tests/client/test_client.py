@@ -28,9 +28,10 @@ from paramclient import (
     UsageError,
 )
 from paramclient.client import link_task
-from paramclient.client.client import COMPONENT_TIMEOUT
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from paramclient.wire import messages
+from tests.client.conftest import connected, fetched
+from tests.conversations.virtual import virtual_on_both
 from tests.shell import (
     VALUES,
     FlakyLink,
@@ -57,6 +58,7 @@ CALLS: dict[str, Call] = {
     "fetch_all": lambda client, component: component.fetch_all(),
     "changes": lambda client, component: first_change(component),
     "client.component": lambda client, component: client.component(system=99, timeout=None),
+    "client.events": lambda client, component: anext(client.events()),
     "client.fetch_all": lambda client, component: client.fetch_all(),
 }
 """The public calls that wait."""
@@ -144,8 +146,7 @@ async def test_calls_on_a_client_that_is_not_open() -> None:
 async def test_closing_while_the_link_is_disconnected() -> None:
     tap = Tap(generic())
     link = FlakyLink(tap)
-    async with a_client(link) as client:
-        component = await client.component()
+    async with connected(link) as (client, component):
         tap.is_mute = True
         waiting = under_way(client, component)
         await settled()
@@ -155,6 +156,52 @@ async def test_closing_while_the_link_is_disconnected() -> None:
     for name, task in waiting.items():
         assert type(await task) is ClientClosed, name
     assert not tasks_beside()
+
+
+LONG_CALLS: dict[str, Call] = {
+    "settle": lambda client, component: component.set("MC_ROLL_P", 5.0, settle=60),
+    "fetch": lambda client, component: component.fetch_all(refresh=True),
+    "extended": lambda client, component: component.ext.fetch_all(),
+    "reboot": lambda client, component: component.reboot(timeout=None),
+}
+
+
+@pytest.mark.parametrize("call", LONG_CALLS)
+@virtual_on_both
+async def test_closing_ends_a_call_of_another_task_at_once(call: str) -> None:
+    client = a_client(PX4Vehicle(burst=1, period=0.05))
+    errors: list[object] = []
+
+    async def wait(component: Component) -> None:
+        errors.append(await outcome(LONG_CALLS[call](client, component)))
+
+    async with anyio.create_task_group() as tasks:
+        await client.open()
+        tasks.start_soon(wait, await client.component())
+        await anyio.sleep(1.0)
+        await client.aclose()
+        closed_at = anyio.current_time()
+    assert anyio.current_time() - closed_at < 0.1
+    assert [type(error) for error in errors] == [ClientClosed]
+
+
+@virtual_on_both
+async def test_a_call_that_begins_while_a_file_is_closed_on_board_ends_too() -> None:
+    client = a_client(Air.symmetric([ArduPilotVehicle()], delay=0.3))
+    errors: list[object] = []
+
+    async def fetch(component: Component) -> None:
+        errors.append(await outcome(component.fetch_all()))
+
+    async with anyio.create_task_group() as tasks:
+        await client.open()
+        component = await client.component()
+        tasks.start_soon(fetch, component)
+        await anyio.sleep(1.3)
+        tasks.start_soon(client.aclose)
+        await anyio.sleep(0.01)
+        tasks.start_soon(fetch, component.ext)
+    assert [type(error) for error in errors] == [ClientClosed] * 2
 
 
 @pytest.mark.asyncio
@@ -167,11 +214,9 @@ async def test_nothing_is_left_behind(tmp_path: Path) -> None:
     with flying(small_px4()) as url:
         tasks, files, threads = present()
         for _ in range(2):
-            async with ParamClient(url, cache=tmp_path / "cache") as client:
-                component = await client.component()
-                await component.fetch_all()
+            async with fetched(url, cache=tmp_path / "cache") as (_, component):
                 await component.set("PARAM_01", 5)
-            del client, component
+            del component
             assert present()[:2] == (tasks, files)
             assert not present()[2] - threads, "one of an earlier test may end meanwhile"
 
@@ -181,8 +226,7 @@ async def test_nothing_is_left_behind(tmp_path: Path) -> None:
 
 @in_simulated_time
 async def test_the_user_knows_better_how_values_are_laid_out() -> None:
-    async with a_client(generic(), encoding=Encoding.C_CAST) as client:
-        component = await client.component()
+    async with connected(generic(), encoding=Encoding.C_CAST) as (_, component):
         assert component.encoding is Encoding.C_CAST
         assert component.encoding_reason == "chosen by the user"
         assert (await component.get("PARAM_01")).value == 0, "1 as the bits of a float32 is next to nothing"
@@ -202,56 +246,9 @@ async def test_bytes_are_counted_both_ways() -> None:
 
 
 @in_simulated_time
-async def test_the_first_autopilot_is_the_component() -> None:
-    camera = generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
-    async with a_client(Air([camera, generic(system=7, component=1), generic(system=9)])) as client:
-        component = await client.component()
-        assert (component.system, component.component) == (7, 1)
-        assert await client.component() is component
-        assert await client.component(system=9) is client.components[9, 1]
-        assert await client.component(component=100) is client.components[1, 100]
-        assert await client.component(system=1, component=100) is client.components[1, 100]
-        assert set(client.components) == {(1, 100), (7, 1), (9, 1)}
-        with pytest.raises(TypeError):
-            client.components[1, 1] = component  # type: ignore[index]  # that it is read-only is the point
-
-
-@in_simulated_time
-@pytest.mark.parametrize(
-    ("wanted", "words"),
-    [
-        ({}, "an autopilot"),
-        ({"system": 3}, "an autopilot with system id 3"),
-        ({"component": 100}, "component */100"),
-        ({"system": 3, "component": 100}, "component 3/100"),
-    ],
-)
-async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str) -> None:
-    async with a_client(generic(component=101, autopilot=messages.MAV_AUTOPILOT_INVALID)) as client:
-        with pytest.raises(NoReply) as caught:
-            await client.component(**wanted, timeout=2.5)
-        error = caught.value
-        assert (error.awaited, error.attempts, round(error.waited, 3)) == (words, 0, 2.5)
-        began = anyio.current_time()
-        with pytest.raises(NoReply):
-            await client.component(**wanted)
-        assert round(anyio.current_time() - began, 3) == COMPONENT_TIMEOUT
-
-
-@in_simulated_time
-@pytest.mark.parametrize("wanted", [{"system": 300}, {"component": -1}])
-async def test_an_id_that_no_component_has_is_an_error_at_once(wanted: dict[str, Any]) -> None:
-    async with ParamClient("sim:px4", cache=False) as client:
-        for find in (client.component, client.only_component):
-            with pytest.raises(UsageError, match="ids are 0 to 255, not"):
-                await find(**wanted, timeout=None)
-
-
-@in_simulated_time
 async def test_the_hash_can_be_read_like_a_parameter_and_is_none() -> None:
     vehicle = small_px4()
-    async with a_client(vehicle) as client:
-        component = await client.component()
+    async with connected(vehicle) as (_, component):
         param = await component.get("_HASH_CHECK")
         assert (param.value, param.type, param.index) == (vehicle.announced_hash(), ParamType.UINT32, None)
         assert "_HASH_CHECK" not in component.params
@@ -263,9 +260,7 @@ async def test_the_hash_can_be_read_like_a_parameter_and_is_none() -> None:
 async def test_invalid_values_and_names_are_not_sent() -> None:
     table: dict[str, Any] = {"SMALL": (ParamType.UINT8, 1), "WHOLE": 1}
     tap = Tap(GenericVehicle(table))
-    async with a_client(tap) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(tap) as (_, component):
         await settled()
         tap.received.clear()
         names = ("SEVENTEEN_LETTERS", "GRÖSSE", "")
@@ -287,8 +282,7 @@ async def test_invalid_values_and_names_are_not_sent() -> None:
 @in_simulated_time
 async def test_every_call_has_a_time_limit_of_its_own() -> None:
     tap = Tap(generic())
-    async with a_client(tap) as client:
-        component = await client.component()
+    async with connected(tap) as (_, component):
         await asyncio.sleep(0.1)
         tap.is_deaf = True
         limited = {
@@ -310,8 +304,7 @@ async def test_every_call_has_a_time_limit_of_its_own() -> None:
 @in_simulated_time
 async def test_a_fetch_that_times_out_returns_the_received_values() -> None:
     slow = generic(burst=1, period=0.1)
-    async with a_client(slow) as client:
-        component = await client.component()
+    async with connected(slow) as (client, component):
         result = await component.fetch_all(timeout=1.05)
         assert 9 <= result.received <= 11
         assert result.count == 24
@@ -361,6 +354,9 @@ async def test_several_vehicles_are_fetched_side_by_side() -> None:
             assert client.components[address].params == result.params
         one_system = await client.fetch_all(1, refresh=True)
         assert one_system.results.keys() == {(1, 1), (1, 100)}
+        await client.components[3, 1].set("RTL_ALT", 1234)
+        assert [each.requests["PARAM_SET"] for each in vehicles.values()] == [0, 0, 0, 1]
+        assert vehicles[3, 1].param("RTL_ALT").value == 1234
 
 
 def silent(**options: Any) -> Tap:
@@ -447,8 +443,7 @@ async def test_a_lossy_link_to_one_vehicle_is_not_given_up_early() -> None:
 @in_simulated_time
 async def test_changes_have_the_old_and_the_new_value() -> None:
     vehicle = small_px4()
-    async with a_client(vehicle) as client:
-        component = await client.component()
+    async with connected(vehicle) as (_, component):
         first, second = component.changes(), component.changes()
         await component.get("PARAM_01")
         vehicle.set_param("PARAM_01", 40)
@@ -475,8 +470,7 @@ async def test_changes_have_the_old_and_the_new_value() -> None:
 async def test_calls_go_on_when_the_link_is_back() -> None:
     vehicle = generic(burst=1, period=0.1)
     link = FlakyLink(vehicle)
-    async with a_client(link) as client:
-        component = await client.component()
+    async with connected(link) as (client, component):
         changes = component.changes()
         fetch = asyncio.create_task(component.fetch_all())
         await asyncio.sleep(1.0)
@@ -503,12 +497,12 @@ async def test_a_link_that_stays_disconnected_fails_the_calls_and_not_the_client
 ) -> None:
     tap = Tap(generic())
     link = FlakyLink(tap)
-    async with a_client(link) as client:
-        component = await client.component()
+    async with connected(link) as (client, component):
         tap.is_mute = True
         waiting = under_way(client, component)
         await settled()
         changes = waiting.pop("changes")
+        assert waiting.pop("client.events")
         limited = asyncio.create_task(outcome(component.get("PARAM_05", timeout=2)))
         await link.drop(stays_offline=True)
         disconnected_at = anyio.current_time()
@@ -542,8 +536,7 @@ async def test_a_link_that_cannot_reconnect_ends_every_call() -> None:
     tap = Tap(generic())
     link = FlakyLink(tap)
     link.reconnects = False
-    async with a_client(link) as client:
-        component = await client.component()
+    async with connected(link) as (client, component):
         tap.is_mute = True
         waiting = under_way(client, component)
         await settled()
@@ -567,8 +560,7 @@ async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyP
         """How long the call takes where a rest, once begun, would last until our next heartbeat."""
         monkeypatch.setattr(link_task, "READ_PAUSE", rest)
         tap = Tap(small_px4(telemetry=200))
-        async with a_client(tap) as client:
-            component = await client.component()
+        async with connected(tap) as (client, component):
             await asyncio.sleep(2.0)  # it has said who it is
             tap.received.clear()
             await until(lambda: tap.messages(messages.Heartbeat))
@@ -586,8 +578,7 @@ async def test_a_blocked_program_processes_received_data_before_timeouts_count()
     """As by a call that blocks the event loop for half a second, in the middle of a list."""
     loop = simulated_time_loop()
     px4 = PX4Vehicle()
-    async with a_client(px4) as client:
-        vehicle = await client.component()
+    async with connected(px4) as (_, vehicle):
         loop.call_later(0.41, lambda: setattr(loop, "now", loop.now + 0.5))
         result = await vehicle.fetch_all()
     assert result.complete
@@ -595,23 +586,10 @@ async def test_a_blocked_program_processes_received_data_before_timeouts_count()
 
 
 @in_simulated_time
-async def test_the_autopilots_are_the_vehicles_without_what_they_carry() -> None:
-    camera = generic(system=1, component=100)
-    vehicles = [generic(system=3), small_px4(), camera, generic(system=2, component=7)]
-    async with a_client(Air(vehicles)) as client:
-        assert client.autopilots == []
-        await client.fetch_all()
-        addresses = [(each.system, each.component) for each in client.autopilots]
-        assert addresses == [(1, 1), (2, 7), (3, 1)]
-        assert len(client.components) == 4
-
-
-@in_simulated_time
 async def test_a_vehicle_that_receives_nothing_at_first_is_identified_later() -> None:
     tap = Tap(PX4Vehicle())
     tap.is_deaf = True
-    async with a_client(tap) as client:
-        component = await client.component()
+    async with connected(tap) as (_, component):
         await anyio.sleep(300.0)
         assert component.identity.uid is None
         tap.is_deaf = False

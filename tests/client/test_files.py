@@ -14,6 +14,7 @@ from paramclient.errors import LinkError
 from paramclient.links import SimLink
 from paramclient.model.values import ParamType
 from paramclient.sim import Air, ArduPilotVehicle, SimParam
+from tests.client.conftest import connected, fetched
 from tests.shell import FlakyLink, Tap, a_client, in_simulated_time, outcome, tasks_beside
 
 LOG = bytes(range(256)) * 200
@@ -30,8 +31,7 @@ def with_files(**options: Any) -> ArduPilotVehicle:
 @in_simulated_time
 async def test_a_time_limit_ends_a_read_and_closes_the_file() -> None:
     vehicle = with_files()
-    async with a_client(vehicle) as client:
-        component = await client.component()
+    async with connected(vehicle) as (_, component):
         began = anyio.current_time()
         with pytest.raises(NoReply, match=r"/APM/LOGS/1.BIN of 1/1"):
             await component.read_file("/APM/LOGS/1.BIN", timeout=0.3)
@@ -48,8 +48,7 @@ async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str)
         vehicle = ArduPilotVehicle(live_period=0)
 
         async def session(vehicle: ArduPilotVehicle, seconds: float) -> None:
-            async with a_client(Air.symmetric([vehicle], delay=0.02)) as client:
-                component = await client.component()
+            async with connected(Air.symmetric([vehicle], delay=0.02)) as (_, component):
                 if how == "error":
                     fetching = asyncio.ensure_future(outcome(component.fetch_all()))
                     await anyio.sleep(seconds)
@@ -102,8 +101,7 @@ async def test_a_scope_around_a_client_ends_it_whatever_the_link_does(
 
     async with anyio.create_task_group() as beside:
         with anyio.CancelScope() as scope:
-            async with a_client(link) as client:
-                component = await client.component()
+            async with connected(link) as (_, component):
                 reading = asyncio.ensure_future(outcome(component.read_file("/APM/LOGS/1.BIN")))
                 await anyio.sleep(0.3)
                 assert vehicle.open_files
@@ -158,8 +156,7 @@ async def test_tasks_that_are_cancelled_each_for_itself_leave_no_file_open() -> 
 @in_simulated_time
 async def test_a_read_goes_on_when_the_link_is_back() -> None:
     link = FlakyLink(with_files())
-    async with a_client(link) as client:
-        component = await client.component()
+    async with connected(link) as (_, component):
         reading = asyncio.ensure_future(component.read_file("/APM/LOGS/1.BIN"))
         await anyio.sleep(0.3)
         await link.drop()
@@ -170,9 +167,7 @@ async def test_a_read_goes_on_when_the_link_is_back() -> None:
 async def test_a_neighbour_of_a_large_integer_can_be_set() -> None:
     big = (1 << 24) + 1
     vehicle = ArduPilotVehicle(table=[SimParam("BIG", ParamType.INT32, big)], live_period=0)
-    async with a_client(vehicle) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(vehicle) as (_, component):
         assert component.params["BIG"].value == big
         result = await component.set("BIG", big - 1)
         assert (result.status, result.actual) == ("accepted", big - 1)

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from paramclient.cli import run
-from tests.shell import a_client, in_simulated_time, small_px4
+from tests.client.conftest import fetched
+from tests.shell import in_simulated_time, small_px4
 
 WATCHED = "paramclient"
 
@@ -18,9 +19,7 @@ WATCHED = "paramclient"
 @in_simulated_time
 async def test_each_step_is_one_line(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
     with caplog.at_level(logging.DEBUG, WATCHED):
-        async with a_client(small_px4(), cache=tmp_path / "cache") as client:
-            component = await client.component()
-            await component.fetch_all()
+        async with fetched(small_px4(), cache=tmp_path / "cache") as (_, component):
             await component.get("PARAM_01")
             await component.set("PARAM_01", 9)
     steps = [each.getMessage() for each in caplog.records]

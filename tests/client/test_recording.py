@@ -20,6 +20,7 @@ from paramclient.links.tlog import TIME_MAX, TIME_STEP_MAX, Record, packed_time,
 from paramclient.sim import ArduPilotVehicle
 from paramclient.wire import frames, messages, signing
 from tests.caches import full_disk
+from tests.client.conftest import connected, fetched
 from tests.conversations.virtual import Puppet
 from tests.shell import VALUES, FlakyLink, Tap, a_client, in_simulated_time, settled, small_px4
 
@@ -111,9 +112,7 @@ async def test_frames_of_both_directions_are_written(tmp_path: Path) -> None:
     vehicle = Tap(small_px4())
     path = tmp_path / "flight.tlog"
     before = time.time()
-    async with a_client(vehicle, tlog=path) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(vehicle, tlog=path) as (client, component):
         await component.set("PARAM_01", 5)
         received = client.bytes_received
     written = records(path.read_bytes())
@@ -195,8 +194,7 @@ async def test_no_key_and_no_signature_is_in_the_log(tmp_path: Path) -> None:
     key = signing.SigningKey(bytes(range(32)))
     path = tmp_path / "signed.tlog"
     vehicle = Tap(small_px4(signing_key=key, usb=True))
-    async with a_client(vehicle, tlog=path, signing=key) as client:
-        component = await client.component()
+    async with connected(vehicle, tlog=path, signing=key) as (_, component):
         await component.get("PARAM_01")
         await component.setup_signing(signing.SigningKey(bytes(range(1, 33))), link_is_safe=True)
     assert any(isinstance(message, messages.SetupSigning) for _, _, message in vehicle.received)
@@ -229,8 +227,7 @@ async def test_a_full_disk_ends_the_log_and_nothing_else(
 ) -> None:
     path = tmp_path / "flight.tlog"
     with full_disk(300):
-        async with a_client(small_px4(), tlog=path) as client:
-            component = await client.component()
+        async with connected(small_px4(), tlog=path) as (_, component):
             await anyio.sleep(1.0)
             assert (await component.fetch_all()).complete
             await anyio.sleep(5.0)

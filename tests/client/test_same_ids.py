@@ -8,7 +8,8 @@ import pytest
 from paramclient import AmbiguousVehicle
 from paramclient.links import Peer
 from paramclient.sim import Endpoint
-from tests.shell import PeersLink, Tap, a_client, generic, in_simulated_time, small_px4
+from tests.client.conftest import fetched
+from tests.shell import PeersLink, Tap, generic, in_simulated_time, small_px4
 
 
 @in_simulated_time
@@ -16,9 +17,7 @@ async def test_another_live_peer_is_one_warning_and_forbids_writes(caplog: pytes
     first, second = small_px4(uid=1), Tap(small_px4(uid=2))
     peers: dict[Peer, Endpoint] = {"one": first, "two": second}
     second.is_mute = True
-    async with a_client(PeersLink(peers)) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(PeersLink(peers)) as (_, component):
         second.is_mute = False
         await anyio.sleep(3.0)
         for write in (component.set("PARAM_01", 5), component.set_many({"PARAM_01": 5})):
@@ -39,9 +38,7 @@ async def test_the_new_connection_of_a_vehicle_has_its_ids_at_once() -> None:
     """As of a vehicle that connects to us again after its TCP connection broke."""
     first = Tap(generic())
     link = PeersLink({"one": first})
-    async with a_client(link) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(link) as (client, component):
         first.is_mute = True
         client.core.station.receive(b"", "one", anyio.current_time())
         link.endpoints["two"] = generic()

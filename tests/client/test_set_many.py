@@ -24,6 +24,7 @@ from paramclient import (
 from paramclient.client.cache_writer import CacheWriter
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire import messages
+from tests.client.conftest import connected, fetched
 from tests.shell import VALUES, Tap, a_client, in_simulated_time, residue, small_px4
 
 MANY: dict[str, int | float] = {f"MANY_{number:03}": float(number) for number in range(200)}
@@ -45,9 +46,7 @@ async def test_each_value_has_an_outcome_of_its_own() -> None:
     )
     wanted = {"PARAM_01": 5.0, "NO_SUCH": 1.0, "COUNT": 7.6, "PARAM_03": 9.0, "PARAM_04": float("nan")}
     seen: list[SetOutcome] = []
-    async with a_client(vehicle) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(vehicle) as (_, component):
         result = await component.set_many({**wanted, "PARAM_05": 6.0}, progress=seen.append)
         assert {each.name: each.status for each in result.outcomes} == {
             **dict.fromkeys(("PARAM_01", "PARAM_05"), "accepted"),
@@ -68,9 +67,7 @@ async def test_each_value_has_an_outcome_of_its_own() -> None:
 @in_simulated_time
 async def test_the_timeout_is_that_of_the_whole_call() -> None:
     tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
-    async with a_client(tap) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(tap) as (_, component):
         result = await component.set_many(NEW, timeout=0.25)
         assert 0.2 < result.elapsed < 0.4
         assert isinstance(result.error, NoReply)
@@ -95,8 +92,7 @@ async def test_the_timeout_is_that_of_the_whole_call() -> None:
 @in_simulated_time
 async def test_nothing_is_sent_if_an_argument_is_wrong(values: dict[str, int], message: str) -> None:
     tap = Tap(small_px4())
-    async with a_client(tap) as client:
-        component = await client.component()
+    async with connected(tap) as (_, component):
         with pytest.raises(UsageError, match=message):
             await component.set_many(values)
         with pytest.raises(UsageError, match="settle"):
@@ -109,9 +105,7 @@ async def test_nothing_is_sent_if_an_argument_is_wrong(values: dict[str, int], m
 @in_simulated_time
 async def test_values_are_watched_while_others_are_written() -> None:
     vehicle = PX4Vehicle(table=MANY)
-    async with a_client(Air.symmetric([vehicle], delay=0.05)) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(Air.symmetric([vehicle], delay=0.05)) as (_, component):
         result = await component.set_many(NEW, settle=1.2)
         assert result.is_complete
         assert 1.2 < result.elapsed < 4.0
@@ -125,9 +119,7 @@ async def test_an_error_of_progress_cancels_the_call() -> None:
     def fail(outcome: SetOutcome) -> None:
         raise RuntimeError(outcome.name)
 
-    async with a_client(tap) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(tap) as (_, component):
         with pytest.raises(RuntimeError, match="MANY_000"):
             await component.set_many(NEW, progress=fail)
         assert not residue(component)
@@ -139,9 +131,7 @@ async def test_an_error_of_progress_cancels_the_call() -> None:
 
 @in_simulated_time
 async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Path) -> None:
-    async with a_client(small_px4(), cache=tmp_path / "cache") as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(small_px4(), cache=tmp_path / "cache") as (_, component):
         assert (await component.set_many({"PARAM_01": 2}, durable=True)).is_complete
         failing = mock.AsyncMock(side_effect=CacheError("disk I/O error"))
         with mock.patch.object(CacheWriter, "write_durably", failing):
@@ -160,9 +150,7 @@ async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Pa
 @in_simulated_time
 async def test_two_calls_at_once_both_end() -> None:
     vehicle = PX4Vehicle(table=MANY)
-    async with a_client(Air.symmetric([vehicle], delay=0.05, loss=0.1)) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(Air.symmetric([vehicle], delay=0.05, loss=0.1)) as (_, component):
         results = []
 
         async def set_all(values: Mapping[str, int | float]) -> None:

@@ -15,6 +15,7 @@ from paramclient import (
     ComponentState,
     Event,
     Events,
+    NoReply,
     ParamCache,
     ParamClient,
     Policy,
@@ -25,6 +26,7 @@ from paramclient import (
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire import frames
 from paramclient.wire.messages import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet
+from tests.client.conftest import connected, fetched
 from tests.shell import (
     VALUES,
     FlakyLink,
@@ -80,9 +82,7 @@ async def away(tap: Tap, seconds: float) -> None:
 async def test_an_update_that_was_lost_is_reported_within_one_interval() -> None:
     vehicle = small_px4()
     tap = Tap(vehicle)
-    async with a_client(tap, watch_interval=10.0) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(tap, watch_interval=10.0) as (client, component):
         await asyncio.sleep(1.0)
         events, changes = client.events(), component.changes()
         vehicle.load({"PARAM_01": 1001, "PARAM_02": 1002})  # without a message
@@ -122,9 +122,7 @@ async def test_parameters_that_appear_and_go_do_so_in_the_cache_too(path: Path) 
     group = {f"GRIP_{number}": number for number in range(5)}
     table = {**VALUES, "GRIP_ENABLE": 0}
     vehicle = ArduPilotVehicle(table=table, groups={"GRIP_ENABLE": group}, ftp=False, live=())
-    async with a_client(vehicle, cache=path) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(vehicle, cache=path) as (_, component):
         changes = component.changes()
         for is_enabled in (1, 0):
             await component.set("GRIP_ENABLE", is_enabled)
@@ -158,9 +156,7 @@ def test_an_interval_that_cannot_be(wrong: float) -> None:
 async def test_lost_and_found() -> None:
     vehicle = small_px4()
     tap = Tap(vehicle)
-    async with a_client(tap) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(tap) as (client, component):
         events = client.events()
         tap.is_mute = tap.is_deaf = True
         with anyio.fail_after(7.0):
@@ -172,6 +168,8 @@ async def test_lost_and_found() -> None:
         assert "lost 25 params" in repr(component)
         assert component.params["PARAM_01"].value == 1
         assert {param.trust for param in component.params.values()} == {Trust.CACHED}
+        with anyio.fail_after(3.0), pytest.raises(NoReply):
+            await component.get("PARAM_01")
         tap.is_mute = tap.is_deaf = False
         with anyio.fail_after(2.0):
             found = await anext(events)
@@ -187,8 +185,7 @@ async def test_lost_and_found() -> None:
 async def test_a_table_is_checked_after_a_fetch_during_which_the_vehicle_rebooted() -> None:
     vehicle = small_px4(burst=1, period=0.1, hash_check=False)
     tap = Tap(vehicle)
-    async with a_client(tap) as client:
-        component = await client.component()
+    async with connected(tap) as (client, component):
         events = client.events()
         await asyncio.sleep(5.0)
         async with asyncio.timeout(20.0), asyncio.TaskGroup() as tasks:
@@ -211,9 +208,7 @@ async def test_a_table_is_checked_after_a_fetch_during_which_the_vehicle_reboote
 async def test_a_link_that_was_disconnected_is_checked_like_a_loss(seconds: float) -> None:
     vehicle = small_px4()
     link = FlakyLink(Air.symmetric([vehicle], delay=0.05))
-    async with a_client(link) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(link) as (client, component):
         events = client.events()
         await link.drop(stays_offline=True)
         vehicle.set_param("PARAM_01", 1001)
@@ -234,9 +229,7 @@ async def test_a_watch_survives_a_link_that_drops_during_a_check() -> None:
     vehicle = small_px4()
     tap = Tap(vehicle)
     link = FlakyLink(tap)
-    async with a_client(link, watch_interval=5.0) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(link, watch_interval=5.0) as (_, component):
         tap.received.clear()
         tap.is_deaf = True
         await until(lambda: hashes(tap), pause=0.01)
@@ -264,8 +257,7 @@ def kept(path: Path) -> dict[tuple[str, int], object]:
 @in_simulated_time
 async def test_a_strangers_values_never_reach_the_other_ones_cache(path: Path, answers: bool) -> None:
     berth, camera = Tap(small_px4(uid=1)), Tap(generic(component=100, uid=1))
-    async with a_client(Air([berth, camera]), cache=path) as client:
-        component = await client.component()
+    async with connected(Air([berth, camera]), cache=path) as (client, component):
         await client.fetch_all()
         await asyncio.sleep(1.0)
         await asyncio.gather(away(berth, 9.0), away(camera, 9.0))
@@ -317,8 +309,7 @@ async def test_cache_only_sends_nothing(path: Path) -> None:
     vehicle = small_px4()
     await learn(vehicle, path)
     tap = Tap(Air([vehicle, generic(component=100)]))
-    async with a_client(tap, cache=path, policy="cache-only") as client:
-        component = await client.component()
+    async with connected(tap, cache=path, policy="cache-only") as (client, component):
         result = await component.fetch_all()
         assert (result.source, result.hash, result.complete) == ("cache", None, True)
         assert "cache-only" in result.notes[0]
@@ -337,8 +328,7 @@ async def test_cache_only_sends_nothing(path: Path) -> None:
 @in_simulated_time
 async def test_cache_only_where_nothing_is_cached(path: Path) -> None:
     tap = Tap(Air([small_px4(), generic(component=100)]))
-    async with a_client(tap, cache=path, policy=Policy.CACHE_ONLY) as client:
-        component = await client.component()
+    async with connected(tap, cache=path, policy=Policy.CACHE_ONLY) as (client, component):
         with pytest.raises(CacheError, match="1/1"):
             await component.fetch_all()
         with pytest.raises(CacheError):
@@ -352,8 +342,7 @@ async def test_hash_only_requests_the_hash_alone(path: Path) -> None:
     vehicle = small_px4()
     await learn(vehicle, path)
     tap = Tap(vehicle)
-    async with a_client(tap, cache=path, policy="hash-only") as client:
-        component = await client.component()
+    async with connected(tap, cache=path, policy="hash-only") as (_, component):
         result = await component.fetch_all()
         assert (result.source, result.hash) == ("cache", vehicle.announced_hash())
         assert component.sync_state is SyncState.SYNCED
@@ -373,8 +362,7 @@ async def test_hash_only_requests_the_hash_alone(path: Path) -> None:
 @in_simulated_time
 async def test_refresh_is_refused_with_a_policy_that_forbids_downloads(policy: Policy) -> None:
     tap = Tap(small_px4())
-    async with a_client(tap, policy=policy) as client:
-        component = await client.component()
+    async with connected(tap, policy=policy) as (client, component):
         for call in (component.fetch_all(refresh=True), client.fetch_all(refresh=True)):
             with pytest.raises(UsageError, match=f"policy is {policy}"):
                 await call
@@ -391,8 +379,7 @@ def test_a_policy_that_does_not_exist() -> None:
 
 @in_simulated_time
 async def test_a_stream_of_events_outlives_a_cancelled_wait_and_has_a_bound_and_an_end() -> None:
-    async with a_client(small_px4()) as client:
-        component = await client.component()
+    async with connected(small_px4()) as (client, component):
         events, others = client.events(), client.events()
         with anyio.move_on_after(0.01):
             await anext(events)
@@ -427,9 +414,7 @@ async def test_several_listeners_hear_the_same() -> None:
 @in_simulated_time
 async def test_a_durable_write_to_a_vehicle_that_does_not_say_who_it_is_is_not_sent(path: Path) -> None:
     berth = Tap(small_px4(uid=1))
-    async with a_client(berth, cache=path) as client:
-        component = await client.component()
-        await component.fetch_all()
+    async with fetched(berth, cache=path) as (_, component):
         await away(berth, 9.0)
         stranger = small_px4(uid=2)
         berth.endpoint = LateVersion(stranger)

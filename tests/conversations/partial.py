@@ -39,6 +39,7 @@ class Partial(Puppet):
         count: returns the param_count of an index.
         encoding: of the values.
         ack_type: the type in acknowledgements; None for the parameter's.
+        on_set: returns the answers to a set, which changes nothing then; None for those of `serves`.
         version: answers requests for it; None for a refusal.
         asked_as: the component id under which it is asked, if that is not its own.
         options: as of `Puppet`.
@@ -53,17 +54,19 @@ class Partial(Puppet):
         count: Callable[[int], int] | None = None,
         encoding: Encoding = Encoding.BYTEWISE,
         ack_type: ParamType | None = None,
+        on_set: Callable[[ParamSet], Iterable[Message]] | None = None,
         version: AutopilotVersion | None = None,
         asked_as: int | None = None,
         **options: Any,
     ) -> None:
         super().__init__(self._answers, **options)
         self.values = {name: encode_value(value, kind, encoding) for name, (value, kind) in table.items()}
-        self._types = {name: kind for name, (_, kind) in table.items()}
+        self.types = {name: kind for name, (_, kind) in table.items()}
         self._serves = frozenset(serves)
         self._first = first
         self._count = count or (lambda index: len(table))
         self._ack_type = ack_type
+        self._on_set = on_set
         self._version = version
         self._target = options.get("component", 1) if asked_as is None else asked_as
 
@@ -73,7 +76,7 @@ class Partial(Puppet):
 
     def _value(self, name: str, kind: ParamType | None = None) -> ParamValue:
         index = self._first + list(self.values).index(name)
-        kind = self._types[name] if kind is None else kind
+        kind = self.types[name] if kind is None else kind
         return ParamValue(name, self.values[name], kind, self._count(index), index)
 
     def _answers(self, message: Message) -> Iterable[Message]:
@@ -87,6 +90,8 @@ class Partial(Puppet):
                 name = by_index.get(index, "") if index >= 0 else name if "names" in self._serves else ""
                 if name in self.values:
                     yield self._value(name)
+            case ParamSet() if self._on_set is not None:
+                yield from self._on_set(message)
             case ParamSet(param_id=name, raw=raw) if name in self.values:
                 if "sets" in self._serves:
                     self.values[name] = raw

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
 import anyio
 import pytest
 
@@ -16,9 +19,10 @@ from paramclient.errors import (
 from paramclient.model.values import Value
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read
+from paramclient.protocol.session import Session
 from paramclient.protocol.set_results import SetResult, SetStatus
 from paramclient.protocol.writes import write, write_many
-from paramclient.sim import Air, Camera, PX4Vehicle
+from paramclient.sim import Air, Camera, Endpoint, PX4Vehicle
 from paramclient.wire.messages import (
     Message,
     ParamExtAck,
@@ -27,17 +31,23 @@ from paramclient.wire.messages import (
     ParamExtValue,
     ParamRequestList,
 )
-from tests.conversations.virtual import Silence, Tap, converse, virtual, virtual_on_both
+from tests.conversations.virtual import Conversation, Silence, Tap, converse, virtual, virtual_on_both
 
 CAMERA = (1, 100)
+
+
+@asynccontextmanager
+async def filming(endpoint: Endpoint) -> AsyncIterator[tuple[Conversation, Session]]:
+    """Open a station on a camera, and wait for it: gives its extended parameters too."""
+    async with converse(endpoint) as conversation:
+        yield conversation, (await conversation.node(*CAMERA)).extended
 
 
 @virtual_on_both
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 async def test_values_of_every_type_are_fetched_read_and_set(loss: float) -> None:
     camera = Camera()
-    async with converse(Air.symmetric([camera], loss=loss, delay=0.02, seed=3)) as conversation:
-        session = (await conversation.node(*CAMERA)).extended
+    async with filming(Air.symmetric([camera], loss=loss, delay=0.02, seed=3)) as (_, session):
         result = await fetch_all(session)
         assert (result.source, result.missing) == ("stream", ())
         assert dict(result.params) == dict(camera.ext_params.items())
@@ -65,8 +75,7 @@ async def test_values_of_every_type_are_fetched_read_and_set(loss: float) -> Non
 @virtual
 async def test_a_set_sends_nothing_that_does_not_fit_and_reports_every_refusal() -> None:
     camera = Camera(supported={"CAM_ISO": [100, 200]}, failing=["CAM_EV"])
-    async with converse(camera) as conversation:
-        session = (await conversation.node(*CAMERA)).extended
+    async with filming(camera) as (conversation, session):
         for name, value in (("CAM_TILT", 128), ("CAM_MODE", "text")):
             with pytest.raises(UsageError):
                 await write(session, name, value)
@@ -84,8 +93,7 @@ async def test_a_set_sends_nothing_that_does_not_fit_and_reports_every_refusal()
 @virtual
 async def test_a_value_that_the_camera_changes_is_adjusted() -> None:
     camera = Camera(limits={"CAM_EV": (-2.0, 2.0)})
-    async with converse(camera) as conversation:
-        session = (await conversation.node(*CAMERA)).extended
+    async with filming(camera) as (_, session):
         result = await write(session, "CAM_EV", 9.5)
         assert (result.status, result.requested, result.actual) == ("adjusted", 9.5, 2.0)
 
@@ -103,8 +111,7 @@ async def test_progress_extends_the_wait_and_a_lost_result_is_requested_again(se
         return True
 
     endpoint = Tap(camera)
-    async with converse(endpoint) as conversation:
-        session = (await conversation.node(*CAMERA)).extended
+    async with filming(endpoint) as (_, session):
         result = await write(session, "CAM_MODE", 2)
         assert (result.actual, result.attempts) == (2, 1)
         endpoint.down = lose_result
@@ -122,8 +129,7 @@ async def test_progress_extends_the_wait_and_a_lost_result_is_requested_again(se
 @pytest.mark.parametrize("after", [0.5, 1.9, 2.1])
 async def test_a_camera_that_is_lost_while_it_reports_progress_ends_the_set(after: float) -> None:
     endpoint = Silence(Camera(slow={"CAM_MODE": 10.0}), at=1e9)
-    async with converse(endpoint) as conversation:
-        session = (await conversation.node(*CAMERA)).extended
+    async with filming(endpoint) as (_, session):
         await fetch_all(session)
         endpoint.at = anyio.current_time() + after
         result = await write_many(session, [("CAM_MODE", 2), ("CAM_ISO", 200)])
@@ -134,8 +140,7 @@ async def test_a_camera_that_is_lost_while_it_reports_progress_ends_the_set(afte
 
 @virtual
 async def test_a_change_by_another_station_is_seen_by_its_acknowledgement() -> None:
-    async with converse(Camera()) as conversation:
-        session = (await conversation.node(*CAMERA)).extended
+    async with filming(Camera()) as (conversation, session):
         await fetch_all(session)
         conversation.hear(ParamExtSet(*CAMERA, "CAM_ISO", b"\x90\x01", 5), system=254, component=190)
         conversation.hear(ParamExtAck("CAM_ISO", b"\x90\x01".ljust(128, b"\0"), 5, 0), component=100)
@@ -145,8 +150,7 @@ async def test_a_change_by_another_station_is_seen_by_its_acknowledgement() -> N
 
 @virtual_on_both
 async def test_the_refusal_of_another_stations_set_is_not_taken_for_ours() -> None:
-    async with converse(Air.symmetric([Camera()], delay=0.05)) as conversation:
-        session = (await conversation.node(*CAMERA)).extended
+    async with filming(Air.symmetric([Camera()], delay=0.05)) as (conversation, session):
         await fetch_all(session)
         results: list[SetResult] = []
 
@@ -165,8 +169,7 @@ async def test_the_refusal_of_another_stations_set_is_not_taken_for_ours() -> No
 @virtual
 async def test_a_list_that_changes_removes_and_adds() -> None:
     camera = Camera()
-    async with converse(camera) as conversation:
-        session = (await conversation.node(*CAMERA)).extended
+    async with filming(camera) as (conversation, session):
         await fetch_all(session)
         camera.remove_ext_param("CAM_ISO")
         camera.add_ext_param("CAM_GAIN", 3)
@@ -181,8 +184,7 @@ async def test_a_list_that_changes_removes_and_adds() -> None:
 async def test_many_are_set_and_a_lost_camera_ends_it() -> None:
     camera = Camera({f"P{number:02}": number for number in range(60)})
     endpoint = Silence(Air.symmetric([camera], delay=0.1), at=1e9)
-    async with converse(endpoint) as conversation:
-        session = (await conversation.node(*CAMERA)).extended
+    async with filming(endpoint) as (_, session):
         await fetch_all(session)
         pairs: list[tuple[str, Value]] = [(f"P{number:02}", number + 100) for number in range(60)]
         result = await write_many(session, pairs)

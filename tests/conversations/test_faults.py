@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from random import Random
 from typing import Any, TypeAlias
@@ -24,7 +24,6 @@ from paramclient.wire.messages import (
     NO_INDEX,
     AutopilotVersion,
     CommandAck,
-    CommandLong,
     FileTransfer,
     Heartbeat,
     Message,
@@ -39,7 +38,8 @@ from paramclient.wire.messages import (
     SystemTime,
     encode,
 )
-from tests.conversations.virtual import Puppet, converse, jump, run, virtual, virtual_on_both
+from tests.conversations.partial import Partial
+from tests.conversations.virtual import Puppet, converse, jump, talking, virtual, virtual_on_both
 
 Faults: TypeAlias = dict[str, Any]
 
@@ -67,10 +67,10 @@ def vehicle_on(kind: str, faults: str) -> Vehicle:
 async def test_reads_that_are_answered_behind_a_whole_list_are_not_given_up(seed: int) -> None:
     """At 57600 baud, where the vehicle does not know of it: the list waits in a queue of 6 s."""
     vehicle = PX4Vehicle()
-    async with converse(
-        Air.symmetric([vehicle], loss=0.05, delay=0.02, rate=5_760, seed=seed)
-    ) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(Air.symmetric([vehicle], loss=0.05, delay=0.02, rate=5_760, seed=seed)) as (
+        _,
+        session,
+    ):
         result = await fetch_all(session)
         assert not result.missing
         assert result.elapsed < 10.0
@@ -83,8 +83,7 @@ async def test_gaps_of_a_file_are_read_when_all_its_bursts_are_over(seed: int) -
     """At 57600 baud the first block is late, so that the burst is requested again."""
     vehicle = ArduPilotVehicle()
     air = Air.symmetric([vehicle], loss=0.05, delay=0.02, rate=5_760, seed=seed)
-    async with converse(air) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(air) as (_, session):
         result = await fetch_all(session)
         assert (result.source, result.missing) == ("ftp", ())
         assert result.elapsed < 10.0
@@ -118,8 +117,7 @@ async def test_values_that_are_forgotten_with_their_encoding_are_read_again() ->
 async def test_a_session_on_a_faulty_link_is_right(kind: str, faults: str) -> None:
     vehicle = vehicle_on(kind, faults)
     seed = Random(kind + faults).randrange(1000)
-    async with converse(Air.symmetric([vehicle], seed=seed, **KINDS[faults])) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(Air.symmetric([vehicle], seed=seed, **KINDS[faults])) as (_, session):
         result = await fetch_all(session)
         assert not result.missing
         assert result.elapsed < (90.0 if faults == "a radio" else 40.0)
@@ -163,57 +161,50 @@ any_message = st.one_of(
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(any_message, max_size=60), st.lists(st.binary(max_size=60), max_size=5))
-def test_no_message_and_no_bytes_raise_whatever_is_in_progress(
+@virtual
+async def test_no_message_and_no_bytes_raise_whatever_is_in_progress(
     messages: list[Message], noise: list[bytes]
 ) -> None:
-    async def main() -> None:
-        async with converse(PX4Vehicle(table={"A": 1, "B": 2.5})) as conversation:
-            node = await conversation.node()
-            calls = (
-                (fetch_all, node.plain),
-                (fetch_all, node.extended),
-                (write, node.plain, "A", 5),
-                (read, node.plain, "B"),
-            )
+    async with converse(PX4Vehicle(table={"A": 1, "B": 2.5})) as conversation:
+        node = await conversation.node()
+        calls = (
+            (fetch_all, node.plain),
+            (fetch_all, node.extended),
+            (write, node.plain, "A", 5),
+            (read, node.plain, "B"),
+        )
 
-            async def ended(call: tuple[object, ...]) -> None:
-                function, *arguments = call
-                with suppress(ParamClientError), anyio.move_on_after(3.0):
-                    await function(*arguments)  # type: ignore[operator]  # one of the calls
+        async def ended(call: tuple[object, ...]) -> None:
+            function, *arguments = call
+            with suppress(ParamClientError), anyio.move_on_after(3.0):
+                await function(*arguments)  # type: ignore[operator]  # one of the calls
 
-            async with anyio.create_task_group() as tasks:
-                for call in calls:
-                    tasks.start_soon(ended, call)
-                for message in messages:
-                    conversation.hear(message)
-                    await anyio.sleep(0.003)
-                for data in noise:
-                    conversation.station.receive(data, "sim", anyio.current_time())
-
-    run(main)
+        async with anyio.create_task_group() as tasks:
+            for call in calls:
+                tasks.start_soon(ended, call)
+            for message in messages:
+                conversation.hear(message)
+                await anyio.sleep(0.003)
+            for data in noise:
+                conversation.station.receive(data, "sim", anyio.current_time())
 
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.binary(max_size=200), max_size=8), st.booleans())
-def test_any_bytes_are_taken_by_a_station(chunks: list[bytes], is_stream: bool) -> None:
-    async def main() -> None:
-        station = Station(
-            link="x", is_stream=is_stream, send=lambda data, peer: None, spawn=lambda *work: None
-        )
-        frame = encode(Heartbeat(2, 12), system=1, component=1, sequence=0)
-        for chunk in chunks:
-            station.receive(chunk, "a", 0.0)
-            station.receive(frame[: len(chunk) % 21] + chunk, "b", 0.0)
-        assert station.frames >= 0
-
-    run(main)
+@virtual
+async def test_any_bytes_are_taken_by_a_station(chunks: list[bytes], is_stream: bool) -> None:
+    station = Station(link="x", is_stream=is_stream, send=lambda data, peer: None, spawn=lambda *work: None)
+    frame = encode(Heartbeat(2, 12), system=1, component=1, sequence=0)
+    for chunk in chunks:
+        station.receive(chunk, "a", 0.0)
+        station.receive(frame[: len(chunk) % 21] + chunk, "b", 0.0)
+    assert station.frames >= 0
 
 
 @virtual_on_both
 async def test_hostile_values_change_no_table() -> None:
     vehicle = GenericVehicle({"A": 1, "B": 2.5})
-    async with converse(vehicle) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(vehicle) as (conversation, session):
         await fetch_all(session)
         before = dict(session.table.params)
         raw = struct.pack("<i", 66)
@@ -266,91 +257,14 @@ async def test_calls_go_on_after_the_computer_was_suspended(kind: str, at: float
 # components that bend the protocol
 
 
-def component(
-    names: list[str | bytes],
-    *,
-    count: int | None = None,
-    answers_list: bool = True,
-    answers_reads: bool = True,
-) -> Puppet:
-    """Return a component whose parameters have their index as the value."""
-    rows = [each if isinstance(each, str) else each.decode("latin-1") for each in names]
-
-    def value(at: int) -> Message:
-        total = len(rows) if count is None else count
-        return ParamValue(rows[at], struct.pack("<i", at), ParamType.INT32, total, at)
-
-    def answer(message: Message) -> Iterable[Message]:
-        if isinstance(message, ParamRequestList) and answers_list:
-            yield from map(value, range(len(rows)))
-        elif isinstance(message, ParamRequestRead) and answers_reads:
-            at = message.param_index
-            if at < 0 and message.param_id in rows:
-                at = rows.index(message.param_id)
-            if 0 <= at < len(rows):
-                yield value(at)
-        elif isinstance(message, CommandLong):
-            yield CommandAck(message.command, 3, 255, 190)
-
-    return Puppet(answer)
-
-
-@virtual
-async def test_a_count_that_is_one_too_high_leaves_one_missing_and_an_end() -> None:
-    async with converse(component([f"P{number}" for number in range(8)], count=9)) as conversation:
-        result = await fetch_all((await conversation.node()).plain)
-        assert (len(result.params), result.missing) == (8, (8,))
-        assert result.elapsed < 30.0
-
-
-@virtual
-async def test_a_false_large_count_ends_within_seconds_and_a_few_hundred_reads() -> None:
-    for count in (30_000, 65_535):
-        async with converse(component([f"P{number}" for number in range(8)], count=count)) as conversation:
-            result = await fetch_all((await conversation.node()).plain)
-            assert (len(result.params), result.complete) == (8, False)
-            assert result.elapsed < 20.0
-            assert len(conversation.sent) < 1000
-
-
-@virtual
-async def test_names_that_no_file_can_hold_leave_the_others_whole() -> None:
-    async with converse(component(["A", b"RC MAP", "B", b"\xff\x01"])) as conversation:
-        result = await fetch_all((await conversation.node()).plain)
-        assert set(result.params) == {"A", "B"}
-        assert result.elapsed < 30.0
-
-
-@virtual
-async def test_a_component_without_a_list_is_read_by_its_indices() -> None:
-    async with converse(component(["A", "B"], answers_list=False)) as conversation:
-        result = await fetch_all((await conversation.node()).plain)
-        assert (result.complete, set(result.params)) == (True, {"A", "B"})
-        assert anyio.current_time() < 30.0
-
-
 @virtual
 async def test_a_component_without_parameters_at_all_is_no_reply_within_seconds() -> None:
-    puppet = component(["A"], answers_list=False, answers_reads=False)
-    async with converse(puppet) as conversation:
-        session = (await conversation.node()).plain
-        for call in (fetch_all(session), read(session, "A"), write(session, "A", 1)):
+    async with talking(Partial(serves=("commands",))) as (_, session):
+        for call in (fetch_all(session), read(session, "MODE"), write(session, "MODE", 1)):
             began = anyio.current_time()
             with pytest.raises(NoReply):
                 await call
             assert anyio.current_time() - began < 40.0
-
-
-@virtual
-async def test_a_component_0_and_one_without_heartbeats_answer() -> None:
-    puppet = component(["A", "B"])
-    async with converse(puppet) as conversation:
-        await conversation.node()
-        for system, number in ((1, 0), (1, 240)):
-            conversation.hear(ParamValue("A", bytes(4), 6, 2, 0), system=system, component=number)
-            node = conversation.station.nodes[system, number]
-            assert node.presence.timeout == float("inf")
-            assert node.plain.table.params["A"].value == 0
 
 
 @virtual
@@ -367,8 +281,7 @@ async def test_a_slow_vehicle_is_waited_for() -> None:
 @virtual
 async def test_a_vehicle_that_restarts_in_the_middle_of_its_list_is_fetched_whole() -> None:
     for vehicle in (PX4Vehicle(), ArduPilotVehicle(ftp=False)):
-        async with converse(vehicle) as conversation:
-            session = (await conversation.node()).plain
+        async with talking(vehicle) as (_, session):
             vehicle.when_listed(300, lambda vehicle=vehicle: vehicle.reboot(down=1.5))  # type: ignore[misc]  # a default
             result = await fetch_all(session)
             assert not result.missing

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import partial
 from random import Random
@@ -10,26 +10,26 @@ from random import Random
 import anyio
 import pytest
 
-from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoReply, UsageError
+from paramclient.errors import FileErrorCode, FileTransferError, NoReply, UsageError
 from paramclient.model.px4_hash import crc32_px4
 from paramclient.model.values import ParamType
 from paramclient.protocol.fetch import fetch_all
-from paramclient.protocol.ftp import (
-    FileCutOff,
-    Opcode,
-    Packet,
-    checksum,
-    path_bytes,
-    read_file,
-)
+from paramclient.protocol.ftp import FileCutOff, Opcode, Packet, checksum, path_bytes, read_file
 from paramclient.protocol.param_pck import PackedParam, encode
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire.messages import FileTransfer, Message, ParamRequestList, ParamRequestRead, ParamValue
-from tests.conversations.virtual import Silence, Tap, converse, virtual, virtual_on_both
+from tests.conversations.virtual import Silence, Tap, talking, virtual, virtual_on_both
 
 BOTH = pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
 Maker = type[PX4Vehicle] | type[ArduPilotVehicle]
 CONTENT = Random(1).randbytes(60_000)
+
+
+def serving(size: int = 60_000, make: Maker = ArduPilotVehicle) -> PX4Vehicle | ArduPilotVehicle:
+    """Return a vehicle with a file of this size."""
+    vehicle = make()
+    vehicle.files["a.bin"] = CONTENT[:size]
+    return vehicle
 
 
 def note(received: list[int], number: int, size: int | None) -> None:
@@ -37,24 +37,20 @@ def note(received: list[int], number: int, size: int | None) -> None:
     received.append(number)
 
 
-def packet_in(message: Message) -> Packet | None:
-    """Return the packet in a message of MAVFTP."""
-    return Packet.unpack(message.payload) if isinstance(message, FileTransfer) else None
+def packets_in(messages: Iterable[Message]) -> list[Packet]:
+    """Return the packets in messages of MAVFTP."""
+    return [Packet.unpack(each.payload) for each in messages if isinstance(each, FileTransfer)]
 
 
 @virtual
 @BOTH
 async def test_the_answer_to_the_last_request_of_an_earlier_program_is_not_taken(make: Maker) -> None:
-    vehicle = make()
-    vehicle.files["a.bin"] = CONTENT[:100]
-    for path in ("none.bin", "a.bin"):
-        async with converse(Air([vehicle])) as conversation:
-            channel = (await conversation.node()).channel
-            if path == "a.bin":
-                assert await read_file(channel, path) == CONTENT[:100]
-            else:
-                with pytest.raises(FileTransferError):
-                    await read_file(channel, path)
+    vehicle = serving(100, make)
+    async with talking(Air([vehicle])) as (_, session):
+        with pytest.raises(FileTransferError):
+            await read_file(session.channel, "none.bin")
+    async with talking(Air([vehicle])) as (_, session):
+        assert await read_file(session.channel, "a.bin") == CONTENT[:100]
 
 
 @virtual_on_both
@@ -62,46 +58,45 @@ async def test_the_answer_to_the_last_request_of_an_earlier_program_is_not_taken
 @pytest.mark.parametrize("loss", [0.0, 0.2])
 async def test_files_of_every_size_arrive_whole_and_are_closed(make: Maker, loss: float) -> None:
     vehicle = make()
-    async with converse(Air.symmetric([vehicle], loss=loss, delay=0.02, seed=2)) as conversation:
-        channel = (await conversation.node()).channel
+    async with talking(Air.symmetric([vehicle], loss=loss, delay=0.02, seed=2)) as (_, session):
         for size in (0, 1, 239, 240, 5_000, 60_000):
             vehicle.files["a.bin"] = CONTENT[:size]
-            received: list[int] = []
+            received = [0]
             began = anyio.current_time()
-            content = await read_file(channel, "a.bin", progress=partial(note, received))
+            content = await read_file(session.channel, "a.bin", progress=partial(note, received))
             assert content == CONTENT[:size]
             assert anyio.current_time() - began < (40.0 if loss else 4.0)
             assert received == sorted(received)
-            assert (received or [0])[-1] >= size
+            assert received[-1] >= size
             assert vehicle.open_files == []
 
 
 @virtual
-async def test_blocks_in_another_order_and_twice_and_in_smaller_reads() -> None:
-    vehicle = ArduPilotVehicle()
-    vehicle.files["a.bin"] = CONTENT[:9_000]
+async def test_blocks_arrive_in_another_order_and_twice() -> None:
+    vehicle = serving(9_000)
     air = Air.symmetric([vehicle], reorder=0.3, duplicate=0.3, jitter=0.02, delay=0.01, seed=1)
-    async with converse(air) as conversation:
-        channel = (await conversation.node()).channel
-        assert await read_file(channel, "a.bin") == CONTENT[:9_000]
+    async with talking(air) as (_, session):
+        assert await read_file(session.channel, "a.bin") == CONTENT[:9_000]
         assert vehicle.open_files == []
 
 
 @virtual
 async def test_refusals_say_why_and_leave_nothing_open() -> None:
-    for vehicle in (PX4Vehicle(), ArduPilotVehicle()):
-        vehicle.files["big.bin"] = CONTENT
-        async with converse(vehicle) as conversation:
-            channel = (await conversation.node()).channel
+    for make in (PX4Vehicle, ArduPilotVehicle):
+        vehicle = serving(make=make)
+        async with talking(vehicle) as (_, session):
             with pytest.raises(FileTransferError, match=r"1/1 refused no\.bin: file not found") as caught:
-                await read_file(channel, "no.bin")
+                await read_file(session.channel, "no.bin")
             assert caught.value.code == FileErrorCode.FILE_NOT_FOUND
             with pytest.raises(FileTransferError) as caught:
-                await read_file(channel, "big.bin", size_max=1_000)
+                await read_file(session.channel, "a.bin", size_max=1_000)
             assert caught.value.code == FileErrorCode.INVALID_DATA_SIZE
             await anyio.sleep(3.0)
             assert vehicle.open_files == []
-            assert not channel.inboxes
+            assert not session.channel.inboxes
+            assert await checksum(session.channel, "a.bin") == crc32_px4(CONTENT)  # opens no session
+            with pytest.raises(FileTransferError):
+                await checksum(session.channel, "no.bin")
 
 
 @pytest.mark.parametrize("path", ["", "a\0b", "x" * 239])
@@ -110,124 +105,100 @@ def test_a_path_that_no_message_holds_is_refused(path: str) -> None:
         path_bytes(path)
 
 
+@pytest.mark.parametrize("code", [FileErrorCode.UNKNOWN_COMMAND, FileErrorCode.FAIL])
 @virtual
-async def test_a_refused_read_ends_the_transfer_and_a_server_without_bursts_serves_reads() -> None:
-    vehicle = ArduPilotVehicle()
-    vehicle.files["a.bin"] = CONTENT[:2_000]
-    async with converse(vehicle) as conversation:
-        channel = (await conversation.node()).channel
+async def test_a_refused_read_ends_the_transfer_and_a_server_without_bursts_serves_reads(
+    code: FileErrorCode,
+) -> None:
+    vehicle = serving(2_000)
 
-        def answers(opcode: int, code: int) -> Callable[[], Coroutine[object, object, None]]:
-            """Return what answers each request of a kind with a NAK, before the vehicle does."""
+    def up(message: Message) -> bool:
+        for request in packets_in([message]):
+            if request.opcode == Opcode.BURST_READ_FILE:
+                numbers = request.sequence + 1, request.session, Opcode.NAK, bytes((code,))
+                nak = Packet(*numbers, requested=request.opcode)
+                conversation.hear(FileTransfer(0, 255, 190, nak.pack()))
+                return False
+        return True
 
-            async def run() -> None:
-                seen = 0
-                while True:
-                    for message in conversation.sent_of(FileTransfer)[seen:]:
-                        seen += 1
-                        request = Packet.unpack(message.payload)
-                        if request.opcode == opcode:
-                            nak = Packet(
-                                *(request.sequence + 1, request.session, Opcode.NAK, bytes((code,))),
-                                requested=opcode,
-                            )
-                            conversation.hear(FileTransfer(0, 255, 190, nak.pack()))
-                    await anyio.sleep(0.001)
-
-            return run
-
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(answers(Opcode.BURST_READ_FILE, FileErrorCode.UNKNOWN_COMMAND))
-            assert await read_file(channel, "a.bin") == CONTENT[:2_000]
-            tasks.cancel_scope.cancel()
-        requests = [Packet.unpack(each.payload).opcode for each in conversation.sent_of(FileTransfer)]
-        assert requests.count(Opcode.READ_FILE) >= 9
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(answers(Opcode.BURST_READ_FILE, FileErrorCode.FAIL))
+    async with talking(Tap(vehicle, up=up)) as (conversation, session):
+        if code is FileErrorCode.UNKNOWN_COMMAND:
+            assert await read_file(session.channel, "a.bin") == CONTENT[:2_000]
+            requests = [each.opcode for each in packets_in(conversation.sent_of(FileTransfer))]
+            assert requests.count(Opcode.READ_FILE) >= 9
+        else:
             with pytest.raises(FileTransferError):
-                await read_file(channel, "a.bin")
-            tasks.cancel_scope.cancel()
+                await read_file(session.channel, "a.bin")
         await anyio.sleep(1.0)
         assert vehicle.open_files == []
 
 
 @virtual
 async def test_the_session_of_another_station_is_waited_for() -> None:
-    vehicle = ArduPilotVehicle()
-    vehicle.files.update({"a.bin": CONTENT[:500], "other.bin": CONTENT[:500]})
-    async with converse(vehicle) as conversation:
-        channel = (await conversation.node()).channel
+    vehicle = serving(500)
+    vehicle.files["other.bin"] = CONTENT[:500]
+    async with talking(vehicle) as (_, session):
         other = Packet(77, 5, Opcode.OPEN_FILE_RO, b"other.bin")
-        channel.send(FileTransfer(0, 1, 1, other.pack()))
+        session.channel.send(FileTransfer(0, 1, 1, other.pack()))
         await anyio.sleep(0.1)
         assert vehicle.open_files == ["other.bin"]
         began = anyio.current_time()
-        assert await read_file(channel, "a.bin") == CONTENT[:500]
+        assert await read_file(session.channel, "a.bin") == CONTENT[:500]
         assert 3.0 < anyio.current_time() - began < 5.0
 
 
 @virtual
 async def test_a_silent_server_is_no_reply_and_a_file_that_is_cut_off_keeps_its_beginning() -> None:
-    vehicle = ArduPilotVehicle()
-    vehicle.files["a.bin"] = CONTENT
-    endpoint = Silence(vehicle, at=1e9)
-    async with converse(endpoint) as conversation:
-        channel = (await conversation.node()).channel
+    endpoint = Silence(serving(), at=1e9)
+    async with talking(endpoint) as (_, session):
         endpoint.at = began = anyio.current_time() + 0.5
         with pytest.raises(FileCutOff) as caught:
-            await read_file(channel, "a.bin")
+            await read_file(session.channel, "a.bin")
         assert anyio.current_time() - began < 10.0
         prefix = caught.value.prefix
         assert 5_000 < len(prefix) < 60_000
         assert CONTENT.startswith(prefix)
         with pytest.raises(NoReply):
-            await read_file(channel, "a.bin", open_attempts=lambda: 3)
+            await read_file(session.channel, "a.bin", open_attempts=lambda: 3)
 
 
 @virtual_on_both
 @BOTH
 async def test_cancelled_at_any_moment_a_session_is_closed_on_board(make: Maker) -> None:
     for step in range(8):
-        vehicle = make()
-        vehicle.files["a.bin"] = CONTENT[:20_000]
-        async with converse(Air.symmetric([vehicle], delay=0.04)) as conversation:
-            channel = (await conversation.node()).channel
+        vehicle = serving(20_000, make)
+        async with talking(Air.symmetric([vehicle], delay=0.04)) as (_, session):
             with anyio.move_on_after(0.02 + 0.055 * step):
-                await read_file(channel, "a.bin")
+                await read_file(session.channel, "a.bin")
             began = anyio.current_time()
             await anyio.sleep(0.3)
             assert vehicle.open_files == []
-            assert not channel.inboxes
-            assert await read_file(channel, "a.bin") == CONTENT[:20_000]
+            assert not session.channel.inboxes
+            assert await read_file(session.channel, "a.bin") == CONTENT[:20_000]
             assert anyio.current_time() - began < 3.0
 
 
 @virtual
 async def test_sessions_are_closed_where_packets_are_lost_in_bursts() -> None:
-    vehicle = ArduPilotVehicle()
-    vehicle.files["a.bin"] = CONTENT[:20_000]
+    vehicle = serving(20_000)
     air = Air.symmetric([vehicle], loss=0.05, loss_burst=4.0, delay=0.3, seed=5)
-    async with converse(air) as conversation:
-        channel = (await conversation.node()).channel
+    async with talking(air) as (_, session):
         for number in range(30):
             with suppress(NoReply), anyio.move_on_after(number * 0.06):
-                await read_file(channel, "a.bin")
+                await read_file(session.channel, "a.bin")
             await anyio.sleep(0.4)  # what was sent last arrives
             assert vehicle.open_files == []
 
 
 @virtual
 async def test_a_cancelled_transfer_ends_within_2_s_although_its_closing_is_lost() -> None:
-    vehicle = ArduPilotVehicle()
-    vehicle.files["a.bin"] = CONTENT
-    endpoint = Silence(vehicle, at=1e9)
-    async with converse(endpoint) as conversation:
-        channel = (await conversation.node()).channel
+    endpoint = Silence(serving(), at=1e9)
+    async with talking(endpoint) as (_, session):
         endpoint.at = anyio.current_time() + 0.3
         with anyio.move_on_after(0.5):
-            await read_file(channel, "a.bin")
+            await read_file(session.channel, "a.bin")
         assert anyio.current_time() - endpoint.at < 2.5
-        assert not channel.inboxes
+        assert not session.channel.inboxes
 
 
 @virtual_on_both
@@ -235,54 +206,26 @@ async def test_uses_of_mavftp_take_turns() -> None:
     vehicle = ArduPilotVehicle()
     files = {f"{number}.bin": CONTENT[number : 3_000 + number] for number in range(4)}
     vehicle.files.update(files)
-    async with converse(Air.symmetric([vehicle], delay=0.02)) as conversation:
-        channel = (await conversation.node()).channel
+    async with talking(Air.symmetric([vehicle], delay=0.02)) as (_, session):
         got: dict[str, bytes] = {}
 
         async def fetch(path: str) -> None:
-            got[path] = await read_file(channel, path)
+            got[path] = await read_file(session.channel, path)
 
         async with anyio.create_task_group() as tasks:
             for path in files:
                 tasks.start_soon(fetch, path)
-            tasks.start_soon(checksum, channel, "0.bin")
+            tasks.start_soon(checksum, session.channel, "0.bin")
         assert got == files
         assert anyio.current_time() < 3.0
 
 
-@virtual
-@BOTH
-async def test_the_checksum_of_a_file_opens_no_session(make: Maker) -> None:
-    vehicle = make()
-    vehicle.files["a.bin"] = CONTENT
-    async with converse(vehicle) as conversation:
-        channel = (await conversation.node()).channel
-        assert await checksum(channel, "a.bin") == crc32_px4(CONTENT)
-        with pytest.raises(FileTransferError):
-            await checksum(channel, "no.bin")
-
-
-@virtual
-async def test_the_end_of_the_link_ends_a_transfer() -> None:
-    vehicle = ArduPilotVehicle()
-    vehicle.files["a.bin"] = CONTENT
-    async with converse(vehicle) as conversation:
-        channel = (await conversation.node()).channel
-        raised: list[LinkError] = []
-
-        async def fetch() -> None:
-            with pytest.raises(LinkError) as caught:
-                await read_file(channel, "a.bin")
-            raised.append(caught.value)
-
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(fetch)
-            await anyio.sleep(0.3)
-            conversation.station.fail(LinkError("gone", link="x"), for_good=True)
-        assert raised
-
-
 # the parameter file
+
+
+def serve_file(vehicle: ArduPilotVehicle, content: bytes) -> None:
+    """Let a vehicle serve another parameter file."""
+    vehicle.files.update(dict.fromkeys(("@PARAM/param.pck", "@PARAM/param.pck?withdefaults=1"), content))
 
 
 def pack_of(vehicle: ArduPilotVehicle, number: int | None = None) -> bytes:
@@ -304,11 +247,9 @@ def pack_of(vehicle: ArduPilotVehicle, number: int | None = None) -> bytes:
 @virtual
 async def test_a_file_that_is_not_valid_leads_to_the_list_and_drops_nothing(content: bytes | None) -> None:
     vehicle = ArduPilotVehicle()
-    async with converse(vehicle) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(vehicle) as (conversation, session):
         first = await fetch_all(session)
-        broken = pack_of(vehicle)[:-7] if content is None else content
-        vehicle.files.update(dict.fromkeys(("@PARAM/param.pck", "@PARAM/param.pck?withdefaults=1"), broken))
+        serve_file(vehicle, pack_of(vehicle)[:-7] if content is None else content)
         second = await fetch_all(session)
         assert (first.source, second.source) == ("ftp", "stream")
         assert second.params.keys() == first.params.keys()
@@ -320,14 +261,10 @@ async def test_a_file_that_is_not_valid_leads_to_the_list_and_drops_nothing(cont
 @virtual
 async def test_a_short_file_replaces_no_table_where_the_indices_begin_at_1() -> None:
     vehicle = ArduPilotVehicle()
-    tap = Tap(
-        vehicle, up=lambda message: not (isinstance(message, ParamRequestRead) and message.param_index == 0)
-    )
-    async with converse(tap) as conversation:
-        session = (await conversation.node()).plain
+    tap = Tap(vehicle, up=lambda each: not (isinstance(each, ParamRequestRead) and each.param_index == 0))
+    async with talking(tap) as (_, session):
         first = await fetch_all(session)
-        short = pack_of(vehicle, 10)
-        vehicle.files.update(dict.fromkeys(("@PARAM/param.pck", "@PARAM/param.pck?withdefaults=1"), short))
+        serve_file(vehicle, pack_of(vehicle, 10))
         second = await fetch_all(session, refresh=True)
         assert (second.source, second.count, second.complete) == ("stream", first.count, True)
         assert second.params.keys() == first.params.keys()
@@ -337,16 +274,15 @@ async def test_a_short_file_replaces_no_table_where_the_indices_begin_at_1() -> 
 @virtual
 async def test_a_fetch_does_not_wait_for_another_file(is_cached: bool) -> None:
     vehicle = ArduPilotVehicle()
-    async with converse(vehicle) as conversation:
-        node = await conversation.node()
+    async with talking(vehicle) as (_, session):
         if is_cached:
-            await fetch_all(node.plain)
-        async with node.channel.ftp:  # as while a log is downloaded
-            result = await fetch_all(node.plain)
+            await fetch_all(session)
+        async with session.channel.ftp:  # as while a log is downloaded
+            result = await fetch_all(session)
         assert (result.source, result.complete) == ("stream", True)
         assert result.elapsed < 6.0
         assert any("in use for another file" in note for note in result.notes)
-        assert (await fetch_all(node.plain)).source in ("ftp", "cache")
+        assert (await fetch_all(session)).source in ("ftp", "cache")
 
 
 @virtual
@@ -354,8 +290,7 @@ async def test_integers_of_a_file_are_exact_and_keep_so_beside_rounded_messages(
     vehicle = ArduPilotVehicle()
     name = next(each.name for each in vehicle.listed if each.type == 6 and each.name.startswith("COMPASS"))
     vehicle.set_param(name, 2**24 + 1)
-    async with converse(vehicle) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(vehicle) as (conversation, session):
         result = await fetch_all(session)
         assert result.source == "ftp"
         assert result.params[name].value == 2**24 + 1
@@ -368,38 +303,34 @@ async def test_integers_of_a_file_are_exact_and_keep_so_beside_rounded_messages(
 @virtual
 async def test_a_refused_file_is_not_requested_again_on_the_link() -> None:
     vehicle = PX4Vehicle(param_error=True)  # claims to have it, and answers: file not found
-    async with converse(vehicle) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(vehicle) as (conversation, session):
         await session.identification.settled()
         for _ in range(2):
             result = await fetch_all(session, refresh=True)
             assert (result.source, bool(result.missing)) == ("stream", False)
-        opened = [packet for each in conversation.sent_of(FileTransfer) if (packet := packet_in(each))]
-        assert sum(packet.opcode == Opcode.OPEN_FILE_RO for packet in opened) <= 1
+        requests = [each.opcode for each in packets_in(conversation.sent_of(FileTransfer))]
+        assert requests.count(Opcode.OPEN_FILE_RO) <= 1
         assert len(conversation.sent_of(ParamRequestList)) == 2
 
 
 @virtual
 async def test_a_lost_opening_of_the_file_is_repeated_before_the_list_is_taken() -> None:
-    vehicle = ArduPilotVehicle()
-    left = [1]
+    lost: list[Message] = []
 
     def lose_first(message: Message) -> bool:
-        if (packet := packet_in(message)) and packet.opcode == Opcode.OPEN_FILE_RO and left[0]:
-            left[0] -= 1
-            return False
-        return True
+        is_lost = not lost and any(each.opcode == Opcode.OPEN_FILE_RO for each in packets_in([message]))
+        lost.extend([message] * is_lost)
+        return not is_lost
 
-    async with converse(Tap(vehicle, up=lose_first)) as conversation:
-        result = await fetch_all((await conversation.node()).plain)
-        assert (result.source, result.elapsed < 2.0) == ("ftp", True)
+    async with talking(Tap(ArduPilotVehicle(), up=lose_first)) as (_, session):
+        result = await fetch_all(session)
+        assert (result.source, result.elapsed < 2.0, len(lost)) == ("ftp", True, 1)
 
 
 @virtual
 async def test_a_file_of_a_table_that_changes_meanwhile_is_right_in_the_end() -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
-    async with converse(Air.symmetric([vehicle], delay=0.02)) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(Air.symmetric([vehicle], delay=0.02)) as (_, session):
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(fetch_all, session)
             await anyio.sleep(0.3)

@@ -16,7 +16,7 @@ from paramclient.protocol.reads import read, read_many
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire.messages import Message, ParamError, ParamRequestRead, ParamValue
-from tests.conversations.virtual import Puppet, Silence, Tap, converse, virtual, virtual_on_both
+from tests.conversations.virtual import Puppet, Silence, Tap, converse, talking, virtual, virtual_on_both
 
 TABLE = {"RTL_ALT": 1500, "MC_ROLL_P": 6.5, "MC_PITCH_P": 6.5}
 MAKERS = {
@@ -34,13 +34,12 @@ EVERY = pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 async def test_reads_by_name_and_index_bring_the_vehicles_values(make: type[Vehicle], loss: float) -> None:
     vehicle = make()
-    async with converse(Air.symmetric([vehicle], loss=loss, delay=0.02, seed=3)) as conversation:
-        node = await conversation.node()
+    async with talking(Air.symmetric([vehicle], loss=loss, delay=0.02, seed=3)) as (_, session):
         for index, param in list(enumerate(vehicle.listed))[::300]:
-            by_index = await read(node.plain, index)
+            by_index = await read(session, index)
             assert (by_index.param_id, by_index.param_index) == (param.name, index)
-            await read(node.plain, param.name)
-            stored = node.plain.table.params[param.name]
+            await read(session, param.name)
+            stored = session.table.params[param.name]
             assert stored.same_value(param)
             assert (stored.index, stored.trust) == (index, Trust.LIVE)
 
@@ -52,15 +51,14 @@ async def test_a_vehicle_that_answers_other_reads_has_no_such_parameter(
     make: type[Vehicle], which: str | int
 ) -> None:
     vehicle = make()
-    async with converse(vehicle) as conversation:
-        node = await conversation.node()
-        await read(node.plain, vehicle.listed[0].name)
+    async with talking(vehicle) as (_, session):
+        await read(session, vehicle.listed[0].name)
         vehicle_has_roll = "MC_ROLL_P" in vehicle.params
         if vehicle_has_roll:
-            await read(node.plain, "MC_ROLL_P")
+            await read(session, "MC_ROLL_P")
         began = anyio.current_time()
         with pytest.raises(UnknownParameter) as caught:
-            await read(node.plain, which)
+            await read(session, which)
         assert anyio.current_time() - began < 3.0
         assert (caught.value.name if isinstance(which, str) else caught.value.index) == which
         assert ("MC_ROLL_P" in str(caught.value)) is (vehicle_has_roll and which == "MC_ROLLP")
@@ -70,8 +68,7 @@ async def test_a_vehicle_that_answers_other_reads_has_no_such_parameter(
 async def test_an_unknown_name_on_a_bad_link_is_never_taken_for_silence_nor_a_known_one_for_unknown() -> None:
     for seed in range(6):
         air = Air.symmetric([PX4Vehicle()], loss=0.3, delay=0.05, seed=seed)
-        async with converse(air) as conversation:
-            session = (await conversation.node()).plain
+        async with talking(air) as (_, session):
             await read(session, "MC_ROLL_P")
             with pytest.raises(UnknownParameter):
                 await read(session, "NO_SUCH")
@@ -81,37 +78,34 @@ async def test_an_unknown_name_on_a_bad_link_is_never_taken_for_silence_nor_a_kn
 @virtual
 async def test_silence_is_no_reply_and_not_an_unknown_parameter() -> None:
     endpoint = Silence(PX4Vehicle(), at=0.5)
-    async with converse(endpoint) as conversation:
-        node = await conversation.node()
+    async with talking(endpoint) as (_, session):
         await anyio.sleep(0.6)
         with pytest.raises(NoReply, match="MC_ROLL_P of 1/1") as caught:
-            await read(node.plain, "MC_ROLL_P")
+            await read(session, "MC_ROLL_P")
         assert caught.value.attempts >= 5
         assert anyio.current_time() < 7.0
-        assert not node.channel.inboxes
+        assert not session.channel.inboxes
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.05, 0.3])
 @virtual
 async def test_on_a_clean_link_few_reads_are_repeated_to_ardupilot(delay: float) -> None:
     vehicle = ArduPilotVehicle()
-    async with converse(Air.symmetric([vehicle], delay=delay)) as conversation:
-        node = await conversation.node()
-        await node.identification.settled()
-        await read(node.plain, 0)
+    async with talking(Air.symmetric([vehicle], delay=delay)) as (conversation, session):
+        await session.identification.settled()
+        await read(session, 0)
         conversation.sent.clear()
         names = [param.name for param in vehicle.listed[10:1210:10]]
         began = anyio.current_time()
-        await read_many(node.plain, names)
-        assert node.plain.table.params.keys() >= set(names)
+        await read_many(session, names)
+        assert session.table.params.keys() >= set(names)
         assert len(conversation.sent_of(ParamRequestRead)) <= 140  # the first ones wait in the queue
         assert anyio.current_time() - began < 120 / 49 + 12 * (0.1 + 2 * delay)  # 5 in each 100 ms
 
 
 @virtual
 async def test_one_value_answers_both_a_read_by_name_and_one_by_index_and_others_none() -> None:
-    async with converse(GenericVehicle(TABLE, dead=range(3))) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(GenericVehicle(TABLE, dead=range(3))) as (conversation, session):
         got: list[str | int] = []
 
         async def ask(which: str | int) -> None:
@@ -157,8 +151,7 @@ async def test_a_refusal_tells_its_reason(which: str | int, code: int, kind: typ
 async def test_a_parameter_that_answers_by_its_index_only_is_read_by_that() -> None:
     vehicle = GenericVehicle(TABLE)
     endpoint = Tap(vehicle, up=lambda each: not isinstance(each, ParamRequestRead) or not each.param_id)
-    async with converse(endpoint) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(endpoint) as (_, session):
         await fetch_all(session)
         await anyio.sleep(1.0)  # late answers
         vehicle.set_param("MC_ROLL_P", 3.0)
@@ -168,8 +161,7 @@ async def test_a_parameter_that_answers_by_its_index_only_is_read_by_that() -> N
 
 @virtual
 async def test_an_ardupilot_takes_names_in_any_case_and_its_table_has_one_of_each() -> None:
-    async with converse(ArduPilotVehicle()) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(ArduPilotVehicle()) as (conversation, session):
         assert (await read(session, "rtl_alt")).param_id == "RTL_ALT"
         result = await write(session, "rtl_alt", 1000)
         assert (result.name, result.actual, result.attempts) == ("RTL_ALT", 1000, 1)
@@ -224,8 +216,7 @@ async def test_equal_reads_at_once_are_one_request_and_a_cancelled_one_ends_only
 ) -> None:
     vehicle = make()
     name = vehicle.listed[5].name
-    async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(Air.symmetric([vehicle], delay=0.05)) as (_, session):
         await read(session, vehicle.listed[0].name)
         values: list[ReportedValue] = []
 
@@ -245,13 +236,12 @@ async def test_equal_reads_at_once_are_one_request_and_a_cancelled_one_ends_only
 
 @virtual_on_both
 async def test_a_cancelled_read_leaves_nothing_behind() -> None:
-    async with converse(PX4Vehicle()) as conversation:
-        node = await conversation.node()
-        await node.identification.settled()
+    async with talking(PX4Vehicle()) as (conversation, session):
+        await session.identification.settled()
         with anyio.move_on_after(0.3):
-            await read(node.plain, "NO_SUCH")
-        assert not node.channel.inboxes
+            await read(session, "NO_SUCH")
+        assert not session.channel.inboxes
         conversation.sent.clear()
         await anyio.sleep(5.0)
         assert not conversation.sent_of(ParamRequestRead)
-        await read_many(node.plain, ["MC_ROLL_P"] * 200)
+        await read_many(session, ["MC_ROLL_P"] * 200)

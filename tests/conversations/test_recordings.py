@@ -35,7 +35,7 @@ from paramclient.wire.messages import (
     ParamValue,
     encode,
 )
-from tests.conversations.virtual import converse, messages_in, run, virtual
+from tests.conversations.virtual import converse, messages_in, talking, virtual
 from tests.recordings import DATA, NAMES, from_ground, from_vehicle
 from tests.recordings import read as records_of
 
@@ -182,8 +182,7 @@ async def named(session: Session, which: str | int) -> Param:
 
 @virtual
 async def test_px4s_list_is_complete_and_its_hash_is_proven() -> None:
-    async with converse(Recorded("px4_full_download")) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(Recorded("px4_full_download")) as (conversation, session):
         result = await fetch_all(session)
         assert (result.source, result.count, result.hash) == ("stream", 903, PX4_HASH)
         assert bits(dict(result.params)) == PX4_TABLE
@@ -194,8 +193,7 @@ async def test_px4s_list_is_complete_and_its_hash_is_proven() -> None:
 
 @virtual
 async def test_ardupilots_list_is_complete() -> None:
-    async with converse(Recorded("ardupilot_full_download")) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(Recorded("ardupilot_full_download")) as (conversation, session):
         session.serves_file = False
         result = await fetch_all(session)
         assert (result.source, result.count, result.hash) == ("stream", 1382, None)
@@ -205,10 +203,9 @@ async def test_ardupilots_list_is_complete() -> None:
 
 @virtual
 async def test_ardupilots_file_with_its_defaults() -> None:
-    async with converse(Recorded("ardupilot_ftp_download")) as conversation:
-        node = await conversation.node()
+    async with talking(Recorded("ardupilot_ftp_download")) as (conversation, session):
         conversation.hear(AutopilotVersion(64495, 0x04060000, uid=7))
-        result = await fetch_all(node.plain)
+        result = await fetch_all(session)
         assert (result.source, result.count) == ("ftp", 1382)
         assert bits(dict(result.params)) == ARDUPILOT_TABLE
         assert (
@@ -229,8 +226,7 @@ async def test_the_file_is_the_recorded_one_byte_by_byte() -> None:
 
 @virtual
 async def test_reads_and_sets_of_px4() -> None:
-    async with converse(endpoint := Recorded("px4_get_set")) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(endpoint := Recorded("px4_get_set")) as (_, session):
         before = await named(session, "MPC_XY_VEL_MAX")
         assert (before.type, before.value) == (ParamType.REAL32, 12.0)
         assert (await named(session, 100)).index == 100
@@ -248,8 +244,7 @@ async def test_reads_and_sets_of_px4() -> None:
 
 @virtual
 async def test_reads_and_sets_of_ardupilot() -> None:
-    async with converse(Recorded("ardupilot_get_set")) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(Recorded("ardupilot_get_set")) as (_, session):
         assert (await named(session, "RTL_ALT")).index is None  # its answer has 65535
         assert (await named(session, 100)).index == 100
         for unknown in ("NO_SUCH_PARAM", 5000):
@@ -270,8 +265,7 @@ async def test_reads_and_sets_of_ardupilot() -> None:
 @pytest.mark.parametrize("name", ["ardupilot_30_sets", "px4_20_sets"])
 @virtual
 async def test_many_sets_at_once_are_acknowledged_as_they_were(name: str) -> None:
-    async with converse(Recorded(name)) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(Recorded(name)) as (conversation, session):
         sets = [each.message for each in from_ground(name) if isinstance(each.message, ParamSet)]
         first = {request.param_id: request for request in reversed(sets)}
         values = [each for _, each in from_vehicle(name) if isinstance(each, ParamValue)]
@@ -293,23 +287,21 @@ async def test_many_sets_at_once_are_acknowledged_as_they_were(name: str) -> Non
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_listener_takes_every_value_and_sends_nothing(name: str) -> None:
-    async def main() -> None:
-        sent: list[bytes] = []
-        options = {"is_stream": False, "spawn": lambda *work: None, "listens_only": True}
-        station = Station(link="log", send=lambda data, peer: sent.append(data), **options)  # type: ignore[arg-type]
-        last: dict[str, bytes] = {}
-        for record in records_of(name):
-            station.receive(record.data, "peer", record.time)
-            if isinstance(record.message, ParamValue) and record.message.param_id != HASH_CHECK:
-                last[record.message.param_id.upper()] = record.message.raw  # one read was of rtl_alt
-        session = station.nodes[1, 1].plain
-        assert not sent
-        assert set(session.table.params) == set(last)
-        encoding = session.table.encoding
-        assert encoding is (Encoding.BYTEWISE if name.startswith("px4") else Encoding.C_CAST)
-        for param_id, raw in last.items():
-            held = session.table.params[param_id]
-            assert held.bits == PLAIN.param(param_id, raw, held.type, None, encoding).bits
-
-    run(main)
+@virtual
+async def test_a_listener_takes_every_value_and_sends_nothing(name: str) -> None:
+    sent: list[bytes] = []
+    options = {"is_stream": False, "spawn": lambda *work: None, "listens_only": True}
+    station = Station(link="log", send=lambda data, peer: sent.append(data), **options)  # type: ignore[arg-type]
+    last: dict[str, bytes] = {}
+    for record in records_of(name):
+        station.receive(record.data, "peer", record.time)
+        if isinstance(record.message, ParamValue) and record.message.param_id != HASH_CHECK:
+            last[record.message.param_id.upper()] = record.message.raw  # one read was of rtl_alt
+    session = station.nodes[1, 1].plain
+    assert not sent
+    assert set(session.table.params) == set(last)
+    encoding = session.table.encoding
+    assert encoding is (Encoding.BYTEWISE if name.startswith("px4") else Encoding.C_CAST)
+    for param_id, raw in last.items():
+        held = session.table.params[param_id]
+        assert held.bits == PLAIN.param(param_id, raw, held.type, None, encoding).bits

@@ -27,10 +27,12 @@ from paramclient.protocol.selection import find, hint_of_link, hint_of_node, onl
 from paramclient.protocol.watch import Watch
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
+from paramclient.wire.frames import build_frame
 from paramclient.wire.messages import (
     CAPABILITY_PARAM_ENCODE_BYTEWISE,
     CAPABILITY_PARAM_ENCODE_C_CAST,
     MAV_AUTOPILOT_INVALID,
+    MAV_CMD_REQUEST_MESSAGE,
     MAV_STATE_BOOT,
     MAV_TYPE_GCS,
     AutopilotVersion,
@@ -40,7 +42,6 @@ from paramclient.wire.messages import (
     HighLatency2,
     Message,
     ParamValue,
-    SetupSigning,
     StatusText,
     SystemTime,
     encode,
@@ -48,11 +49,11 @@ from paramclient.wire.messages import (
 )
 from paramclient.wire.signing import Refusal, Signer, SigningKey, Verifier
 from tests.conversations.virtual import (
-    Conversation,
     Puppet,
     Silence,
     converse,
     messages_in,
+    talking,
     virtual,
     virtual_on_both,
 )
@@ -102,15 +103,17 @@ async def test_vehicles_are_identified(loss: float) -> None:
         (ArduPilotVehicle(), "ardupilot"),
         (GenericVehicle({"A": 1}), ""),
     ):
-        async with converse(Air.symmetric([vehicle], loss=loss, delay=0.03, seed=1)) as conversation:
-            node = await conversation.node()
-            await node.identification.settled()
-            assert node.identification.capabilities is not None
+        async with talking(Air.symmetric([vehicle], loss=loss, delay=0.03, seed=1)) as (
+            conversation,
+            session,
+        ):
+            await session.identification.settled()
+            assert session.identification.capabilities is not None
             assert (name == "px4", name == "ardupilot") == (
-                node.identification.is_px4,
-                node.identification.is_ardupilot,
+                session.identification.is_px4,
+                session.identification.is_ardupilot,
             )
-            assert node.identification.identity.link == "sim:test"
+            assert session.identification.identity.link == "sim:test"
             assert conversation.of("identified")
             asked = len(conversation.sent_of(CommandLong))
             await anyio.sleep(20.0)
@@ -126,27 +129,40 @@ async def test_a_vehicle_without_a_version_is_settled_within_seconds(refuses: bo
         if isinstance(message, CommandLong) and refuses:
             yield CommandAck(message.command, CommandResult.UNSUPPORTED, 255, 190)
 
-    async with converse(Puppet(answer)) as conversation:
-        node = await conversation.node()
+    async with talking(Puppet(answer)) as (conversation, session):
         began = anyio.current_time()
-        await node.identification.settled()
+        await session.identification.settled()
         assert anyio.current_time() - began < (2.5 if refuses else 45.0)
         assert {each.command for each in conversation.sent_of(CommandLong)} == {512, 520}
-        assert node.identification.capabilities is None
-        assert node.identification.encoding is Encoding.BYTEWISE
+        assert session.identification.capabilities is None
+        assert session.identification.encoding is Encoding.BYTEWISE
         await anyio.sleep(0.01)
         assert len(conversation.of("identified")) == 1
 
 
 @virtual
-async def test_values_received_before_the_encoding_is_known_are_decoded_again() -> None:
+async def test_values_received_before_the_encoding_is_known_are_decoded_again_and_then_reported() -> None:
     async with converse(Nothing()) as conversation:
         raw = encode_value(1500, ParamType.INT32, Encoding.C_CAST)
         conversation.hear(ParamValue("RTL_ALT", raw, 6, 10, 0))
         table = conversation.station.nodes[1, 1].plain.table
         assert table.params["RTL_ALT"].value != 1500
+        assert not conversation.changes
         conversation.hear(ARDUPILOT)
         assert table.params["RTL_ALT"].value == 1500
+        assert [(each.new and each.new.value, each.kind) for each in conversation.changes] == [
+            (1500, "first")
+        ]
+
+
+@virtual
+async def test_the_heartbeat_of_a_vehicle_that_sends_other_messages_is_requested() -> None:
+    async with converse(Nothing()) as conversation:
+        for number in range(5):
+            await anyio.sleep(0.1)
+            attitude = build_frame(30, bytes(range(28)), system=7, component=1, sequence=number)
+            conversation.station.receive(attitude, "peer", anyio.current_time())
+        assert conversation.sent_of(CommandLong) == [CommandLong(7, 1, MAV_CMD_REQUEST_MESSAGE, 0.0)] * 2
 
 
 @virtual
@@ -192,31 +208,6 @@ async def test_our_heartbeat_is_sent_once_a_second_and_a_listener_sends_nothing(
 
 
 # presence
-
-
-@virtual_on_both
-async def test_a_silent_vehicle_is_lost_after_5_s_and_found_again() -> None:
-    vehicle = PX4Vehicle()
-    endpoint = Silence(vehicle, at=10.5)
-    async with converse(endpoint) as conversation:
-        node = await conversation.node()
-        await read(node.plain, "MC_ROLL_P")
-        await anyio.sleep_until(14.9)
-        assert not conversation.of("lost")
-        await anyio.sleep_until(16.2)
-        assert conversation.of("lost")
-        assert str(node.plain.table.params["MC_ROLL_P"].trust) == "cached"
-        began = anyio.current_time()
-        with pytest.raises(NoReply):
-            await read(node.plain, "MC_ROLL_P")
-        assert anyio.current_time() - began < 3.0
-        endpoint.at = 1e9
-        await anyio.sleep(2.0)
-        lost, found = conversation.of("lost"), conversation.of("found")
-        assert [5.0 <= each["silence"] < 6.1 for each in lost] == [True]
-        assert len(found) == 1
-        assert 5.0 < found[0]["silence"] < 12.0
-        await read(node.plain, "MC_ROLL_P")
 
 
 @virtual_on_both
@@ -305,28 +296,17 @@ async def test_clocks_of_different_messages_are_not_compared_and_two_signs_are_o
         assert str(node.plain.table.params["A"].trust) == "cached"
 
 
+@pytest.mark.parametrize("vehicle", [ArduPilotVehicle(), PX4Vehicle(telemetry=10.0)], ids=["AP", "PX4"])
 @virtual
-async def test_a_reboot_of_an_ardupilot_that_sends_heartbeats_only_is_seen_by_its_clock() -> None:
-    vehicle = ArduPilotVehicle()
-    async with converse(vehicle) as conversation:
-        node = await conversation.node()
-        await read(node.plain, "RTL_ALT")
+async def test_a_reboot_by_others_is_seen_by_the_clock_in_telemetry_or_requested(vehicle: Vehicle) -> None:
+    async with talking(vehicle) as (conversation, session):
+        name = vehicle.listed[0].name
+        await read(session, name)
         await anyio.sleep(10.0)
         vehicle.reboot(down=1.5)
         await anyio.sleep(8.0)
         assert len(conversation.of("rebooted")) == 1
-        assert node.plain.table.params["RTL_ALT"].trust == "cached"
-
-
-@virtual
-async def test_a_reboot_by_others_is_seen_with_telemetry() -> None:
-    vehicle = PX4Vehicle(telemetry=10.0)
-    async with converse(vehicle) as conversation:
-        await conversation.node()
-        await anyio.sleep(8.0)
-        vehicle.reboot(anyio.current_time(), down=1.0)
-        await anyio.sleep(4.0)
-        assert len(conversation.of("rebooted")) == 1
+        assert session.table.params[name].trust == "cached"
 
 
 MAKES = pytest.mark.parametrize(
@@ -387,15 +367,9 @@ async def test_a_reboot_is_refused_by_an_armed_vehicle_and_waits_for_px4_to_save
         await anyio.sleep(1.5)
         await reboot(node)
         assert vehicle.param("MC_ROLL_P").value == 3.0
-        with pytest.raises(NoReply):
-            await node_of_silent_reboot(conversation)
-
-
-async def node_of_silent_reboot(conversation: Conversation) -> None:
-    """Send a command to a component that does not exist any more."""
-    conversation.hear(PX4, system=9)
-    node = conversation.station.nodes[9, 1]
-    await send_command(node.channel, CommandLong(9, 1, 246, 1.0))
+        conversation.hear(PX4, system=9)
+        with pytest.raises(NoReply):  # it answers nothing
+            await send_command(conversation.station.nodes[9, 1].channel, CommandLong(9, 1, 246, 1.0))
 
 
 @virtual
@@ -505,8 +479,7 @@ async def test_a_stream_may_cut_frames_anywhere_for_each_peer() -> None:
 @MAKES
 async def test_a_whole_session_in_mavlink_1(make: type[Vehicle]) -> None:
     vehicle = make(mavlink_version=1)
-    async with converse(vehicle) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(vehicle) as (conversation, session):
         await session.identification.settled()
         conversation.sent.clear()
         result = await fetch_all(session)
@@ -516,23 +489,6 @@ async def test_a_whole_session_in_mavlink_1(make: type[Vehicle]) -> None:
         assert {data[0] for data in conversation.sent if not isinstance(messages_in(data)[0], Heartbeat)} == {
             0xFE
         }
-
-
-@virtual
-async def test_several_vehicles_on_one_link_get_only_their_own() -> None:
-    vehicles = [PX4Vehicle(system=1), ArduPilotVehicle(system=2), PX4Vehicle(system=3)]
-    vehicles[2].set_param("MC_ROLL_P", 2.25)
-    async with converse(Air.symmetric(vehicles, loss=0.05, delay=0.02, seed=1)) as conversation:
-        async with anyio.create_task_group() as tasks:
-            for system in (1, 2, 3):
-                tasks.start_soon(fetch_all, (await conversation.node(system)).plain)
-        for vehicle, system in zip(vehicles, (1, 2, 3), strict=True):
-            table = conversation.station.nodes[system, 1].plain.table
-            assert {name: each.bits for name, each in table.params.items()} == {
-                name: each.bits for name, each in vehicle.params.items()
-            }
-        await write(conversation.station.nodes[3, 1].plain, "MC_ROLL_P", 2.75)
-        assert [vehicle.param("MC_ROLL_P").value for vehicle in vehicles[::2]] == [4.0, 2.75]
 
 
 @virtual
@@ -568,46 +524,7 @@ async def test_a_signed_session_takes_no_forged_and_no_replayed_value(make: type
         assert not vehicle.signing_report.refused
 
 
-@virtual
-async def test_setup_signing_is_obeyed_and_another_key_is_not_understood() -> None:
-    vehicle = PX4Vehicle()
-    async with converse(vehicle) as conversation:
-        node = await conversation.node()
-        conversation.station.transmit(SetupSigning(1, 1, KEY, NOW), node.peer)
-        await anyio.sleep(0.5)
-        assert vehicle.signing_key == KEY
-        with pytest.raises(NoReply):
-            await read(node.plain, "MC_ROLL_P")
-    async with converse(PX4Vehicle(signing_key=KEY, signing_timestamp=NOW)) as conversation:
-        signer = Signer(SigningKey(bytes(range(2, 34))), timestamp=NOW)
-        conversation.station.begin_signing(signer, verifier := Verifier(signer))
-        await anyio.sleep(5.0)
-        assert not conversation.station.nodes
-        assert verifier.report().refused.keys() == {Refusal.BAD_SIGNATURE}
-
-
 # the only vehicle, and hints
-
-
-@virtual
-async def test_the_only_autopilot_is_chosen_and_peripherals_and_stations_do_not_count() -> None:
-    async with converse(Nothing()) as conversation:
-        await anyio.sleep(5.0)
-        nodes = conversation.station.nodes
-        choose = partial(only_vehicle, nodes.values(), listening_since=-math.inf)
-        conversation.hear(CAMERA, component=100)
-        conversation.hear(GCS, system=254, component=190)
-        conversation.hear(Heartbeat(18, 0, system_status=4), system=2, component=191)  # a companion computer
-        assert choose(None, None, 5.0) is None
-        conversation.hear(PX4)
-        assert choose(None, None, 5.0) == 6.2
-        assert choose(None, None, 6.2) is nodes[1, 1]
-        assert choose(1, None, 5.0) is nodes[1, 1]
-        assert choose(1, 100, 5.0) is nodes[1, 100]
-        assert find(nodes.values(), None, None, None) is nodes[1, 1]
-        conversation.hear(ARDUPILOT, system=3)
-        with pytest.raises(AmbiguousVehicle, match="1/1 PX4 quadrotor, 3/1 ArduPilot rover"):
-            choose(None, None, 6.2)
 
 
 @virtual

@@ -34,7 +34,7 @@ from paramclient.wire.messages import (
     ParamValue,
 )
 from tests.conversations.partial import EVERYTHING, TABLE, Partial
-from tests.conversations.virtual import QUIET, Puppet, Tap, converse, virtual, virtual_on_both
+from tests.conversations.virtual import QUIET, Puppet, Tap, converse, talking, virtual, virtual_on_both
 
 ARDUPILOT = Heartbeat(2, 3, system_status=4)
 PX4 = Heartbeat(2, 12, system_status=4)
@@ -62,8 +62,7 @@ async def test_what_a_vehicle_serves_is_enough_to_read_and_to_prove_a_set(
     parts: tuple[str, ...], delay: float, loss: float
 ) -> None:
     vehicle = Partial(serves=parts)
-    async with converse(Air.symmetric([vehicle], delay=delay, loss=loss, seed=1)) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(Air.symmetric([vehicle], delay=delay, loss=loss, seed=1)) as (_, session):
         if "list" not in parts and "names" not in parts:
             await read(session, 5)  # nothing else tells the name
         began = anyio.current_time()
@@ -80,15 +79,17 @@ async def test_what_a_vehicle_serves_is_enough_to_read_and_to_prove_a_set(
                 await read(session, "OFFSETS")
 
 
-@pytest.mark.parametrize("parts", [("list",), ("list", "names"), ("list", "acks")], ids="+".join)
+@pytest.mark.parametrize(
+    "parts", [("list",), ("list", "names"), ("list", "acks"), ("names",), ("names", "acks")], ids="+".join
+)
 @virtual
 async def test_a_set_that_changes_nothing_is_told_as_that_within_a_dozen(parts: tuple[str, ...]) -> None:
     vehicle = Partial(serves=parts)
-    async with converse(vehicle) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(vehicle) as (_, session):
         began = anyio.current_time()
-        with pytest.raises(ValueNotApplied, match="1/1 keeps MODE at 5"):
+        with pytest.raises(ValueNotApplied, match="1/1 keeps MODE at 5") as caught:
             await write(session, "MODE", 4)
+        assert (caught.value.requested, caught.value.actual) == (4, 5)
         assert anyio.current_time() - began < 15.0
         assert vehicle.number_of(ParamSet) <= 12
 
@@ -97,8 +98,7 @@ async def test_a_set_that_changes_nothing_is_told_as_that_within_a_dozen(parts: 
 async def test_an_acknowledgement_in_another_type_changes_neither_the_type_nor_the_history() -> None:
     for kind in (ParamType.REAL32, ParamType.UINT32, ParamType.INT8):
         vehicle = Partial(ack_type=kind)
-        async with converse(vehicle) as conversation:
-            session = (await conversation.node()).plain
+        async with talking(vehicle) as (conversation, session):
             await fetch_all(session)
             conversation.changes.clear()
             result = await write(session, "MODE", 4)
@@ -132,8 +132,7 @@ async def test_odd_indices_and_counts_make_a_complete_table(
 ) -> None:
     table = {f"P{number:02}": (number, ParamType.INT32) for number in range(40)}
     vehicle = Partial(table, serves=serves, count=COUNTS[count], first=first, heartbeat=heartbeat)
-    async with converse(Air.symmetric([vehicle], loss=loss, seed=5)) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(Air.symmetric([vehicle], loss=loss, seed=5)) as (conversation, session):
         result = await fetch_all(session)
         assert (result.complete, len(result.params), result.count, result.missing) == (True, 40, 40, ())
         assert {name: (each.value, each.index) for name, each in result.params.items()} == {
@@ -164,8 +163,7 @@ async def test_a_list_whose_count_grows_is_never_complete_without_its_end(
 async def test_a_slow_list_whose_count_grows_is_received_to_its_end(
     interval: float, heartbeat: Heartbeat
 ) -> None:
-    async with converse(Puppet(lambda message: (), heartbeat=heartbeat)) as conversation:
-        node = await conversation.node()
+    async with talking(Puppet(lambda message: (), heartbeat=heartbeat)) as (conversation, session):
 
         async def send_list() -> None:
             while not conversation.sent_of(ParamRequestList):  # noqa: ASYNC110 - in virtual time
@@ -176,7 +174,7 @@ async def test_a_slow_list_whose_count_grows_is_received_to_its_end(
 
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(send_list)
-            result = await fetch_all(node.plain)
+            result = await fetch_all(session)
             assert (result.complete, len(result.params)) == (True, 12)
 
 
@@ -189,8 +187,7 @@ async def test_a_vehicle_without_list_is_read_by_its_indices(
     heartbeat: Heartbeat, serves: tuple[str, ...]
 ) -> None:
     table = {f"P{number:02}": (number / 2, ParamType.REAL32) for number in range(60)}
-    async with converse(Partial(table, serves=serves, heartbeat=heartbeat)) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(Partial(table, serves=serves, heartbeat=heartbeat)) as (_, session):
         began = anyio.current_time()
         assert (await write(session, "P50", 7.5)).actual == 7.5
         assert anyio.current_time() - began < 15.0
@@ -204,45 +201,36 @@ async def test_a_vehicle_without_list_is_read_by_its_indices(
 async def test_the_end_of_a_list_without_a_count_is_not_sought_for_long(delay: float, size: int) -> None:
     table = {f"P{number}": (number, ParamType.REAL32) for number in range(size)}
     vehicle = Partial(table, count=lambda index: index + 1)
-    async with converse(Air.symmetric([vehicle], delay=delay)) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(Air.symmetric([vehicle], delay=delay)) as (_, session):
         began = anyio.current_time()
         result = await fetch_all(session)
         assert (result.complete, len(result.params)) == (True, size)
         assert anyio.current_time() - began < 15.0
 
 
+@pytest.mark.parametrize("count", [9, 3_008, 30_000, 65_535])
 @virtual
-async def test_a_count_of_more_than_can_be_requested_is_told_as_what_can() -> None:
-    async with converse(Partial(count=lambda index: 65_535)) as conversation:
-        result = await fetch_all((await conversation.node()).plain)
-        assert (set(result.params), result.received, result.count) == (set(TABLE), len(TABLE), 32_768)
-
-
-@pytest.mark.parametrize("too_many", [1, 3_000])
-@virtual
-async def test_a_count_that_is_too_large_costs_seconds_and_no_value(too_many: int) -> None:
-    vehicle = Partial(count=lambda index: len(TABLE) + too_many)
-    async with converse(vehicle) as conversation:
-        session = (await conversation.node()).plain
+async def test_a_count_that_is_too_large_costs_seconds_and_no_value(count: int) -> None:
+    async with talking(Partial(count=lambda index: count)) as (conversation, session):
         result = await fetch_all(session)
-        assert set(result.params) == set(TABLE)
-        assert result.missing == tuple(range(len(TABLE), len(TABLE) + too_many))
+        assert (set(result.params), result.received) == (set(TABLE), len(TABLE))
+        assert result.count == min(count, 32_768)  # what can be requested
+        assert result.missing == tuple(range(len(TABLE), result.count))
         assert anyio.current_time() < 20.0
+        assert len(conversation.sent) < 1_000
 
 
 @virtual
 async def test_names_in_lower_case_are_found_whatever_the_autopilot() -> None:
     vehicle = Partial({"gain": (0.5, ParamType.REAL32), "mode": (5, ParamType.REAL32)}, heartbeat=ARDUPILOT)
-    async with converse(vehicle) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(vehicle) as (_, session):
         result = await write(session, "mode", 4)
         assert (result.name, result.actual) == ("mode", 4)
         await fetch_all(session)
         assert set(session.table.params) == {"mode", "gain"}
 
 
-@pytest.mark.parametrize("name", ["RC MAP", "A,B", "42"])
+@pytest.mark.parametrize("name", ["RC MAP", "A,B", "42", "\xff\x01"])
 @virtual
 async def test_a_name_that_no_file_can_hold_is_noted_and_not_missed(name: str) -> None:
     vehicle = Partial({**TABLE, name: (1.0, ParamType.REAL32)})
@@ -262,8 +250,7 @@ async def test_a_name_that_is_not_in_the_list_of_an_ardupilot_without_reads_is_u
     vehicle = Partial(
         table, serves=("list",), first=first, count=lambda index: 2 + too_many, heartbeat=ARDUPILOT
     )
-    async with converse(vehicle) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(vehicle) as (_, session):
         with pytest.raises(UnknownParameter, match=r"1/1 has no ABC_DEF; did you mean abc_def"):
             await read(session, "ABC_DEF")
         assert (await read(session, "abc_def")).param_id == "abc_def"
@@ -274,8 +261,7 @@ async def test_a_name_that_is_not_in_the_list_of_an_ardupilot_without_reads_is_u
 @virtual
 async def test_an_unknown_name_of_a_px4_without_hash_is_told_as_what_it_is(serves: tuple[str, ...]) -> None:
     vehicle = Partial(serves=serves, heartbeat=PX4, count=lambda index: len(TABLE) + 2)
-    async with converse(vehicle) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(vehicle) as (_, session):
         with pytest.raises(UnknownParameter) as caught:
             await read(session, "NOPE")
         assert "answers no reads" not in str(caught.value)
@@ -292,8 +278,7 @@ async def test_a_value_of_a_list_is_taken_without_its_end(
     count = len(TABLE) + 3_000
     table = {name: (value, ParamType.REAL32) for name, (value, _) in TABLE.items()}
     vehicle = Partial(table, serves=parts, heartbeat=heartbeat, count=lambda index: count)
-    async with converse(vehicle) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(vehicle) as (_, session):
         await read(session, "OFFSET")
         assert anyio.current_time() < 8.5
         assert (await write(session, "MODE", 4)).status == "accepted"
@@ -322,15 +307,13 @@ async def test_integers_in_another_encoding_are_told_and_not_written(
     table = {"ZERO": (0, ParamType.INT32), **TABLE}
     version = None if capabilities is None else AutopilotVersion(capabilities, uid=7)
     vehicle = Partial(table, heartbeat=heartbeat, encoding=encoding, version=version)
-    async with converse(vehicle) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(vehicle) as (_, session):
         with pytest.raises(UsageError, match=rf"was not written.*--encoding {encoding}"):
             await write(session, name, 9)
         assert (await write(session, "GAIN_1", 2.5)).status == "accepted"
         assert vehicle.number_of(ParamSet) == 1
         assert any(f"--encoding {encoding}" in note for note in (await fetch_all(session)).notes)
-    async with converse(vehicle, encoding=encoding) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(vehicle, encoding=encoding) as (_, session):
         asked = vehicle.number_of(ParamRequestRead)
         assert (await write(session, name, 9)).status == "accepted"
         assert vehicle.number_of(ParamRequestRead) == asked + 1
@@ -347,8 +330,7 @@ async def test_right_encodings_are_not_doubted() -> None:
             if encoding is Encoding.BYTEWISE
             else GenericVehicle({name: value for name, (value, _) in table.items()})
         )
-        async with converse(vehicle) as conversation:
-            session = (await conversation.node()).plain
+        async with talking(vehicle) as (_, session):
             await fetch_all(session)
             assert not session.encoding_doubt
 
@@ -358,8 +340,7 @@ async def test_right_encodings_are_not_doubted() -> None:
 async def test_the_encoding_is_looked_for_once_and_within_a_round_trip(maker: type[PX4Vehicle]) -> None:
     vehicle = maker()
     zeros = [each.name for each in vehicle.listed if each.type is ParamType.INT32 and not each.value][:20]
-    async with converse(Air.symmetric([vehicle], delay=0.1)) as conversation:
-        session = (await conversation.node()).plain
+    async with talking(Air.symmetric([vehicle], delay=0.1)) as (_, session):
         await anyio.sleep(1.0)
         outcomes = (await write_many(session, [(name, 1) for name in zeros])).outcomes
         assert {each.status for each in outcomes} <= {SetStatus.ACCEPTED, SetStatus.REFUSED}

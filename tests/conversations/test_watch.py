@@ -13,8 +13,8 @@ from paramclient.protocol.node import Node
 from paramclient.protocol.session import Session
 from paramclient.protocol.watch import SyncState, Watch
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
-from paramclient.wire.messages import ParamRequestList, ParamRequestRead, ParamSet, ParamValue, encode
-from tests.conversations.virtual import Conversation, Silence, Tap, converse, virtual, virtual_on_both
+from paramclient.wire.messages import ParamRequestList, ParamRequestRead, ParamSet, encode
+from tests.conversations.virtual import Conversation, Tap, converse, virtual, virtual_on_both
 
 REQUESTS = (ParamRequestList, ParamRequestRead, ParamSet)
 
@@ -64,54 +64,6 @@ async def watched(
             tasks.cancel_scope.cancel()
 
 
-@virtual_on_both
-async def test_a_silent_change_is_found_within_one_interval() -> None:
-    vehicle = PX4Vehicle()
-    async with watched(Air.symmetric([vehicle], delay=0.02), interval=10.0) as found:
-        assert found.watch.state is SyncState.SYNCED
-        vehicle.load({"MC_ROLL_P": 3.25})
-        await anyio.sleep(13.0)
-        assert found.session.table.params["MC_ROLL_P"].value == 3.25
-        assert found.resynced == [("MC_ROLL_P",)]
-        change = found.conversation.changes[-1]
-        assert (change.name, change.kind, change.by) == ("MC_ROLL_P", "changed", "vehicle")
-
-
-@virtual
-async def test_a_value_announcement_that_is_lost_is_found() -> None:
-    vehicle = PX4Vehicle()
-    lost = [False]
-    endpoint = Tap(vehicle, down=lambda message: not (lost[0] and isinstance(message, ParamValue)))
-    async with watched(endpoint, interval=10.0) as found:
-        lost[0] = True
-        vehicle.set_param("MC_ROLL_P", 3.25)
-        await anyio.sleep(1.0)
-        lost[0] = False
-        await anyio.sleep(12.0)
-        assert found.session.table.params["MC_ROLL_P"].value == 3.25
-
-
-@virtual
-async def test_an_idle_table_costs_one_read_of_the_hash_each_30_s() -> None:
-    async with watched(PX4Vehicle()) as found:
-        before = found.requests
-        await anyio.sleep(140.0)
-        assert found.requests - before == 4
-        assert not found.resynced
-
-
-@pytest.mark.parametrize("policy", [Policy.CACHE_ONLY, Policy.HASH_ONLY, "none"])
-@virtual
-async def test_nothing_is_sent_without_a_policy_or_an_interval(policy: str) -> None:
-    vehicle = PX4Vehicle()
-    options = {"interval": 0.0} if policy == "none" else {"policy": Policy(policy)}
-    async with watched(vehicle, **options) as found:
-        before = found.requests
-        vehicle.load({"MC_ROLL_P": 3.25})
-        await anyio.sleep(100.0)
-        assert found.requests == before
-
-
 @virtual
 async def test_an_armed_vehicle_is_asked_only_after_a_sign_of_change() -> None:
     vehicle = PX4Vehicle()
@@ -144,24 +96,6 @@ async def test_a_group_that_is_shown_or_hidden_is_found_by_the_count(ftp: bool) 
         kinds = [each.kind for each in found.conversation.changes if each.name == "EK2_GPS_TYPE"]
         assert kinds == ["added", "removed"]
         assert len(found.resynced) == 2
-
-
-@virtual
-async def test_a_lost_vehicle_is_checked_when_it_is_back_and_its_values_are_cached_meanwhile() -> None:
-    vehicle = PX4Vehicle()
-    endpoint = Silence(vehicle, at=1e9)
-    async with watched(endpoint, interval=0.0) as found:
-        endpoint.at = anyio.current_time()
-        await anyio.sleep(7.0)
-        assert str(found.watch.state) == "lost"
-        assert {str(each.trust) for each in found.session.table.params.values()} == {"cached"}
-        vehicle.load({"MC_ROLL_P": 3.25})
-        endpoint.at = 1e9
-        found.watch.doubt()
-        await anyio.sleep(5.0)
-        assert found.watch.state is SyncState.SYNCED
-        assert found.session.table.params["MC_ROLL_P"].value == 3.25
-        assert not any(str(each.trust) == "cached" for each in found.session.table.params.values())
 
 
 @virtual
@@ -201,6 +135,6 @@ async def test_a_list_for_another_station_is_taken_and_restarts_nothing() -> Non
         before = found.requests
         request = encode(ParamRequestList(1, 1), system=254, component=190, sequence=0)
         vehicle.receive(request, anyio.current_time())
-        await anyio.sleep(9.0)
+        await anyio.sleep(100.0)
         assert found.requests == before
         assert found.session.table.params["MC_ROLL_P"].value == 3.25

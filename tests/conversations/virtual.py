@@ -20,6 +20,7 @@ from trio.testing import MockClock
 from paramclient.errors import ParamClientError
 from paramclient.links.sim import SimLink
 from paramclient.protocol.node import Node
+from paramclient.protocol.session import Session
 from paramclient.protocol.station import Station
 from paramclient.protocol.table import Change
 from paramclient.sim import Endpoint
@@ -197,6 +198,13 @@ async def converse(endpoint: Endpoint, **options: Any) -> AsyncIterator[Conversa
             yield conversation
         finally:
             tasks.cancel_scope.cancel()
+
+
+@asynccontextmanager
+async def talking(endpoint: Endpoint, **options: Any) -> AsyncIterator[tuple[Conversation, Session]]:
+    """Open a station on a simulated endpoint, and wait for 1/1: gives its plain parameters too."""
+    async with converse(endpoint, **options) as conversation:
+        yield conversation, (await conversation.node()).plain
 
 
 def messages_in(data: bytes) -> list[Message]:

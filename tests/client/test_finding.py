@@ -1,0 +1,228 @@
+"""Finding components: the first autopilot, the only vehicle, all vehicles or an expected number."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import anyio
+import anyio.abc
+import pytest
+
+from paramclient import (
+    AmbiguousVehicle,
+    NoReply,
+    ParamClient,
+    UsageError,
+)
+from paramclient.client.client import COMPONENT_TIMEOUT, VEHICLES_LISTENING_TIME
+from paramclient.protocol.identity import HEARTBEAT_WAIT
+from paramclient.sim import Air, ArduPilotVehicle
+from paramclient.wire import messages
+from tests.client.conftest import connected
+from tests.shell import (
+    FlakyLink,
+    Late,
+    Tap,
+    a_client,
+    generic,
+    in_simulated_time,
+    outcome,
+    simulated_time_loop,
+    small_px4,
+    until,
+)
+
+
+@in_simulated_time
+async def test_the_first_autopilot_is_the_component() -> None:
+    camera = generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
+    async with connected(Air([camera, generic(system=7, component=1), generic(system=9)])) as (
+        client,
+        component,
+    ):
+        assert (component.system, component.component) == (7, 1)
+        assert await client.component() is component
+        assert await client.component(system=9) is client.components[9, 1]
+        assert await client.component(component=100) is client.components[1, 100]
+        assert await client.component(system=1, component=100) is client.components[1, 100]
+        assert set(client.components) == {(1, 100), (7, 1), (9, 1)}
+        with pytest.raises(TypeError):
+            client.components[1, 1] = component  # type: ignore[index]  # that it is read-only is the point
+
+
+@in_simulated_time
+@pytest.mark.parametrize(
+    ("wanted", "words"),
+    [
+        ({}, "an autopilot"),
+        ({"system": 3}, "an autopilot with system id 3"),
+        ({"component": 100}, "component */100"),
+        ({"system": 3, "component": 100}, "component 3/100"),
+    ],
+)
+async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str) -> None:
+    async with a_client(generic(component=101, autopilot=messages.MAV_AUTOPILOT_INVALID)) as client:
+        with pytest.raises(NoReply) as caught:
+            await client.component(**wanted, timeout=2.5)
+        error = caught.value
+        assert (error.awaited, error.attempts, round(error.waited, 3)) == (words, 0, 2.5)
+        began = anyio.current_time()
+        with pytest.raises(NoReply):
+            await client.component(**wanted)
+        assert round(anyio.current_time() - began, 3) == COMPONENT_TIMEOUT
+
+
+@in_simulated_time
+@pytest.mark.parametrize("wanted", [{"system": 300}, {"component": -1}])
+async def test_an_id_that_no_component_has_is_an_error_at_once(wanted: dict[str, Any]) -> None:
+    async with ParamClient("sim:px4", cache=False) as client:
+        for find in (client.component, client.only_component):
+            with pytest.raises(UsageError, match="ids are 0 to 255, not"):
+                await find(**wanted, timeout=None)
+
+
+@in_simulated_time
+async def test_the_autopilots_are_the_vehicles_without_what_they_carry() -> None:
+    camera = generic(system=1, component=100)
+    vehicles = [generic(system=3), small_px4(), camera, generic(system=2, component=7)]
+    async with a_client(Air(vehicles)) as client:
+        assert client.autopilots == []
+        await client.fetch_all()
+        addresses = [(each.system, each.component) for each in client.autopilots]
+        assert addresses == [(1, 1), (2, 7), (3, 1)]
+        assert len(client.components) == 4
+
+
+# the only vehicle
+
+TEXT = "2 vehicles on this link: 1/1 PX4 quadrotor, 2/1 ArduPilot quadrotor."
+
+
+def copter() -> ArduPilotVehicle:
+    return ArduPilotVehicle(system=2, table={"RTL_ALT": 1500})
+
+
+@in_simulated_time
+async def test_the_only_vehicle_is_given_when_it_is_certain_and_at_once_from_then_on() -> None:
+    began = simulated_time_loop().now
+    async with a_client(Late(small_px4(), 0.5)) as client:
+        found = await client.only_component()
+        assert found.address == (1, 1)
+        assert 0.5 + HEARTBEAT_WAIT <= simulated_time_loop().now - began < 0.5 + HEARTBEAT_WAIT + 0.1
+        before = simulated_time_loop().now
+        for named in ((None, None), (1, None), (1, 1), (None, 1)):
+            assert await client.only_component(*named) is found
+        assert simulated_time_loop().now - before < 0.05
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.4, 0.99])
+@in_simulated_time
+async def test_several_are_refused_with_the_list_as_soon_as_they_are_heard(phase: float) -> None:
+    began = simulated_time_loop().now
+    tap = Tap(Air([Late(copter(), phase), small_px4()]))
+    async with a_client(tap) as client:
+        with pytest.raises(AmbiguousVehicle) as caught:
+            await client.only_component()
+        assert simulated_time_loop().now - began < phase + 0.1
+    error = caught.value
+    assert str(error) == f"{TEXT} Choose one with the argument system."
+    assert error.vehicles == ("1/1 PX4 quadrotor", "2/1 ArduPilot quadrotor")
+    assert (error.choose_by, error.summary) == ("system", TEXT)
+    assert isinstance(error, UsageError | ValueError)
+    assert {type(message) for _, _, message in tap.received} <= {messages.Heartbeat, messages.CommandLong}
+
+
+@in_simulated_time
+async def test_a_named_system_is_returned_although_there_are_several() -> None:
+    async with a_client(Air([small_px4(), copter(), small_px4(system=3)])) as client:
+        assert (await client.only_component(2)).address == (2, 1)
+        assert (await client.only_component(3, 1)).address == (3, 1)
+        with pytest.raises(AmbiguousVehicle, match="3 vehicles"):
+            await client.only_component(component=1)
+
+
+@in_simulated_time
+async def test_a_time_limit_holds_for_everything() -> None:
+    async with a_client(Late(small_px4(), 0.5)) as client:
+        with pytest.raises(NoReply, match="an autopilot") as caught:
+            await client.only_component(timeout=0.4)
+        assert 0.3 < caught.value.waited < 0.5
+        with pytest.raises(NoReply, match=r"an autopilot, then 1\.2 s without another vehicle"):
+            await client.only_component(timeout=1.0)
+        with pytest.raises(NoReply, match="system id 7"):
+            await client.only_component(7, timeout=0.1)
+        assert (await client.only_component()).address == (1, 1)
+
+
+@in_simulated_time
+async def test_a_vehicle_that_was_lost_is_waited_for() -> None:
+    async with a_client(Air([small_px4(), Late(copter(), 0.0, until=2.0)])) as client:
+        assert isinstance(await outcome(client.only_component()), AmbiguousVehicle)
+        await anyio.sleep(8.0)
+        assert client.components[2, 1].state == "lost"
+        assert (await client.only_component()).address == (1, 1)
+        with pytest.raises(NoReply, match="system id 2"):
+            await client.only_component(2, timeout=3.0)
+
+
+@in_simulated_time
+async def test_after_an_absence_of_the_link_a_second_one_is_looked_for_again() -> None:
+    link = FlakyLink(Air([small_px4(), copter()]))
+    tap = link.endpoint = Tap(Air([small_px4(), Late(copter(), 4.0)]))
+    async with a_client(link) as client:
+        await client.only_component()
+        await link.drop()
+        await until(lambda: client.core.link_task.is_disconnected)
+        began = simulated_time_loop().now
+        found = await client.only_component()
+        assert simulated_time_loop().now - began >= HEARTBEAT_WAIT
+        assert found.address == (1, 1)
+        assert not tap.messages(messages.ParamSet)
+
+
+# all vehicles, or an expected number
+
+
+def fleet() -> Air:
+    """Four vehicles, found one after the other, and a camera of the first."""
+    vehicles = [Late(small_px4(system=number), 0.7 * number) for number in (1, 2, 3, 4)]
+    return Air([*vehicles, generic(system=1, component=100)])
+
+
+@in_simulated_time
+async def test_the_expected_vehicles_are_returned_as_soon_as_they_are_heard() -> None:
+    began = simulated_time_loop().now
+    async with a_client(fleet()) as client:
+        found = await client.find_autopilots(expect=4)
+        assert [each.system for each in found] == [1, 2, 3, 4]
+        assert simulated_time_loop().now - began < 3.5
+        assert await client.find_autopilots(expect=4, timeout=0.5) == found
+
+
+@in_simulated_time
+async def test_fewer_vehicles_than_expected_are_an_error_that_names_them() -> None:
+    async with a_client(fleet()) as client:
+        with pytest.raises(NoReply) as caught:
+            await client.find_autopilots(expect=5, timeout=6.0)
+        heard = ", ".join(f"{system}/1 PX4 quadrotor" for system in (1, 2, 3, 4))
+        assert heard in str(caught.value)
+        assert caught.value.waited == pytest.approx(6.0, abs=0.2)
+
+
+@in_simulated_time
+async def test_without_a_number_all_that_are_heard_in_3_s_are_returned() -> None:
+    async with a_client(fleet()) as client:
+        began = simulated_time_loop().now
+        found = await client.find_autopilots()
+        assert [each.system for each in found] == [1, 2, 3, 4]
+        assert simulated_time_loop().now - began >= VEHICLES_LISTENING_TIME
+
+
+@in_simulated_time
+async def test_no_vehicle_is_an_error_and_none_cannot_be_expected() -> None:
+    async with a_client(Air([])) as client:
+        for expect in (None, 2):
+            with pytest.raises(NoReply):
+                await client.find_autopilots(expect=expect, timeout=0.5)
+        with pytest.raises(UsageError, match="from 1 up, not 0"):
+            await client.find_autopilots(expect=0)
