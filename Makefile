@@ -116,9 +116,6 @@ pictures: $(VENV)/made
 
 bench: $(VENV)/with-cli
 	$(BIN)/python bench/parse.py
-	$(BIN)/python bench/startup.py
-
-cost: $(VENV)/with-cli
 	$(BIN)/python bench/cost.py
 
 peers: $(VENV)/with-peers
