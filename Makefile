@@ -5,8 +5,8 @@
 #   make test-slow    tests in real time, of many processes, and of every program and command in the documentation
 #   make test-all     test, test-slow, lint-platforms, and soak, kills and fuzz for some minutes each
 #   make coverage     the tests with their coverage  make docs       the documentation, into docs/_build/html
-#   make bench        parser and start-up time       make dist       wheel and sdist, into dist
-#   make cost         CPU and memory                 make peers      downloads, compared with other clients
+#   make bench        CPU, memory, time to start     make dist       wheel and sdist, into dist
+#   make peers        downloads, compared with other clients
 #   make fuzz         each target of fuzz/ for SECONDS
 #   make soak         random sessions                make kills      programs killed while they write
 #   make sync         generates the types of the blocking client
@@ -43,7 +43,7 @@ WORKERS ?= $(shell $(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 2)
 # the tests start several hundred processes; without bytecode, each of them would compile paramclient again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow test-all coverage soak kills live fuzz lint lint-platforms docs screenshots pictures sync bench cost peers dist clean
+.PHONY: demo test test-slow test-all coverage soak kills live fuzz lint lint-platforms docs screenshots pictures sync bench peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
