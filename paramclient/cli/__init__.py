@@ -1,8 +1,8 @@
 """The command line: parses arguments, calls the client, and prints tables or JSON.
 
 - `app`: all subcommands, the main function, signals and errors.
-- Subcommands: `read_commands` (fetch, get), `set_command` with `writes`, `reset_command`, `watch`,
-  `show`, `cached` (cache, history), `search` (search, info), `logs` (import), `apply` (apply, restore),
+- Subcommands: `read_commands` (fetch, get, watch), `set_command` with `writes`, `reset_command`,
+  `show` (show, search, info), `cached` (cache, history), `logs` (import), `apply` (apply, restore),
   `save`, `diff`, `metadata`, `link`, `check`, `ports`, `signing`, `serve` (serve, token) and `simulate`
   (sim).
 - `session`: open links with the vehicles of --vehicle, on which a subcommand works. `options`: options.

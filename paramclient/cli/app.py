@@ -194,14 +194,14 @@ _add(_app, "read_commands:fetch", "URL [NAME...]", "sim:px4 'MC_*'", "tcp:127.0.
 _add(_app, "read_commands:get", "URL NAME [NAME...]", "udpin:0.0.0.0:14550 MC_ROLL_P 'MC_PITCH*'")
 _add(_app, "set_command:set_", "URL NAME VALUE [NAME VALUE...]", "sim:px4 MC_ROLL_P 6.5 MC_PITCH_P 6.5")
 _add(_app, "reset_command:reset", "URL NAME [NAME...]|--all|--changed", "sim:ardupilot 'RTL_*' --dry-run")
-_add(_app, "watch:watch", "URL [NAME...]", "udpin:0.0.0.0:14550 MC_ROLL_P --json")
+_add(_app, "read_commands:watch", "URL [NAME...]", "udpin:0.0.0.0:14550 MC_ROLL_P --json")
 _add(_app, "link:link", None, "udpin:0.0.0.0:14550 --seconds 10 --json")
 _add(_app, "check:check", None, "udpin:0.0.0.0:14550")
 _add(_app, "show:show", "[FILE|VEHICLE [NAME...]]", "", "1 MC_ROLL_P", "quad.params")
 _add(_app, "diff:diff", "LEFT RIGHT", "quad.param udpin:0.0.0.0:14550 --only 'MC_*'", "1 2 --base defaults")
 _add(_app, "cached:history", "VEHICLE [NAME...]", "1 'MC_*' --since '2h ago'", "1 --snapshots")
-_add(_app, "search:search", "WORD [WORD...]", "roll rate", "geofence --metadata apm.pdef.xml")
-_add(_app, "search:info", None, "MC_ROLL_P", "rtl_alt --vehicle 1 --json")
+_add(_app, "show:search", "WORD [WORD...]", "roll rate", "geofence --metadata apm.pdef.xml")
+_add(_app, "show:info", None, "MC_ROLL_P", "rtl_alt --vehicle 1 --json")
 _add(_app, "save:save", "URL|LOG|VEHICLE FILE", "udpin:0.0.0.0:14550 quad.params", "1 tuned.param --changed")
 _add(
     _app, "apply:apply", "URL FILE", "sim:px4 quad.params --dry-run", "sim:px4 '{system}.param' --vehicle all"

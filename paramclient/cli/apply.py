@@ -17,7 +17,7 @@ import anyio.to_thread
 from paramclient.cli.file_output import described
 from paramclient.cli.json_apply import apply_json, plan_json, rows_json
 from paramclient.cli.json_output import JsonObject
-from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
+from paramclient.cli.metadata import MetadataChoice, known_of_session
 from paramclient.cli.options import ApplyFlags
 from paramclient.cli.output import (
     Coloured,
@@ -262,7 +262,7 @@ async def run(
     flags: ApplyFlags,
     load: Callable[[CommandSession], Awaitable[State]],
     source: _Files | None,
-    metadata: str | None,
+    metadata: MetadataChoice,
     more: dict[str, Any],
 ) -> int:
     """Plan, ask, and write; print the plans or the results, also those so far after an interruption.
@@ -283,13 +283,13 @@ async def run(
         FileError: a file of --backup exists, or a file of a vehicle does not.
     """
     check_pattern("the file of --backup", flags.backup, flags)
-    given, file = from_file(metadata), None if source is None else source.file
+    file = None if source is None else source.file
     flags = replace(flags, extended=flags.extended or (file is not None and file.is_extended))
     async with sessions(url, flags, writes=True) as found:
 
         async def job(session: CommandSession) -> _Job:
             state = await load(session)
-            info = given or await known_of_session(session, metadata)
+            info = await known_of_session(session, metadata)
             return _Job(session, state, flags, {"info": info, **more}, is_restore=not more)
 
         loaded = await found.work(job)
@@ -309,9 +309,8 @@ async def run(
             has_work = any(each.has_work for each in plans)
             if flags.dry_run or has_work:
                 code = found.show([*made, *failed])
-                codes = [each.say_plan() for each in plans]
             if flags.dry_run:
-                return max([code, *codes])
+                return code
             if has_work and not await confirm("go on?"):
                 return ExitCode.INCOMPLETE
         if flags.no_cache and flags.backup is None and not url.startswith("sim:"):
@@ -328,7 +327,6 @@ async def run(
             )
             raise
         code = found.show([*done, *failed])
-        code = max([code, *(each.result.say_result() for each in done if each.result is not None)])
         return max(code, ExitCode.INCOMPLETE) if any(job.state.left_out for job in jobs.values()) else code
 
 
@@ -471,7 +469,13 @@ class _Job:
             return False
         return bool(self.plan.to_write) or (self.flags.reboot and bool(self.plan.awaiting_reboot))
 
-    def say_plan(self) -> int:
+    def report(self) -> int:
+        """Print a summary of the plan or of the result; return the exit code."""
+        if self.plan is not None:
+            return self._say_plan()
+        return ExitCode.DONE if self.result is None else self._say_result()
+
+    def _say_plan(self) -> int:
         """Print a summary of the plan; return the exit code that the command is expected to have."""
         session, made, code = self.session, self.plan, ExitCode.DONE
         assert made is not None
@@ -489,7 +493,7 @@ class _Job:
             code = max(code, ExitCode.INCOMPLETE)
         return code
 
-    def say_result(self) -> int:
+    def _say_result(self) -> int:
         """Print what became of the vehicle; return the exit code."""
         result, session = self.result, self.session
         assert result is not None

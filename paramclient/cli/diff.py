@@ -10,9 +10,8 @@ from paramclient.cli.file_output import described, value_text
 from paramclient.cli.json_apply import diff_json
 from paramclient.cli.metadata import (
     METADATA_HINT,
-    MetadataChoice,
+    MetadataFile,
     defaults_in,
-    from_file,
     known_of_sets,
     meaning_of,
     units_of,
@@ -51,7 +50,7 @@ async def diff(
     base: str | None = None,
     only: tuple[str, ...] = (),
     partial: bool = False,
-    metadata: MetadataChoice = None,
+    metadata: MetadataFile = None,
     options: LinkOptions = _OPTIONS,
 ) -> ExitCode:
     """Compare the parameters of two files, links or vehicles in the cache.
@@ -68,7 +67,6 @@ async def diff(
             one is not, those that only the left side has.
         metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
     """
-    chosen = from_file(metadata, offline=True)
     if left == right and not is_offline(left):
         raise UsageError(
             f"both sides are the vehicle on {left}. Two vehicles of one link are compared in the cache: "
@@ -80,9 +78,7 @@ async def diff(
         first = _limited(first, second)
     elif partial:
         second = _limited(second, first)
-    known: list[Metadata | None] = [chosen] * len(given)
-    if chosen is None:
-        known = known_of_sets([first, second, *third], options)
+    known = known_of_sets([first, second, *third], options, metadata)
     before = third[0] if third else None
     if base == DEFAULTS:
         try:

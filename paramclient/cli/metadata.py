@@ -5,18 +5,18 @@ The subcommands metadata add, list and remove: metadata files that are stored fo
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Final, TypeAlias
 
 import anyio
 import anyio.to_thread
-from cyclopts import Parameter
+from cyclopts import Parameter, Token
 
-from paramclient.cache import CachedComponent, ParamCache
+from paramclient.cache import ParamCache
 from paramclient.cli.json_output import JsonObject
 from paramclient.cli.options import CacheOptions, LinkOptions
-from paramclient.cli.output import ExitCode, Status, print_json, print_line, report, say, show
+from paramclient.cli.output import ExitCode, Status, print_json, say, show
 from paramclient.cli.session import CommandSession, wait_for_firmware
 from paramclient.errors import UsageError
 from paramclient.metadata import (
@@ -31,11 +31,8 @@ from paramclient.metadata import (
 from paramclient.metadata.store import AddedFiles
 from paramclient.model.names import counted
 from paramclient.model.paramset import Default, DefaultSource, ParamSet
-from paramclient.model.values import Value, format_value
+from paramclient.model.values import Value
 from paramclient.protocol.fetch import Progress
-
-MetadataChoice: TypeAlias = Annotated[str | None, Parameter(name="--metadata")]
-"""A metadata file, or `vehicle`."""
 
 VEHICLE: Final = "vehicle"
 """The value of --metadata that downloads the metadata from the vehicle."""
@@ -49,21 +46,37 @@ METADATA_HINT: Final = (
 _DEFAULTS: Final = CacheOptions()
 
 
-def from_file(choice: str | None, *, offline: bool = False) -> Metadata | None:
-    """Return the metadata of the file that --metadata names; None if it names none.
+def _choice(_: object, tokens: Sequence[Token]) -> Metadata | str:
+    """Return the metadata of the file that --metadata names, or `VEHICLE`.
 
     Raises:
-        UsageError: the file has no metadata, or --metadata is `vehicle` in a subcommand without a link.
+        UsageError: the file has no metadata.
     """
-    if choice == VEHICLE and offline:
-        raise UsageError("--metadata takes a file here; that of a vehicle is stored by `paramclient fetch`")
-    return None if choice in (None, VEHICLE) else read_metadata(choice)
+    return VEHICLE if tokens[0].value == VEHICLE else read_metadata(tokens[0].value)
+
+
+def _file(_: object, tokens: Sequence[Token]) -> Metadata:
+    """Return the metadata of the file that --metadata names.
+
+    Raises:
+        UsageError: the file has no metadata, or a vehicle is meant.
+    """
+    if tokens[0].value == VEHICLE:
+        raise UsageError("it takes a file here; that of a vehicle is stored by `paramclient fetch`")
+    return read_metadata(tokens[0].value)
+
+
+_NAME: Final = Parameter(name="--metadata", n_tokens=1, accepts_keys=False)
+MetadataChoice: TypeAlias = Annotated[Metadata | str | None, _NAME, Parameter(converter=_choice)]
+"""The metadata of a file, or `VEHICLE`."""
+MetadataFile: TypeAlias = Annotated[Metadata | None, _NAME, Parameter(converter=_file)]
+"""The metadata of a file, of a subcommand without a link to a vehicle."""
 
 
 async def known_of_session(
-    session: CommandSession, choice: str | None, *, needed_for: str = ""
+    session: CommandSession, choice: Metadata | str | None, *, needed_for: str = ""
 ) -> Metadata | None:
-    """Return the metadata of the vehicle, or None.
+    """Return the metadata of a file, else of the vehicle, or None.
 
     Downloads it from the vehicle if --metadata is `vehicle`, or with `needed_for`, as for values that are
     written. Otherwise uses the stored metadata of its firmware, without any request.
@@ -77,10 +90,12 @@ async def known_of_session(
         UsageError: the vehicle provides no metadata although it is required.
         VehicleError, NoReply, LinkError: as `metadata_of`.
     """
-    if choice != VEHICLE and not needed_for:
+    if isinstance(choice, Metadata):
+        return choice
+    if choice is None and not needed_for:
         return await _stored(session)
     found = await request_from_vehicle(session)
-    if found is None and choice != VEHICLE:
+    if found is None and choice is None:
         found = await _stored(session, added_only=True)
     if found is None:
         problem = f"{needed_for}. " if needed_for else ""
@@ -120,15 +135,12 @@ async def _stored(session: CommandSession, *, added_only: bool = False) -> Metad
     return await anyio.to_thread.run_sync(find, component.identity, component.component)
 
 
-def known_of_table(cache: Path, table: CachedComponent) -> Metadata | None:
-    """Return the stored metadata of the firmware of a cached table, or None."""
-    return MetadataStore.beside(cache).known(table.identity, table.component)
-
-
-def known_of_sets(sets: Sequence[ParamSet], options: LinkOptions) -> list[Metadata | None]:
-    """Return the stored metadata of the firmware of each set; a set without a firmware gets another set's."""
-    if options.place is False:
-        return [None] * len(sets)
+def known_of_sets(
+    sets: Sequence[ParamSet], options: CacheOptions | LinkOptions, given: Metadata | None
+) -> list[Metadata | None]:
+    """Return the given metadata, else what is stored for the firmware of each set, or of another set."""
+    if given is not None or options.place is False:
+        return [given] * len(sets)
     return MetadataStore.beside(ParamCache(options.cache).path).known_of_sets(sets)
 
 
@@ -153,11 +165,11 @@ def say_sources(label: str, defaults: Iterable[Default | None]) -> None:
         say(f"{label}: {what}, which does not have the defaults of an airframe")
 
 
-def report_no_defaults() -> None:
-    """Print that the defaults are not known, and what to do."""
+def no_defaults() -> str:
+    """Return that the defaults are not known, and what to do."""
     from paramclient.provision.sources import NO_DEFAULTS  # only here: loads provision
 
-    report(f"{NO_DEFAULTS}; {METADATA_HINT}")
+    return f"{NO_DEFAULTS}; {METADATA_HINT}"
 
 
 # Output
@@ -173,42 +185,6 @@ def units_of(metadata: Metadata | None, name: str) -> str | None:
     """Return the units of a parameter, or None."""
     info = info_of(metadata, name)
     return None if info is None else info.units or None
-
-
-def print_descriptions(names: Iterable[str], metadata: Metadata) -> None:
-    """Print the whole metadata of parameters as text."""
-    for name in names:
-        print_line("")
-        if (info := metadata.find(name)) is None:
-            print_line(f"{name} is not described.")
-            continue
-        print_line(f"{name}: {info.short_description}".removesuffix(": "))
-        for line in info.long_description.splitlines():
-            print_line(f"  {line}" if line.strip() else "")
-        for label, text in _fields(info):
-            print_line(f"  {label}: {text}")
-
-
-def _fields(info: ParamInfo) -> Iterator[tuple[str, str]]:
-    units = f" {info.units}" if info.units else ""
-    if info.minimum is not None or info.maximum is not None:
-        low, high = ("..." if each is None else format_value(each) for each in (info.minimum, info.maximum))
-        yield "range", f"{low} to {high}{units}"
-    elif units:
-        yield "units", info.units
-    if info.increment is not None:
-        yield "step", f"{format_value(info.increment)}{units}"
-    if info.default is not None:
-        text = info.text(info.default)
-        yield "default", format_value(info.default) + (f" ({text})" if text else units)
-    for value, name in info.values.items():
-        yield format_value(value), name
-    for bit, name in info.bits.items():
-        yield f"bit {bit}", name
-    if info.is_read_only:
-        yield "read-only", "the vehicle sets it"
-    if info.reboot_required:
-        yield "reboot", "a change takes effect after a reboot"
 
 
 # Subcommands

@@ -46,6 +46,11 @@ class CacheOptions:
     cache: str | None = None
     """The cache file, or the postgresql:// URL of a shared cache. Default: the user's own cache."""
 
+    @property
+    def place(self) -> str | None:
+        """The cache argument of `ParamCache`."""
+        return self.cache
+
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -116,7 +121,7 @@ class LinkOptions(TrafficOptions):
     """Send nothing; receive what other stations on the link request."""
 
     @property
-    def place(self) -> str | bool:
+    def place(self) -> str | bool | None:
         """The cache argument of `ParamClient`.
 
         Raises:
@@ -124,7 +129,7 @@ class LinkOptions(TrafficOptions):
         """
         if self.no_cache and self.cache is not None:
             raise UsageError("--cache and --no-cache exclude each other")
-        return not self.no_cache if self.cache is None else self.cache
+        return False if self.no_cache else self.cache
 
 
 @Parameter(name="*")

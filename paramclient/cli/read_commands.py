@@ -1,22 +1,23 @@
-"""The subcommands fetch and get."""
+"""The subcommands fetch, get and watch."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Final
 
 import anyio
 
-from paramclient.cli.json_output import JsonObject, fetch_json, param_json
+from paramclient.cli.json_output import JsonObject, fetch_json, known_members, param_json, param_value
 from paramclient.cli.metadata import (
     MetadataChoice,
     defaults_in,
-    from_file,
     info_of,
     known_of_session,
     meaning_of,
-    report_no_defaults,
+    no_defaults,
     say_sources,
     units_of,
 )
@@ -26,20 +27,27 @@ from paramclient.cli.output import (
     ExitCode,
     Status,
     by_index,
+    local_time,
     milliseconds,
+    print_json,
+    print_line,
     report,
     report_all,
     say,
 )
 from paramclient.cli.param_names import check_given, choose_names, suggest
-from paramclient.cli.session import CommandSession, sessions
-from paramclient.errors import ParamClientError
+from paramclient.cli.session import CommandSession, Sessions, sessions
+from paramclient.client.client import Event
+from paramclient.errors import ParamClientError, VehicleError
+from paramclient.links import ReplayLink
 from paramclient.metadata import Metadata
 from paramclient.model.names import NameChoice, counted, first_of, is_pattern
-from paramclient.model.notation import hash_text
-from paramclient.model.paramset import Default, add_default, default_of
+from paramclient.model.notation import hash_text, rounded, time_text
+from paramclient.model.paramset import add_default, default_of
 from paramclient.model.values import Param, Trust, format_value
+from paramclient.protocol.channel import task_group
 from paramclient.protocol.fetch import FetchResult
+from paramclient.protocol.table import Change
 
 AWAITED_NAMES_MAX: Final = 3
 """Parameters that the line about awaited values names."""
@@ -65,7 +73,7 @@ async def fetch(
         changed: Print only values that differ from the firmware's defaults.
         metadata: A file with defaults; or vehicle, to download them from it.
     """
-    chosen, given = check_given(names), from_file(metadata)
+    chosen = NameChoice(check_given(names) or ["*"])
     async with sessions(url, options) as found:
 
         async def work(session: CommandSession) -> _Fetched:
@@ -74,37 +82,20 @@ async def fetch(
             unknown = [param.name for param in params if param.default is None]
             described: Mapping[str, int | float] = {}
             if unknown and (changed or options.json or metadata is not None):
-                described = defaults_in(given or await known_of_session(session, metadata), unknown)
+                described = defaults_in(await known_of_session(session, metadata), unknown)
+            filled = {param.name: add_default(param, described.get(param.name)) for param in params}
+            if changed and all(param.default is None for param in filled.values()):
+                raise VehicleError(no_defaults(), *session.component.address)
+            kept = chosen.choose(filled) if names else filled
+            params = [
+                param
+                for param in params
+                if param.name in kept and not (changed and not filled[param.name].is_changed)
+            ]
             return _Fetched(session, result, params, described, shows_defaults=changed)
 
         done = await found.work(work)
-    fetched = [each.result for each in done if each.result is not None]
-    lacks_defaults = changed and not any(each.defaults for each in fetched)
-    if chosen and fetched:
-        kept = NameChoice(chosen).choose({param.name for each in fetched for param in each.params})
-        for each in fetched:
-            each.params = [param for param in each.params if param.name in kept]
-    for each in fetched:
-        if changed:
-            each.params = [param for param in each.params if each.filled(param).is_changed]
-        for note in each.result.notes:
-            report(f"{each.session.prefix}{note}")
-    code = found.show(done)
-    for each in fetched:
-        if not (options.json or lacks_defaults):
-            if changed:
-                say_sources(each.session.label, each.defaults)
-            say(each.summary)
-        if missing := each.result.missing:
-            report(
-                f"incomplete: {each.session.label} did not send {counted(len(missing), 'parameter')}, "
-                f"index {first_of(missing, LINE_NAMES_MAX)}; run the command again to request them"
-            )
-            code = max(code, ExitCode.INCOMPLETE)
-    if lacks_defaults:
-        report_no_defaults()
-        code = max(code, ExitCode.INCOMPLETE)
-    return code
+    return found.show(done)
 
 
 async def get(
@@ -124,22 +115,15 @@ async def get(
         names: Further parameters and patterns.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
     """
-    chosen, given = check_given((name, *names)), from_file(metadata)
+    chosen = check_given((name, *names))
     async with sessions(url, options) as found:
 
         async def work(session: CommandSession) -> _Read:
             params, errors = await get_chosen(session, chosen)
-            known = given or await known_of_session(session, metadata)
-            return _Read(session, params, errors, known)
+            return _Read(session, params, errors, await known_of_session(session, metadata))
 
         done = await found.work(work)
-    read = [each.result for each in done if each.result is not None]
-    code = found.show(done)
-    for each in read:
-        if doubt := each.session.component.session.encoding_doubt:
-            report(f"{each.session.prefix}{doubt}")
-        code = max(code, report_all(each.errors.values(), each.session.prefix))
-    return code
+    return found.show(done)
 
 
 @dataclass(slots=True)
@@ -162,18 +146,27 @@ class _Fetched:
     described: Mapping[str, int | float]
     shows_defaults: bool
 
-    @property
-    def defaults(self) -> list[Default]:
-        """The known defaults of the parameters."""
-        found = (default_of(param, self.described.get(param.name)) for param in self.params)
-        return [default for default in found if default is not None]
+    def report(self) -> int:
+        """Print notes, a summary, and what is missing; return the exit code."""
+        session, result = self.session, self.result
+        for note in result.notes:
+            report(f"{session.prefix}{note}")
+        if not session.options.json:
+            if self.shows_defaults:
+                known = (default_of(param, self.described.get(param.name)) for param in self.params)
+                say_sources(session.label, known)
+            say(self._summary)
+        if not result.missing:
+            return ExitCode.DONE
+        missing = counted(len(result.missing), "parameter")
+        report(
+            f"incomplete: {session.label} did not send {missing}, index "
+            f"{first_of(result.missing, LINE_NAMES_MAX)}; run the command again to request them"
+        )
+        return ExitCode.INCOMPLETE
 
-    def filled(self, param: Param) -> Param:
-        """Return a parameter with its default."""
-        return add_default(param, self.described.get(param.name))
-
     @property
-    def summary(self) -> str:
+    def _summary(self) -> str:
         """The line about the fetch: parameters, source, seconds, losses, bytes, hash."""
         result, client = self.result, self.session.client
         of = f" of {result.count}" if result.missing else ""
@@ -194,8 +187,8 @@ class _Fetched:
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the cells of each parameter."""
         for param in self.params:
-            default = self.filled(param).default if self.shows_defaults else None
-            yield *_cells(param), param.trust, None if default is None else format_value(default, param.type)
+            default = default_of(param, self.described.get(param.name)) if self.shows_defaults else None
+            yield *_cells(param), param.trust, default and format_value(default.value, param.type)
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,6 +209,13 @@ class _Read:
             each.name: param_json(each, info_of(self.metadata, each.name), whole=True) for each in self.params
         }
         return {"params": found} | ({"errors": failed} if failed else {})
+
+    def report(self) -> int:
+        """Print a doubt about the values, and the errors; return the exit code."""
+        prefix = self.session.prefix
+        if doubt := self.session.component.session.encoding_doubt:
+            report(f"{prefix}{doubt}")
+        return report_all(self.errors.values(), prefix)
 
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the cells of each parameter, with meaning and units if metadata is known."""
@@ -257,3 +257,98 @@ async def get_chosen(
                 tasks.start_soon(read, name)
     in_order = {name: errors[name] for name in requested if name in errors}
     return [found[name] for name in names if name in found], await suggest(session, in_order | unmatched)
+
+
+# watch
+
+
+async def watch(url: str, /, *names: str, options: LinkOptions = _DEFAULTS) -> int:
+    """Print changes of values by any source, as they happen, until Ctrl-C or --timeout.
+
+    Updates the table first, and also prints values that have changed since the cache was written. Also prints
+    when the vehicle is lost, found or rebooted, and when its table is in sync again. Parameters that appear
+    later, such as after a change of an *_ENABLE parameter, are watched too if a name or pattern matches.
+
+    Args:
+        url: The link.
+        names: The parameters to watch, or patterns such as "MC_*". Default: all.
+    """
+    given = check_given(names)
+    async with sessions(url, options, is_live=True) as found:
+        codes = [each.result for each in await found.work(partial(_watch, given=given, found=found))]
+    return max(code or ExitCode.DONE for code in codes)
+
+
+async def _watch(session: CommandSession, given: Sequence[str], found: Sessions) -> int:
+    """Watch one vehicle; return the exit code."""
+    component, choice = session.component, NameChoice(given or ["*"])
+    changes, events = component.changes(), session.client.events()
+    is_first: set[str] | None = None
+    if not session.client.listens_only:
+        await session.fetch()
+        _, errors = await get_chosen(session, given, is_fetched=True)
+        if errors:
+            return report_all(errors.values(), session.prefix)
+        is_first = set(component.params)
+    everything = counted(len(component.params), session.noun)
+    say(f"watching {', '.join(given) or everything} of {session.label}")
+    if session is found[0]:
+        found.report_others()
+
+    async def print_events() -> None:
+        async for event in events:
+            if event.kind != "discovered" and event.component.node is component.node:
+                _print(session, _event_json(event), _event_text(event))
+
+    with anyio.move_on_after(session.deadline.left()):
+        async with task_group() as tasks:  # both end with a log
+            tasks.start_soon(print_events)
+            async for change in changes:
+                # the first value of a parameter that the table had, or of any of a log, is no change
+                if change.kind == "first" and (is_first is None or change.name in is_first):
+                    is_first = is_first and is_first - {change.name}
+                elif choice.has(change.name):
+                    _print(session, _change_json(change), f"{session.prefix}{_change_text(change)}")
+    return ExitCode.DONE
+
+
+def _print(session: CommandSession, item: JsonObject, text: str) -> None:
+    """Print with the current time; in a log, that of the last frame read from it."""
+    link = session.client.link
+    now = (link.at if isinstance(link, ReplayLink) else None) or time.time()
+    if session.options.json:
+        print_json({"time": time_text(now)} | (session.ids if session.choice.is_all else {}) | item)
+    else:
+        print_line(f"{local_time(now)}  {text}")
+
+
+def _change_json(change: Change) -> JsonObject:
+    values = {"old": param_value(change.old), "new": param_value(change.new)}
+    return {"name": change.name, **values, "by": change.by, "kind": change.kind}
+
+
+def _event_json(event: Event) -> JsonObject:
+    component, more = event.component, {}
+    if event.kind == "resynced":
+        more = {"changed": event.changed, "hash": hash_text(event.hash)}
+    ids = {"system": component.system, "component": component.component}
+    return {"event": event.kind, **ids, **known_members(silence_s=rounded(event.silence)), **more}
+
+
+def _change_text(change: Change) -> str:
+    old, new = (
+        "none" if param is None else format_value(param.settable, param.type)
+        for param in (change.old, change.new)
+    )
+    if change.kind == "added":
+        return f"{change.name}  added: {new}  ({change.by})"
+    if change.kind == "removed":
+        return f"{change.name}  removed, was {old}  ({change.by})"
+    return f"{change.name}  {old} -> {new}  ({change.by})"
+
+
+def _event_text(event: Event) -> str:
+    more = "" if event.silence is None else f" after {event.silence:.1f} s without a message"
+    if event.kind == "resynced":
+        more = f": {counted(len(event.changed), 'value')} had changed"
+    return f"{event.component.system}/{event.component.component} {event.kind}{more}"

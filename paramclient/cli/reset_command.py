@@ -12,9 +12,8 @@ from paramclient.cli.apply import State, run
 from paramclient.cli.metadata import (
     MetadataChoice,
     defaults_in,
-    from_file,
     known_of_session,
-    report_no_defaults,
+    no_defaults,
     request_from_vehicle,
     say_sources,
 )
@@ -58,7 +57,7 @@ async def reset(
     """
     if bool(names) + all_ + changed != 1:
         raise UsageError("reset takes names, or --all, or --changed")
-    chosen, given = check_given(names), from_file(metadata)
+    chosen = check_given(names)
     is_part = False
 
     async def load(session: CommandSession) -> State:
@@ -70,12 +69,12 @@ async def reset(
         if fetched.missing and any(map(is_pattern, chosen or "*")):
             is_part = True
             report(f"{session.prefix}incomplete: {counted(len(fetched.missing), 'parameter')} not received")
-        known = defaults_in(given or await _known(session, metadata, params), [each.name for each in params])
+        known = defaults_in(await _known(session, metadata, params), [each.name for each in params])
         found = {param: default_of(param, known.get(param.name)) for param in params}
         without = [param.name for param, default in found.items() if default is None]
         if len(without) == len(found):
             is_part = True
-            report_no_defaults()
+            report(no_defaults())
         elif without and not changed:
             is_part = True
             listed = first_of(without, LINE_NAMES_MAX)
@@ -93,7 +92,7 @@ async def reset(
     return max(code, ExitCode.INCOMPLETE if is_part else ExitCode.DONE)
 
 
-async def _known(session: CommandSession, choice: str | None, params: Sequence[Param]) -> Metadata | None:
+async def _known(session: CommandSession, choice: MetadataChoice, params: Sequence[Param]) -> Metadata | None:
     """Return the metadata of the vehicle, or None if there is none.
 
     Without a choice of the user, it is downloaded only if the vehicle does not give a default.

@@ -15,9 +15,8 @@ from cyclopts import Parameter
 from paramclient.cli.file_output import noun_of
 from paramclient.cli.metadata import (
     METADATA_HINT,
-    MetadataChoice,
+    MetadataFile,
     defaults_in,
-    from_file,
     known_of_sets,
     say_sources,
 )
@@ -45,7 +44,7 @@ async def save(
     changed: bool = False,
     only: tuple[str, ...] = (),
     incomplete: bool = False,
-    metadata: MetadataChoice = None,
+    metadata: MetadataFile = None,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Write the parameters of a vehicle to a file, in the file format of any ground station.
@@ -71,7 +70,7 @@ async def save(
     if metadata is not None and not changed:
         raise UsageError("--metadata gives the defaults for --changed")
     written = file_format or format_of_name(str(file))
-    choice, given = ChosenVehicle.parse(options.vehicle), from_file(metadata, offline=True)
+    choice = ChosenVehicle.parse(options.vehicle)
     faults: list[str] = []
     if sources.is_offline(where):
         with _hint_at_incomplete():
@@ -99,7 +98,7 @@ async def save(
         sets = [each.result for each in done if each.result is not None]
         faults = [f"{each.session.address}: {each.error}" for each in done if each.error is not None]
     if changed:
-        known = known_of_sets(sets, options) if given is None else [given] * len(sets)
+        known = known_of_sets(sets, options, metadata)
         sets = [*filter(None, map(partial(_differing, faults), sets, known))]
     for fault in faults:
         report(fault)

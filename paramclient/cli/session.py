@@ -222,6 +222,9 @@ class Shown(Protocol):
     def rows(self) -> Iterable[Sequence[object]]:
         """Return the rows."""
 
+    def report(self) -> int:
+        """Print a summary and remarks; return the exit code."""
+
 
 class Sessions(list[CommandSession]):
     """The vehicles that a subcommand works on: the one of --vehicle, or all of them."""
@@ -253,7 +256,7 @@ class Sessions(list[CommandSession]):
         return [done[place] for place in sorted(done)]
 
     def show(self, done: Sequence[Done[Shown]], *, errors: bool = True) -> int:
-        """Print the results as one table or as JSON, then the failures; return the exit code for these.
+        """Print the results as one table or as JSON, then remarks and failures; return the exit code.
 
         If several vehicles are heard, and none was named, the table says which one it shows.
 
@@ -279,7 +282,9 @@ class Sessions(list[CommandSession]):
             print_json({"vehicles": vehicles} | ({"errors": failures} if errors else {}))
         else:
             print_json(found[0][1].as_json())
-        return max([ExitCode.DONE, *(report_all([error], f"{session.label}: ") for session, error in failed)])
+        codes = [result.report() for _, result in found]
+        codes += [report_all([error], f"{session.label}: ") for session, error in failed]
+        return max(codes, default=ExitCode.DONE)
 
     @property
     def others(self) -> list[str]:
@@ -328,7 +333,7 @@ async def sessions(
     async with _client(
         f"{url}?speed=0" if is_log and not is_live and "?speed=" not in url else url,
         options,
-        cache=None if options.place is True else options.place,
+        cache=options.place,
         encoding=options.encoding,
         listen_only=options.listen_only,
     ) as client:

@@ -10,7 +10,7 @@ from typing import Annotated, Final
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from paramclient.cli.metadata import MetadataChoice, from_file, info_of, known_of_session
+from paramclient.cli.metadata import MetadataChoice, info_of, known_of_session
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import can_ask, confirm, report
 from paramclient.cli.param_names import spelling
@@ -54,12 +54,11 @@ async def set_(
             ArduPilot.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
     """
-    described, wanted = from_file(metadata), _parse_pairs(pairs)
-    if described is not None and not options.extended:
-        _values(wanted, described)
+    wanted = _parse_pairs(pairs)
+    if isinstance(metadata, Metadata) and not options.extended:
+        _values(wanted, metadata)
     async with sessions(url, options, writes=True) as found:
-        prepare = _prepare_extended if options.extended else _prepare
-        jobs = [await prepare(each, wanted, described, metadata) for each in found]
+        jobs = [await _prepare(each, wanted, metadata) for each in found]
         doubts = dict.fromkeys([doubt for job in jobs for doubt in await _doubts(job)])
         for doubt in doubts:
             report(doubt)
@@ -95,19 +94,31 @@ def _parse_pairs(words: Sequence[str]) -> dict[str, str]:
     return pairs
 
 
-async def _prepare(
-    session: CommandSession, wanted: dict[str, str], described: Metadata | None, choice: MetadataChoice
-) -> WriteJob:
+async def _prepare(session: CommandSession, wanted: dict[str, str], choice: MetadataChoice) -> WriteJob:
     """Return names and values as the vehicle and its metadata have them.
+
+    The types of extended parameters are read, as their texts have values only with them.
 
     Raises:
         UsageError: a text is no value of its parameter.
+        ParamClientError: the type of an extended parameter could not be read.
     """
     component = session.component
+    if component.is_extended:
+        params, errors = await get_chosen(session, [*wanted])
+        for error in errors.values():
+            if not isinstance(error, UnknownParameter):  # the write reports that
+                raise error
+        types = {param.name: param.type for param in params}
     texts = {spelling(name, component): text for name, text in wanted.items()}
-    if described is None:
-        named = [f"{name}: {text!r} is not a number" for name, text in texts.items() if not _is_number(text)]
-        described = await known_of_session(session, choice, needed_for=named[0] if named else "")
+    if component.is_extended:
+        values = {
+            name: parse_ext_value(name, text, types[name]) if name in types else text
+            for name, text in texts.items()
+        }
+        return WriteJob(session, values, None)
+    named = [f"{name}: {text!r} is not a number" for name, text in texts.items() if not _is_number(text)]
+    described = await known_of_session(session, choice, needed_for=named[0] if named else "")
     return WriteJob(session, _values(texts, described), described)
 
 
@@ -130,25 +141,6 @@ def _is_number(text: str) -> bool:
     with suppress(UsageError):
         return number_of(text) is not None
     return True  # beyond the range of a float
-
-
-async def _prepare_extended(session: CommandSession, wanted: dict[str, str], *_: object) -> WriteJob:
-    """Return names and values of extended parameters, whose types must be known for that.
-
-    Raises:
-        UsageError: a text is no value of its parameter.
-        ParamClientError: a type could not be read.
-    """
-    component = session.component
-    params, errors = await get_chosen(session, [*wanted])
-    for error in errors.values():
-        if not isinstance(error, UnknownParameter):  # the write reports that
-            raise error
-    types, writes = {param.name: param.type for param in params}, dict[str, Value]()
-    for given, text in wanted.items():
-        name = spelling(given, component)
-        writes[name] = parse_ext_value(name, text, types[name]) if name in types else text
-    return WriteJob(session, writes, None)
 
 
 async def _doubts(job: WriteJob) -> list[str]:

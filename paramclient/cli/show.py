@@ -1,36 +1,47 @@
-"""The subcommand show: cached tables, parameter files and logs."""
+"""The subcommands show, search and info, which need no link: cached tables, files, logs and descriptions."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Final
 
-from paramclient.cache import ParamCache
-from paramclient.cli.cached import extended_sizes, show_summaries
+from paramclient.cache import CachedComponent, CachedSummary, ParamCache
+from paramclient.cli.cached import extended_sizes, load_tables, show_summaries
 from paramclient.cli.file_output import described, value_text
-from paramclient.cli.json_output import JsonObject, info_json, known_members, set_json
+from paramclient.cli.json_output import (
+    JsonObject,
+    info_json,
+    known_members,
+    set_json,
+    table_param_json,
+    taken,
+)
 from paramclient.cli.metadata import (
-    MetadataChoice,
+    METADATA_HINT,
+    MetadataFile,
     defaults_in,
-    from_file,
     info_of,
+    known_of_sets,
     meaning_of,
-    print_descriptions,
-    report_no_defaults,
+    no_defaults,
     say_sources,
     units_of,
 )
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import ExitCode, print_json, print_table, say
+from paramclient.cli.output import ExitCode, local_time, print_json, print_line, print_table, report, say
 from paramclient.cli.param_names import check_given
 from paramclient.cli.sources import check_link
+from paramclient.errors import UsageError
 from paramclient.files.formats import address
-from paramclient.metadata import Metadata, MetadataStore
+from paramclient.metadata import Metadata, MetadataStore, ParamInfo
 from paramclient.model.comparison import non_defaults
-from paramclient.model.names import NameChoice
-from paramclient.model.paramset import Default, ParamSet, add_default, default_of
-from paramclient.provision.sources import link_of, read_source, resolve
+from paramclient.model.identity import autopilot_name, has_autopilot
+from paramclient.model.names import NameChoice, counted
+from paramclient.model.notation import time_text
+from paramclient.model.paramset import ParamSet, add_default, default_of
+from paramclient.model.values import check_name, format_value
+from paramclient.provision.sources import link_of, read_source, resolve, tables_in
 
 _DEFAULTS: Final = CacheOptions()
 
@@ -40,7 +51,7 @@ async def show(
     /,
     *names: str,
     changed: bool = False,
-    metadata: MetadataChoice = None,
+    metadata: MetadataFile = None,
     extended: bool = False,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
@@ -59,7 +70,7 @@ async def show(
         metadata: A file that describes parameters. Default: the stored metadata of the vehicle's firmware.
         extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
-    chosen, given = check_given(names), from_file(metadata, offline=True)
+    chosen = check_given(names)
     with ParamCache(options.cache) as cache:
         if vehicle is None:
             summaries = cache.components(extended=extended)
@@ -70,26 +81,21 @@ async def show(
         check_link(link_of(vehicle))
         found = read_source(vehicle, every=True, extended=extended, incomplete=True, cache=cache)
         sets = [await resolve(vehicle, cache=False)] if found is None else found.sets
-        everything = {name for each in sets for name in each}
-        kept = NameChoice(chosen).choose(everything) if chosen else everything
-        known = MetadataStore.beside(cache.path).known_of_sets(sets) if given is None else [given] * len(sets)
+    everything = {name for each in sets for name in each}
+    kept = NameChoice(chosen).choose(everything) if chosen else everything
     views = [
-        _View(_part(each, kept), metadata, is_chosen=bool(chosen), is_changed=changed)
-        for each, metadata in zip(sets, known, strict=True)
+        _View(replace(params, params={name: params[name] for name in params if name in kept}), known, changed)
+        for params, known in zip(sets, known_of_sets(sets, options, metadata), strict=True)
     ]
-    if options.json:
-        print_json({"components": [view.as_json() for view in views]})
-    elif not changed or any(view.defaults for view in views):
-        for view in views:
-            view.print()
     if changed and not any(view.defaults for view in views):
-        report_no_defaults()
+        report(no_defaults())
         return ExitCode.INCOMPLETE
+    if options.json:
+        print_json({"components": [view.as_json(is_chosen=bool(chosen)) for view in views]})
+        return ExitCode.DONE
+    for view in views:
+        view.print(is_chosen=bool(chosen))
     return ExitCode.DONE
-
-
-def _part(params: ParamSet, names: Collection[str]) -> ParamSet:
-    return replace(params, params={name: param for name, param in params.items() if name in names})
 
 
 class _View:
@@ -98,14 +104,11 @@ class _View:
     Args:
         params: the set.
         metadata: its metadata, or None.
-        is_chosen: whether the user has named the parameters.
         is_changed: whether only parameters that differ from the defaults are shown.
     """
 
-    def __init__(
-        self, params: ParamSet, metadata: Metadata | None, *, is_chosen: bool, is_changed: bool
-    ) -> None:
-        self._metadata, self._is_chosen, self._is_changed = metadata, is_chosen, is_changed
+    def __init__(self, params: ParamSet, metadata: Metadata | None, is_changed: bool) -> None:
+        self._metadata, self._is_changed = metadata, is_changed
         more = defaults_in(metadata, params)
         found = {name: default_of(param, more.get(name)) for name, param in params.items()}
         self.defaults = {name: default for name, default in found.items() if default is not None}
@@ -114,21 +117,20 @@ class _View:
         if is_changed:
             self._shown = non_defaults(self._shown)
 
-    def as_json(self) -> JsonObject:
+    def as_json(self, *, is_chosen: bool) -> JsonObject:
         """Return the JSON of the set; of chosen parameters with their metadata."""
-        sources = {name: default.source for name, default in self.defaults.items()}
-        shown = set_json(self._shown, sources)
+        shown = set_json(self._shown, {name: default.source for name, default in self.defaults.items()})
         for name, param in shown["params"].items():
             if (info := info_of(self._metadata, name)) is not None:
                 text, units = info.text(self._shown[name].settable), info.units
                 param |= known_members(text=text or None, units=units or None)
-                param |= {"metadata": info_json(info)} if self._is_chosen else {}
+                param |= {"metadata": info_json(info)} if is_chosen else {}
         return shown
 
-    def print(self) -> None:
-        """Print the table without empty columns, and a line about it on stderr."""
+    def print(self, *, is_chosen: bool) -> None:
+        """Print the table, the descriptions of chosen parameters, and a line about the set on stderr."""
         columns = ("name", "value", "default", "type", "meaning", "units", "comment")
-        rows = [
+        rows = (
             (
                 param.name,
                 value_text(param),
@@ -139,11 +141,213 @@ class _View:
                 param.comment or None,
             )
             for param in self._shown.values()
-        ]
+        )
         print_table(columns, rows, right="value default")
-        if self._is_chosen and self._metadata is not None:
-            print_descriptions(self._shown, self._metadata)
+        if is_chosen and self._metadata is not None:
+            for name in self._shown:
+                _print_description(name, self._metadata.find(name))
         say(described(self._shown) + (", those that differ from their default" if self._is_changed else ""))
         if self._is_changed:
-            shown: list[Default] = [self.defaults[name] for name in self._shown]
-            say_sources(address(self._shown), shown)
+            say_sources(address(self._shown), [self.defaults[name] for name in self._shown])
+
+
+def search(
+    word: str,
+    /,
+    *words: str,
+    vehicle: str | None = None,
+    metadata: MetadataFile = None,
+    options: CacheOptions = _DEFAULTS,
+) -> ExitCode:
+    """Find parameters whose name, description or value names contain all words, in upper or lower case.
+
+    Searches the tables in the cache, with the stored metadata of their firmware, and the file of --metadata.
+    Parameters with the words in their name come first, then those with the words in the short description.
+    Exit code 1: nothing was found.
+
+    Args:
+        word: A word or a part of one, or several words in quotes.
+        words: Further words.
+        vehicle: Search only this vehicle in the cache: 4, px4 or ardupilot, its hardware id, or its key.
+        metadata: A file that describes parameters. Default: the stored metadata of each vehicle's firmware.
+    """
+    lowered_words = " ".join((word, *words)).casefold().split()
+    if not lowered_words:
+        raise UsageError("search takes one or more words")
+    known = _Cached(options, vehicle, metadata)
+    ranks = {name: _rank(name, known.info(name), lowered_words) for name in known.names}
+    names = [name for _, name in sorted((rank, name) for name, rank in ranks.items() if rank is not None)]
+    if options.json:
+        print_json({"results": [known.result_json(name) for name in names]})
+    elif names:
+        print_table(["name", "value", "vehicle", "description"], map(known.cells, names), right="value")
+    if not names:
+        report(f"nothing found; {counted(len(known.names), 'parameter')} searched")
+    if known.undescribed and not options.json:
+        say(f"only names of {known.undescribed} were searched: {METADATA_HINT}")
+    return ExitCode.DONE if names else ExitCode.INCOMPLETE
+
+
+def info(
+    name: str,
+    /,
+    *,
+    vehicle: str | None = None,
+    metadata: MetadataFile = None,
+    options: CacheOptions = _DEFAULTS,
+) -> ExitCode:
+    """Print the description, range, value names and cached values of a parameter.
+
+    Args:
+        name: The parameter, in upper or lower case.
+        vehicle: Only of this vehicle in the cache: 4, px4 or ardupilot, its hardware id, or its key.
+        metadata: A file that describes parameters. Default: the stored metadata of each vehicle's firmware.
+    """
+    known = _Cached(options, vehicle, metadata)
+    spelled = next((each for each in known.names if each.upper() == name.upper()), check_name(name).upper())
+    info = known.info(spelled)  # also that of a group, FOO{n}_BAR, which is not among the names
+    if info is None:
+        NameChoice([name]).choose(known.names, " of the cache")
+    default = None if info is None else info.default
+    tables = known.having(spelled)
+    if options.json:
+        vehicles = [
+            {
+                **taken(table, "key", "system", "component"),
+                "autopilot": autopilot_name(table.autopilot),
+                "heard_at": time_text(table.heard_at[spelled]),
+                "param": table_param_json(table.params[spelled], described=default),
+            }
+            for table in tables
+        ]
+        print_json({"name": spelled, "metadata": info and info_json(info), "vehicles": vehicles})
+        return ExitCode.DONE
+    _print_description(spelled, info)
+    if info is None and known.undescribed:
+        say(f"no metadata of {known.undescribed} is known: {METADATA_HINT}")
+    if tables:
+        print_line("")
+        columns = ("vehicle", "value", "meaning", "type", "default", "source", "heard", "key")
+        rows = (_value_cells(table, spelled, info) for table in tables)
+        print_table(columns, rows, right="value default")
+    return ExitCode.DONE
+
+
+class _Cached:
+    """The cached tables of all vehicles or of one, and their metadata.
+
+    Attributes:
+        names: the names of the tables; without a table, those of the metadata.
+        undescribed: the vehicles without metadata, in words. A camera has none: its firmware has none.
+    """
+
+    def __init__(self, options: CacheOptions, vehicle: str | None, given: Metadata | None) -> None:
+        with ParamCache(options.cache) as cache:
+            summaries = cache.components() if vehicle is None else tables_in(cache, vehicle)
+            tables = load_tables(cache, sorted(summaries, key=_address))
+            store = MetadataStore.beside(cache.path)
+        found = [given or store.known(table.identity, table.component) for table in tables]
+        self._tables = tables
+        self._metadata = [*{id(each): each for each in (given, *found) if each is not None}.values()]
+        self.names = {name for table in tables for name in table.params}
+        if given is not None:
+            self.names.update(name for name in given if "{" not in name)
+        self.undescribed = ", ".join(
+            f"{table.system}/{table.component} {autopilot_name(table.autopilot)}"
+            for table, each in zip(tables, found, strict=True)
+            if each is None and has_autopilot(table.autopilot)
+        )
+
+    def info(self, name: str) -> ParamInfo | None:
+        """Return the description of a parameter, or None."""
+        return next((known for each in self._metadata if (known := each.find(name)) is not None), None)
+
+    def having(self, name: str) -> list[CachedComponent]:
+        """Return the tables with this parameter."""
+        return [table for table in self._tables if name in table.params]
+
+    def result_json(self, name: str) -> JsonObject:
+        """Return the JSON of a found parameter; `vehicles` are the keys of the vehicles that have it."""
+        info, keys = self.info(name), [each.key for each in self.having(name)]
+        return {"name": name, "description": (info and info.short_description) or None, "vehicles": keys}
+
+    def cells(self, name: str) -> Sequence[object]:
+        """Return the row of a found parameter, with its value if that is the same on all vehicles."""
+        tables, info = self.having(name), self.info(name)
+        values = {_value(table, name) for table in tables}
+        value = f"{len(values)} values" if len(values) > 1 else next(iter(values), None)
+        where = ", ".join(f"{each.system}/{each.component}" for each in tables)
+        return name, value, where, info and info.short_description
+
+
+def _address(table: CachedComponent | CachedSummary) -> tuple[int, int]:
+    return table.system, table.component
+
+
+def _rank(name: str, info: ParamInfo | None, lowered_words: Sequence[str]) -> int | None:
+    """Return 0 if all words are in the name, 1 with the short description, 2 elsewhere; None if not."""
+    texts = [name]
+    if info is not None:
+        named = [*info.values.values(), *info.bits.values(), info.group]
+        texts += [info.short_description, " ".join([info.long_description, *named])]
+    for rank in range(len(texts)):
+        text = " ".join(texts[: rank + 1]).casefold()
+        if all(word in text for word in lowered_words):
+            return rank
+    return None
+
+
+def _value_cells(table: CachedComponent, name: str, info: ParamInfo | None) -> Sequence[object]:
+    """Return the row of the value of one vehicle."""
+    param = table.params[name]
+    default = default_of(param, None if info is None else info.default)
+    return (
+        f"{table.system}/{table.component}",
+        _value(table, name),
+        info and info.text(param.settable),
+        param.type.name,
+        default and format_value(default.value, param.type),
+        default and default.source,
+        local_time(table.heard_at[name]),
+        table.key,
+    )
+
+
+def _value(table: CachedComponent, name: str) -> str:
+    param = table.params[name]
+    return format_value(param.settable, param.type)
+
+
+def _print_description(name: str, info: ParamInfo | None) -> None:
+    """Print the whole metadata of a parameter as text."""
+    print_line("")
+    if info is None:
+        print_line(f"{name} is not described.")
+        return
+    print_line(f"{name}: {info.short_description}".removesuffix(": "))
+    for line in info.long_description.splitlines():
+        print_line(f"  {line}" if line.strip() else "")
+    for label, text in _fields(info):
+        print_line(f"  {label}: {text}")
+
+
+def _fields(info: ParamInfo) -> Iterator[tuple[str, str]]:
+    units = f" {info.units}" if info.units else ""
+    if info.minimum is not None or info.maximum is not None:
+        low, high = ("..." if each is None else format_value(each) for each in (info.minimum, info.maximum))
+        yield "range", f"{low} to {high}{units}"
+    elif units:
+        yield "units", info.units
+    if info.increment is not None:
+        yield "step", f"{format_value(info.increment)}{units}"
+    if info.default is not None:
+        text = info.text(info.default)
+        yield "default", format_value(info.default) + (f" ({text})" if text else units)
+    for value, name in info.values.items():
+        yield format_value(value), name
+    for bit, name in info.bits.items():
+        yield f"bit {bit}", name
+    if info.is_read_only:
+        yield "read-only", "the vehicle sets it"
+    if info.reboot_required:
+        yield "reboot", "a change takes effect after a reboot"

@@ -41,6 +41,7 @@ class WriteJob:
         writes: the values by name.
         described: the metadata of the vehicle, or None.
         arrived: the outcomes so far, by name.
+        began: the time of the event loop at which it was made.
     """
 
     columns: ClassVar[Sequence[str]] = ("name", "requested", "actual", "status")
@@ -49,10 +50,11 @@ class WriteJob:
     writes: Mapping[str, Value]
     described: Metadata | None
     arrived: dict[str, SetOutcome] = field(default_factory=dict)
+    began: float = field(default_factory=anyio.current_time)
 
     async def write(self, *, settle: float, force: bool) -> None:
         """Write the values as `Component.set_many` does; afterwards each has an outcome in any case."""
-        session, began = self.session, anyio.current_time()
+        session = self.session
         is_announced = False
 
         def update(outcome: SetOutcome) -> None:
@@ -62,7 +64,7 @@ class WriteJob:
                 is_announced = True
                 session.announce_write()
             self.arrived[outcome.name] = outcome
-            elapsed = anyio.current_time() - began
+            elapsed = anyio.current_time() - self.began
             status.update(Progress.after(len(self.arrived), len(self.writes), elapsed))
 
         label = session.label
@@ -91,17 +93,16 @@ class WriteJob:
 
     @property
     def summary(self) -> str:
-        """The numbers of outcomes in words: `2 of 4 set, 1 refused, 1 not tried on 1/1 PX4 …`."""
+        """The numbers of outcomes in words: `2 of 4 set, 1 refused, 1 not tried on 1/1 PX4 … in 0.2 s, …`."""
         counts = Counter(each.status for each in self.outcomes)
         done = counts.pop(SetStatus.ACCEPTED, 0) + counts.pop(SetStatus.ADJUSTED, 0)
         others = [f"{counts[status]} {status}" for status in SetStatus if status in counts]
-        return f"{', '.join([f'{done} of {len(self.writes)} set', *others])} on {self.session.receiver}"
-
-    @property
-    def code(self) -> int:
-        """The exit code for all outcomes."""
-        errors = [each.error for each in self.arrived.values() if each.error is not None]
-        return max(map(code_of, errors), default=ExitCode.DONE)
+        session, client = self.session, self.session.client
+        what = f"{', '.join([f'{done} of {len(self.writes)} set', *others])} on {session.receiver}"
+        if session.choice.is_all:
+            return what
+        traffic = f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent"
+        return f"{what} in {anyio.current_time() - self.began:.2f} s, {traffic}"
 
     def as_json(self) -> JsonObject:
         """Return the JSON of the vehicle and the outcomes."""
@@ -125,9 +126,12 @@ class WriteJob:
                 Coloured(each.status, _STYLES[each.status]),
             )
 
-    def report(self) -> None:
-        """Print remarks, and errors: one line for all values without a response, and for one cause."""
+    def report(self) -> int:
+        """Print a summary, remarks, and a line for the errors of each cause; return the exit code."""
         prefix, errors = self.session.prefix, dict[object, list[SetOutcome]]()
+        code = ExitCode.DONE
+        if not self.session.options.json:
+            say(self.summary)
         for each in self.arrived.values():
             info = info_of(self.described, each.name)
             if each.is_set and info is not None and info.reboot_required:
@@ -135,6 +139,7 @@ class WriteJob:
             if each.result is not None and each.result.note:
                 say(f"{prefix}{each.name}: {each.result.note}")
             if each.error is not None:
+                code = max(code, code_of(each.error))
                 is_open = each.status in (SetStatus.UNKNOWN, SetStatus.NOT_TRIED)
                 cause = (each.status, type(each.error)) if is_open else str(each.error)
                 errors.setdefault(cause, []).append(each)
@@ -142,6 +147,7 @@ class WriteJob:
             names, text = [each.name for each in group], str(group[0].error)
             is_named = len(names) == 1 and names[0] in re.split(r"[ ,:;]", text)
             report(f"{prefix}{'' if is_named else first_of(names, LINE_NAMES_MAX) + ': '}{text}")
+        return code
 
     def _type_of(self, outcome: SetOutcome) -> ParamType | int:
         """Return the vehicle's type of a parameter; REAL32 if it is not known."""
@@ -161,8 +167,6 @@ async def write_all(found: Sessions, jobs: Sequence[WriteJob], *, settle: float,
         AmbiguousVehicle, NoReply, LinkError: as from `CommandSession.check_only`; nothing was written.
     """
     by_session, done = {job.session: job for job in jobs}, [Done(job.session, job) for job in jobs]
-    began = anyio.current_time()
-
     if any(job.writes for job in jobs):
         for each in found:
             await each.check_only()
@@ -176,12 +180,4 @@ async def write_all(found: Sessions, jobs: Sequence[WriteJob], *, settle: float,
                 "have them; run it again to continue"
             )
             raise
-    found.show(done, errors=False)
-    for job in jobs:
-        client = job.session.client
-        traffic = f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent"
-        if not job.session.options.json:
-            elapsed = anyio.current_time() - began
-            say(f"{job.summary}{'' if found.is_all else f' in {elapsed:.2f} s, {traffic}'}")
-        job.report()
-    return max(job.code for job in jobs)
+    return found.show(done, errors=False)

@@ -91,9 +91,9 @@ def test_save_writes_what_differs(command: Command, put: Put, tmp_path: Path) ->
     assert list(read_file(tmp_path / "cached.parm").choose(None)) == ["MC_ROLL_P"]
     whole = tmp_path / "whole.parm"
     assert command("save", "1", whole).code == 0
-    refused = command("save", "1", whole, "--metadata", file)
-    assert (refused.code, "--metadata gives the defaults for --changed" in refused.err) == (2, True)
     given = a_file(tmp_path, MC_ROLL_P=6.25, MC_PITCH_P=1.0)
+    refused = command("save", "1", whole, "--metadata", given)
+    assert (refused.code, "--metadata gives the defaults for --changed" in refused.err) == (2, True)
     converted = command("save", whole, tmp_path / "part.parm", "--changed", "--metadata", given)
     assert converted.code == 0, converted.err
     assert list(read_file(tmp_path / "part.parm").choose(None)) == ["MC_PITCH_P"]

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from paramclient import read_file
-from paramclient.cli import set_command
-from paramclient.metadata import Metadata, ParamInfo
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.commands import Command, Put
 from tests.shell import Tap
@@ -133,36 +132,27 @@ def test_a_diff_with_partial_leaves_out_the_rest_of_the_vehicle_on_either_side(
 # Values that are probably wrong
 
 
-def described(name: str) -> Metadata:
-    return Metadata({name: ParamInfo(name, minimum=0, maximum=10)}, source="test")
-
-
 @pytest.mark.parametrize(("name", "value"), [("GAIN", "11"), ("MODE", "3.5")], ids=["range", "fraction"])
 def test_a_doubtful_value_is_written_only_after_a_question(
-    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch, name: str, value: str
+    command: Command, put: Put, at_terminal: Callable[[str], None], tmp_path: Path, name: str, value: str
 ) -> None:
     vehicle = ArduPilotVehicle(table=SHARED)
-    url = put(vehicle)
-    monkeypatch.setattr(set_command, "from_file", lambda _: described("GAIN"))
+    described = tmp_path / "parameters.json"
+    described.write_text(
+        '{"version": 1, "parameters": [{"name": "GAIN", "type": "Float", "min": 0, "max": 10}]}'
+    )
+    words = ("set", put(vehicle), name, value, "--metadata", described)
     before = dict(vehicle.values)
-    refused = command("set", url, name, value)
-    assert refused.code == 2
+    refused = command(*words)
+    assert (refused.code, vehicle.values) == (2, before)
     assert ("above the maximum of 10" if name == "GAIN" else "not a whole number") in refused.err
     assert "--force" in refused.err
-    answers = [False, True]
-
-    async def confirm(question: str) -> bool:
-        assert question.startswith("Write these values to 1/1 ArduPilot quadrotor, firmware ")
-        return answers.pop(0)
-
-    monkeypatch.setattr(set_command, "can_ask", lambda: True)
-    monkeypatch.setattr(set_command, "confirm", confirm)
-    refused = command("set", url, name, value)
-    assert (refused.code, vehicle.values) == (2, before)
-    for arguments in ([], ["--force"]):
-        command("set", url, name, value, *arguments)
-        assert vehicle.values != before
-    assert answers == []
+    for answer, is_written in (("n", False), ("y", True)):
+        at_terminal(answer)
+        asked = command(*words)
+        assert "Write these values to 1/1 ArduPilot quadrotor, firmware " in asked.err
+        assert (asked.code == 0, vehicle.values != before) == (is_written, is_written)
+    assert "[y/N]" not in command(*words, "--force").err
 
 
 def test_a_read_names_the_other_vehicles_on_the_link(
