@@ -20,8 +20,7 @@ from paramclient.links import tlog
 from paramclient.links.names import LinkKind, LinkSpec
 from paramclient.links.replay import ReplayLink
 from paramclient.links.tlog import Record, open_log, read_records
-from paramclient.logs.logged_params import ImportedTable
-from paramclient.logs.telemetry import import_log
+from paramclient.logs.imports import ImportedTable, import_log
 from paramclient.model.values import Encoding, bits_of, decode_value
 from paramclient.wire import messages
 from paramclient.wire.frames import Framer

@@ -12,9 +12,8 @@ from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import ExitCode, code_of, print_json, print_table, report
 from paramclient.errors import FileError, LinkError, ParamClientError
 from paramclient.files.other_files import kind_of
-from paramclient.logs.logged_params import ImportedTable
-from paramclient.logs.onboard import import_onboard_log, is_onboard_log
-from paramclient.logs.telemetry import import_log
+from paramclient.logs.imports import ImportedTable, import_log, import_onboard_log
+from paramclient.logs.onboard import is_onboard_log
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import hash_text
 

@@ -1,26 +1,75 @@
-"""On-board logs, ArduPilot's dataflash logs and PX4's ULog files: reading, and import into a cache."""
+"""On-board logs: the parameters in ArduPilot's dataflash logs (.bin) and PX4's ULog files (.ulg).
+
+ArduPilot documents its format in the "Log messages" pages; pymavlink's DFReader parses it. The messages read
+here are PARM (name, value, from version 4.3 on also the default), VER and MSG (firmware, board, hardware id),
+GPS (time). The PX4 guide documents ULog in "ULog File Format"; pyulog parses it.
+"""
 
 from __future__ import annotations
 
 import io
+import math
 import os
-from collections.abc import Mapping
-from contextlib import redirect_stderr, redirect_stdout
-from functools import partial
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-import anyio.to_thread
-
-from paramclient.cache import ParamCache, StoredParam, TableUpdate
 from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import AUTOPILOT, LogFormat
-from paramclient.logs.logged_params import ImportedTable, OnboardLog
-from paramclient.model.paramset import WrittenParam
-from paramclient.model.values import ParamType
+from paramclient.metadata.store import ARDUPILOT, OLD_NAMES
+from paramclient.model.identity import Identity
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import ParamType, Value, check_name, is_portable_name, shortest_float
+from paramclient.wire.messages import MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4
 
 LOG_MAGICS: Final = {b"ULog\x01\x12\x35": LogFormat.ULOG, b"\xa3\x95": LogFormat.DATAFLASH}
 """The first bytes of a ULog file, and of each message of a dataflash log."""
+GPS_FIX_MIN: Final = 3
+"""Status of a GPS receiver from which its time is valid: a 3D fix."""
+
+
+@dataclass(frozen=True, slots=True)
+class OnboardLog:
+    """The parameters of an on-board log.
+
+    Attributes:
+        source: the file's name, as given.
+        file_format: the log format.
+        identity: the vehicle, as far as the log describes it.
+        initial: the parameters at the beginning of the log, by name.
+        changes: the later values in the order of the log, each with its time in seconds since boot.
+        began: when the initial parameters were recorded, in seconds since boot.
+        ended: the last time that was read, in seconds since boot.
+        boot_time: the Unix time of the boot in seconds, or None if the log has no time of a GPS receiver.
+        notes: remarks for the user, in sentences: damaged parts.
+    """
+
+    source: str
+    file_format: LogFormat
+    identity: Identity
+    initial: Mapping[str, WrittenParam]
+    changes: tuple[tuple[float, WrittenParam], ...] = ()
+    began: float = 0.0
+    ended: float = 0.0
+    boot_time: float | None = None
+    notes: tuple[str, ...] = ()
+
+    def at_start(self) -> ParamSet:
+        """Return the parameters at the beginning of the log."""
+        ids = AUTOPILOT, self.identity.system or None
+        at = None if self.boot_time is None else self.boot_time + self.began
+        return ParamSet(self.initial, *ids, self.identity, at, self.source)
+
+    def at_end(self) -> ParamSet:
+        """Return the parameters at the end of the log: the initial ones with all changes."""
+        start = self.at_start()
+        params = {**self.initial, **{each.name: each for _, each in self.changes}}
+        at = None if self.boot_time is None else self.boot_time + self.ended
+        return replace(start, params=params, at=at)
 
 
 def is_onboard_log(path: str | os.PathLike[str]) -> bool:
@@ -34,6 +83,8 @@ def is_onboard_log(path: str | os.PathLike[str]) -> bool:
 def read_onboard_log(path: str | os.PathLike[str]) -> OnboardLog:
     """Read the parameters of an on-board log. Blocks: a log of 100 MB takes seconds.
 
+    A dataflash log contains no types: integers are numbers without a type, as in a list of Mission Planner.
+
     Args:
         path: a dataflash log (`.bin`) or a ULog file (`.ulg`); the content decides.
 
@@ -44,17 +95,11 @@ def read_onboard_log(path: str | os.PathLike[str]) -> OnboardLog:
     source = os.fspath(path)
     try:
         file_format = _format_of(Path(source))
-        # Both libraries print remarks on damaged parts, which would mix with the output of a program. They
-        # take up to 0.3 s to load.
+        if file_format is None:
+            raise FileError("neither a dataflash log nor a ULog file", source=source)
+        # Both libraries print remarks on damaged parts, which would mix with the output of a program.
         with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-            if file_format is LogFormat.DATAFLASH:
-                from paramclient.logs.dataflash import read_dataflash
-
-                return read_dataflash(source)
-            if file_format is LogFormat.ULOG:
-                from paramclient.logs.ulog import read_ulog
-
-                return read_ulog(source)
+            log = _read_ulog(source) if file_format is LogFormat.ULOG else _read_dataflash(source)
     except UsageError:
         raise
     except ImportError:
@@ -63,7 +108,9 @@ def read_onboard_log(path: str | os.PathLike[str]) -> OnboardLog:
         raise FileError(f"cannot be read: {error.strerror}", source=source) from error
     except Exception as error:  # the libraries do not state what they raise for damaged files
         raise FileError(f"the log is damaged: {error}", source=source) from error
-    raise FileError("neither a dataflash log nor a ULog file", source=source)
+    if not log.initial:
+        raise FileError("the log has no parameters", source=source)
+    return log
 
 
 def _format_of(path: Path) -> LogFormat | None:
@@ -75,66 +122,233 @@ def _format_of(path: Path) -> LogFormat | None:
     return next((each for magic, each in LOG_MAGICS.items() if begin.startswith(magic)), None)
 
 
-async def import_onboard_log(path: str | os.PathLike[str], cache: ParamCache) -> ImportedTable:
-    """Import the parameters of an on-board log into a cache, in one transaction.
-
-    Each value and each change has the time of the log. Later observations in the cache stay unchanged, so
-    logs may be imported in any order and repeatedly. A log does not say whether it has all parameters of the
-    vehicle: the table is complete only after a fetch. A dataflash log has no types: they are those of the
-    vehicle's cached table, else those of another cached vehicle of the same autopilot, else REAL32.
-
-    Args:
-        path: the log.
-        cache: the cache to write to.
-
-    Raises:
-        FileError: as from `read_onboard_log`; or the log has no UTC time or no system id.
-        UsageError: a ULog file, and pyulog is not installed.
-        CacheError: the cache cannot be written.
-    """
-    return await anyio.to_thread.run_sync(lambda: _store(read_onboard_log(path), cache))
+def _link(path: str) -> str:
+    """Return the link name of a log, which is part of the identity of a vehicle without a hardware id."""
+    return f"log:{os.path.realpath(path)}"
 
 
-def _store(log: OnboardLog, cache: ParamCache) -> ImportedTable:
-    identity = log.identity
-    if log.boot_time is None:
-        raise FileError(
-            "not imported: the log has no UTC time, as no GPS receiver had a fix, so its values cannot be "
-            "ordered with those in the cache. show, diff and save can read it",
-            source=log.source,
-        )
-    if not identity.system:
-        raise FileError("not imported: the log has no system id", source=log.source)
-    types, boot = _types(log, cache), log.boot_time
-    observed = [(log.began, each) for each in log.initial.values()] + [*log.changes]
-    stored = [_stored(each, types, boot + time) for time, each in observed]
-    update = partial(TableUpdate, identity=identity, component=AUTOPILOT, autopilot=identity.autopilot)
-    times = [each.heard_at for each in stored]
-    cache.merge([update(at=min(times)), update(at=max(times), params=stored)])
-    notes = log.notes
-    if untyped := sum(param.type is None and name not in types for name, param in log.initial.items()):
-        notes += (f"the log has no types: {untyped} parameters that no cached table has are REAL32",)
-    ids = identity.system, AUTOPILOT, identity.autopilot
-    return ImportedTable(identity.key, *ids, params=len(log.at_end()), notes=notes)
+# Dataflash
+
+VEHICLE_TYPES: Final = {name: types[0] for name, types in ARDUPILOT.values()}
+"""MAV_TYPE by the name of the firmware in MSG. A copter with other than four rotors reports another type in
+its heartbeat."""
+SYSTEM_ID_NAMES: Final = ("MAV_SYSID", "SYSID_THISMAV")
+"""The parameters that contain the system id: from version 4.7 on, and before."""
+GPS_EPOCH: Final = 315_964_800
+"""Unix time of 1980-01-06."""
+GPS_LEAP_SECONDS: Final = 18
+"""Seconds between GPS time and UTC, since 2017."""
+UID_SIZE: Final = 18
+"""Bytes of AUTOPILOT_VERSION.uid2; the hardware id of ArduPilot's boards has 12, zeros follow."""
+INITIAL_GAP_MAX: Final = 2.0
+"""Seconds without a PARM message after which further ones are changes: the logger writes the initial ones
+in one run, a few in each of its loops."""
+
+_FIRMWARE: Final = re.compile(r"^(\w+) V(\d+)\.(\d+)\.(\d+)[^(]*(?:\(([0-9a-f]{7,8})\))?")
+"""MSG: `ArduCopter V4.6.0-dev (3fc7011a)`."""
+_HARDWARE_ID: Final = re.compile(r" ([0-9A-F]{8}) ([0-9A-F]{8}) ([0-9A-F]{8})$")
+"""MSG: `CubeOrange 00380043 31385115 32383033`, the board's name and three words of its hardware id."""
 
 
-def _types(log: OnboardLog, cache: ParamCache) -> Mapping[str, ParamType | int]:
-    """Return types by name: those of the vehicle's cached table, else of another one."""
-    types: dict[str, ParamType | int] = {}
-    if log.file_format is LogFormat.DATAFLASH:
-        own = log.identity.key, AUTOPILOT
-        same = [each for each in cache.components() if each.autopilot == log.identity.autopilot]
-        for each in sorted(same, key=lambda each: (each.key, each.component) == own):
-            table = cache.load(each.key, each.component)
-            if table is not None:  # another process may have removed it
-                types |= {name: param.type for name, param in table.params.items()}
-    return types
+def _read_dataflash(path: str) -> OnboardLog:
+    found, boot_time = _messages(path)
+    initial: dict[str, WrittenParam] = {}
+    latest: dict[str, WrittenParam] = {}
+    changes: list[tuple[float, WrittenParam]] = []
+    times: list[float] = []
+    last_initial = math.inf
+    for fields in found["PARM"]:
+        try:
+            name, value, time = check_name(fields["Name"]), _number(fields["Value"]), fields["TimeUS"] / 1e6
+        except (UsageError, KeyError, TypeError):
+            continue
+        times.append(time)
+        default = fields.get("Default", math.nan)
+        default = None if math.isnan(default) else _number(default)
+        known = latest.get(name)
+        if known is None and (default is not None or time - last_initial <= INITIAL_GAP_MAX):
+            latest[name] = initial[name] = WrittenParam(name, value, None, default)
+            last_initial = time
+        elif known is None or value != known.value:
+            latest[name] = WrittenParam(name, value, None, None if known is None else known.default)
+            changes.append((time, latest[name]))
+    damaged = len(found["PARM"]) - len(times)
+    ids = (initial[name].value for name in SYSTEM_ID_NAMES if name in initial)
+    return OnboardLog(
+        path,
+        LogFormat.DATAFLASH,
+        Identity(
+            next((each for each in ids if isinstance(each, int) and 0 < each < 256), 0),
+            _link(path),
+            autopilot=MAV_AUTOPILOT_ARDUPILOTMEGA,
+            **_described(found["MSG"], found["VER"]),
+        ),
+        initial,
+        tuple(changes),
+        next(iter(times), 0.0),
+        max(times, default=0.0),
+        boot_time,
+        (f"{damaged} PARM messages are damaged and left out",) if damaged else (),
+    )
 
 
-def _stored(param: WrittenParam, types: Mapping[str, ParamType | int], at: float) -> StoredParam:
-    """Return the observation of a logged value; as a REAL32 if its type is unknown or cannot hold it."""
-    kind = types.get(param.name, ParamType.REAL32) if param.type is None else param.type
+def _messages(path: str) -> tuple[Mapping[str, list[dict[str, Any]]], float | None]:
+    """Return the messages of a log by their name, and the Unix time of the boot by the first GPS fix."""
+    from pymavlink.DFReader import DFReader_binary  # imported here: takes long to load
+
+    found = defaultdict[str, list[dict[str, Any]]](list)
+    boot_time = None
+    reader: Any = object.__new__(DFReader_binary)
     try:
-        return StoredParam.of(WrittenParam(param.name, param.value, kind, param.default), at)
-    except UsageError:
-        return StoredParam.of(WrittenParam(param.name, param.value, ParamType.REAL32), at)
+        reader.__init__(path, zero_time_base=True)
+        while (message := reader.recv_match(type={"PARM", "GPS", "VER", "MSG"}, strict=True)) is not None:
+            kind, fields = message.get_type(), message.to_dict()
+            if kind != "GPS":
+                found[kind].append(fields)
+            elif boot_time is None:
+                boot_time = _boot_time_by_gps(fields)
+    finally:
+        with suppress(AttributeError):  # the file could not be opened
+            reader.filehandle.close()  # a reader that cannot parse its file leaves it open
+    return found, boot_time
+
+
+def _described(texts: Iterable[Mapping[str, Any]], versions: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the fields of the identity. VER counts before MSG."""
+    fields: dict[str, Any] = {}
+    for text in (str(each.get("Message", "")) for each in texts):
+        if (found := _FIRMWARE.match(text)) is not None:
+            name, *numbers, commit = found.groups()
+            fields["firmware"] = int.from_bytes(bytes(min(int(each), 255) for each in (*numbers, 0)))
+            fields["git_hash"] = commit or ""
+            if (kind := VEHICLE_TYPES.get(OLD_NAMES.get(name, name))) is not None:
+                fields["vehicle_type"] = kind
+        elif (found := _HARDWARE_ID.search(text)) is not None:
+            words = (bytes.fromhex(word)[::-1] for word in found.groups())
+            fields["uid"] = b"".join(words).ljust(UID_SIZE, b"\0").hex()
+    for each in versions:
+        parts = bytes(each.get(name, 0) & 0xFF for name in ("Maj", "Min", "Pat", "FWT"))
+        fields |= {"firmware": int.from_bytes(parts), "git_hash": f"{each.get('GH', 0):08x}"}
+    return fields
+
+
+def _boot_time_by_gps(fields: dict[str, Any]) -> float | None:
+    """Return the Unix time of the boot, by one GPS message; None without a fix."""
+    week, time, micros = (fields.get(name) for name in ("GWk", "GMS", "TimeUS"))
+    if not week or time is None or micros is None or fields.get("Status", 0) < GPS_FIX_MIN:
+        return None
+    return float(GPS_EPOCH + week * 604800 + time / 1e3 - GPS_LEAP_SECONDS - micros / 1e6)
+
+
+def _number(value: float) -> Value:
+    """Return a float32 as the number that a person would write."""
+    return int(value) if value.is_integer() else shortest_float(value)
+
+
+# ULog
+
+ID_NAMES: Final = ("MAV_SYS_ID", "MAV_TYPE")
+"""The parameters that contain the system id and the MAV_TYPE of the heartbeat."""
+CURRENT_DEFAULTS: Final = 1
+"""Defaults of the airframe that is set up, in pyulog's numbering of the default types."""
+FIRMWARE_DEFAULTS: Final = 0
+"""Defaults of the firmware, likewise."""
+GIT_HASH_DIGITS: Final = 16
+"""Digits of the commit in AUTOPILOT_VERSION, which is what an `Identity` contains."""
+GPS_TOPICS: Final = ("vehicle_gps_position", "sensor_gps")
+"""Topics with the UTC time; the second in newer versions, if the first is not logged."""
+CLOCK_TOPICS: Final = ("vehicle_attitude", "vehicle_status", "cpuload")
+"""Topics that every flight has; vehicle_attitude is logged at 20 Hz or more. A change has no time of its own
+in the file, and takes that of the last data before it. The other topics take as much memory as the file."""
+
+_GUID: Final = re.compile(r"[0-9a-f]{36}")
+
+
+def _read_ulog(path: str) -> OnboardLog:
+    from pyulog import ULog  # imported here: needs the extra, and takes long to load
+
+    with Path(path).open("rb") as file:  # ULog closes none of its own if it fails
+        log = ULog(file, [*GPS_TOPICS, *CLOCK_TOPICS])
+    params, changes = _valid(log.initial_parameters.items()), log.changed_parameters
+    defaults = _defaults(log, params)
+    initial = {name: _param(name, value, defaults) for name, value in params.items()}
+    valid = [change for change in changes if _valid([change[1:]])]
+    damaged = len(log.initial_parameters) - len(params) + len(changes) - len(valid)
+    notes = []
+    if log.file_corruption:
+        notes.append("the log is damaged; values and changes may be missing")
+    if damaged:
+        notes.append(f"{damaged} parameters are damaged and left out")
+    return OnboardLog(
+        path,
+        LogFormat.ULOG,
+        _identity(log.msg_info_dict, initial, path),
+        initial,
+        tuple((micros / 1e6, _param(name, value, defaults)) for micros, name, value in valid),
+        log.start_timestamp / 1e6,
+        log.last_timestamp / 1e6,
+        _boot_time(log),
+        tuple(notes),
+    )
+
+
+def _valid(params: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the parameters that are not damaged. PX4 has int32 and float parameters only."""
+    return {
+        name: value
+        for name, value in params
+        if is_portable_name(name)
+        and (isinstance(value, float) or (isinstance(value, int) and -(1 << 31) <= value < 1 << 31))
+    }
+
+
+def _defaults(log: Any, params: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the defaults of the parameters.
+
+    PX4 logs a default only where the value differs from it (PX4 guide); for the others, the value is the
+    default. A log without that flag has no defaults.
+    """
+    if not log.has_default_parameters:
+        return {}
+    firmware, current = map(log.get_default_parameters, (FIRMWARE_DEFAULTS, CURRENT_DEFAULTS))
+    return {**params, **firmware, **current}
+
+
+def _param(name: str, value: Any, defaults: Mapping[str, Any]) -> WrittenParam:
+    kind = ParamType.REAL32 if isinstance(value, float) else ParamType.INT32
+    return WrittenParam(name, value, kind, defaults.get(name))
+
+
+def _identity(info: Mapping[str, Any], params: Mapping[str, WrittenParam], path: str) -> Identity:
+    system, kind = (_integer(params[name].value) if name in params else 0 for name in ID_NAMES)
+    guid = _text(info, "sys_uuid").lower()
+    return Identity(
+        system=system if 0 < system < 256 else 0,
+        link=_link(path),
+        uid=guid if _GUID.fullmatch(guid) else None,
+        autopilot=MAV_AUTOPILOT_PX4,
+        vehicle_type=kind,
+        firmware=_integer(info.get("ver_sw_release")),
+        git_hash=_text(info, "ver_sw")[:GIT_HASH_DIGITS],
+    )
+
+
+def _integer(value: object) -> int:
+    return value if isinstance(value, int) else 0
+
+
+def _text(info: Mapping[str, Any], name: str) -> str:
+    value = info.get(name, "")
+    return value.rstrip("\0") if isinstance(value, str) else ""
+
+
+def _boot_time(log: Any) -> float | None:
+    """Return the Unix time of the boot, by the first fix of a GPS receiver; None without one."""
+    for dataset in log.data_list:
+        fields = dataset.data
+        if dataset.name in GPS_TOPICS and {"time_utc_usec", "fix_type"} <= fields.keys():
+            times = zip(fields["timestamp"], fields["time_utc_usec"], fields["fix_type"], strict=True)
+            for micros, utc, fix in times:
+                if utc > 0 and fix >= GPS_FIX_MIN:
+                    return float((int(utc) - int(micros)) / 1e6)
+    return None

@@ -154,7 +154,7 @@ def test_other_files_are_not_on_board_logs(tmp_path: Path, data: bytes) -> None:
 def test_without_pyulog_the_error_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(tmp_path, bytes(flight().data), "flight.ulg")
     monkeypatch.setitem(sys.modules, "pyulog", None)
-    monkeypatch.delitem(sys.modules, "paramclient.logs.ulog", raising=False)
+    monkeypatch.delitem(sys.modules, "paramclient.logs.onboard", raising=False)
     with pytest.raises(UsageError, match=r"paramclient\[logs\]"):
         read_onboard_log(path)
 

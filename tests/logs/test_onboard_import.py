@@ -11,7 +11,8 @@ import pytest
 from paramclient import ParamCache, ParamType, read_file
 from paramclient.cache import StoredParam, TableUpdate
 from paramclient.errors import FileError
-from paramclient.logs.onboard import import_onboard_log, read_onboard_log
+from paramclient.logs.imports import import_onboard_log
+from paramclient.logs.onboard import read_onboard_log
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param
 from tests.logs.test_onboard import BOOT, COMMON, FIX, written

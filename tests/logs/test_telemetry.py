@@ -20,8 +20,7 @@ from paramclient import (
 )
 from paramclient.cache import BY_US, StoredParam, TableUpdate
 from paramclient.links.replay import PAUSE_MAX
-from paramclient.logs.logged_params import ImportedTable
-from paramclient.logs.telemetry import import_log
+from paramclient.logs.imports import ImportedTable, import_log
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import ParamType

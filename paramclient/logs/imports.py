@@ -1,11 +1,11 @@
-"""Import of telemetry logs into a cache, with the times of the log."""
+"""Import of logs into a cache, with the times of the log: telemetry logs and on-board logs."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import AsyncIterator, Iterator, Mapping
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
@@ -13,12 +13,16 @@ import anyio
 import anyio.lowlevel
 import anyio.to_thread
 
-from paramclient.cache import ParamCache, TableUpdate
+from paramclient.cache import ParamCache, StoredParam, TableUpdate
 from paramclient.client.cache_writer import update_of
+from paramclient.errors import FileError, UsageError
+from paramclient.files.formats import AUTOPILOT, LogFormat
 from paramclient.links.replay import LOG_PEER
 from paramclient.links.tlog import Record, open_log, read_records
-from paramclient.logs.logged_params import ImportedTable
+from paramclient.logs.onboard import OnboardLog, read_onboard_log
 from paramclient.model.identity import Identity
+from paramclient.model.paramset import WrittenParam
+from paramclient.model.values import ParamType
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.node import Node
 from paramclient.protocol.selection import vehicle_of
@@ -30,6 +34,33 @@ from paramclient.wire.messages import AutopilotVersion, Heartbeat, message_id
 
 RECORDS_PER_CHECKPOINT: Final = 1_000
 """Frames between two checkpoints, at which other tasks can run: a few milliseconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedTable:
+    """The imported table of one component.
+
+    Attributes:
+        key: the key of the vehicle's tables in the cache.
+        system, component: its address.
+        autopilot: MAV_AUTOPILOT of its heartbeat, or None.
+        params: the number of received parameters, plain and extended.
+        complete: whether the plain table is complete; the extended one if there are no plain parameters.
+        hash: the PX4 hash that confirms the table at the end of the log, or None.
+        notes: remarks for the user, in sentences: parts that were skipped, types that are unknown.
+    """
+
+    key: str
+    system: int
+    component: int
+    autopilot: int | None
+    params: int
+    complete: bool = False
+    hash: int | None = None
+    notes: tuple[str, ...] = ()
+
+
+# Telemetry logs
 
 
 async def import_log(path: str | os.PathLike[str], cache: ParamCache) -> tuple[ImportedTable, ...]:
@@ -159,3 +190,71 @@ class _Import:
 
 def _ignore(*_: object) -> None:
     """Send nothing, and start nothing: a log is only read."""
+
+
+# On-board logs
+
+
+async def import_onboard_log(path: str | os.PathLike[str], cache: ParamCache) -> ImportedTable:
+    """Import the parameters of an on-board log into a cache, in one transaction.
+
+    Each value and each change has the time of the log. Later observations in the cache stay unchanged, so
+    logs may be imported in any order and repeatedly. A log does not say whether it has all parameters of the
+    vehicle: the table is complete only after a fetch. A dataflash log has no types: they are those of the
+    vehicle's cached table, else those of another cached vehicle of the same autopilot, else REAL32.
+
+    Args:
+        path: the log.
+        cache: the cache to write to.
+
+    Raises:
+        FileError: as from `read_onboard_log`; or the log has no UTC time or no system id.
+        UsageError: a ULog file, and pyulog is not installed.
+        CacheError: the cache cannot be written.
+    """
+    return await anyio.to_thread.run_sync(lambda: _store(read_onboard_log(path), cache))
+
+
+def _store(log: OnboardLog, cache: ParamCache) -> ImportedTable:
+    identity = log.identity
+    if log.boot_time is None:
+        raise FileError(
+            "not imported: the log has no UTC time, as no GPS receiver had a fix, so its values cannot be "
+            "ordered with those in the cache. show, diff and save can read it",
+            source=log.source,
+        )
+    if not identity.system:
+        raise FileError("not imported: the log has no system id", source=log.source)
+    types, boot = _types(log, cache), log.boot_time
+    observed = [(log.began, each) for each in log.initial.values()] + [*log.changes]
+    stored = [_stored(each, types, boot + time) for time, each in observed]
+    update = partial(TableUpdate, identity=identity, component=AUTOPILOT, autopilot=identity.autopilot)
+    times = [each.heard_at for each in stored]
+    cache.merge([update(at=min(times)), update(at=max(times), params=stored)])
+    notes = log.notes
+    if untyped := sum(param.type is None and name not in types for name, param in log.initial.items()):
+        notes += (f"the log has no types: {untyped} parameters that no cached table has are REAL32",)
+    ids = identity.system, AUTOPILOT, identity.autopilot
+    return ImportedTable(identity.key, *ids, params=len(log.at_end()), notes=notes)
+
+
+def _types(log: OnboardLog, cache: ParamCache) -> Mapping[str, ParamType | int]:
+    """Return types by name: those of the vehicle's cached table, else of another one."""
+    types: dict[str, ParamType | int] = {}
+    if log.file_format is LogFormat.DATAFLASH:
+        own = log.identity.key, AUTOPILOT
+        same = [each for each in cache.components() if each.autopilot == log.identity.autopilot]
+        for each in sorted(same, key=lambda each: (each.key, each.component) == own):
+            table = cache.load(each.key, each.component)
+            if table is not None:  # another process may have removed it
+                types |= {name: param.type for name, param in table.params.items()}
+    return types
+
+
+def _stored(param: WrittenParam, types: Mapping[str, ParamType | int], at: float) -> StoredParam:
+    """Return the observation of a logged value; as a REAL32 if its type is unknown or cannot hold it."""
+    kind = types.get(param.name, ParamType.REAL32) if param.type is None else param.type
+    try:
+        return StoredParam.of(WrittenParam(param.name, param.value, kind, param.default), at)
+    except UsageError:
+        return StoredParam.of(WrittenParam(param.name, param.value, ParamType.REAL32), at)
