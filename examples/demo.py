@@ -19,7 +19,7 @@ from rich.table import Table
 
 from paramclient import Component, FetchResult, ParamClient, Progress
 from paramclient.links import parse_link, serve_endpoint
-from paramclient.links.udp import UdpIn
+from paramclient.links.sockets import UdpIn
 from paramclient.sim import PX4Vehicle
 
 NAME, WANTED = "MC_ROLL_P", 7.25

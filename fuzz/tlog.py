@@ -18,8 +18,7 @@ from paramclient.cache import ParamCache
 from paramclient.errors import LinkError
 from paramclient.links import tlog
 from paramclient.links.names import LinkKind, LinkSpec
-from paramclient.links.replay import ReplayLink
-from paramclient.links.tlog import Record, open_log, read_records
+from paramclient.links.tlog import Record, ReplayLink, open_log, read_records
 from paramclient.logs.imports import ImportedTable, import_log
 from paramclient.model.values import Encoding, bits_of, decode_value
 from paramclient.wire import messages

@@ -12,7 +12,7 @@ import anyio.from_thread
 import anyio.lowlevel
 
 from paramclient.links import create_link, serve_endpoint
-from paramclient.links.udp import UdpIn
+from paramclient.links.sockets import UdpIn
 from paramclient.sim import Endpoint
 
 __all__ = ["flying"]

@@ -13,8 +13,7 @@ from paramclient.client.signing import read_key, timestamp_now
 from paramclient.errors import UsageError
 from paramclient.links import Link, LinkKind, LinkSpec, create_link, parse_link, serve_endpoint
 from paramclient.links.sim import simulated
-from paramclient.links.tcp import TcpIn
-from paramclient.links.udp import UdpIn
+from paramclient.links.sockets import TcpIn, UdpIn
 
 
 async def sim(

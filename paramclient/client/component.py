@@ -16,7 +16,7 @@ from paramclient.client.core import ClientCore
 from paramclient.client.signing import timestamp_now
 from paramclient.client.streams import Changes, Subscribers
 from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, NotDurable, ParamClientError, UsageError
-from paramclient.links.replay import ReplayLink
+from paramclient.links.tlog import ReplayLink
 from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.paramset import ParamMap
 from paramclient.model.values import (

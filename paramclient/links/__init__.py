@@ -4,9 +4,8 @@ Link names follow pymavlink, MAVProxy and MAVSDK. `parse_link` parses a name, `c
 All links implement `Link`; a program can provide its own implementation.
 
 - `link`, `names`: the interface of links, and their names.
-- `udp`, `tcp`, `serial`, `sim`, `replay`: one module for each kind of link.
-- `refusals`: the reason why a link cannot be opened.
-- `ports`, `tlog`: the list of serial ports, logs.
+- `sockets`, `serial`, `sim`: links over UDP and TCP, over serial ports with their list, in this process.
+- `tlog`: telemetry logs, also as links.
 """
 
 from __future__ import annotations
@@ -17,12 +16,10 @@ from typing import TYPE_CHECKING
 from paramclient.errors import UsageError
 from paramclient.links.link import Link, Peer
 from paramclient.links.names import FORMS, LinkKind, LinkSpec, parse_link
-from paramclient.links.ports import SerialPort, list_ports
-from paramclient.links.replay import ReplayLink
-from paramclient.links.serial import SerialLink
+from paramclient.links.serial import SerialLink, SerialPort, list_ports
 from paramclient.links.sim import SimLink, serve_endpoint, simulated
-from paramclient.links.tcp import TcpIn, TcpOut
-from paramclient.links.udp import UdpIn, UdpOut
+from paramclient.links.sockets import TcpIn, TcpOut, UdpIn, UdpOut
+from paramclient.links.tlog import ReplayLink
 
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint

@@ -7,24 +7,17 @@ the port before it returns, and no transport, task or thread outlives it.
 
 from __future__ import annotations
 
-import socket
-import sys
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
-from contextlib import suppress
-from typing import Any, Final, NoReturn, Protocol, TypeAlias, runtime_checkable
+from typing import Final, NoReturn, Protocol, TypeAlias, runtime_checkable
 
 import anyio
+import anyio.lowlevel
 
 from paramclient.errors import LinkError
-from paramclient.links.names import LinkSpec
-from paramclient.links.refusals import host_refusal, reason, socket_refusal
 
 Peer: TypeAlias = Hashable
 """The sender of data: an address on UDP, a connection on TCP, a constant on links with one remote end."""
-
-Address: TypeAlias = tuple[Any, ...]
-"""A socket address: (host, port), with two more numbers for IPv6."""
 
 OPEN_TIMEOUT: Final = 5.0
 """Seconds for resolving a name and connecting. A TCP connection on a slow radio takes about 1 s."""
@@ -157,85 +150,52 @@ class BaseLink(ABC):
         return LinkError(f"{self.name}: {problem}", link=self.name)
 
 
-class SocketLink(BaseLink):
-    """Base class of the links over sockets.
+class StreamLink(BaseLink):
+    """Base class of byte streams with one remote end.
 
-    Attributes:
-        address: the local host and port while the link is open, else None. With port 0, shows the port that
-            the operating system chose.
+    Each opening has another peer, so that half a frame received before is not continued with later bytes.
     """
 
-    def __init__(self, spec: LinkSpec) -> None:
-        super().__init__(spec.name)
-        self._host = spec.host
-        self._port = spec.port
-        self._open_socket: socket.socket | None = None
+    is_stream = True
 
-    @property
-    def address(self) -> tuple[str, int] | None:
-        if self._open_socket is None:
-            return None
-        host, port, *_ = self._open_socket.getsockname()
-        return host, port
-
-    @property
-    def _socket(self) -> socket.socket:
-        if self._open_socket is None:
-            raise self._error("not open")
-        return self._open_socket
-
-    def _adopt(self, sock: socket.socket, opening: int) -> None:
-        """Replace the current socket, unless the link was closed while the new socket was opened."""
-        if opening != self._openings:
-            sock.close()
-        self._check(opening)
-        close_socket(self._open_socket)
-        self._open_socket = sock
-
-    async def _release(self) -> None:
-        close_socket(self._open_socket)
-        self._open_socket = None
-
-    async def _readable(self, waitable: socket.socket | int, opening: int) -> None:
-        """Wait until there is data to read; LinkError if the link is closed meanwhile."""
-        with suppress(anyio.ClosedResourceError):
-            await anyio.wait_readable(waitable)
-        self._check(opening)
-
-    def _refusal(self, error: OSError) -> str:
-        return socket_refusal(error, self._host, self._port, self._target, is_stream=self.is_stream)
-
-    @property
-    def _target(self) -> str:
-        return f"[{self._host}]:{self._port}" if ":" in self._host else f"{self._host}:{self._port}"
-
-    async def _resolve(self, kind: socket.SocketKind) -> list[tuple[socket.AddressFamily, Address]]:
-        """Return the addresses of the host, IPv4 first, because most MAVLink programs listen on IPv4."""
+    async def receive(self) -> list[tuple[Peer, bytes]]:
+        """See `Link.receive`: one chunk."""
+        opening = self._opened()
         try:
-            found: Any = socket.getaddrinfo(self._host, self._port, type=kind, flags=_NUMERIC)
-        except socket.gaierror:  # not an address: use the resolver, in a thread
+            data = await self._read()
+        except OSError as error:
+            await self._fail(opening, self._loss(error), error)
+        if not data:
+            await self._fail(opening, self._loss(None))
+        return [((self.name, opening), data)]
+
+    async def send(self, data: bytes, peer: Peer | None) -> None:
+        """See `Link.send`. Waits for space until a timeout; then the link counts as dropped.
+
+        After cancellation, a part may have been sent.
+        """
+        await anyio.lowlevel.checkpoint()
+        opening = self._opened()
+        if peer in (None, (self.name, opening)):
             try:
-                found = await anyio.getaddrinfo(self._host, self._port, type=kind)
-            except socket.gaierror as error:
-                raise self._error(host_refusal(self._host, error)) from error
-        pairs = [(family, address) for family, _, _, _, address in found]
-        return sorted(pairs, key=lambda pair: pair[0] != socket.AF_INET)
+                await self._write(data)
+            except OSError as error:
+                await self._fail(opening, self._loss(error), error)
+            self._check(opening)
+
+    @abstractmethod
+    async def _read(self) -> bytes:
+        """Wait for bytes; return b"" if the remote end has closed the link. OSError: the link dropped."""
+
+    @abstractmethod
+    async def _write(self, data: bytes) -> None:
+        """Send all bytes. OSError: the link dropped, or has no space until a timeout."""
+
+    @abstractmethod
+    def _loss(self, error: OSError | None) -> str:
+        """Return why the link has dropped: an error, or None where the remote end has closed it."""
 
 
-def claim(sock: socket.socket) -> None:
-    """Make a socket's port exclusive, before binding.
-
-    On systems other than Windows, two sockets share a port only if both request it.
-    """
-    if sys.platform == "win32":
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
-
-
-def close_socket(sock: socket.socket | None) -> None:
-    """Close a socket; tasks that wait for it get ClosedResourceError."""
-    if sock is not None:
-        anyio.notify_closing(sock)
-        sock.close()
-
-
-_NUMERIC = socket.AI_NUMERICHOST | socket.AI_NUMERICSERV
+def reason(error: OSError) -> str:
+    """Return the operating system's text for an error, without its number."""
+    return error.strerror or str(error)

@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass
 from enum import StrEnum
 from ipaddress import AddressValueError, IPv4Address, IPv6Address
-from typing import Final, NoReturn
+from typing import Final
 from urllib.parse import parse_qsl
 
 from paramclient.errors import UsageError
@@ -102,13 +102,9 @@ def parse_link(text: str) -> LinkSpec:
     name = text.strip()
     try:
         return _parse(name)
-    except _BadName as problem:
+    except UsageError as problem:
         shown = name if len(name) <= 80 else name[:80] + "…"
         raise UsageError(f"link name {shown!r}: {problem}\naccepted forms:\n{FORMS}") from None
-
-
-class _BadName(Exception):
-    """The problem of a link name, in words."""
 
 
 _SCHEMES: dict[str, LinkKind] = {
@@ -122,7 +118,7 @@ _SERVICE = re.compile(r"https?://", re.IGNORECASE)
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*):(.*)")
 _HOST_PORT = re.compile(r"(?:(?:\[([^\[\]]+)\]|([^:\[\]]*)):)?([0-9]{1,5})")
 _LABEL = "[A-Za-z0-9_](?:[A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?"
-_HOST = re.compile(rf"(?=.{{1,253}}$){_LABEL}(?:\.{_LABEL})*\.?")
+_HOST = re.compile(rf"(?=.{{1,253}}$)(?![0-9.]+$){_LABEL}(?:\.{_LABEL})*\.?")
 _DEVICE = re.compile(r"(/[!-~]+?|COM[0-9]{1,3})(?:[:,]([0-9]{1,8}))?", re.IGNORECASE)
 _BARE_DEVICE = re.compile(r"/dev/|COM[0-9]", re.IGNORECASE)
 
@@ -131,7 +127,7 @@ def _parse(name: str) -> LinkSpec:
     if _BARE_DEVICE.match(name):
         return _serial(name)
     if _SERVICE.match(name):
-        _fail(
+        raise UsageError(
             "this is an HTTP address, not a link. Connect to the vehicle's own link, or use the HTTP API of"
             " the service with an HTTP client"
         )
@@ -139,7 +135,8 @@ def _parse(name: str) -> LinkSpec:
     kind = _SCHEMES.get(scheme[1].lower()) if scheme else None
     if scheme is None or kind is None:
         if "/" in name or ":" not in name or not _HOST_PORT.fullmatch(name):
-            _fail(f"{scheme[1]!r} is not a kind of link" if scheme else "the kind of link is missing")
+            what = f"{scheme[1]!r} is not a kind of link" if scheme else "the kind of link is missing"
+            raise UsageError(what)
         return _network(LinkKind.UDPIN, name)
     rest = scheme[2].removeprefix("//")
     if kind in _PARSERS:
@@ -153,44 +150,44 @@ def _network(kind: LinkKind, rest: str) -> LinkSpec:
     bracketed, host, port = parts.groups() if parts else (None, None, "-1")
     host = host or ("0.0.0.0" if is_listening else "")
     if not (0 if is_listening else 1) <= int(port) <= 65535 or not (bracketed or host):
-        _fail("expected HOST:PORT, with an IPv6 address in brackets, and a port up to 65535")
+        raise UsageError("expected HOST:PORT, with an IPv6 address in brackets, and a port up to 65535")
     try:
-        if bracketed:
-            host = str(IPv6Address(bracketed))
-        elif re.fullmatch(r"[0-9.]+", host):
-            host = str(IPv4Address(host))
-        elif not _HOST.fullmatch(host):
-            raise AddressValueError
+        host = str(IPv6Address(bracketed) if bracketed else IPv4Address(host))
     except AddressValueError:
-        _fail(f"{bracketed or host!r} is not a host name or an address")
+        if bracketed or not _HOST.fullmatch(host):
+            raise UsageError(f"{bracketed or host!r} is not a host name or an address") from None
     return LinkSpec(kind, host.lower(), int(port))
 
 
 def _serial(rest: str) -> LinkSpec:
     parts = _DEVICE.fullmatch(rest)
     if parts is None:
-        _fail("a serial link is a device and a baud rate")
+        raise UsageError("a serial link is a device and a baud rate")
     device, digits = parts.groups()
     baud = int(digits) if digits else DEFAULT_BAUD
     if not BAUD_MIN <= baud <= BAUD_MAX:
-        _fail(f"a baud rate is from {BAUD_MIN} to {BAUD_MAX}, for example 57600 or 115200, not {baud}")
+        raise UsageError(
+            f"a baud rate is from {BAUD_MIN} to {BAUD_MAX}, for example 57600 or 115200, not {baud}"
+        )
     return LinkSpec(LinkKind.SERIAL, device if device.startswith("/") else device.upper(), baud)
 
 
 def _sim(rest: str) -> LinkSpec:
     autopilot, _, query = rest.partition("?")
     if autopilot.lower() not in SIMULATED:
-        _fail("simulated vehicles are px4, ardupilot and camera")
+        raise UsageError("simulated vehicles are px4, ardupilot and camera")
     options: dict[str, int | float] = {}
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True, max_num_fields=32)
     except ValueError:
-        _fail("options are written as NAME=VALUE with & between them")
+        raise UsageError("options are written as NAME=VALUE with & between them") from None
     for key, value in pairs:
         if key not in SIM_OPTIONS:
-            _fail(f"{key!r} is not an option of a simulated link; the options are {', '.join(SIM_OPTIONS)}")
+            raise UsageError(
+                f"{key!r} is not an option of a simulated link; the options are {', '.join(SIM_OPTIONS)}"
+            )
         if key in options:
-            _fail(f"option {key} is given twice")
+            raise UsageError(f"option {key} is given twice")
         options[key] = _number(key, value)
     return LinkSpec(LinkKind.SIM, autopilot.lower(), options=tuple(sorted(options.items())))
 
@@ -200,15 +197,11 @@ def _replay(rest: str) -> LinkSpec:
     if not mark:
         path = rest
     if not path:
-        _fail("the file is missing")
+        raise UsageError("the file is missing")
     number = 0.0 if speed == "inf" else _number("speed", speed) if mark else 1.0
     if number < 0:
-        _fail(f"option speed is 0 or more, not {number}")
+        raise UsageError(f"option speed is 0 or more, not {number}")
     return LinkSpec(LinkKind.REPLAY, path, options=(("speed", number),) if mark else ())
-
-
-def _fail(problem: str) -> NoReturn:
-    raise _BadName(problem)
 
 
 def _number(key: str, text: str) -> int | float:
@@ -218,7 +211,7 @@ def _number(key: str, text: str) -> int | float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        _fail(f"option {key} must be a number, not {text!r}")
+        raise UsageError(f"option {key} must be a number, not {text!r}")
     return abs(value) if value == 0 else value  # −0.0 is 0.0
 
 

@@ -17,26 +17,26 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import sys
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from typing import Any, Final, NamedTuple
 
 import anyio
 import anyio.lowlevel
 import anyio.to_thread
 
 from paramclient.errors import UsageError
-from paramclient.links.link import OPEN_TIMEOUT, BaseLink, Peer
-from paramclient.links.names import LinkSpec
-from paramclient.links.ports import need_serialx
-from paramclient.links.refusals import device_refusal, reason
+from paramclient.links.link import OPEN_TIMEOUT, StreamLink, reason
+from paramclient.links.names import DEFAULT_BAUD, LinkKind, LinkSpec
 
 if sys.platform != "win32":
     import fcntl
     import termios
-
-if TYPE_CHECKING:
-    import serialx
 
 READ_SIZE: Final = 65536
 """Bytes per read. Linux holds 4,095 for a reader, and bytes that arrive meanwhile in the driver."""
@@ -55,15 +55,7 @@ CLOSE_TIMEOUT: Final = 2.0
 """Seconds that closing waits for a driver. Unsent bytes are dropped before, so it rarely has to wait."""
 
 
-class SerialDevice(NamedTuple):
-    """A serial port as a peer. The number changes with each opening, so that half a frame received before
-    unplugging is not continued with later bytes."""
-
-    number: int
-    path: str
-
-
-class SerialLink(BaseLink):
+class SerialLink(StreamLink):
     """`serial`: one serial port. `open` restores the link after the device was unplugged.
 
     The link has no queue. If the operating system's buffer is full, a frame waits for space, so a slow port
@@ -78,55 +70,44 @@ class SerialLink(BaseLink):
         UsageError: the extra `serial` is not installed.
     """
 
-    is_stream = True
-
     def __init__(self, spec: LinkSpec) -> None:
         need_serialx(spec.name)
         super().__init__(spec.name)
         self.device = spec.host
         self.baud = spec.port
-        self._port: _Port | None = None
-        self._peer = SerialDevice(0, spec.host)
+        self._port: Port | None = None
 
-    async def receive(self) -> list[tuple[Peer, bytes]]:
-        """See `Link.receive`: one chunk of up to `READ_SIZE` bytes."""
-        opening = self._opened()
+    async def _read(self) -> bytes:
         assert self._port is not None
-        try:
-            data = await self._port.read()
-        except OSError as error:
-            await self._fail(opening, f"lost {self.device}: unplugged, or reset ({reason(error)})", error)
-        if not data:
-            await self._fail(opening, f"lost {self.device}: unplugged, or hung up")
-        return [(self._peer, data)]
+        return await self._port.read()
 
-    async def send(self, data: bytes, peer: Peer | None) -> None:
-        """See `Link.send`. Waits for space until `STALL_TIMEOUT`; then the port counts as lost.
-
-        After cancellation, a part may have been sent.
-        """
-        await anyio.lowlevel.checkpoint()
-        opening = self._opened()
+    async def _write(self, data: bytes) -> None:
         assert self._port is not None
-        if peer not in (None, self._peer):
-            return
         timeout = STALL_TIMEOUT + SYSTEM_BUFFER * BITS_PER_BYTE / self.baud
-        with anyio.move_on_after(timeout) as wait:
-            try:
-                await self._port.write(data)
-            except OSError as error:
-                await self._fail(opening, f"lost {self.device}: unplugged, or reset ({reason(error)})", error)
-        if wait.cancelled_caught:
-            await self._fail(opening, f"{self.device} has accepted no data for {timeout:.0f} s")
-        self._check(opening)
+        with anyio.move_on_after(timeout):
+            await self._port.write(data)
+            return
+        raise OSError(errno.ETIMEDOUT, f"{self.device} has accepted no data for {timeout:.0f} s")
+
+    def _loss(self, error: OSError | None) -> str:
+        if isinstance(error, TimeoutError):
+            return reason(error)
+        how = "hung up" if error is None else f"reset ({reason(error)})"
+        return f"lost {self.device}: unplugged, or {how}"
 
     async def _open(self, opening: int) -> None:
-        port = await open_port(self.device, self.baud)
+        import serialx  # imported here: needs the extra, and takes long to load
+
+        try:
+            port = await open_port(self.device, self.baud)
+        except serialx.UnsupportedSetting as error:
+            raise UsageError(f"{self.device}: this system does not support {self.baud} baud") from error
+        except RuntimeError as error:  # of drivers that do not report the rate that they set
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL)) from error
         if opening != self._openings:
             await port.close()
         self._check(opening)
         self._port = port
-        self._peer = self._peer._replace(number=self._peer.number + 1)
 
     async def _release(self) -> None:
         port, self._port = self._port, None
@@ -139,119 +120,218 @@ class SerialLink(BaseLink):
         return device_refusal(self.device, self.baud, error)
 
 
-class _Port(Protocol):
-    """An open port."""
+class Port(NamedTuple):
+    """An open port.
 
-    async def read(self) -> bytes:
-        """Wait for bytes; return b"" if the port has hung up, or is closed meanwhile."""
-
-    async def write(self, data: bytes) -> None:
-        """Wait until the operating system has accepted all bytes, or the port is closed."""
-
-    async def close(self) -> None:
-        """Wake waiting tasks, drop unsent bytes, close. Not cancellable; takes at most `CLOSE_TIMEOUT`."""
-
-
-async def open_port(device: str, baud: int) -> _Port:
-    """Open a port.
-
-    Raises:
-        OSError, UsageError: it cannot be opened.
+    Attributes:
+        read: waits for bytes; b"" if the port has hung up, or is closed meanwhile.
+        write: waits until the operating system has accepted all bytes, or the port is closed.
+        close: wakes waiting tasks, drops unsent bytes, closes. Takes at most `CLOSE_TIMEOUT`.
     """
-    import serialx  # imported here: needs the extra, and takes long to load
 
-    try:
-        return await open_here(device, baud)
-    except serialx.UnsupportedSetting as error:
-        raise UsageError(f"{device}: this system does not support {baud} baud") from error
-    except RuntimeError as error:  # of drivers that do not report the rate that they set
-        raise OSError(errno.EINVAL, os.strerror(errno.EINVAL)) from error
+    read: Callable[[], Awaitable[bytes]]
+    write: Callable[[bytes], Awaitable[None]]
+    close: Callable[[], Awaitable[None]]
 
 
-async def open_here(device: str, baud: int) -> _Port:
+async def open_port(device: str, baud: int) -> Port:
     """Open a port, as this system does."""
     if sys.platform == "win32":
-        return await AsyncioPort.opened(device, baud)
+        return await open_asyncio(device, baud)
     else:  # noqa: RET505 - with else, the type checker of each system skips the other branch
         # A driver may hang. A port that opens after the timeout is closed when its object is dropped.
-        return await anyio.to_thread.run_sync(_Descriptor, device, baud, abandon_on_cancel=True)
+        return await anyio.to_thread.run_sync(_open_descriptor, device, baud, abandon_on_cancel=True)
 
 
-class AsyncioPort:
-    """A port of serialx's asyncio interface, for Windows."""
+async def open_asyncio(device: str, baud: int) -> Port:
+    """Open a port with serialx's asyncio interface, for Windows."""
+    import serialx
 
-    def __init__(self, port: serialx.AsyncSerial) -> None:
-        self._port = port
+    options: Any = {"baudrate": baud}
+    port = serialx.async_serial_for_url(device, **options)
+    await port.open()
+    port.transport.set_write_buffer_limits(high=0)
 
-    @classmethod
-    async def opened(cls, device: str, baud: int) -> AsyncioPort:
-        """Open a port. OSError if that fails."""
-        import serialx
-
-        options: Any = {"baudrate": baud}
-        port = serialx.async_serial_for_url(device, **options)
-        await port.open()
-        port.transport.set_write_buffer_limits(high=0)
-        return cls(port)
-
-    async def read(self) -> bytes:
-        """See `_Port`."""
-        return await self._port.read(READ_SIZE)
-
-    async def write(self, data: bytes) -> None:
-        """See `_Port`."""
-        await self._port.write(data)
-
-    async def close(self) -> None:
-        """See `_Port`."""
-        self._port.abort()
+    async def close() -> None:
+        port.abort()
         with anyio.move_on_after(CLOSE_TIMEOUT, shield=True):
-            await self._port.wait_closed()
+            await port.wait_closed()
+
+    return Port(partial(port.read, READ_SIZE), port.write, close)
 
 
 if sys.platform != "win32":
 
-    class _Descriptor:
-        """A port as a non-blocking file descriptor. Opening and closing may block."""
+    def _open_descriptor(device: str, baud: int) -> Port:
+        """Open a port as a non-blocking file descriptor. Opening and closing may block."""
+        import serialx
 
-        def __init__(self, device: str, baud: int) -> None:
-            import serialx
+        port = serialx.serial_for_url(device, baud)
+        port.open()
+        file = port.fileno()
+        try:
+            # serialx's lock is advisory; TIOCEXCL makes open fail for every other program.
+            fcntl.ioctl(file, termios.TIOCEXCL)
+        except OSError:
+            port.close()
+            raise
 
-            self._serial = serialx.serial_for_url(device, baud)
-            self._serial.open()
-            self._file = self._serial.fileno()
-            try:
-                # serialx's lock is advisory; TIOCEXCL makes open fail for every other program.
-                fcntl.ioctl(self._file, termios.TIOCEXCL)
-            except OSError:
-                self._serial.close()
-                raise
-
-        async def read(self) -> bytes:
+        async def read() -> bytes:
             with suppress(anyio.ClosedResourceError):
                 while True:
-                    await anyio.wait_readable(self._file)
+                    await anyio.wait_readable(file)
                     with suppress(BlockingIOError):
-                        return os.read(self._file, READ_SIZE)
+                        return os.read(file, READ_SIZE)
             return b""
 
-        async def write(self, data: bytes) -> None:
+        async def write(data: bytes) -> None:
             view = memoryview(data)
             with suppress(anyio.ClosedResourceError):
                 while view:
                     try:
-                        view = view[os.write(self._file, view) :]
+                        view = view[os.write(file, view) :]
                     except BlockingIOError:
-                        await anyio.wait_writable(self._file)
+                        await anyio.wait_writable(file)
 
-        async def close(self) -> None:
-            anyio.notify_closing(self._file)
+        async def close() -> None:
+            anyio.notify_closing(file)
             with anyio.move_on_after(CLOSE_TIMEOUT, shield=True):
-                await anyio.to_thread.run_sync(self._release, abandon_on_cancel=True)
+                await anyio.to_thread.run_sync(release, abandon_on_cancel=True)
 
-        def _release(self) -> None:
+        def release() -> None:
             with suppress(OSError, termios.error):  # the device may be unplugged
-                termios.tcflush(self._file, termios.TCOFLUSH)  # otherwise close waits for it, 30 s on Linux
-                fcntl.ioctl(self._file, termios.TIOCNXCL)  # a pseudo-terminal would stay exclusive
+                termios.tcflush(file, termios.TCOFLUSH)  # otherwise close waits for it, 30 s on Linux
+                fcntl.ioctl(file, termios.TIOCNXCL)  # a pseudo-terminal would stay exclusive
             with suppress(OSError):
-                self._serial.close()
+                port.close()
+
+        return Port(read, write, close)
+
+
+AUTOPILOT_VENDORS: Final = {
+    0x26AC: "Pixhawk",  # 3D Robotics, and after it PX4's own boards
+    0x27AC: "VRBrain",  # Laser Navigation
+    0x2DAE: "CubePilot",
+    0x3162: "Holybro",
+    0x3185: "Pixhawk",  # Auterion: FMU v5X and later, ARK
+}
+"""USB vendors with only autopilots.
+
+Sources: QGroundControl's list of boards (USBBoardInfo.json), and ArduPilot's USB_VENDOR (hwdef.dat).
+"""
+
+AUTOPILOT_DEVICES: Final = {
+    (0x0483, 0x0037): "SmartAP AIRLink",
+    (0x0483, 0xA32F): "ModalAI",
+    (0x0483, 0xA330): "ModalAI",
+    (0x1008, 0x0001): "UVify Core",
+    (0x1209, 0x5740): "ArduPilot",  # with two ports on one USB: the second may be for CAN
+    (0x1209, 0x5741): "ArduPilot",
+    (0x1B8C, 0x0036): "Pixhawk",  # FMU v6U
+    (0x1FC9, 0x001C): "NXP FMUK66",
+    (0x3163, 0x004C): "CUAV",
+    (0x35A7, 0x0001): "ThePeach",
+    (0x35A7, 0x0002): "ThePeach",
+    (0x3643, 0x001D): "Pixhawk",  # FMU v6X-RT
+    (0x26AC, 0x0015): None,  # PX4 Flow, a sensor
+}
+"""Devices of vendors with other products too, or with shared ids; None is no autopilot. Sources: as for
+`AUTOPILOT_VENDORS`, and ArduPilot's chibios_hwdef.py for its own ids."""
+
+AUTOPILOT_MANUFACTURERS: Final = {
+    "ArduPilot": "ArduPilot",
+    "Hex/ProfiCNC": "CubePilot",
+    "Holybro": "Holybro",
+    "mRo": "mRo",
+}
+"""Manufacturer texts of autopilots with the default ids of a chip, such as ST's 0483:5740. Source:
+QGroundControl's list of boards."""
+
+
+@dataclass(frozen=True, slots=True)
+class SerialPort:
+    """A serial port of this computer. Unknown attributes are None; texts are those of the device.
+
+    Attributes:
+        device: the path or name, such as `/dev/ttyACM0` or `COM5`.
+        by_id: a path that is the same on every USB socket (Linux).
+        vendor_id, product_id: the USB ids.
+        manufacturer, product, serial_number: the texts of the USB descriptor.
+        interface: the number of the port on a device with several ports.
+    """
+
+    device: str
+    by_id: str | None = None
+    vendor_id: int | None = None
+    product_id: int | None = None
+    manufacturer: str | None = None
+    product: str | None = None
+    serial_number: str | None = None
+    interface: int | None = None
+
+    @property
+    def link(self) -> str:
+        """The link name of the port, with the default baud rate."""
+        return LinkSpec(LinkKind.SERIAL, self.by_id or self.device, DEFAULT_BAUD).name
+
+    @property
+    def autopilot(self) -> str | None:
+        """The make, if the USB ids or the manufacturer are those of an autopilot; else None."""
+        if self.vendor_id is None or self.product_id is None:
+            return None
+        ids = (self.vendor_id, self.product_id)
+        make = AUTOPILOT_VENDORS.get(self.vendor_id) or AUTOPILOT_MANUFACTURERS.get(self.manufacturer or "")
+        return AUTOPILOT_DEVICES.get(ids, make)
+
+
+def list_ports() -> list[SerialPort]:
+    """Return the serial ports of this computer: autopilots first, then other USB devices, sorted by name.
+
+    Queries the operating system, which takes some milliseconds.
+
+    Raises:
+        UsageError: the extra `serial` is not installed.
+    """
+    need_serialx("a list of serial ports")
+    import serialx  # imported here because it needs the extra
+
+    found = [
+        SerialPort(
+            each.resolved_device,
+            None if each.device == each.resolved_device else each.device,
+            *(each.vid, each.pid, each.manufacturer, each.product, each.serial_number, each.interface_num),
+        )
+        for each in serialx.list_serial_ports()
+    ]
+    return sorted(found, key=_order)
+
+
+def need_serialx(what: str) -> None:
+    """Raise UsageError with the command that installs the extra, if serialx is missing."""
+    if find_spec("serialx") is None:
+        raise UsageError(f"{what} needs serialx: pip install 'paramclient[serial]'")
+
+
+def _order(port: SerialPort) -> tuple[bool, bool, list[tuple[str, int]]]:
+    parts = re.findall(r"(\D*)(\d*)", port.device)  # sorts ttyUSB10 after ttyUSB9
+    return (
+        port.autopilot is None,
+        port.vendor_id is None,
+        [(text, int(number or 0)) for text, number in parts],
+    )
+
+
+def device_refusal(device: str, baud: int, error: OSError) -> str:
+    """Return why a serial port cannot be opened."""
+    ports = "'paramclient ports' lists the serial ports"
+    if error.errno in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
+        return f"{device} does not exist. {ports}"
+    if error.errno == errno.EBUSY or (sys.platform == "win32" and error.errno == errno.EACCES):
+        return f"{device} is in use by another link or program, such as a ground station or ModemManager"
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return f"no permission to open {device}. Is the user in the group of the port (dialout or uucp)?"
+    if error.errno in (errno.ENOTTY, errno.EISDIR):
+        return f"{device} is not a serial port. {ports}"
+    if error.errno == errno.EINVAL:
+        return f"{device} cannot be set to {baud} baud"
+    return f"cannot open {device}: {reason(error)}"

@@ -17,8 +17,7 @@ from paramclient.cache import ParamCache, StoredParam, TableUpdate
 from paramclient.client.cache_writer import update_of
 from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import AUTOPILOT, LogFormat
-from paramclient.links.replay import LOG_PEER
-from paramclient.links.tlog import Record, open_log, read_records
+from paramclient.links.tlog import LOG_PEER, Record, open_log, read_records
 from paramclient.logs.onboard import OnboardLog, read_onboard_log
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam

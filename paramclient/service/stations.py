@@ -16,7 +16,7 @@ from paramclient.client.signing import Signing, read_key
 from paramclient.client.taps import FrameCutter, SeenFrame
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link
-from paramclient.links.tcp import TcpIn
+from paramclient.links.sockets import TcpIn
 from paramclient.protocol.addresses import peer_in_words
 from paramclient.wire.frames import renumber_frame, sign_frame
 from paramclient.wire.messages import Message, encode, message_id

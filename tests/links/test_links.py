@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import selectors
 import socket
 import struct
 import time
@@ -31,8 +32,7 @@ from paramclient.links import (
     create_link,
     link,
     parse_link,
-    tcp,
-    udp,
+    sockets,
 )
 from paramclient.sim import Air, PX4Vehicle
 from paramclient.wire import frames, messages
@@ -601,7 +601,7 @@ async def test_a_burst_waits_for_a_late_reader(kind: str) -> None:
                 far.send(frame(number))
             time.sleep(0.1)  # noqa: ASYNC251 - blocks the event loop on purpose
             # If the system grants a smaller buffer, the datagrams that fit must still be received.
-            whole = link.receive_buffer >= udp.RECEIVE_BUFFER
+            whole = link.receive_buffer >= sockets.RECEIVE_BUFFER
             expected = count if whole else min(count, link.receive_buffer // 1280)
             with anyio.fail_after(TIMEOUT):
                 while len(got) < expected:
@@ -758,7 +758,7 @@ def reset(sock: socket.socket) -> None:
 async def test_tcp_drops_a_peer_that_does_not_read(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(tcp, "SEND_TIMEOUT", 0.05)
+    monkeypatch.setattr(sockets, "SEND_TIMEOUT", 0.05)
     problem = r"the peer has not read any data for 0\.05 s"
     async with connected("tcp") as (link, _), anyio.create_task_group() as tasks:
 
@@ -775,7 +775,13 @@ async def test_tcp_drops_a_peer_that_does_not_read(
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("leave", [socket.socket.close, reset])
-async def test_tcpin_continues_when_a_client_disconnects(leave: Callable[[socket.socket], None]) -> None:
+@pytest.mark.parametrize("selector", [selectors.DefaultSelector, selectors.SelectSelector])
+async def test_tcpin_continues_when_a_client_disconnects(
+    leave: Callable[[socket.socket], None],
+    selector: type[selectors.BaseSelector],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(selectors, "DefaultSelector", selector)  # the second one is that of Windows
     async with opened("tcpin:127.0.0.1:0") as link:
         await link.send(HEARTBEAT, None)
         with (
@@ -801,7 +807,7 @@ async def test_tcpin_continues_when_a_client_disconnects(leave: Callable[[socket
 
 @pytest.mark.asyncio
 async def test_tcpin_limits_its_connections(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tcp, "CONNECTIONS_MAX", 1)
+    monkeypatch.setattr(sockets, "CONNECTIONS_MAX", 1)
     async with connected("tcpin") as (link, far):
         with socket.create_connection(link.address, timeout=TIMEOUT) as second:
             far.send(frame(1))

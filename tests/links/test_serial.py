@@ -23,7 +23,7 @@ import serialx
 from paramclient.client import link_task
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link, link, serial
-from paramclient.links.serial import AsyncioPort
+from paramclient.links.serial import open_asyncio
 from paramclient.wire import messages
 from tests.cable import TIMEOUT, Cable
 from tests.shell import a_client, bits, generic, small_px4, until
@@ -45,7 +45,7 @@ def cable(tmp_path: Path) -> Iterator[Cable]:
 def port(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Both implementations; the second is that of Windows, which also works here."""
     if request.param == "asyncio":
-        monkeypatch.setattr(serial, "open_here", AsyncioPort.opened)
+        monkeypatch.setattr(serial, "open_port", open_asyncio)
     return str(request.param)
 
 

@@ -31,7 +31,7 @@ from paramclient.client.taps import FrameCutter
 from paramclient.errors import FileErrorCode, LinkError
 from paramclient.links import create_link, parse_link
 from paramclient.links.link import Peer
-from paramclient.links.udp import UdpIn
+from paramclient.links.sockets import UdpIn
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.sim import Air, FaultyLink
 from paramclient.wire import frames, messages

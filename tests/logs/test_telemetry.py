@@ -19,7 +19,7 @@ from paramclient import (
     UsageError,
 )
 from paramclient.cache import BY_US, StoredParam, TableUpdate
-from paramclient.links.replay import PAUSE_MAX
+from paramclient.links.tlog import PAUSE_MAX
 from paramclient.logs.imports import ImportedTable, import_log
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam

@@ -22,7 +22,7 @@ import pytest
 
 from paramclient import ParamType
 from paramclient.errors import LinkError, UsageError
-from paramclient.links import create_link, serve_endpoint, tcp
+from paramclient.links import create_link, serve_endpoint, sockets
 from paramclient.model.values import Encoding, encode_value
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.param_pck import PackedParam, decode, encode
@@ -1047,7 +1047,7 @@ async def test_a_station_that_floods_and_one_that_sends_garbage() -> None:
 @pytest.mark.asyncio
 async def test_a_station_that_never_reads(monkeypatch: pytest.MonkeyPatch) -> None:
     """Others are served meanwhile, and its connection is closed."""
-    monkeypatch.setattr(tcp, "SEND_TIMEOUT", 0.5)
+    monkeypatch.setattr(sockets, "SEND_TIMEOUT", 0.5)
     endpoint = parse_endpoint("tcpin:0")
     async with Hub([PX4Vehicle()], cache=False, mavlink=[endpoint]) as hub:
         await until(lambda: hub.targets and hub.targets[0].component.sync_state == "synced")
