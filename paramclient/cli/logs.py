@@ -11,7 +11,7 @@ from paramclient.cache import ParamCache
 from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import ExitCode, code_of, print_json, print_table, report
 from paramclient.errors import FileError, LinkError, ParamClientError
-from paramclient.files.other_files import kind_of
+from paramclient.files.conversion import kind_of
 from paramclient.logs.imports import ImportedTable, import_log, import_onboard_log
 from paramclient.logs.onboard import is_onboard_log
 from paramclient.model.identity import autopilot_name

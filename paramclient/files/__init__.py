@@ -1,11 +1,10 @@
 """Parameter files: formats of QGroundControl, MAVProxy and Mission Planner, packed files, JSON.
 
 - `formats`: the known formats, and the content of a file.
-- `conversion`: the table of formats: recognizing, reading and writing; packed files. `disk`: reading and
-  replacing files.
+- `conversion`: the table of formats: recognizing, reading and writing; packed files; files that are mistaken
+  for parameter files. `disk`: reading and replacing files.
 - `lists`, `json_format`: lists of ground stations, JSON.
 - `reading`: one file while it is read: its text, its parameters, its notes and its faults.
-- `other_files`: files that are mistaken for parameter files.
 """
 
 from paramclient.files.conversion import dumps, loads, read_file, writable, write_file

@@ -10,20 +10,24 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, ParamSpec, TypeVar
+from typing import Final
 
-import anyio.to_thread
+from anyio.to_thread import run_sync
 
 from paramclient.client.component import Component
 from paramclient.errors import FileError, UsageError
-from paramclient.metadata.formats import PACKED_SIZE_MAX, json_of, naming, read_content, unpacked
 from paramclient.metadata.info import Metadata
-from paramclient.metadata.store import MetadataStore, has_checksum
+from paramclient.metadata.store import (
+    PACKED_SIZE_MAX,
+    MetadataStore,
+    has_checksum,
+    json_of,
+    naming,
+    read_content,
+    unpacked,
+)
 from paramclient.protocol.commands import request_message
 from paramclient.wire.messages import ComponentMetadata
-
-P = ParamSpec("P")
-Result = TypeVar("Result")
 
 PARAMETER_TYPE: Final = 1
 """COMP_METADATA_TYPE_PARAMETER."""
@@ -66,15 +70,15 @@ async def metadata_of(
         if announced is None or not announced.uri:
             return None
         general = await files.get(announced.uri, announced.file_crc or None)
-        places = await _in_thread(_places_of_parameters, general, f"{announced.uri} of {files.label}")
+        places = await run_sync(_places_of_parameters, general, f"{announced.uri} of {files.label}")
         if not places:
             return None
-        uri, crc = next((place for place in places if place[0].startswith(_SCHEME)), places[0])
+        uri, crc = next((place for place in places if place[0].startswith("mftp://")), places[0])
         content = await files.get(uri, crc)
-        read = await _in_thread(read_content, content, source=f"{uri} of {files.label}")
+        read = await run_sync(partial(read_content, content, source=f"{uri} of {files.label}"))
         now = component.identity
         if kept is not None and crc is not None and before.uid in (None, now.uid):
-            await _in_thread(kept.remember, now, component.component, crc)
+            await run_sync(kept.remember, now, component.component, crc)
         return read
 
 
@@ -104,7 +108,7 @@ class _Files:
             crc: the file's checksum, or None if unknown; the file is not cached then.
         """
         if self.kept is not None and crc is not None:
-            content = await _in_thread(self.kept.get, crc)
+            content = await run_sync(self.kept.get, crc)
             if content is not None:
                 return content
         server, path = self._on_board(uri)
@@ -113,11 +117,11 @@ class _Files:
         except UsageError as error:
             raise FileError(f"announced by {self.label}: {error}", source=uri) from error
         if crc is not None:
-            if not await _in_thread(has_checksum, content, crc):
+            if not await run_sync(has_checksum, content, crc):
                 problem = f"the file of {self.label} does not have the announced checksum {crc:08x}"
                 raise FileError(problem, source=uri)
             if self.kept is not None:
-                await _in_thread(self.kept.put, content, crc)
+                await run_sync(self.kept.put, content, crc)
         return content
 
     def _on_board(self, uri: str) -> tuple[Component, str]:
@@ -142,7 +146,7 @@ class _Files:
 
 def _places_of_parameters(general: bytes, source: str) -> list[tuple[str, int | None]]:
     """Return the addresses and checksums of the parameter metadata in a general file."""
-    from paramclient.metadata.px4 import read_general  # imported here: loads pydantic
+    from paramclient.metadata.schemas import read_general
 
     with naming(source):
         files = read_general(json_of(unpacked(general)))
@@ -155,10 +159,4 @@ def _places_of_parameters(general: bytes, source: str) -> list[tuple[str, int | 
     ]
 
 
-async def _in_thread(work: Callable[P, Result], *args: P.args, **kwargs: P.kwargs) -> Result:
-    """Run blocking work in a worker thread."""
-    return await anyio.to_thread.run_sync(partial(work, *args, **kwargs))
-
-
-_SCHEME: Final = "mftp://"
 _ON_BOARD: Final = re.compile(r"mftp://(?:\[;comp=([0-9]{1,3})\])?(.+)")

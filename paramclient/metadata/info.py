@@ -311,11 +311,9 @@ def _choice(sentence: str, named: Mapping[Key, str], text: str) -> str:
         return f"{sentence}: {', '.join(f'{name} ({number})' for number, name in named.items())}"
     folded = {_folded(name): name for name in named.values()}
     nearest = [folded[each] for each in difflib.get_close_matches(_folded(text), folded, n=3, cutoff=0.5)]
-    return (
-        f"{sentence}; similar: {', '.join(nearest)}"
-        if nearest
-        else f"{sentence}, of which there are {len(named)}"
-    )
+    if nearest:
+        return f"{sentence}; similar: {', '.join(nearest)}"
+    return f"{sentence}, of which there are {len(named)}"
 
 
 def _is_below(a: int | float, b: int | float) -> bool:

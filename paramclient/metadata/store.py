@@ -1,13 +1,14 @@
-"""MetadataStore: metadata files of vehicles, cached on disk, and files that the user has added."""
+"""Metadata files: reading, a cache of those of vehicles, and files that the user has added."""
 
 from __future__ import annotations
 
 import hashlib
 import logging
+import lzma
 import os
 import re
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -16,12 +17,18 @@ from typing import Final, Literal, TypeAlias, get_args
 from paramclient.errors import FileError, UsageError
 from paramclient.files.disk import read_bytes, replace_file
 from paramclient.files.formats import AUTOPILOT
-from paramclient.metadata.formats import read_content, unpacked
 from paramclient.metadata.info import Metadata
 from paramclient.model.identity import Identity, autopilot_name, version_text
 from paramclient.model.paramset import ParamSet
 from paramclient.model.px4_hash import crc32_px4
 
+PACKED_SIZE_MAX: Final = 4 << 20
+"""Bytes of a packed file, or of a file from a vehicle; PX4's has about 0.1 million."""
+CONTENT_SIZE_MAX: Final = 8 << 20
+"""Bytes of a file, and of an unpacked one; those of ArduPilot and PX4 have 2 to 5 million. To read one takes
+up to seven times as much memory, if its text is not ASCII."""
+UNPACKING_MEMORY_MAX: Final = 96 << 20
+"""Bytes of memory for unpacking. PX4 packs with a dictionary of 64 million, `xz -9`."""
 PARSED_FILES_MAX: Final = 2
 """Most recently used files that are kept parsed: a comparison has mostly one or two firmwares. The largest
 takes 50 MB."""
@@ -47,6 +54,104 @@ _kinds: Final[dict[str, VehicleKind]] = {kind: kind for kind in get_args(Vehicle
 _name: Final = re.compile(rf"({'|'.join(_kinds)})(?:-([0-9.]+))?\.added").fullmatch
 
 logger = logging.getLogger(__name__)
+
+
+# Reading
+
+
+def read_metadata(path: str | os.PathLike[str]) -> Metadata:
+    """Read a metadata file: PX4's parameters.json, or ArduPilot's apm.pdef.xml or apm.pdef.json.
+
+    Each may be packed with xz. The format is detected from the content, not from the name.
+
+    Raises:
+        FileError: the file cannot be read, is too large, or has another format.
+    """
+    source = os.fspath(path)
+    return read_content(read_bytes(source), source=source)
+
+
+def read_content(content: bytes, *, source: str) -> Metadata:
+    """Read the bytes of a metadata file, as `read_metadata`.
+
+    Args:
+        content: the bytes, possibly packed.
+        source: their origin, for errors and for users.
+
+    Raises:
+        FileError: as `read_metadata`.
+    """
+    with naming(source):
+        metadata = _read_unpacked(unpacked(content).removeprefix(b"\xef\xbb\xbf"))
+    return replace(metadata, source=source)
+
+
+@contextmanager
+def naming(source: str) -> Iterator[None]:
+    """Turn UsageError into FileError with the origin of a file."""
+    try:
+        yield
+    except UsageError as error:
+        raise FileError(str(error), source=source) from None
+
+
+def json_of(content: bytes) -> dict[str, object]:
+    """Parse a JSON object.
+
+    Raises:
+        UsageError: the text is not a JSON object.
+    """
+    from pydantic_core import from_json  # imported here: loads pydantic
+
+    try:
+        document = from_json(content)
+    except ValueError as error:
+        raise UsageError(f"not JSON: {error}") from None
+    if not isinstance(document, dict):
+        raise UsageError("is JSON, but not an object")
+    return document
+
+
+def unpacked(content: bytes) -> bytes:
+    """Return the content of a file that may be packed with xz.
+
+    Raises:
+        UsageError: the file is damaged, or too large.
+    """
+    is_packed = content.startswith(b"\xfd7zXZ\0")
+    if len(content) > (PACKED_SIZE_MAX if is_packed else CONTENT_SIZE_MAX):
+        raise UsageError("is too large for a metadata file")
+    if not is_packed:
+        return content
+    unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=UNPACKING_MEMORY_MAX)
+    try:
+        result = unpacker.decompress(content, CONTENT_SIZE_MAX + 1)
+    except lzma.LZMAError as error:
+        raise UsageError(f"cannot be unpacked: {error}") from None
+    if len(result) > CONTENT_SIZE_MAX:
+        raise UsageError("is too large for a metadata file")
+    if not unpacker.eof:
+        raise UsageError("cannot be unpacked: the file is truncated")
+    return result
+
+
+def _read_unpacked(content: bytes) -> Metadata:
+    start = content.lstrip(b" \t\r\n")[:1]
+    if start not in (b"<", b"{"):
+        what = "PX4's parameters.json, ArduPilot's apm.pdef.xml or apm.pdef.json"
+        raise UsageError(f"is neither JSON nor XML; expected {what}")
+    from paramclient.metadata import schemas  # imported here: loads pydantic
+
+    if start == b"<":
+        return schemas.read_xml(content)
+    document = json_of(content)
+    if "parameters" in document:
+        return schemas.read_parameters(document)
+    if "metadataTypes" in document:
+        raise UsageError(
+            "is the general metadata file, which only names other files; use the file with the parameters"
+        )
+    return schemas.read_json(document)
 
 
 # Files of vehicles
@@ -79,7 +184,7 @@ class MetadataStore:
     @property
     def has_notes(self) -> bool:
         """Whether metadata of any firmware is cached or was added."""
-        return any(path.suffix == _NOTES for path in self._files()) or any(True for _ in self.added)
+        return bool([*self.folder.glob(f"*{_NOTES}"), *self.added])
 
     def get(self, crc: int) -> bytes | None:
         """Return a file as stored on board, or None if it is not cached."""
@@ -147,10 +252,6 @@ class MetadataStore:
         name = hashlib.sha256(repr((firmware, component)).encode()).hexdigest()[:16]
         return self.folder / f"{name}{_NOTES}"
 
-    def _files(self) -> Iterator[Path]:
-        with suppress(OSError):
-            yield from self.folder.iterdir()
-
     def _read(self, path: Path) -> bytes | None:
         if not path.exists():
             return None
@@ -175,10 +276,9 @@ def has_checksum(content: bytes, crc: int) -> bool:
     """
     if crc32_px4(content) == crc:
         return True
-    try:
+    with suppress(UsageError):
         return crc32_px4(unpacked(content)) == crc
-    except UsageError:
-        return False
+    return False
 
 
 @lru_cache(maxsize=PARSED_FILES_MAX)
@@ -225,10 +325,8 @@ class AddedFiles:
         self.folder = folder
 
     def __iter__(self) -> Iterator[AddedMetadata]:
-        found: list[AddedMetadata] = []
-        with suppress(OSError):
-            named = ((_name(path.name), path) for path in self.folder.iterdir())
-            found += [AddedMetadata(_kinds[match[1]], match[2], path) for match, path in named if match]
+        named = ((_name(path.name), path) for path in self.folder.glob("*.added"))
+        found = [AddedMetadata(_kinds[match[1]], match[2], path) for match, path in named if match]
         return iter(sorted(found, key=lambda each: (each.kind, _numbers(each.firmware))))
 
     def add(

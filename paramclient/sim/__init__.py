@@ -20,7 +20,7 @@ The vehicles behave as measured on real ones, with the real timing. The docstrin
 
 - `px4`, `ardupilot`: the autopilots. `camera`: a camera with extended parameters.
 - `vehicle`, `device`: their base classes, and the vehicle of the standard.
-- `param_table`, `ftp`, `metadata`: parameter tables, the MAVFTP server, metadata files.
+- `param_table`, `ftp`: parameter tables, the MAVFTP server.
 - `air`: the faulty link.
 """
 

@@ -1,20 +1,24 @@
-"""A simulated PX4 autopilot."""
+"""A simulated PX4 autopilot, and the metadata files that it serves."""
 
 from __future__ import annotations
 
+import json
+import lzma
 import math
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Final
+from functools import cache
+from importlib import resources
+from typing import Any, ClassVar, Final
 
 from paramclient.errors import CommandResult, ParamErrorCode
 from paramclient.model.px4_hash import crc32_px4, hash_bits
-from paramclient.model.values import ParamType, bits_of
+from paramclient.model.values import TYPES_BY_NAME, ParamType, bits_of
 from paramclient.sim.ftp import FileServer
-from paramclient.sim.metadata import GENERAL_FILE, metadata_files
 from paramclient.sim.param_table import (
     Entry,
+    SimParam,
     Table,
     as_table,
     px4_table,
@@ -23,6 +27,10 @@ from paramclient.sim.param_table import (
 from paramclient.sim.vehicle import SIMULATED_COMMIT, Vehicle
 from paramclient.wire import frames, messages
 
+GENERAL_FILE: Final = "etc/extras/component_general.json.xz"
+"""Path of PX4's general metadata file (COMPONENT_METADATA.hpp)."""
+METADATA_FILE: Final = "etc/extras/parameters.json.xz"
+"""Path of PX4's parameter metadata file (PX4's build)."""
 LIMITS: Final[tuple[tuple[str, Callable[[float, float], float], str | float], ...]] = (
     ("MPC_TILTMAX_AIR", min, 89.0),
     ("MPC_TILTMAX_LND", min, "MPC_TILTMAX_AIR"),
@@ -354,3 +362,45 @@ _SAVE_INTERVAL = 2.0
 """Seconds between two saves, at least."""
 _RESET_ALL = 2.0
 """First parameter of MAV_CMD_PREFLIGHT_STORAGE that resets all parameters."""
+
+
+@cache
+def metadata_files(rows: tuple[SimParam, ...]) -> dict[str, bytes]:
+    """Return the two packed files of a table, by path. Only a few parameters have more than a type."""
+    path = resources.files(__package__).joinpath("tables", "px4_descriptions.json")
+    known = json.loads(path.read_text(encoding="ascii"))
+    described = [_described(row) | known.get(row.name, {}) for row in rows]
+    parameters = _packed({"version": 1, "parameters": described})
+    kinds = [{"type": 1, "uri": f"mftp://{METADATA_FILE}", "fileCrc": crc32_px4(parameters)}]
+    return {
+        GENERAL_FILE: _packed({"version": 1, "metadataTypes": kinds}),
+        METADATA_FILE: parameters,
+    }
+
+
+def _packed(document: dict[str, Any]) -> bytes:
+    return lzma.compress(json.dumps(document).encode(), preset=1)
+
+
+def _described(row: SimParam) -> dict[str, Any]:
+    value = row.value
+    described: dict[str, Any] = {
+        "name": row.name,
+        "group": row.name.partition("_")[0],
+        "category": "Standard",
+        "shortDesc": f"{row.name} of the simulated vehicle",
+    }
+    if row.type in _TYPES:
+        described["type"] = _TYPES[row.type]
+    if isinstance(value, int | float) and math.isfinite(value):
+        described["default"] = value
+    if row.volatile:
+        described["volatile"] = True
+    return described
+
+
+_TYPES: Final[dict[int, str]] = {
+    kind: "Float" if kind is ParamType.REAL32 else kind.name.capitalize()
+    for kind in TYPES_BY_NAME.values()
+    if kind.size <= 4
+}

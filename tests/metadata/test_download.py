@@ -20,7 +20,7 @@ from paramclient.metadata import Metadata, MetadataStore, download, metadata_of
 from paramclient.model.identity import Identity
 from paramclient.model.px4_hash import crc32_px4
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
-from paramclient.sim.metadata import GENERAL_FILE, METADATA_FILE
+from paramclient.sim.px4 import GENERAL_FILE, METADATA_FILE
 from paramclient.wire.messages import FileTransfer
 from tests.shell import (
     Tap,
