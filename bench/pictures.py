@@ -1,6 +1,6 @@
-"""Draws the downloads of the README's comparison with other clients into docs/images: `make pictures`.
+"""Draws the comparison with other clients into docs/images: `make pictures`.
 
-The figures are those of the table in the README, so that picture and table cannot differ.
+The figures are those of the tables in docs/performance.md, so that picture and tables cannot differ.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from xml.sax.saxutils import escape
 __all__ = ["LOOKS", "Download", "alternative_text", "description", "downloads_in", "draw", "main"]
 
 ROOT: Final = Path(__file__).parent.parent
-README: Final = ROOT / "README.md"
+PAGE: Final = ROOT / "docs/performance.md"
 """The page with the figures."""
 IMAGES: Final = ROOT / "docs/images"
 """The folder of the pictures."""
@@ -44,10 +44,10 @@ GROUP_GAP: Final = 16
 """Distance between two groups of bars."""
 FOOT: Final = 50
 """Height of the axis and the notes."""
-FILE_GAP: Final = 6
-"""Distance between the bars of the list, those of the file, and that of the warm start."""
-WAYS: Final = ("list", "file", "warm")
-"""The order of these bars."""
+WAY_GAP: Final = 6
+"""Distance between the bars of two ways."""
+WAYS: Final = {"list": "", "file": ", by file", "gateway": ", by gateway", "warm": ", warm"}
+"""The ways in the order of their bars, as they stand behind the client."""
 TICK: Final = 30
 """Seconds between two lines of the axis."""
 FONT: Final = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
@@ -66,7 +66,7 @@ class Download:
 
     Attributes:
         autopilot: `PX4`, `ArduPilot`.
-        way: "list", "file" (the vehicle's MAVFTP parameter file), or "warm" (a proven cache).
+        way: "list", "file" (the vehicle's MAVFTP parameter file), "gateway" or "warm" (a proven cache).
         count: parameters of the vehicle.
         condition: `clean`, or the share of lost datagrams.
         client: the name of the client.
@@ -83,34 +83,45 @@ class Download:
     @property
     def label(self) -> str:
         """The client and the way, short enough for the picture."""
-        return self.client.partition(",")[0] + {"file": ", by file", "warm": ", warm"}.get(self.way, "")
+        return self.client.partition(",")[0] + WAYS[self.way]
 
     @property
     def is_ours(self) -> bool:
-        return self.client == "paramclient"
+        return self.client == "paramclient" or self.way == "gateway"
 
 
 def downloads_in(text: str) -> list[Download]:
-    """Return the figures of the first table below "Comparison with other clients".
+    """Return the figures of the tables of other clients and of the gateway, in the order of their bars.
 
-    Cells without a number ("not supported") are left out.
+    Cells without a number ("not supported") are left out. Of the gateway, the slowest station in sync counts.
 
     Raises:
-        ValueError: the table is missing, or a row has another form.
+        ValueError: a table is missing, or a row has another form.
     """
-    found = re.search(r"^### Comparison with other clients$.*?^(\|.*?)\n\n", text, re.MULTILINE | re.DOTALL)
-    if found is None:
-        raise ValueError("README.md has no table below 'Comparison with other clients'")
-    (_, *clients), _, *rows = (_cells(line) for line in found[1].splitlines())
+    (_, *clients), *rows = _table(text, "Other clients")
     downloads = []
     for what, *cells in rows:
         row = re.fullmatch(r"(\w+)(?: (?:by )?(list|file|warm))?, (\d+), (\S+)", what)
         if row is None or row[4] not in CONDITIONS or len(cells) != len(clients):
-            raise ValueError(f"unexpected row in the table of README.md: {what}")
+            raise ValueError(f"unexpected row in the table of {PAGE.name}: {what}")
         for client, cell in zip(clients, cells, strict=True):
             if seconds := re.match(r"\d+\.\d+\b", cell):
                 downloads.append(Download(row[1], row[2] or "list", int(row[3]), row[4], client, seconds[0]))
-    return downloads
+    counts = {each.autopilot: each.count for each in downloads}
+    _, *stations = _table(text, "Ground stations behind the gateway")
+    for autopilot, count in counts.items():
+        in_sync = [cells[3] for cells in stations if cells[0] == f"{autopilot} 20%" and cells[3]]
+        downloads.append(Download(autopilot, "gateway", count, "20%", "any", max(in_sync, key=float)))
+    return sorted(downloads, key=lambda each: list(WAYS).index(each.way))
+
+
+def _table(text: str, heading: str) -> list[list[str]]:
+    """Return the cells of the first table below a heading, without the line below its first row."""
+    found = re.search(rf"^## {heading}$.*?^(\|.*?)\n\n", text, re.MULTILINE | re.DOTALL)
+    if found is None:
+        raise ValueError(f"{PAGE.name} has no table below {heading!r}")
+    first, _, *rows = (_cells(line) for line in found[1].splitlines())
+    return [first, *rows]
 
 
 def _cells(line: str) -> list[str]:
@@ -142,7 +153,7 @@ def draw(downloads: list[Download], look: str) -> str:
 
 def main() -> None:
     """Write the pictures."""
-    downloads = downloads_in(README.read_text(encoding="utf-8"))
+    downloads = downloads_in(PAGE.read_text(encoding="utf-8"))
     for look in LOOKS:
         path = IMAGES / f"downloads-{look}.svg"
         path.write_text(draw(downloads, look), encoding="utf-8")
@@ -169,7 +180,7 @@ def _lines(downloads: list[Download], look: dict[str, str]) -> Iterator[str]:
     autopilots = _autopilots(downloads)
     heights = [
         GROUP_HEAD
-        + FILE_GAP * max(WAYS.index(each.way) for each in downloads)
+        + WAY_GAP * (len(WAYS) - 1)
         + ROW * max(len(_group(downloads, autopilot, condition)) for autopilot in autopilots)
         for condition in CONDITIONS
     ]
@@ -212,10 +223,7 @@ def _lines(downloads: list[Download], look: dict[str, str]) -> Iterator[str]:
         )
     others = dict.fromkeys(each.client for each in downloads if ", " in each.client)
     notes = [each.replace(", ", ": ", 1) for each in others]
-    notes.append("By file: the vehicle's MAVFTP parameter file")
-    if any(each.way == "warm" for each in downloads):
-        notes.append("Warm: a proven cache")
-    notes.append("All other bars: the parameter list")
+    notes += ["By file: the MAVFTP parameter file", "By gateway: any station behind it", "Warm: a proven cache"]
     yield f'<text class="quiet" x="0" y="{height - 5}">{escape(". ".join(notes))}.</text>'
     yield "</svg>"
 
@@ -249,7 +257,7 @@ def _panel(
     for (condition, words), height in zip(CONDITIONS.items(), heights, strict=True):
         yield f'<text class="group" x="{left}" y="{top + 14}">{escape(words)}</text>'
         for row, each in enumerate(_group(downloads, autopilot, condition)):
-            base = top + GROUP_HEAD + row * ROW + WAYS.index(each.way) * FILE_GAP + BAR - 1
+            base = top + GROUP_HEAD + row * ROW + list(WAYS).index(each.way) * WAY_GAP + BAR - 1
             kind = "ours" if each.is_ours else "peer"
             text = ' class="ours"' if each.is_ours else ""
             width = float(each.seconds) * scale
