@@ -10,6 +10,7 @@
 #   make fuzz         each target of fuzz/ for SECONDS
 #   make soak         random sessions                make kills      programs killed while they write
 #   make sync         generates the types of the blocking client
+#   make reference    the generated parts of docs/command.md and docs/json.md
 #   make clean        removes .venv and all other files that these commands create
 #   make pictures     the comparison with other clients as pictures, into docs/images
 #   make screenshots  screenshots of the web page, into docs/images
@@ -43,7 +44,7 @@ WORKERS ?= $(shell $(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 2)
 # the tests start several hundred processes; without bytecode, each of them would compile paramclient again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow test-all coverage soak kills live fuzz lint lint-platforms docs screenshots pictures sync bench peers dist clean
+.PHONY: demo test test-slow test-all coverage soak kills live fuzz lint lint-platforms docs screenshots pictures sync reference bench peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -110,7 +111,11 @@ screenshots: $(VENV)/with-test
 sync: $(VENV)/with-test
 	$(BIN)/python -m tests.sync_stub
 
-# needed after each change of the table in the README; a test compares the result
+# needed after each change of a subcommand or of the JSON; a test compares
+reference: $(VENV)/with-cli
+	$(BIN)/python docs/reference.py
+
+# needed after each change of the tables in docs/performance.md; a test compares the result
 pictures: $(VENV)/made
 	$(BIN)/python bench/pictures.py
 

@@ -223,7 +223,11 @@ def _lines(downloads: list[Download], look: dict[str, str]) -> Iterator[str]:
         )
     others = dict.fromkeys(each.client for each in downloads if ", " in each.client)
     notes = [each.replace(", ", ": ", 1) for each in others]
-    notes += ["By file: the MAVFTP parameter file", "By gateway: any station behind it", "Warm: a proven cache"]
+    notes += [
+        "By file: the MAVFTP parameter file",
+        "By gateway: any station behind it",
+        "Warm: a proven cache",
+    ]
     yield f'<text class="quiet" x="0" y="{height - 5}">{escape(". ".join(notes))}.</text>'
     yield "</svg>"
 

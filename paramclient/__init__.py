@@ -10,7 +10,7 @@
 - `service`, `cli`: the HTTP service, the command line.
 - `sim`, `testing`: simulated vehicles, and fixtures for tests.
 
-To find the module of a rule, see "Find the code" in `docs/internals/design.md`.
+To find the module of a rule, see "Find the code" in `docs/internals.md`.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ def run(arguments: Sequence[str]) -> int:
     """
     shows_help = _shows_help(arguments)
     if shows_help:
-        _load(_app)
+        dict(subcommands())  # imports all of them, so that the help can describe each
     with _messages_shown(verbose=not {"--verbose", "-v"}.isdisjoint(arguments)):
         try:
             words = [STDIN if word == "-" else word for word in arguments]
@@ -73,10 +73,16 @@ def _usage_text(error: CycloptsError) -> str:
     return f"{error} {app.usage or ''}".rstrip()
 
 
-def _load(app: App) -> None:
-    """Import all subcommands, so that the help can describe each of them."""
-    for name in app:
-        _load(app[name])
+def subcommands(*words: str) -> Iterator[tuple[str, App]]:
+    """Yield each subcommand with its name, such as `cache list`."""
+    app = _app
+    for word in words:
+        app = app[word]
+    names = [name for name in app if not name.startswith("-")]
+    if not names:
+        yield " ".join(words), app
+    for name in names:
+        yield from subcommands(*words, name)
 
 
 @contextmanager
