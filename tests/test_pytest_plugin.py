@@ -115,11 +115,8 @@ def test_now_it_is(sim_px4):
 def test_fixtures_work_with_every_runner(suite: Suite) -> None:
     """With pytest-asyncio, with anyio's plugin and with neither; includes the documentation's programs."""
     page = (ROOT / "docs/testing.md").read_text(encoding="utf-8")
-    programs = [
-        each
-        for each in re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
-        if "def test_" in each
-    ]
+    found = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    programs = [each for each in found if "def test_" in each]
     modules = {f"test_of_page_{number}": program for number, program in enumerate(programs)}
     modules["test_runners"] = RUNNERS
     tests = [re.findall(r"^(?:async )?def test_", module, re.MULTILINE) for module in modules.values()]
