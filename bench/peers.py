@@ -225,7 +225,7 @@ class LiveField:
     @property
     def value(self) -> float:
         """The time of the first request for list or file; infinite before."""
-        requested_at = self.relay.counts().first_request_at
+        requested_at = self.relay.first_request_at()
         return math.inf if requested_at is None else requested_at
 
     def cases(self) -> list[Case]:

@@ -17,8 +17,7 @@ import pytest
 from paramclient.model.values import ParamType, Value
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from tests.live import __main__ as suite
-from tests.live.checks import checks
-from tests.live.session import Check, Session
+from tests.live.checks import Check, Session, checks
 from tests.simulated_on_udp import flying
 
 pytestmark = pytest.mark.slow
@@ -65,65 +64,35 @@ def results(printed: str) -> dict[str, str]:
 
 
 EVERYWHERE = (
-    *(
-        "fetch, nothing known",
-        "fetch, 20% loss, 20 ms",
-        "get by name",
-        "set, REAL32",
-    ),
-    *("30 sets at once", "two sessions, a change in one"),
+    *("fetch, nothing known", "fetch, 20% loss, 20 ms", "get by name", "set, REAL32", "30 sets at once"),
+    *("restore, the state before", "two sessions, a change in one", "a group shown and hidden"),
 )
-
-
-SET_UPS = ("restore, the state before",)
-
-
-def test_the_live_checks_pass_on_a_simulated_px4(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    vehicle = px4()
-    before = vehicle.values
-    having(
-        monkeypatch,
-        *EVERYWHERE,
-        *SET_UPS,
-        "fetch in a new session, cached",
-        "a group shown and hidden",
-    )
-    with flying(vehicle) as link:
-        code = suite.main([link, "--kind", "px4"])
-    printed = capsys.readouterr().out
-    found = results(printed)
-    assert found.pop("a group shown and hidden") == "skipped"
-    assert set(found.values()) <= {"ok"}, printed
-    assert code == 0
-    assert "from the cache" in printed
-    assert vehicle.requests["PARAM_SET"] > 28
-    assert vehicle.values == before
-
-
-def test_the_live_checks_pass_on_a_simulated_ardupilot(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    vehicle = ardupilot()
-    before = vehicle.values
-    having(
-        monkeypatch,
-        *EVERYWHERE,
-        *SET_UPS,
-        "set, a fraction for an integer",
-        "a group shown and hidden",
-        "apply, a group that is hidden",
+OF_A_KIND = {
+    "px4": ("fetch in a new session, cached",),
+    "ardupilot": (
+        *("set, a fraction for an integer", "apply, a group that is hidden"),
         "fetch by list, 5% loss, 100 ms",
-    )
+    ),
+}
+SEEN = {"px4": "from the cache", "ardupilot": "GRIP_ENABLE: {0}, {1}, {0} parameters"}
+
+
+@pytest.mark.parametrize("make", [px4, ardupilot])
+def test_the_live_checks_pass_on_a_simulated_vehicle(
+    make: Callable[[], Vehicle], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    vehicle, kind = make(), make.__name__
+    before = vehicle.values
+    having(monkeypatch, *EVERYWHERE, *OF_A_KIND[kind])
     with flying(vehicle) as link:
-        code = suite.main([link, "--kind", "ardupilot"])
+        code = suite.main([link, "--kind", kind])
     printed = capsys.readouterr().out
     found = results(printed)
-    assert set(found.values()) <= {"ok"}, printed
-    assert len(found) == len(EVERYWHERE) + len(SET_UPS) + 5
-    assert code == 0
-    assert f"GRIP_ENABLE: {len(before)}, {len(before) + 2}, {len(before)} parameters" in printed
+    assert len(found) == len(EVERYWHERE) + len(OF_A_KIND[kind]) + 1
+    assert found.pop("a group shown and hidden") == ("skipped" if kind == "px4" else "ok")
+    assert (code, {*found.values()}) == (0, {"ok"}), printed
+    assert SEEN[kind].format(len(before), len(before) + 2) in printed
+    assert vehicle.requests["PARAM_SET"] > 28
     assert vehicle.values == before
 
 
@@ -215,6 +184,3 @@ def test_read_only_changes_nothing(
         assert suite.main([link, "--read-only"]) == 0
     assert results(capsys.readouterr().out)["set, INT32"] == "skipped"
     assert vehicle.requests["PARAM_SET"] == 0
-
-
-# The relay's end towards the vehicle

@@ -16,21 +16,19 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import anyio
 import anyio.lowlevel
 
 from paramclient import ParamClient
 from paramclient.errors import LinkError, NoReply, ParamClientError, UsageError, VehicleArmed
-from tests.live.checks import checks
+from tests.live.checks import Check, CheckFailed, Session, Skip, checks
 from tests.live.choice import choose
 from tests.live.journal import Journal, check_disarmed
 from tests.live.relay import CLEAN, Relay
-from tests.live.report import FAILED, OK, SKIPPED, Report, Result, Row
-from tests.live.session import Check, CheckFailed, Session, Skip
 
 HOW_TO_CALL: Final = """\
 usage: make live LINK=udpin:127.0.0.1:14550 [KIND=px4|ardupilot] [SYSTEM=1] [ONLY='fetch'] [READ_ONLY=yes]
@@ -48,12 +46,31 @@ CHECK_TIMEOUT: Final = 300.0
 PUT_BACK_TIMEOUT: Final = 120.0
 """Seconds for putting back and for the comparison with the state before."""
 
+OK, SKIPPED, FAILED = "ok", "skipped", "FAILED"
+
+
+class Row(NamedTuple):
+    """One line of the table: the check, what was measured or went wrong, the promise, and the result."""
+
+    name: str
+    measured: str
+    promise: str
+    result: str
+
+
+def table(rows: Sequence[Row]) -> Iterator[str]:
+    """Give the lines of a Markdown table."""
+    head = Row("check", "measured", "the documentation promises", "result")
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    rule = Row(*("-" * width for width in widths))
+    for row in (head, rule, *rows):
+        yield f"| {' | '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))} |"
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the suite; the exit code is 0, 1 when a check failed, 2 when it could not begin."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.live", description=(__doc__ or "").partition("\n")[0]
-    )
+    description = (__doc__ or "").partition("\n")[0]
+    parser = argparse.ArgumentParser(prog="python -m tests.live", description=description)
     parser.add_argument("link", nargs="?", help="the link to the vehicle")
     parser.add_argument("--kind", choices=["px4", "ardupilot"], help="the autopilot that is expected")
     parser.add_argument("--system", type=int, help="the vehicle's system id, where several are on the link")
@@ -65,25 +82,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.link is None:
         print(HOW_TO_CALL, file=sys.stderr)
         return 2
-    with _run_folder() as folder:
-        try:
-            with Relay(options.link) as relay:
-                return anyio.run(_Run(options, relay, folder).run)
-        except (UsageError, LinkError, NoReply, VehicleArmed) as error:
-            print(f"{error}. Nothing was changed.", file=sys.stderr)
-            return 2
-        except KeyboardInterrupt:
-            print("Stopped.", file=sys.stderr)
-            return 1
-
-
-@contextmanager
-def _run_folder() -> Iterator[Path]:
-    """Give a folder for caches and the state before; it stays if that state was not put back."""
     folder = Path(tempfile.mkdtemp(prefix="paramclient-live-"))
-    yield folder
-    if not (folder / "keep").exists():
-        shutil.rmtree(folder)
+    try:
+        with Relay(options.link) as relay:
+            return anyio.run(_Run(options, relay, folder).run)
+    except (UsageError, LinkError, NoReply, VehicleArmed) as error:
+        print(f"{error}. Nothing was changed.", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("Stopped.", file=sys.stderr)
+        return 1
+    finally:
+        if not (folder / "keep").exists():  # it is there while the state before was not put back
+            shutil.rmtree(folder)
 
 
 class _Run:
@@ -93,7 +104,7 @@ class _Run:
         self._options = options
         self._relay = relay
         self._folder = folder
-        self._report = Report(_tell)
+        self._rows: list[Row] = []
         self._is_interrupted = False
 
     async def run(self) -> int:
@@ -113,13 +124,15 @@ class _Run:
                 with anyio.CancelScope(shield=True):
                     await self._end(session)
             tasks.cancel_scope.cancel()
-        print()
-        for line in self._report.table():
-            print(line)
-        counts = Counter(row.result for row in self._report.rows)
+        print("", *table(self._rows), sep="\n")
+        counts = Counter(row.result for row in self._rows)
         print(f"\n{', '.join(f'{count} {result}' for result, count in counts.items())};", end=" ")
         print(f"{time.monotonic() - began:.0f} s{', interrupted' if self._is_interrupted else ''}.")
-        return 1 if self._report.failures or self._is_interrupted else 0
+        return 1 if counts[FAILED] or self._is_interrupted else 0
+
+    def _add(self, row: Row) -> None:
+        self._rows.append(row)
+        _tell(f"{row.result:8}{row.name}: {row.measured}")
 
     async def _begin(self) -> Session:
         """Look at the vehicle and its state, and say what may be changed."""
@@ -129,43 +142,33 @@ class _Run:
             await anyio.sleep(LISTENING_TIME)
             if options.system is None and len(client.autopilots) > 1:
                 found = ", ".join(f"{each.system} ({each.autopilot})" for each in client.autopilots)
-                raise UsageError(
-                    f"{len(client.autopilots)} vehicles on this link: {found}. Choose one with --system"
-                )
+                text = f"{len(client.autopilots)} vehicles on this link: {found}. Choose one with --system"
+                raise UsageError(text)
             if options.kind not in (None, vehicle.autopilot):
                 raise UsageError(f"the vehicle is {vehicle.autopilot}, not {options.kind}")
             if not options.read_only:
                 await check_disarmed(vehicle)
             result = await vehicle.fetch_all(timeout=CHECK_TIMEOUT)
-            if not result.complete:
-                raise UsageError(
-                    f"{len(result.missing)} parameters were not received; see what is wrong with the link"
-                )
+            if missing := len(result.missing):
+                raise UsageError(f"{missing} parameters were not received; see what is wrong with the link")
             listed = {name: param for name, param in result.params.items() if param.index is not None}
             journal = Journal(self._folder)
             journal.begin(vehicle, listed)
             choice = choose(vehicle.autopilot, listed)
             _tell(f"{vehicle.identity}, {len(listed)} parameters")
-            if options.read_only:
-                _tell("Changes nothing.")
-            elif choice.names:
+            if options.read_only or not choice.names:
+                reason = (
+                    "" if options.read_only else ": no parameter of this autopilot is known to be harmless"
+                )
+                _tell(f"Changes nothing{reason}.")
+            else:
                 _tell(f"Changes, and puts back: {', '.join(choice.names)}")
                 _tell(f"The state before is in {journal.file} until it is back.")
-            else:
-                _tell("Changes nothing: no parameter of this autopilot is known to be harmless.")
-            return Session(
-                self._relay,
-                self._folder,
-                journal,
-                vehicle.system,
-                vehicle.autopilot,
-                options.second_link,
-                choice,
-            )
+            vehicle_kind = vehicle.system, vehicle.autopilot
+            return Session(self._relay, self._folder, journal, *vehicle_kind, options.second_link, choice)
 
     async def _make(self, check: Check, session: Session) -> None:
         """Make one check and add its row."""
-        promise = check.promise
         result, text = FAILED, f"no end within {CHECK_TIMEOUT:.0f} s"
         if check.kinds is not None and session.kind not in check.kinds:
             result, text = SKIPPED, f"has a meaning for {' and '.join(check.kinds)} only"
@@ -174,7 +177,7 @@ class _Run:
         else:
             with anyio.move_on_after(CHECK_TIMEOUT):
                 result, text = await _outcome_of(check, session)
-        self._report.add(Row(check.name, result, text, promise))
+        self._add(Row(check.name, text, check.promise, result))
 
     async def _stop_on_signals(self, scope: anyio.CancelScope) -> None:
         """End the checks on Ctrl-C and the like, and say why the program goes on for a while."""
@@ -188,9 +191,8 @@ class _Run:
 
     async def _end(self, session: Session) -> None:
         """Put back what is still changed, compare with the state before, and add the last row."""
-        promise = "the state before"
-        keep = self._folder / "keep"
-        if not self._options.read_only:
+        keep, writes = self._folder / "keep", not self._options.read_only
+        if writes:
             keep.touch()
         problems: list[str] = []
         changed: list[str] = []
@@ -201,27 +203,25 @@ class _Run:
                     problems += await session.journal.put_back(vehicle)
                     result = await vehicle.fetch_all(refresh=True)
                     if not result.complete:
-                        problems.append(
-                            f"{len(result.missing)} parameters were not received; requested once more"
-                        )
+                        problems.append(f"{len(result.missing)} parameters were not received at first")
                         result = await vehicle.fetch_all(refresh=True)
             listed = {name: param for name, param in result.params.items() if param.index is not None}
             wrong, changed = session.journal.differences(listed)
             problems += wrong
         except (ParamClientError, TimeoutError) as error:
             problems.append(f"{type(error).__name__}: {error}")
-        if problems:
-            self._report.add(Row("state after", FAILED, "; ".join(problems), promise))
-            if not self._options.read_only:
-                _tell(f"To bring it back: paramclient restore {self._options.link} {session.journal.file}")
-            return
-        keep.unlink(missing_ok=True)
-        itself = f"; changed by the vehicle itself: {', '.join(changed)}" if changed else ""
-        text = f"{len(session.journal.before)} parameters as before{itself}"
-        self._report.add(Row("state after", OK, text, promise))
+        text = f"{len(session.journal.before)} parameters as before"
+        if changed:
+            text += f"; changed by the vehicle itself: {', '.join(changed)}"
+        result_text = "; ".join(problems) or text
+        self._add(Row("state after", result_text, "the state before", FAILED if problems else OK))
+        if not problems:
+            keep.unlink(missing_ok=True)
+        elif writes:
+            _tell(f"To bring it back: paramclient restore {self._options.link} {session.journal.file}")
 
 
-async def _outcome_of(check: Check, session: Session) -> tuple[Result, str]:
+async def _outcome_of(check: Check, session: Session) -> tuple[str, str]:
     """Make a check; its result, and what it has measured or why it has failed."""
     try:
         return OK, await check.run(session)

@@ -36,8 +36,6 @@ from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.sim import Air, FaultyLink
 from paramclient.wire import frames, messages
 
-__all__ = ["CLEAN", "Conditions", "Counts", "RealVehicle", "Relay"]
-
 PROGRAM_TIMEOUT: Final = 5.0
 """Seconds of silence after which a program no longer receives what the vehicle sends."""
 START_TIMEOUT: Final = 30.0
@@ -101,23 +99,6 @@ class Conditions:
 
 
 CLEAN: Final = Conditions()
-
-
-@dataclass(frozen=True)
-class Counts:
-    """Datagrams since the last change of the conditions.
-
-    Attributes:
-        up, down: given to the lossy link, from programs to the vehicle and back.
-        lost: those of them that were lost, both directions together.
-        first_request_at: when a program first requested the list or a file, on the clock of
-            `time.monotonic`; None when none did.
-    """
-
-    up: int
-    down: int
-    lost: int
-    first_request_at: float | None
 
 
 class RealVehicle:
@@ -248,30 +229,28 @@ class Relay:
     ) -> None:
         self._stop()
 
-    def change(self, conditions: Conditions) -> Counts:
-        """Put other conditions into force, and return the counts of those before.
+    def change(self, conditions: Conditions) -> None:
+        """Put other conditions into force. What is on its way at that moment still arrives in its time."""
+        self._ask(conditions)
 
-        What is on its way at that moment still arrives in its time.
+    def first_request_at(self) -> float | None:
+        """Return when a program first requested the list or a file since the conditions were changed.
+
+        On the clock of `time.monotonic`; None when none did.
         """
-        return self._ask(conditions)
-
-    def counts(self) -> Counts:
-        """Return the counts of the present conditions."""
         return self._ask(None)
 
-    def _ask(self, conditions: Conditions | None) -> Counts:
+    def _ask(self, conditions: Conditions | None) -> float | None:
         assert self._control is not None
         try:
             self._control.send(conditions)
         except OSError as error:
             raise LinkError(f"{self._vehicle_link}: the relay has ended", link=self._vehicle_link) from error
-        counts = self._reply(REPLY_TIMEOUT)
-        assert isinstance(counts, Counts)
-        return counts
+        return self._reply(REPLY_TIMEOUT)
 
-    def _reply(self, timeout: float) -> int | Counts:
+    def _reply(self, timeout: float) -> float | None:
         assert self._control is not None
-        reply: int | Counts | str = f"{self._vehicle_link}: the relay did not answer for {timeout:.0f} s"
+        reply: float | str | None = f"{self._vehicle_link}: the relay did not answer for {timeout:.0f} s"
         try:
             if self._control.poll(timeout):
                 reply = self._control.recv()
@@ -332,22 +311,16 @@ class _Traffic:
         await self._near.close()
         await self._far.close()
 
-    def _change(self, conditions: Conditions | None) -> Counts:
-        """Put other conditions into force, unless there are none; the counts of those before."""
-        old = self._air
-        counts = Counts(
-            old.uplink.sent,
-            old.downlink.sent,
-            old.uplink.lost + old.downlink.lost,
-            self._vehicle.first_request_at,
-        )
+    def _change(self, conditions: Conditions | None) -> float | None:
+        """Put other conditions into force, unless there are none; when a program first requested the table."""
+        old, requested_at = self._air, self._vehicle.first_request_at
         if conditions is not None:
             self._leaving.append((old.uplink, self._vehicle.outgoing.append))
             self._leaving.append((old.downlink, self._arrived.append))
             self._vehicle.change(conditions)
             self._air = _air_of(self._vehicle, conditions)
             self._wake.set()
-        return counts
+        return requested_at
 
     async def _read_far(self) -> None:
         while True:
