@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import os
 import random
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -33,7 +34,11 @@ def pytest_report_header() -> str:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Shuffle the modules, and the tests of each module."""
+    """Run asynchronous tests in virtual time, and shuffle the modules, and the tests of each module."""
+    for item in items:
+        is_marked = any(item.get_closest_marker(plugin) for plugin in ("anyio", "asyncio"))
+        if isinstance(item, pytest.Function) and inspect.iscoroutinefunction(item.obj) and not is_marked:
+            item.obj = _in_virtual_time(item)
     if ORDER == "0":
         return
     modules = defaultdict[Path, list[pytest.Item]](list)
@@ -45,6 +50,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for group in groups:
         chance.shuffle(group)
     items[:] = itertools.chain.from_iterable(groups)
+
+
+def _in_virtual_time(item: pytest.Function) -> Callable[..., object]:
+    """Run a test of conversations on trio, and any other on the loop of the client's tests."""
+    from tests.conversations.virtual import virtual
+    from tests.shell import in_simulated_time
+
+    return (virtual if item.path.parent.name == "conversations" else in_simulated_time)(item.obj)
 
 
 def _use_home(environment: pytest.MonkeyPatch, home: Path) -> Path:

@@ -136,7 +136,6 @@ def test_the_package_loads_with_the_first_test_that_uses_a_fixture(suite: Suite)
 # the makers themselves
 
 
-@in_simulated_time
 async def test_a_simulated_radio_has_the_configured_loss() -> None:
     px4 = sim_px4(table=TABLE, loss=0.3, seed=3)
     async with ParamClient(px4, cache=False) as client:
@@ -150,7 +149,6 @@ async def test_a_simulated_radio_has_the_configured_loss() -> None:
 
 @pytest.mark.parametrize("make", [sim_px4, partial(sim_ardupilot, ftp=False)])
 @pytest.mark.parametrize("pace", [40.0, 333.0])
-@in_simulated_time
 async def test_a_pace_is_that_of_the_list(make: Callable[..., SimVehicle[Vehicle]], pace: float) -> None:
     vehicle = make(pace=pace, table={f"P{number:03}": number for number in range(400)})
     async with ParamClient(vehicle, cache=False) as client:

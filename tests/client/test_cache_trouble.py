@@ -23,7 +23,7 @@ from paramclient.provision import apply
 from paramclient.sim import PX4Vehicle
 from tests.caches import PX4, full_disk, rubbish, set_aside, stored, update
 from tests.client.conftest import connected, fetched
-from tests.shell import Tap, bits, in_simulated_time, simulated_time_loop, small_px4
+from tests.shell import Tap, bits, simulated_time_loop, small_px4
 
 NAME = "PARAM_01"
 
@@ -62,7 +62,6 @@ def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 
 @UNWRITABLE
-@in_simulated_time
 async def test_values_written_late_keep_their_times_and_the_whole_history(
     unwritable: Holding, path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -95,7 +94,6 @@ async def test_values_written_late_keep_their_times_and_the_whole_history(
     assert warning.startswith("continuing without the cache: ")
 
 
-@in_simulated_time
 async def test_a_cause_has_one_warning_from_open_to_close(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -114,7 +112,6 @@ async def test_a_cause_has_one_warning_from_open_to_close(
     assert "\n" not in warning
 
 
-@in_simulated_time
 async def test_after_very_many_changes_the_whole_table_is_written(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -133,7 +130,6 @@ async def test_after_very_many_changes_the_whole_table_is_written(
 
 
 @UNWRITABLE
-@in_simulated_time
 async def test_a_client_that_ends_says_what_is_lost(
     unwritable: Holding, path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -147,7 +143,6 @@ async def test_a_client_that_ends_says_what_is_lost(
     assert lost.startswith(f"the last values of 1/1 ({key}) are not in the cache, and lost: ")
 
 
-@in_simulated_time
 async def test_a_client_that_ends_waits_for_the_cache(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A database that is restarting refuses connections for a time."""
     failures = iter([CacheError("the database is starting")] * 9)
@@ -182,7 +177,6 @@ def no_disk() -> Iterator[None]:
         yield
 
 
-@in_simulated_time
 async def test_a_durable_set_is_on_the_disk_with_its_line_when_it_returns(tmp_path: Path) -> None:
     path = tmp_path / "cache"
     async with connected(small_px4(), cache=path) as (_, component):
@@ -194,7 +188,6 @@ async def test_a_durable_set_is_on_the_disk_with_its_line_when_it_returns(tmp_pa
                 assert cache.component().params[NAME].value == value
 
 
-@in_simulated_time
 async def test_without_a_disk_nothing_is_sent_or_it_is_said_what_the_vehicle_has(tmp_path: Path) -> None:
     vehicle = small_px4()
     async with connected(vehicle, cache=False) as (_, component):
@@ -212,7 +205,6 @@ async def test_without_a_disk_nothing_is_sent_or_it_is_said_what_the_vehicle_has
         assert client.cache.component().params[NAME].value == 11.0
 
 
-@in_simulated_time
 async def test_a_durable_apply_ends_on_the_disk(tmp_path: Path) -> None:
     async with connected(vehicle := small_px4(), cache=tmp_path / "cache") as (_, component):
         assert (await apply(component, {NAME: 5.0}, durable=True)).complete
@@ -247,7 +239,6 @@ def wall() -> Wall:
 
 
 @pytest.mark.parametrize("step", [-HOUR, -DAY, HOUR, 400 * DAY])
-@in_simulated_time
 async def test_a_step_of_the_clock_changes_only_recorded_times(path: Path, wall: Wall, step: float) -> None:
     tap = Tap(vehicle := small_px4())
     wall.now = 1_800_000_000.0
@@ -285,7 +276,6 @@ async def test_a_step_of_the_clock_changes_only_recorded_times(path: Path, wall:
 
 
 @pytest.mark.parametrize("wrong", [-DAY, 1e12, math.nan])
-@in_simulated_time
 async def test_a_clock_that_cannot_be_costs_a_warning_and_nothing_is_lost(
     path: Path, wall: Wall, wrong: float, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -334,7 +324,6 @@ def of_another_vehicle() -> TableUpdate:
 @pytest.mark.parametrize("happens", [delete, move, damage, put_another_in_its_place])
 @pytest.mark.parametrize("known", [False, True], ids=["new", "known from before"])
 @pytest.mark.parametrize("seconds_to_the_end", [3.0, 0.0])
-@in_simulated_time
 async def test_a_file_that_goes_is_followed_by_one_that_holds_everything(
     path: Path, happens: Callable[[Path], None], known: bool, seconds_to_the_end: float
 ) -> None:
@@ -360,7 +349,6 @@ async def test_a_file_that_goes_is_followed_by_one_that_holds_everything(
         assert (await component.fetch_all()).source == "cache"
 
 
-@in_simulated_time
 async def test_half_a_table_removes_nothing_from_a_file_that_others_made(path: Path) -> None:
     """Another program has fetched all of it into the file that it found gone; we know a part."""
     vehicle = small_px4()

@@ -86,7 +86,6 @@ def trusts(component: Component, names: Collection[str] | None = None) -> set[Tr
 # Starting from it
 
 
-@in_simulated_time
 async def test_a_long_round_trip_is_no_reason_for_a_download(path: Path) -> None:
     """The cached table is known only with the identity, which is late then."""
     vehicle = ArduPilotVehicle()
@@ -95,7 +94,6 @@ async def test_a_long_round_trip_is_no_reason_for_a_download(path: Path) -> None
     assert (result.source, result.missing) == ("cache", ())
 
 
-@in_simulated_time
 async def test_an_unchanged_vehicle_is_not_downloaded_again(path: Path) -> None:
     vehicle = PX4Vehicle()
     volatile = {each.name for each in vehicle.entries if each.row.volatile and each.name in vehicle.params}
@@ -122,7 +120,6 @@ async def test_an_unchanged_vehicle_is_not_downloaded_again(path: Path) -> None:
     assert kept(path) == bits(vehicle.params)
 
 
-@in_simulated_time
 async def test_changes_are_on_the_disk_within_the_flush_interval_whatever_a_commit_takes(path: Path) -> None:
     """Beside a busy event loop, commits took 0.03 to 0.11 s in turn, and the first one longest."""
     loop = simulated_time_loop()
@@ -150,7 +147,6 @@ async def test_changes_are_on_the_disk_within_the_flush_interval_whatever_a_comm
     assert max(ages) <= cache_writer.FLUSH_INTERVAL
 
 
-@in_simulated_time
 async def test_a_fetch_waits_for_the_cached_table(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
@@ -159,7 +155,6 @@ async def test_a_fetch_waits_for_the_cached_table(path: Path) -> None:
         assert (await client.components[1, 1].fetch_all()).source == "cache"
 
 
-@in_simulated_time
 async def test_a_change_between_two_sessions_is_a_cache_miss(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
@@ -176,7 +171,6 @@ async def test_a_change_between_two_sessions_is_a_cache_miss(path: Path) -> None
     assert (await session(vehicle, path)).source == "cache"
 
 
-@in_simulated_time
 async def test_a_parameter_that_the_vehicle_no_longer_has_leaves_the_cache(path: Path) -> None:
     larger = PX4Vehicle(table=VALUES)
     await session(larger, path)
@@ -187,7 +181,6 @@ async def test_a_parameter_that_the_vehicle_no_longer_has_leaves_the_cache(path:
     assert (await session(smaller, path)).source == "cache"
 
 
-@in_simulated_time
 async def test_a_table_that_the_client_has_synced_by_itself_is_cached_whole(path: Path) -> None:
     """Without PARAM_02, all later parameters have other indices, and the same values."""
     larger, smaller = PX4Vehicle(table=VALUES), PX4Vehicle(table=VALUES, not_in_use=["PARAM_02"])
@@ -215,7 +208,6 @@ PARAMETER_REQUESTS = (messages.ParamRequestRead, messages.ParamRequestList)
 
 
 @pytest.mark.parametrize("unanswered", [PARAMETER_REQUESTS, (*PARAMETER_REQUESTS, messages.CommandLong)])
-@in_simulated_time
 async def test_a_silent_component_with_a_cached_table_delays_no_other_component(
     path: Path, unanswered: Any
 ) -> None:
@@ -234,7 +226,6 @@ async def test_a_silent_component_with_a_cached_table_delays_no_other_component(
 
 
 @pytest.mark.parametrize("known", [False, True])
-@in_simulated_time
 async def test_another_vehicle_takes_the_place_within_a_session(path: Path, known: bool) -> None:
     first, second = small_px4(uid=0xA), small_px4(uid=0xB)
     second.set_param("PARAM_01", 77)
@@ -261,7 +252,6 @@ async def test_another_vehicle_takes_the_place_within_a_session(path: Path, know
         assert not any(cache.history(each.key) for each in cache.vehicles()), "nothing was changed"
 
 
-@in_simulated_time
 async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
     vehicle = Reticent(table=VALUES)
     vehicle.unanswered = (messages.CommandLong,)
@@ -292,7 +282,6 @@ async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
 
 
 @pytest.mark.parametrize("fetched", [True, False])
-@in_simulated_time
 async def test_an_identity_that_arrives_long_after_the_values(path: Path, fetched: bool) -> None:
     await session(PX4Vehicle(table=VALUES), path)
     changed = Reticent(table={**VALUES, "PARAM_01": 99}, not_in_use=["PARAM_02"])
@@ -331,7 +320,6 @@ async def test_an_identity_that_arrives_long_after_the_values(path: Path, fetche
 
 @pytest.mark.parametrize("volatile", [("CAL_ACC0_XOFF",), ODD], ids=["proven", "not proven"])
 @pytest.mark.parametrize("fetched", [True, False])
-@in_simulated_time
 async def test_after_our_own_set_the_next_session_hits_where_the_hash_is_computed(
     path: Path, volatile: Collection[str], fetched: bool
 ) -> None:
@@ -348,7 +336,6 @@ async def test_after_our_own_set_the_next_session_hits_where_the_hash_is_compute
     assert history(path, "PARAM_01") == [("PARAM_01", 1, 100, "us"), ("PARAM_01", 100, 101, "us")]
 
 
-@in_simulated_time
 async def test_every_own_write_is_in_the_history_however_briefly_it_was_valid(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
@@ -370,7 +357,6 @@ async def test_every_own_write_is_in_the_history_however_briefly_it_was_valid(pa
     ]
 
 
-@in_simulated_time
 async def test_a_write_without_a_waiting_caller_is_reported_as_ours(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
@@ -387,7 +373,6 @@ async def test_a_write_without_a_waiting_caller_is_reported_as_ours(path: Path) 
     assert [line[2:] for line in history(path, "PARAM_01")] == [(100, "us for anna"), (7, "vehicle")]
 
 
-@in_simulated_time
 async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_before(path: Path) -> None:
     vehicle = small_px4()
     before, vehicle_had = (vehicle.param(name).value for name in ("PARAM_01", "PARAM_02"))
@@ -402,7 +387,6 @@ async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_befor
 
 
 @pytest.mark.parametrize("author", ["", "x" * 129, "a\nb", "Änne", "\x7f"])
-@in_simulated_time
 async def test_an_author_must_be_printable_ascii(path: Path, author: str) -> None:
     vehicle = small_px4()
     async with connected(vehicle, cache=path) as (_, component):
@@ -412,7 +396,6 @@ async def test_an_author_must_be_printable_ascii(path: Path, author: str) -> Non
             await apply(component, ParamSet({}), author=author)
 
 
-@in_simulated_time
 async def test_a_change_by_another_station_is_in_the_history_with_its_address(path: Path) -> None:
     vehicle = small_px4()
     radio = Radio(vehicle)
@@ -434,7 +417,6 @@ async def test_a_change_by_another_station_is_in_the_history_with_its_address(pa
     assert (await session(vehicle, path)).source == "cache"
 
 
-@in_simulated_time
 async def test_a_table_is_never_called_whole_that_is_not(path: Path) -> None:
     vehicle = PX4Vehicle(burst=1, period=0.05, table=VALUES)
     async with connected(vehicle, cache=path) as (_, component):
@@ -452,7 +434,6 @@ async def test_a_table_is_never_called_whole_that_is_not(path: Path) -> None:
 # With it, and without
 
 
-@in_simulated_time
 async def test_a_cache_that_was_given_stays_open(path: Path) -> None:
     with ParamCache(path) as cache:
         async with ParamClient(small_px4(), cache=cache) as client:
@@ -466,7 +447,6 @@ async def test_a_cache_that_was_given_stays_open(path: Path) -> None:
         client.cache.components()
 
 
-@in_simulated_time
 async def test_the_users_cache_is_used_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     async with ParamClient(small_px4(), cache=False) as client:
@@ -513,7 +493,6 @@ def said(path: Path) -> tuple[int, bool | None]:
         return sum(param.default is not None for param in params), cache.components()[0].file_works
 
 
-@in_simulated_time
 async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Path) -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     result = await session(vehicle, path)
@@ -533,7 +512,6 @@ async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Pa
     assert said(path) == (0, None)
 
 
-@in_simulated_time
 async def test_names_that_change_by_themselves_are_learnt_for_later_sessions(path: Path) -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     await session(vehicle, path)
@@ -545,7 +523,6 @@ async def test_names_that_change_by_themselves_are_learnt_for_later_sessions(pat
 
 
 @pytest.mark.parametrize("kind", ["no file", "silent"])
-@in_simulated_time
 async def test_a_vehicle_without_the_parameter_file_is_remembered_for_its_firmware(
     path: Path, kind: str
 ) -> None:

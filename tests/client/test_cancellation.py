@@ -30,7 +30,6 @@ from tests.shell import (
     a_client,
     bits,
     generic,
-    in_simulated_time,
     residue,
     settled,
     simulated_time_loop,
@@ -151,7 +150,6 @@ async def check_after(call: Call, client: ParamClient, component: Component) -> 
 
 @EVERY_CALL
 @pytest.mark.parametrize("how", ["before", "after", "task", "scope"])
-@in_simulated_time
 async def test_cancelled_at_each_point(call: Call, how: str) -> None:
     loop = simulated_time_loop()
     in_rounds = how in ("task", "scope")
@@ -182,7 +180,6 @@ async def test_cancelled_at_each_point(call: Call, how: str) -> None:
 
 
 @EVERY_CALL
-@in_simulated_time
 async def test_cancelled_while_the_link_is_disconnected(call: Call) -> None:
     link = FlakyLink(Air([small_px4(), generic(system=2)]))
     async with connected(link) as (client, component):
@@ -198,7 +195,6 @@ async def test_cancelled_while_the_link_is_disconnected(call: Call) -> None:
 
 
 @pytest.mark.parametrize("point", ["before", "after", "round"])
-@in_simulated_time
 async def test_a_whole_session_cancelled_at_each_point(tmp_path: Path, point: str) -> None:
     path = tmp_path / "cache"
     vehicle = small_px4()

@@ -39,7 +39,6 @@ from tests.shell import (
     a_client,
     bits,
     generic,
-    in_simulated_time,
     outcome,
     residue,
     settled,
@@ -76,7 +75,6 @@ def under_way(client: ParamClient, component: Component) -> dict[str, asyncio.Ta
 # Life and death
 
 
-@in_simulated_time
 async def test_an_exception_of_the_body_is_raised_unchanged() -> None:
     class Stop(BaseException):
         pass
@@ -99,7 +97,6 @@ async def test_an_exception_of_the_body_is_raised_unchanged() -> None:
         assert not tasks_beside()
 
 
-@in_simulated_time
 async def test_a_time_limit_around_the_client_ends_it() -> None:
     task = asyncio.current_task()
     assert task is not None
@@ -126,7 +123,6 @@ def test_a_client_can_be_made_before_the_event_loop() -> None:
     asyncio.run(use())
 
 
-@in_simulated_time
 async def test_calls_on_a_client_that_is_not_open() -> None:
     client = a_client(small_px4())
     for before in (client.component(), client.only_component(), client.fetch_all()):
@@ -142,7 +138,6 @@ async def test_calls_on_a_client_that_is_not_open() -> None:
     assert not residue(component)
 
 
-@in_simulated_time
 async def test_closing_while_the_link_is_disconnected() -> None:
     tap = Tap(generic())
     link = FlakyLink(tap)
@@ -224,7 +219,6 @@ async def test_nothing_is_left_behind(tmp_path: Path) -> None:
 # On the link
 
 
-@in_simulated_time
 async def test_the_user_knows_better_how_values_are_laid_out() -> None:
     async with connected(generic(), encoding=Encoding.C_CAST) as (_, component):
         assert component.encoding is Encoding.C_CAST
@@ -232,7 +226,6 @@ async def test_the_user_knows_better_how_values_are_laid_out() -> None:
         assert (await component.get("PARAM_01")).value == 0, "1 as the bits of a float32 is next to nothing"
 
 
-@in_simulated_time
 async def test_bytes_are_counted_both_ways() -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:
@@ -245,7 +238,6 @@ async def test_bytes_are_counted_both_ways() -> None:
 # Finding a component
 
 
-@in_simulated_time
 async def test_the_hash_can_be_read_like_a_parameter_and_is_none() -> None:
     vehicle = small_px4()
     async with connected(vehicle) as (_, component):
@@ -256,7 +248,6 @@ async def test_the_hash_can_be_read_like_a_parameter_and_is_none() -> None:
             await component.set("_HASH_CHECK", 0)
 
 
-@in_simulated_time
 async def test_invalid_values_and_names_are_not_sent() -> None:
     table: dict[str, Any] = {"SMALL": (ParamType.UINT8, 1), "WHOLE": 1}
     tap = Tap(GenericVehicle(table))
@@ -279,7 +270,6 @@ async def test_invalid_values_and_names_are_not_sent() -> None:
 # Time-outs
 
 
-@in_simulated_time
 async def test_every_call_has_a_time_limit_of_its_own() -> None:
     tap = Tap(generic())
     async with connected(tap) as (_, component):
@@ -301,7 +291,6 @@ async def test_every_call_has_a_time_limit_of_its_own() -> None:
             assert not residue(component)
 
 
-@in_simulated_time
 async def test_a_fetch_that_times_out_returns_the_received_values() -> None:
     slow = generic(burst=1, period=0.1)
     async with connected(slow) as (client, component):
@@ -323,7 +312,6 @@ async def test_a_fetch_that_times_out_returns_the_received_values() -> None:
         assert dict(whole.params) == slow.params
 
 
-@in_simulated_time
 async def test_the_progress_of_a_fetch_has_a_rate() -> None:
     async with a_client(generic(burst=1, period=0.05)) as client:
         seen: list[Progress] = []
@@ -334,7 +322,6 @@ async def test_the_progress_of_a_fetch_has_a_rate() -> None:
 # Several vehicles
 
 
-@in_simulated_time
 async def test_several_vehicles_are_fetched_side_by_side() -> None:
     vehicles: dict[tuple[int, int], Any] = {
         (1, 1): small_px4(period=0.1, burst=1),
@@ -366,7 +353,6 @@ def silent(**options: Any) -> Tap:
     return tap
 
 
-@in_simulated_time
 @pytest.mark.parametrize("autopilot", [messages.MAV_AUTOPILOT_GENERIC, messages.MAV_AUTOPILOT_INVALID])
 async def test_a_silent_component_delays_no_other_component(autopilot: int) -> None:
     parts = [silent(**at, autopilot=autopilot) for at in ({"component": 100}, {"system": 2})]
@@ -388,7 +374,6 @@ async def test_a_silent_component_delays_no_other_component(autopilot: int) -> N
         assert not any(residue(each) for each in client.components.values())
 
 
-@in_simulated_time
 async def test_fetch_all_waits_for_a_vehicle_at_a_long_round_trip() -> None:
     far = Air.symmetric([generic(system=2)], delay=1.25)
     async with a_client(Air([generic(), far])) as client:
@@ -397,7 +382,6 @@ async def test_fetch_all_waits_for_a_vehicle_at_a_long_round_trip() -> None:
         assert (await client.fetch_all()).results.keys() == {(1, 1), (2, 1)}
 
 
-@in_simulated_time
 async def test_fetch_all_includes_a_vehicle_that_is_heard_late() -> None:
     late = generic(system=2)
     late.reboot(1000.0, down=0.9)
@@ -405,7 +389,6 @@ async def test_fetch_all_includes_a_vehicle_that_is_heard_late() -> None:
         assert (await client.fetch_all()).results.keys() == {(1, 1), (2, 1)}
 
 
-@in_simulated_time
 async def test_a_link_without_an_autopilot_can_be_fetched() -> None:
     async with a_client(generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)) as client:
         assert (await client.fetch_all()).results.keys() == {(1, 100)}
@@ -414,7 +397,6 @@ async def test_a_link_without_an_autopilot_can_be_fetched() -> None:
             await client.fetch_all(2)
 
 
-@in_simulated_time
 async def test_a_vehicle_that_answers_nothing_ends_a_fetch_within_7_s() -> None:
     for options in ({}, {"component": 100, "autopilot": messages.MAV_AUTOPILOT_INVALID}):
         async with a_client(silent(**options)) as client:
@@ -425,7 +407,6 @@ async def test_a_vehicle_that_answers_nothing_ends_a_fetch_within_7_s() -> None:
             assert anyio.current_time() - began < 7.0
 
 
-@in_simulated_time
 async def test_a_lossy_link_to_one_vehicle_is_not_given_up_early() -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:
@@ -440,7 +421,6 @@ async def test_a_lossy_link_to_one_vehicle_is_not_given_up_early() -> None:
 # Changes
 
 
-@in_simulated_time
 async def test_changes_have_the_old_and_the_new_value() -> None:
     vehicle = small_px4()
     async with connected(vehicle) as (_, component):
@@ -466,7 +446,6 @@ async def test_changes_have_the_old_and_the_new_value() -> None:
 # Links that drop
 
 
-@in_simulated_time
 async def test_calls_go_on_when_the_link_is_back() -> None:
     vehicle = generic(burst=1, period=0.1)
     link = FlakyLink(vehicle)
@@ -491,7 +470,6 @@ async def test_calls_go_on_when_the_link_is_back() -> None:
         assert not residue(component)
 
 
-@in_simulated_time
 async def test_a_link_that_stays_disconnected_fails_the_calls_and_not_the_client(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -531,7 +509,6 @@ async def test_a_link_that_stays_disconnected_fails_the_calls_and_not_the_client
     assert "reconnecting" in reported[0].getMessage()
 
 
-@in_simulated_time
 async def test_a_link_that_cannot_reconnect_ends_every_call() -> None:
     tap = Tap(generic())
     link = FlakyLink(tap)
@@ -554,7 +531,6 @@ async def test_a_link_that_cannot_reconnect_ends_every_call() -> None:
 
 
 @pytest.mark.parametrize("call", ["get", "set", "fetch_all", "client.fetch_all"])
-@in_simulated_time
 async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyPatch) -> None:
     async def seconds(rest: float) -> float:
         """How long the call takes where a rest, once begun, would last until our next heartbeat."""
@@ -573,7 +549,6 @@ async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyP
     assert await seconds(60.0) < await seconds(0.0) + 0.05
 
 
-@in_simulated_time
 async def test_a_blocked_program_processes_received_data_before_timeouts_count() -> None:
     """As by a call that blocks the event loop for half a second, in the middle of a list."""
     loop = simulated_time_loop()
@@ -585,7 +560,6 @@ async def test_a_blocked_program_processes_received_data_before_timeouts_count()
     assert (result.lost, result.repeated, px4.requests["PARAM_REQUEST_READ"]) == (0, 0, 0)
 
 
-@in_simulated_time
 async def test_a_vehicle_that_receives_nothing_at_first_is_identified_later() -> None:
     tap = Tap(PX4Vehicle())
     tap.is_deaf = True

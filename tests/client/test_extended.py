@@ -11,7 +11,7 @@ import pytest
 from paramclient import Component, ParamCache, ParamClient, Trust
 from paramclient.sim import Air, Camera
 from tests.caches import extended
-from tests.shell import in_simulated_time, small_px4
+from tests.shell import small_px4
 
 TABLE: dict[str, int | float | str | bytes] = {"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_ISO": 100}
 
@@ -28,7 +28,6 @@ def history(path: Path) -> list[tuple[str, object, object, str]]:
         return [(each.name, each.old.value, each.new and each.new.value, each.by) for each in found]
 
 
-@in_simulated_time
 async def test_the_next_session_knows_the_table(tmp_path: Path) -> None:
     path = tmp_path / "cache"
     camera = Camera(TABLE)
@@ -53,7 +52,6 @@ async def test_the_next_session_knows_the_table(tmp_path: Path) -> None:
     ]
 
 
-@in_simulated_time
 async def test_a_removed_parameter_leaves_the_cache(tmp_path: Path) -> None:
     path = tmp_path / "cache"
     camera = Camera(TABLE)
@@ -67,7 +65,6 @@ async def test_a_removed_parameter_leaves_the_cache(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("is_first", [True, False], ids=["before its autopilot", "after its autopilot"])
-@in_simulated_time
 async def test_a_camera_is_cached_with_its_vehicle(tmp_path: Path, is_first: bool) -> None:
     """A vehicle is its autopilot's hardware id; the camera has another one of its own."""
     path = tmp_path / "cache"

@@ -15,7 +15,7 @@ from paramclient.links import SimLink
 from paramclient.model.values import ParamType
 from paramclient.sim import Air, ArduPilotVehicle, SimParam
 from tests.client.conftest import connected, fetched
-from tests.shell import FlakyLink, Tap, a_client, in_simulated_time, outcome, tasks_beside
+from tests.shell import FlakyLink, Tap, a_client, outcome, tasks_beside
 
 LOG = bytes(range(256)) * 200
 """A file of 51,200 bytes, which takes a second."""
@@ -28,7 +28,6 @@ def with_files(**options: Any) -> ArduPilotVehicle:
     return vehicle
 
 
-@in_simulated_time
 async def test_a_time_limit_ends_a_read_and_closes_the_file() -> None:
     vehicle = with_files()
     async with connected(vehicle) as (_, component):
@@ -41,7 +40,6 @@ async def test_a_time_limit_ends_a_read_and_closes_the_file() -> None:
 
 
 @pytest.mark.parametrize("how", ["timeout", "error", "cancelled", "scope"])
-@in_simulated_time
 async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str) -> None:
     requests = 0
     for step in range(1, 40):
@@ -87,7 +85,6 @@ async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str)
         pytest.param(SimLink, 0.1, 0.1, id="fails"),
     ],
 )
-@in_simulated_time
 async def test_a_scope_around_a_client_ends_it_whatever_the_link_does(
     make: Any, closes_after: float | None, longest: float
 ) -> None:
@@ -127,7 +124,6 @@ async def test_a_scope_around_a_client_ends_it_whatever_the_link_does(
     assert isinstance(await outcome(component.file_checksum("/x")), ClientClosed)
 
 
-@in_simulated_time
 async def test_tasks_that_are_cancelled_each_for_itself_leave_no_file_open() -> None:
     """As `asyncio.run` does with all that remain when its main task has ended."""
     vehicle = with_files()
@@ -153,7 +149,6 @@ async def test_tasks_that_are_cancelled_each_for_itself_leave_no_file_open() -> 
     assert not tasks_beside()
 
 
-@in_simulated_time
 async def test_a_read_goes_on_when_the_link_is_back() -> None:
     link = FlakyLink(with_files())
     async with connected(link) as (_, component):
@@ -163,7 +158,6 @@ async def test_a_read_goes_on_when_the_link_is_back() -> None:
         assert await reading == LOG
 
 
-@in_simulated_time
 async def test_a_neighbour_of_a_large_integer_can_be_set() -> None:
     big = (1 << 24) + 1
     vehicle = ArduPilotVehicle(table=[SimParam("BIG", ParamType.INT32, big)], live_period=0)

@@ -25,7 +25,6 @@ from tests.shell import (
     Tap,
     a_client,
     generic,
-    in_simulated_time,
     outcome,
     simulated_time_loop,
     small_px4,
@@ -33,7 +32,6 @@ from tests.shell import (
 )
 
 
-@in_simulated_time
 async def test_the_first_autopilot_is_the_component() -> None:
     camera = generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
     async with connected(Air([camera, generic(system=7, component=1), generic(system=9)])) as (
@@ -50,7 +48,6 @@ async def test_the_first_autopilot_is_the_component() -> None:
             client.components[1, 1] = component  # type: ignore[index]  # that it is read-only is the point
 
 
-@in_simulated_time
 @pytest.mark.parametrize(
     ("wanted", "words"),
     [
@@ -72,7 +69,6 @@ async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str)
         assert round(anyio.current_time() - began, 3) == COMPONENT_TIMEOUT
 
 
-@in_simulated_time
 @pytest.mark.parametrize("wanted", [{"system": 300}, {"component": -1}])
 async def test_an_id_that_no_component_has_is_an_error_at_once(wanted: dict[str, Any]) -> None:
     async with ParamClient("sim:px4", cache=False) as client:
@@ -81,7 +77,6 @@ async def test_an_id_that_no_component_has_is_an_error_at_once(wanted: dict[str,
                 await find(**wanted, timeout=None)
 
 
-@in_simulated_time
 async def test_the_autopilots_are_the_vehicles_without_what_they_carry() -> None:
     camera = generic(system=1, component=100)
     vehicles = [generic(system=3), small_px4(), camera, generic(system=2, component=7)]
@@ -102,7 +97,6 @@ def copter() -> ArduPilotVehicle:
     return ArduPilotVehicle(system=2, table={"RTL_ALT": 1500})
 
 
-@in_simulated_time
 async def test_the_only_vehicle_is_given_when_it_is_certain_and_at_once_from_then_on() -> None:
     began = simulated_time_loop().now
     async with a_client(Late(small_px4(), 0.5)) as client:
@@ -116,7 +110,6 @@ async def test_the_only_vehicle_is_given_when_it_is_certain_and_at_once_from_the
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.4, 0.99])
-@in_simulated_time
 async def test_several_are_refused_with_the_list_as_soon_as_they_are_heard(phase: float) -> None:
     began = simulated_time_loop().now
     tap = Tap(Air([Late(copter(), phase), small_px4()]))
@@ -132,7 +125,6 @@ async def test_several_are_refused_with_the_list_as_soon_as_they_are_heard(phase
     assert {type(message) for _, _, message in tap.received} <= {messages.Heartbeat, messages.CommandLong}
 
 
-@in_simulated_time
 async def test_a_named_system_is_returned_although_there_are_several() -> None:
     async with a_client(Air([small_px4(), copter(), small_px4(system=3)])) as client:
         assert (await client.only_component(2)).address == (2, 1)
@@ -141,7 +133,6 @@ async def test_a_named_system_is_returned_although_there_are_several() -> None:
             await client.only_component(component=1)
 
 
-@in_simulated_time
 async def test_a_time_limit_holds_for_everything() -> None:
     async with a_client(Late(small_px4(), 0.5)) as client:
         with pytest.raises(NoReply, match="an autopilot") as caught:
@@ -154,7 +145,6 @@ async def test_a_time_limit_holds_for_everything() -> None:
         assert (await client.only_component()).address == (1, 1)
 
 
-@in_simulated_time
 async def test_a_vehicle_that_was_lost_is_waited_for() -> None:
     async with a_client(Air([small_px4(), Late(copter(), 0.0, until=2.0)])) as client:
         assert isinstance(await outcome(client.only_component()), AmbiguousVehicle)
@@ -165,7 +155,6 @@ async def test_a_vehicle_that_was_lost_is_waited_for() -> None:
             await client.only_component(2, timeout=3.0)
 
 
-@in_simulated_time
 async def test_after_an_absence_of_the_link_a_second_one_is_looked_for_again() -> None:
     link = FlakyLink(Air([small_px4(), copter()]))
     tap = link.endpoint = Tap(Air([small_px4(), Late(copter(), 4.0)]))
@@ -189,7 +178,6 @@ def fleet() -> Air:
     return Air([*vehicles, generic(system=1, component=100)])
 
 
-@in_simulated_time
 async def test_the_expected_vehicles_are_returned_as_soon_as_they_are_heard() -> None:
     began = simulated_time_loop().now
     async with a_client(fleet()) as client:
@@ -199,7 +187,6 @@ async def test_the_expected_vehicles_are_returned_as_soon_as_they_are_heard() ->
         assert await client.find_autopilots(expect=4, timeout=0.5) == found
 
 
-@in_simulated_time
 async def test_fewer_vehicles_than_expected_are_an_error_that_names_them() -> None:
     async with a_client(fleet()) as client:
         with pytest.raises(NoReply) as caught:
@@ -209,7 +196,6 @@ async def test_fewer_vehicles_than_expected_are_an_error_that_names_them() -> No
         assert caught.value.waited == pytest.approx(6.0, abs=0.2)
 
 
-@in_simulated_time
 async def test_without_a_number_all_that_are_heard_in_3_s_are_returned() -> None:
     async with a_client(fleet()) as client:
         began = simulated_time_loop().now
@@ -218,7 +204,6 @@ async def test_without_a_number_all_that_are_heard_in_3_s_are_returned() -> None
         assert simulated_time_loop().now - began >= VEHICLES_LISTENING_TIME
 
 
-@in_simulated_time
 async def test_no_vehicle_is_an_error_and_none_cannot_be_expected() -> None:
     async with a_client(Air([])) as client:
         for expect in (None, 2):

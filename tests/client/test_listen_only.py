@@ -24,7 +24,7 @@ from paramclient.client.component import PASSIVE_TIMEOUT
 from paramclient.model.values import Encoding, encode_value
 from paramclient.sim import Endpoint
 from paramclient.wire import messages
-from tests.shell import Radio, bits, generic, in_simulated_time, residue, small_px4
+from tests.shell import Radio, bits, generic, residue, small_px4
 
 LIST = messages.ParamRequestList(1, 1)
 HASH = messages.ParamRequestRead(1, 1, messages.HASH_CHECK, -1)
@@ -42,7 +42,6 @@ def listener(link: Endpoint, **options: object) -> ParamClient:
     return ParamClient(link, **{"cache": False, "listen_only": True} | options)  # type: ignore[arg-type]  # any
 
 
-@in_simulated_time
 async def test_not_a_byte_is_sent() -> None:
     channel = Channel(small_px4())
     async with listener(channel) as client:
@@ -63,7 +62,6 @@ async def test_not_a_byte_is_sent() -> None:
     assert channel.received == []
 
 
-@in_simulated_time
 async def test_the_list_that_another_station_requests_fills_the_table() -> None:
     vehicle = small_px4()
     channel = Channel(vehicle)
@@ -86,7 +84,6 @@ async def test_the_list_that_another_station_requests_fills_the_table() -> None:
     assert channel.received == []
 
 
-@in_simulated_time
 async def test_a_write_of_another_station_is_a_change_with_its_author() -> None:
     channel = Channel(generic())
     async with listener(channel) as client:
@@ -103,7 +100,6 @@ async def test_a_write_of_another_station_is_a_change_with_its_author() -> None:
         assert component.sync_state is SyncState.SYNCED
 
 
-@in_simulated_time
 async def test_calls_that_send_are_refused_at_once() -> None:
     channel = Channel(small_px4())
     async with listener(channel) as client:
@@ -133,7 +129,6 @@ def test_policy_and_watch_interval_are_refused_with_listen_only() -> None:
 
 
 @pytest.mark.parametrize("timeout", [None, 3.0])
-@in_simulated_time
 async def test_fetch_all_without_any_request_of_others_ends_with_no_reply(timeout: float | None) -> None:
     async with listener(Channel(generic())) as client:
         component = await client.component()
@@ -147,7 +142,6 @@ async def test_fetch_all_without_any_request_of_others_ends_with_no_reply(timeou
         assert residue(component) == []
 
 
-@in_simulated_time
 async def test_a_timeout_returns_what_was_received() -> None:
     channel = Channel(small_px4(dead=[24]))
     async with listener(channel) as client:
@@ -158,7 +152,6 @@ async def test_a_timeout_returns_what_was_received() -> None:
         assert "ended at its timeout" in result.notes[0]
 
 
-@in_simulated_time
 async def test_a_cached_table_is_confirmed_by_a_hash_that_others_ask_for(tmp_path: Path) -> None:
     vehicle = small_px4()
     path = tmp_path / "cache"

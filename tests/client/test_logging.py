@@ -11,12 +11,11 @@ import pytest
 
 from paramclient.cli import run
 from tests.client.conftest import fetched
-from tests.shell import in_simulated_time, small_px4
+from tests.shell import small_px4
 
 WATCHED = "paramclient"
 
 
-@in_simulated_time
 async def test_each_step_is_one_line(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
     with caplog.at_level(logging.DEBUG, WATCHED):
         async with fetched(small_px4(), cache=tmp_path / "cache") as (_, component):

@@ -14,7 +14,6 @@ from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from tests.client.conftest import connected, fetched
 from tests.conversations.test_fetch import new_vehicle
 from tests.conversations.virtual import Silence
-from tests.shell import in_simulated_time
 
 TIME_MAX = 7.0
 
@@ -46,7 +45,6 @@ class World:
 
 
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
-@in_simulated_time
 async def test_a_refresh_of_a_cached_table(kind: str, tmp_path: Path) -> None:
     world = World(kind)
     cache = tmp_path / "cache.sqlite3"
@@ -87,7 +85,6 @@ async def test_a_refresh_of_a_cached_table(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "list", "generic"])
 @pytest.mark.parametrize("delay", [0.05, 1.25])
-@in_simulated_time
 async def test_set_many(kind: str, delay: float, tmp_path: Path) -> None:
     world = World(kind, delay)
     cache = tmp_path / "cache.sqlite3"

@@ -107,7 +107,6 @@ def test_a_record_that_the_end_cuts_off_is_left_out(missing: int) -> None:
 # writing
 
 
-@in_simulated_time
 async def test_frames_of_both_directions_are_written(tmp_path: Path) -> None:
     vehicle = Tap(small_px4())
     path = tmp_path / "flight.tlog"
@@ -176,7 +175,6 @@ def test_the_command_writes_logs_too(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize("now", [-86400.0, 30.0])
-@in_simulated_time
 async def test_a_clock_that_was_never_set_ends_nothing(
     now: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -188,7 +186,6 @@ async def test_a_clock_that_was_never_set_ends_nothing(
     assert any(isinstance(each, messages.ParamValue) for each in recorded(path))
 
 
-@in_simulated_time
 async def test_no_key_and_no_signature_is_in_the_log(tmp_path: Path) -> None:
     """As the guide to message signing asks: a log is passed on, and a key is not."""
     key = signing.SigningKey(bytes(range(32)))
@@ -207,7 +204,6 @@ async def test_no_key_and_no_signature_is_in_the_log(tmp_path: Path) -> None:
     assert bytes(range(1, 33)) not in path.read_bytes()
 
 
-@in_simulated_time
 async def test_a_log_that_exists_is_not_written_over(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     path.write_bytes(b"precious")
@@ -221,7 +217,6 @@ async def test_a_log_that_exists_is_not_written_over(tmp_path: Path) -> None:
             raise AssertionError("it was opened")
 
 
-@in_simulated_time
 async def test_a_full_disk_ends_the_log_and_nothing_else(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -237,7 +232,6 @@ async def test_a_full_disk_ends_the_log_and_nothing_else(
     assert recorded(path)  # whole frames, and nothing behind them
 
 
-@in_simulated_time
 async def test_a_disk_that_falls_behind_ends_the_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -270,7 +264,6 @@ def test_streams_are_cut_into_whole_frames() -> None:
     assert cut(b"", "one") == [first]
 
 
-@in_simulated_time
 async def test_a_stream_that_drops_is_not_continued(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     vehicle = Puppet(lambda message: (), heartbeat=None)

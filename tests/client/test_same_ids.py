@@ -9,10 +9,9 @@ from paramclient import AmbiguousVehicle
 from paramclient.links import Peer
 from paramclient.sim import Endpoint
 from tests.client.conftest import fetched
-from tests.shell import PeersLink, Tap, generic, in_simulated_time, small_px4
+from tests.shell import PeersLink, Tap, generic, small_px4
 
 
-@in_simulated_time
 async def test_another_live_peer_is_one_warning_and_forbids_writes(caplog: pytest.LogCaptureFixture) -> None:
     first, second = small_px4(uid=1), Tap(small_px4(uid=2))
     peers: dict[Peer, Endpoint] = {"one": first, "two": second}
@@ -33,7 +32,6 @@ async def test_another_live_peer_is_one_warning_and_forbids_writes(caplog: pytes
     assert "two vehicles have the same ids" in warnings[0]
 
 
-@in_simulated_time
 async def test_the_new_connection_of_a_vehicle_has_its_ids_at_once() -> None:
     """As of a vehicle that connects to us again after its TCP connection broke."""
     first = Tap(generic())

@@ -25,7 +25,7 @@ from paramclient.client.cache_writer import CacheWriter
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire import messages
 from tests.client.conftest import connected, fetched
-from tests.shell import VALUES, Tap, a_client, in_simulated_time, residue, small_px4
+from tests.shell import VALUES, Tap, a_client, residue, small_px4
 
 MANY: dict[str, int | float] = {f"MANY_{number:03}": float(number) for number in range(200)}
 NEW: dict[str, int | float] = {name: value + 0.5 for name, value in MANY.items()}
@@ -35,7 +35,6 @@ def values_of(params: Mapping[str, Param], names: Mapping[str, object]) -> dict[
     return {name: params[name].value for name in names}
 
 
-@in_simulated_time
 async def test_each_value_has_an_outcome_of_its_own() -> None:
     vehicle = ArduPilotVehicle(
         table={**{name: float(value) for name, value in VALUES.items()}, "COUNT": 3},
@@ -64,7 +63,6 @@ async def test_each_value_has_an_outcome_of_its_own() -> None:
             result["PARAM_02"]
 
 
-@in_simulated_time
 async def test_the_timeout_is_that_of_the_whole_call() -> None:
     tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
     async with fetched(tap) as (_, component):
@@ -89,7 +87,6 @@ async def test_the_timeout_is_that_of_the_whole_call() -> None:
         ({"PARAM_01": 1, "_HASH_CHECK": 1}, "read-only"),
     ],
 )
-@in_simulated_time
 async def test_nothing_is_sent_if_an_argument_is_wrong(values: dict[str, int], message: str) -> None:
     tap = Tap(small_px4())
     async with connected(tap) as (_, component):
@@ -102,7 +99,6 @@ async def test_nothing_is_sent_if_an_argument_is_wrong(values: dict[str, int], m
         assert not tap.messages(messages.ParamSet)
 
 
-@in_simulated_time
 async def test_values_are_watched_while_others_are_written() -> None:
     vehicle = PX4Vehicle(table=MANY)
     async with fetched(Air.symmetric([vehicle], delay=0.05)) as (_, component):
@@ -112,7 +108,6 @@ async def test_values_are_watched_while_others_are_written() -> None:
         assert not residue(component)
 
 
-@in_simulated_time
 async def test_an_error_of_progress_cancels_the_call() -> None:
     tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
 
@@ -129,7 +124,6 @@ async def test_an_error_of_progress_cancels_the_call() -> None:
         assert len(tap.messages(messages.ParamSet)) == sent < 60
 
 
-@in_simulated_time
 async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Path) -> None:
     async with fetched(small_px4(), cache=tmp_path / "cache") as (_, component):
         assert (await component.set_many({"PARAM_01": 2}, durable=True)).is_complete
@@ -147,7 +141,6 @@ async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Pa
             await (await client.component()).set_many({"PARAM_01": 2}, durable=True)
 
 
-@in_simulated_time
 async def test_two_calls_at_once_both_end() -> None:
     vehicle = PX4Vehicle(table=MANY)
     async with fetched(Air.symmetric([vehicle], delay=0.05, loss=0.1)) as (_, component):

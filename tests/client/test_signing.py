@@ -107,7 +107,6 @@ def test_invalid_signing_settings_are_refused_at_once() -> None:
 # Timestamps
 
 
-@in_simulated_time
 async def test_a_client_whose_clock_was_set_back_adopts_the_timestamp_of_the_vehicle(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -122,7 +121,6 @@ async def test_a_client_whose_clock_was_set_back_adopts_the_timestamp_of_the_veh
 # Clients
 
 
-@in_simulated_time
 async def test_a_signed_client() -> None:
     vehicle = signed_vehicle()
     async with (
@@ -145,7 +143,6 @@ async def test_a_signed_client() -> None:
         assert unsigned.signing_report() is None
 
 
-@in_simulated_time
 async def test_no_reply_says_that_frames_were_refused() -> None:
     async with a_client(signed_vehicle(), signing=OTHER_KEY) as client:
         with pytest.raises(NoReply, match=r"an autopilot \(frames were refused, [0-9]+ for: bad signature\)"):
@@ -158,7 +155,6 @@ async def test_no_reply_says_that_frames_were_refused() -> None:
         assert report.refused.keys() == {Refusal.UNSIGNED}
 
 
-@in_simulated_time
 async def test_a_key_is_sent_only_if_the_caller_says_that_the_link_is_safe() -> None:
     vehicle = ArduPilotVehicle(table=VALUES)
     async with a_client(vehicle, signing=None) as client:
@@ -175,7 +171,6 @@ async def test_a_key_is_sent_only_if_the_caller_says_that_the_link_is_safe() -> 
     assert vehicle.signing_key is None
 
 
-@in_simulated_time
 async def test_a_vehicle_of_mavlink_1_is_given_no_key_and_is_answered_unsigned() -> None:
     vehicle = small_px4(mavlink_version=1)
     async with a_client(vehicle, signing=None) as client:

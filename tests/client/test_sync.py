@@ -34,7 +34,6 @@ from tests.shell import (
     a_client,
     bits,
     generic,
-    in_simulated_time,
     outcome,
     residue,
     settled,
@@ -78,7 +77,6 @@ async def away(tap: Tap, seconds: float) -> None:
 # the watch
 
 
-@in_simulated_time
 async def test_an_update_that_was_lost_is_reported_within_one_interval() -> None:
     vehicle = small_px4()
     tap = Tap(vehicle)
@@ -102,7 +100,6 @@ async def test_an_update_that_was_lost_is_reported_within_one_interval() -> None
         assert not residue(component)
 
 
-@in_simulated_time
 async def test_by_default_a_hash_is_watched_and_a_list_is_not() -> None:
     px4, ardupilot = Tap(small_px4()), Tap(ArduPilotVehicle(table=VALUES, system=2))
     async with a_client(Air([px4, ardupilot])) as client:
@@ -117,7 +114,6 @@ async def test_by_default_a_hash_is_watched_and_a_list_is_not() -> None:
         assert not px4.messages(ParamRequestList), "nor one for the other vehicle"
 
 
-@in_simulated_time
 async def test_parameters_that_appear_and_go_do_so_in_the_cache_too(path: Path) -> None:
     group = {f"GRIP_{number}": number for number in range(5)}
     table = {**VALUES, "GRIP_ENABLE": 0}
@@ -152,7 +148,6 @@ def test_an_interval_that_cannot_be(wrong: float) -> None:
 # lost and found
 
 
-@in_simulated_time
 async def test_lost_and_found() -> None:
     vehicle = small_px4()
     tap = Tap(vehicle)
@@ -181,7 +176,6 @@ async def test_lost_and_found() -> None:
             assert param.trust is (Trust.LIVE if name in VOLATILE else Trust.VERIFIED)
 
 
-@in_simulated_time
 async def test_a_table_is_checked_after_a_fetch_during_which_the_vehicle_rebooted() -> None:
     vehicle = small_px4(burst=1, period=0.1, hash_check=False)
     tap = Tap(vehicle)
@@ -204,7 +198,6 @@ async def test_a_table_is_checked_after_a_fetch_during_which_the_vehicle_reboote
 
 
 @pytest.mark.parametrize("seconds", [2.0, 8.0])
-@in_simulated_time
 async def test_a_link_that_was_disconnected_is_checked_like_a_loss(seconds: float) -> None:
     vehicle = small_px4()
     link = FlakyLink(Air.symmetric([vehicle], delay=0.05))
@@ -224,7 +217,6 @@ async def test_a_link_that_was_disconnected_is_checked_like_a_loss(seconds: floa
         assert bits(component.params) == bits(vehicle.params)
 
 
-@in_simulated_time
 async def test_a_watch_survives_a_link_that_drops_during_a_check() -> None:
     vehicle = small_px4()
     tap = Tap(vehicle)
@@ -254,7 +246,6 @@ def kept(path: Path) -> dict[tuple[str, int], object]:
 
 
 @pytest.mark.parametrize("answers", [True, False], ids=["says who it is late", "never says who it is"])
-@in_simulated_time
 async def test_a_strangers_values_never_reach_the_other_ones_cache(path: Path, answers: bool) -> None:
     berth, camera = Tap(small_px4(uid=1)), Tap(generic(component=100, uid=1))
     async with connected(Air([berth, camera]), cache=path) as (client, component):
@@ -304,7 +295,6 @@ async def learn(vehicle: PX4Vehicle, path: Path) -> None:
         await (await client.component()).fetch_all()
 
 
-@in_simulated_time
 async def test_cache_only_sends_nothing(path: Path) -> None:
     vehicle = small_px4()
     await learn(vehicle, path)
@@ -325,7 +315,6 @@ async def test_cache_only_sends_nothing(path: Path) -> None:
         assert (await component.get("PARAM_01")).trust is Trust.LIVE, "a name that is requested is read"
 
 
-@in_simulated_time
 async def test_cache_only_where_nothing_is_cached(path: Path) -> None:
     tap = Tap(Air([small_px4(), generic(component=100)]))
     async with connected(tap, cache=path, policy=Policy.CACHE_ONLY) as (client, component):
@@ -337,7 +326,6 @@ async def test_cache_only_where_nothing_is_cached(path: Path) -> None:
         assert not residue(component)
 
 
-@in_simulated_time
 async def test_hash_only_requests_the_hash_alone(path: Path) -> None:
     vehicle = small_px4()
     await learn(vehicle, path)
@@ -359,7 +347,6 @@ async def test_hash_only_requests_the_hash_alone(path: Path) -> None:
 
 
 @pytest.mark.parametrize("policy", [Policy.CACHE_ONLY, Policy.HASH_ONLY])
-@in_simulated_time
 async def test_refresh_is_refused_with_a_policy_that_forbids_downloads(policy: Policy) -> None:
     tap = Tap(small_px4())
     async with connected(tap, policy=policy) as (client, component):
@@ -377,7 +364,6 @@ def test_a_policy_that_does_not_exist() -> None:
 # events
 
 
-@in_simulated_time
 async def test_a_stream_of_events_outlives_a_cancelled_wait_and_has_a_bound_and_an_end() -> None:
     async with connected(small_px4()) as (client, component):
         events, others = client.events(), client.events()
@@ -394,7 +380,6 @@ async def test_a_stream_of_events_outlives_a_cancelled_wait_and_has_a_bound_and_
             await anext(each)
 
 
-@in_simulated_time
 async def test_several_listeners_hear_the_same() -> None:
     vehicle = small_px4()
     client = a_client(vehicle)
@@ -411,7 +396,6 @@ async def test_several_listeners_hear_the_same() -> None:
         assert await drained(late) == reported[1:]
 
 
-@in_simulated_time
 async def test_a_durable_write_to_a_vehicle_that_does_not_say_who_it_is_is_not_sent(path: Path) -> None:
     berth = Tap(small_px4(uid=1))
     async with fetched(berth, cache=path) as (_, component):

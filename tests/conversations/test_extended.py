@@ -31,7 +31,7 @@ from paramclient.wire.messages import (
     ParamExtValue,
     ParamRequestList,
 )
-from tests.conversations.virtual import Conversation, Silence, Tap, converse, virtual, virtual_on_both
+from tests.conversations.virtual import Conversation, Silence, Tap, converse, virtual_on_both
 
 CAMERA = (1, 100)
 
@@ -72,7 +72,6 @@ async def test_values_of_every_type_are_fetched_read_and_set(loss: float) -> Non
         assert by_index.param_id == "CAM_ISO"
 
 
-@virtual
 async def test_a_set_sends_nothing_that_does_not_fit_and_reports_every_refusal() -> None:
     camera = Camera(supported={"CAM_ISO": [100, 200]}, failing=["CAM_EV"])
     async with filming(camera) as (conversation, session):
@@ -90,7 +89,6 @@ async def test_a_set_sends_nothing_that_does_not_fit_and_reports_every_refusal()
         assert session.table.params["CAM_ISO"].value == 100
 
 
-@virtual
 async def test_a_value_that_the_camera_changes_is_adjusted() -> None:
     camera = Camera(limits={"CAM_EV": (-2.0, 2.0)})
     async with filming(camera) as (_, session):
@@ -99,7 +97,6 @@ async def test_a_value_that_the_camera_changes_is_adjusted() -> None:
 
 
 @pytest.mark.parametrize("seconds", [0.5, 30.0])
-@virtual
 async def test_progress_extends_the_wait_and_a_lost_result_is_requested_again(seconds: float) -> None:
     camera = Camera(slow={"CAM_MODE": seconds})
     lost = [0]
@@ -138,7 +135,6 @@ async def test_a_camera_that_is_lost_while_it_reports_progress_ends_the_set(afte
         assert isinstance(result.error, NoReply)
 
 
-@virtual
 async def test_a_change_by_another_station_is_seen_by_its_acknowledgement() -> None:
     async with filming(Camera()) as (conversation, session):
         await fetch_all(session)
@@ -166,7 +162,6 @@ async def test_the_refusal_of_another_stations_set_is_not_taken_for_ours() -> No
         assert session.table.params["CAM_MODE"].value == 2
 
 
-@virtual
 async def test_a_list_that_changes_removes_and_adds() -> None:
     camera = Camera()
     async with filming(camera) as (conversation, session):
@@ -180,7 +175,6 @@ async def test_a_list_that_changes_removes_and_adds() -> None:
         assert (kinds["CAM_ISO"], kinds["CAM_GAIN"]) == ("removed", "added")
 
 
-@virtual
 async def test_many_are_set_and_a_lost_camera_ends_it() -> None:
     camera = Camera({f"P{number:02}": number for number in range(60)})
     endpoint = Silence(Air.symmetric([camera], delay=0.1), at=1e9)
@@ -196,7 +190,6 @@ async def test_many_are_set_and_a_lost_camera_ends_it() -> None:
         assert {each.status for each in result.outcomes} >= {SetStatus.UNKNOWN, SetStatus.NOT_TRIED}
 
 
-@virtual
 async def test_a_component_may_have_both_kinds_or_none() -> None:
     camera = Camera({"A": "text"}, plain={"A": 5})
     async with converse(Air([camera, PX4Vehicle()])) as conversation:
@@ -215,7 +208,6 @@ async def test_a_component_may_have_both_kinds_or_none() -> None:
         assert len(conversation.sent_of(ParamRequestList)) == 1
 
 
-@virtual
 async def test_what_other_stations_request_is_taken_too() -> None:
     async with converse(Camera()) as conversation:
         node = await conversation.node(*CAMERA)

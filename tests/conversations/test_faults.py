@@ -39,7 +39,7 @@ from paramclient.wire.messages import (
     encode,
 )
 from tests.conversations.partial import Partial
-from tests.conversations.virtual import Puppet, converse, jump, talking, virtual, virtual_on_both
+from tests.conversations.virtual import Puppet, converse, jump, talking, virtual_on_both
 
 Faults: TypeAlias = dict[str, Any]
 
@@ -63,7 +63,6 @@ def vehicle_on(kind: str, faults: str) -> Vehicle:
 
 
 @pytest.mark.parametrize("seed", range(3))
-@virtual
 async def test_reads_that_are_answered_behind_a_whole_list_are_not_given_up(seed: int) -> None:
     """At 57600 baud, where the vehicle does not know of it: the list waits in a queue of 6 s."""
     vehicle = PX4Vehicle()
@@ -78,7 +77,6 @@ async def test_reads_that_are_answered_behind_a_whole_list_are_not_given_up(seed
 
 
 @pytest.mark.parametrize("seed", [8, 23])
-@virtual
 async def test_gaps_of_a_file_are_read_when_all_its_bursts_are_over(seed: int) -> None:
     """At 57600 baud the first block is late, so that the burst is requested again."""
     vehicle = ArduPilotVehicle()
@@ -90,7 +88,6 @@ async def test_gaps_of_a_file_are_read_when_all_its_bursts_are_over(seed: int) -
         check_right(vehicle, session.table.params)
 
 
-@virtual
 async def test_values_that_are_forgotten_with_their_encoding_are_read_again() -> None:
     """The first heartbeat of an ArduPilot is late: it waits behind a list, and arrives in the middle."""
     float_120 = struct.pack("<f", 120)
@@ -113,7 +110,6 @@ async def test_values_that_are_forgotten_with_their_encoding_are_read_again() ->
 
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "ardupilot by list"])
 @pytest.mark.parametrize("faults", KINDS)
-@virtual
 async def test_a_session_on_a_faulty_link_is_right(kind: str, faults: str) -> None:
     vehicle = vehicle_on(kind, faults)
     seed = Random(kind + faults).randrange(1000)
@@ -161,7 +157,6 @@ any_message = st.one_of(
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(any_message, max_size=60), st.lists(st.binary(max_size=60), max_size=5))
-@virtual
 async def test_no_message_and_no_bytes_raise_whatever_is_in_progress(
     messages: list[Message], noise: list[bytes]
 ) -> None:
@@ -191,7 +186,6 @@ async def test_no_message_and_no_bytes_raise_whatever_is_in_progress(
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.binary(max_size=200), max_size=8), st.booleans())
-@virtual
 async def test_any_bytes_are_taken_by_a_station(chunks: list[bytes], is_stream: bool) -> None:
     station = Station(link="x", is_stream=is_stream, send=lambda data, peer: None, spawn=lambda *work: None)
     frame = encode(Heartbeat(2, 12), system=1, component=1, sequence=0)
@@ -257,7 +251,6 @@ async def test_calls_go_on_after_the_computer_was_suspended(kind: str, at: float
 # components that bend the protocol
 
 
-@virtual
 async def test_a_component_without_parameters_at_all_is_no_reply_within_seconds() -> None:
     async with talking(Partial(serves=("commands",))) as (_, session):
         for call in (fetch_all(session), read(session, "MODE"), write(session, "MODE", 1)):
@@ -267,7 +260,6 @@ async def test_a_component_without_parameters_at_all_is_no_reply_within_seconds(
             assert anyio.current_time() - began < 40.0
 
 
-@virtual
 async def test_a_slow_vehicle_is_waited_for() -> None:
     vehicle = ArduPilotVehicle(
         ftp=False, burst=1, period=0.3, table={f"P{number}": number for number in range(40)}
@@ -278,7 +270,6 @@ async def test_a_slow_vehicle_is_waited_for() -> None:
         assert len(conversation.sent_of(ParamRequestList)) <= 3
 
 
-@virtual
 async def test_a_vehicle_that_restarts_in_the_middle_of_its_list_is_fetched_whole() -> None:
     for vehicle in (PX4Vehicle(), ArduPilotVehicle(ftp=False)):
         async with talking(vehicle) as (_, session):

@@ -23,7 +23,7 @@ from paramclient.wire.messages import (
     ParamRequestRead,
     ParamValue,
 )
-from tests.conversations.virtual import Silence, Tap, converse, run, talking, virtual, virtual_on_both
+from tests.conversations.virtual import Silence, Tap, converse, run, talking, virtual_on_both
 
 BACKENDS = pytest.mark.parametrize("backend", ["trio", "asyncio"])
 
@@ -74,7 +74,6 @@ async def test_every_value_arrives_on_a_lossy_link(kind: str, loss: float) -> No
 
 @pytest.mark.parametrize("loss", [0.0, 0.1])
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
-@virtual
 async def test_every_value_arrives_over_a_satellite(kind: str, loss: float) -> None:
     for seed in range(4 if loss else 1):
         vehicle = new_vehicle(kind)
@@ -103,7 +102,6 @@ async def test_the_hash_confirms_a_table_without_a_download() -> None:
         assert trusts[Trust.LIVE] == len(session.table.volatile)
 
 
-@virtual
 async def test_a_value_changed_meanwhile_is_downloaded() -> None:
     vehicle = PX4Vehicle()
     async with talking(vehicle) as (_, session):
@@ -212,7 +210,6 @@ async def test_a_vehicle_that_takes_the_address_of_another_is_fetched_whole(
 
 
 @pytest.mark.parametrize(("known_at", "source"), [(1.0, "ftp"), (2.5, "stream")])
-@virtual
 async def test_a_first_fetch_waits_for_the_identity_of_the_vehicle_but_not_for_long(
     known_at: float, source: str
 ) -> None:
@@ -229,7 +226,6 @@ async def test_a_first_fetch_waits_for_the_identity_of_the_vehicle_but_not_for_l
         assert result.source == source
 
 
-@virtual
 async def test_a_vehicle_that_never_answers_is_no_reply() -> None:
     endpoint = Silence(PX4Vehicle(), at=1e9)
     async with talking(endpoint) as (_, session):
@@ -239,7 +235,6 @@ async def test_a_vehicle_that_never_answers_is_no_reply() -> None:
         assert anyio.current_time() - endpoint.at < 7.0
 
 
-@virtual
 async def test_dead_indices_are_missing() -> None:
     async with talking(PX4Vehicle(dead=[3, 77])) as (_, session):
         result = await fetch_all(session)
@@ -247,7 +242,6 @@ async def test_dead_indices_are_missing() -> None:
         assert not result.complete
 
 
-@virtual
 async def test_a_list_that_stops_is_completed() -> None:
     for vehicle, count in ((PX4Vehicle(), 500), (ArduPilotVehicle(ftp=False), 700)):
         vehicle.when_listed(count, vehicle.stop_list)
@@ -274,7 +268,6 @@ def test_silent_mavftp_costs_at_most_one_and_a_half_seconds(delay: float) -> Non
     assert run(lambda: elapsed(asks=True)) - run(lambda: elapsed(asks=False)) < 1.5
 
 
-@virtual
 async def test_silent_mavftp_is_learnt_on_a_lossy_link() -> None:
     tap = Tap(ArduPilotVehicle(), up=is_no_file)
     async with talking(Air.symmetric([tap], loss=0.2, delay=0.05, seed=2)) as (conversation, session):
@@ -286,7 +279,6 @@ async def test_silent_mavftp_is_learnt_on_a_lossy_link() -> None:
 
 
 @pytest.mark.parametrize("code", ParamErrorCode)
-@virtual
 async def test_a_hash_that_is_refused_for_any_reason_is_no_hash(code: ParamErrorCode) -> None:
     def up(message: Message) -> bool:
         is_hash = isinstance(message, ParamRequestRead) and message.param_id == HASH_CHECK
@@ -300,7 +292,6 @@ async def test_a_hash_that_is_refused_for_any_reason_is_no_hash(code: ParamError
             check_right(vehicle, await fetch_all(session))
 
 
-@virtual
 async def test_a_value_outside_the_hash_that_is_not_received_is_missing() -> None:
     vehicle = PX4Vehicle()
     secret = vehicle.param(next(row.name for row in px4_table() if row.volatile))
@@ -319,7 +310,6 @@ async def test_a_value_outside_the_hash_that_is_not_received_is_missing() -> Non
         assert any(secret.name in note for note in result.notes)
 
 
-@virtual
 async def test_policies_limit_what_is_sent() -> None:
     vehicle = PX4Vehicle()
     async with talking(vehicle) as (_, session):
@@ -333,7 +323,6 @@ async def test_policies_limit_what_is_sent() -> None:
         assert (asked.source, vehicle.requests["PARAM_REQUEST_LIST"]) == ("cache", 1)
 
 
-@virtual
 async def test_progress_rises_to_the_count() -> None:
     async with converse(PX4Vehicle()) as conversation:
         seen: list[Progress] = []
@@ -343,7 +332,6 @@ async def test_progress_rises_to_the_count() -> None:
         assert (seen[-1].received, seen[-1].total) == (result.count, result.count)
 
 
-@virtual
 async def test_a_group_that_appears_changes_the_count_and_all_is_fetched() -> None:
     vehicle = ArduPilotVehicle()
     async with talking(vehicle) as (_, session):

@@ -18,7 +18,7 @@ from paramclient.protocol.ftp import FileCutOff, Opcode, Packet, checksum, path_
 from paramclient.protocol.param_pck import PackedParam, encode
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire.messages import FileTransfer, Message, ParamRequestList, ParamRequestRead, ParamValue
-from tests.conversations.virtual import Silence, Tap, talking, virtual, virtual_on_both
+from tests.conversations.virtual import Silence, Tap, talking, virtual_on_both
 
 BOTH = pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
 Maker = type[PX4Vehicle] | type[ArduPilotVehicle]
@@ -42,7 +42,6 @@ def packets_in(messages: Iterable[Message]) -> list[Packet]:
     return [Packet.unpack(each.payload) for each in messages if isinstance(each, FileTransfer)]
 
 
-@virtual
 @BOTH
 async def test_the_answer_to_the_last_request_of_an_earlier_program_is_not_taken(make: Maker) -> None:
     vehicle = serving(100, make)
@@ -71,7 +70,6 @@ async def test_files_of_every_size_arrive_whole_and_are_closed(make: Maker, loss
             assert vehicle.open_files == []
 
 
-@virtual
 async def test_blocks_arrive_in_another_order_and_twice() -> None:
     vehicle = serving(9_000)
     air = Air.symmetric([vehicle], reorder=0.3, duplicate=0.3, jitter=0.02, delay=0.01, seed=1)
@@ -80,7 +78,6 @@ async def test_blocks_arrive_in_another_order_and_twice() -> None:
         assert vehicle.open_files == []
 
 
-@virtual
 async def test_refusals_say_why_and_leave_nothing_open() -> None:
     for make in (PX4Vehicle, ArduPilotVehicle):
         vehicle = serving(make=make)
@@ -106,7 +103,6 @@ def test_a_path_that_no_message_holds_is_refused(path: str) -> None:
 
 
 @pytest.mark.parametrize("code", [FileErrorCode.UNKNOWN_COMMAND, FileErrorCode.FAIL])
-@virtual
 async def test_a_refused_read_ends_the_transfer_and_a_server_without_bursts_serves_reads(
     code: FileErrorCode,
 ) -> None:
@@ -133,7 +129,6 @@ async def test_a_refused_read_ends_the_transfer_and_a_server_without_bursts_serv
         assert vehicle.open_files == []
 
 
-@virtual
 async def test_the_session_of_another_station_is_waited_for() -> None:
     vehicle = serving(500)
     vehicle.files["other.bin"] = CONTENT[:500]
@@ -147,7 +142,6 @@ async def test_the_session_of_another_station_is_waited_for() -> None:
         assert 3.0 < anyio.current_time() - began < 5.0
 
 
-@virtual
 async def test_a_silent_server_is_no_reply_and_a_file_that_is_cut_off_keeps_its_beginning() -> None:
     endpoint = Silence(serving(), at=1e9)
     async with talking(endpoint) as (_, session):
@@ -178,7 +172,6 @@ async def test_cancelled_at_any_moment_a_session_is_closed_on_board(make: Maker)
             assert anyio.current_time() - began < 3.0
 
 
-@virtual
 async def test_sessions_are_closed_where_packets_are_lost_in_bursts() -> None:
     vehicle = serving(20_000)
     air = Air.symmetric([vehicle], loss=0.05, loss_burst=4.0, delay=0.3, seed=5)
@@ -190,7 +183,6 @@ async def test_sessions_are_closed_where_packets_are_lost_in_bursts() -> None:
             assert vehicle.open_files == []
 
 
-@virtual
 async def test_a_cancelled_transfer_ends_within_2_s_although_its_closing_is_lost() -> None:
     endpoint = Silence(serving(), at=1e9)
     async with talking(endpoint) as (_, session):
@@ -244,7 +236,6 @@ def pack_of(vehicle: ArduPilotVehicle, number: int | None = None) -> bytes:
         pytest.param(None, id="cut off"),
     ],
 )
-@virtual
 async def test_a_file_that_is_not_valid_leads_to_the_list_and_drops_nothing(content: bytes | None) -> None:
     vehicle = ArduPilotVehicle()
     async with talking(vehicle) as (conversation, session):
@@ -258,7 +249,6 @@ async def test_a_file_that_is_not_valid_leads_to_the_list_and_drops_nothing(cont
         assert not [each for each in conversation.changes if each.kind == "removed"]
 
 
-@virtual
 async def test_a_short_file_replaces_no_table_where_the_indices_begin_at_1() -> None:
     vehicle = ArduPilotVehicle()
     tap = Tap(vehicle, up=lambda each: not (isinstance(each, ParamRequestRead) and each.param_index == 0))
@@ -271,7 +261,6 @@ async def test_a_short_file_replaces_no_table_where_the_indices_begin_at_1() -> 
 
 
 @pytest.mark.parametrize("is_cached", [False, True])
-@virtual
 async def test_a_fetch_does_not_wait_for_another_file(is_cached: bool) -> None:
     vehicle = ArduPilotVehicle()
     async with talking(vehicle) as (_, session):
@@ -285,7 +274,6 @@ async def test_a_fetch_does_not_wait_for_another_file(is_cached: bool) -> None:
         assert (await fetch_all(session)).source in ("ftp", "cache")
 
 
-@virtual
 async def test_integers_of_a_file_are_exact_and_keep_so_beside_rounded_messages() -> None:
     vehicle = ArduPilotVehicle()
     name = next(each.name for each in vehicle.listed if each.type == 6 and each.name.startswith("COMPASS"))
@@ -300,7 +288,6 @@ async def test_integers_of_a_file_are_exact_and_keep_so_beside_rounded_messages(
         assert isinstance(default, int)
 
 
-@virtual
 async def test_a_refused_file_is_not_requested_again_on_the_link() -> None:
     vehicle = PX4Vehicle(param_error=True)  # claims to have it, and answers: file not found
     async with talking(vehicle) as (conversation, session):
@@ -313,7 +300,6 @@ async def test_a_refused_file_is_not_requested_again_on_the_link() -> None:
         assert len(conversation.sent_of(ParamRequestList)) == 2
 
 
-@virtual
 async def test_a_lost_opening_of_the_file_is_repeated_before_the_list_is_taken() -> None:
     lost: list[Message] = []
 
@@ -327,7 +313,6 @@ async def test_a_lost_opening_of_the_file_is_repeated_before_the_list_is_taken()
         assert (result.source, result.elapsed < 2.0, len(lost)) == ("ftp", True, 1)
 
 
-@virtual
 async def test_a_file_of_a_table_that_changes_meanwhile_is_right_in_the_end() -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
     async with talking(Air.symmetric([vehicle], delay=0.02)) as (_, session):

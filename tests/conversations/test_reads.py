@@ -16,7 +16,7 @@ from paramclient.protocol.reads import read, read_many
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire.messages import Message, ParamError, ParamRequestRead, ParamValue
-from tests.conversations.virtual import Puppet, Silence, Tap, converse, talking, virtual, virtual_on_both
+from tests.conversations.virtual import Puppet, Silence, Tap, converse, talking, virtual_on_both
 
 TABLE = {"RTL_ALT": 1500, "MC_ROLL_P": 6.5, "MC_PITCH_P": 6.5}
 MAKERS = {
@@ -44,7 +44,6 @@ async def test_reads_by_name_and_index_bring_the_vehicles_values(make: type[Vehi
             assert (stored.index, stored.trust) == (index, Trust.LIVE)
 
 
-@virtual
 @EVERY
 @pytest.mark.parametrize("which", ["MC_ROLLP", 5000])
 async def test_a_vehicle_that_answers_other_reads_has_no_such_parameter(
@@ -64,7 +63,6 @@ async def test_a_vehicle_that_answers_other_reads_has_no_such_parameter(
         assert ("MC_ROLL_P" in str(caught.value)) is (vehicle_has_roll and which == "MC_ROLLP")
 
 
-@virtual
 async def test_an_unknown_name_on_a_bad_link_is_never_taken_for_silence_nor_a_known_one_for_unknown() -> None:
     for seed in range(6):
         air = Air.symmetric([PX4Vehicle()], loss=0.3, delay=0.05, seed=seed)
@@ -75,7 +73,6 @@ async def test_an_unknown_name_on_a_bad_link_is_never_taken_for_silence_nor_a_kn
             await read(session, "MC_PITCH_P")
 
 
-@virtual
 async def test_silence_is_no_reply_and_not_an_unknown_parameter() -> None:
     endpoint = Silence(PX4Vehicle(), at=0.5)
     async with talking(endpoint) as (_, session):
@@ -88,7 +85,6 @@ async def test_silence_is_no_reply_and_not_an_unknown_parameter() -> None:
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.05, 0.3])
-@virtual
 async def test_on_a_clean_link_few_reads_are_repeated_to_ardupilot(delay: float) -> None:
     vehicle = ArduPilotVehicle()
     async with talking(Air.symmetric([vehicle], delay=delay)) as (conversation, session):
@@ -103,7 +99,6 @@ async def test_on_a_clean_link_few_reads_are_repeated_to_ardupilot(delay: float)
         assert anyio.current_time() - began < 120 / 49 + 12 * (0.1 + 2 * delay)  # 5 in each 100 ms
 
 
-@virtual
 async def test_one_value_answers_both_a_read_by_name_and_one_by_index_and_others_none() -> None:
     async with talking(GenericVehicle(TABLE, dead=range(3))) as (conversation, session):
         got: list[str | int] = []
@@ -132,7 +127,6 @@ async def test_one_value_answers_both_a_read_by_name_and_one_by_index_and_others
         (77, Refused),
     ],
 )
-@virtual
 async def test_a_refusal_tells_its_reason(which: str | int, code: int, kind: type[Exception]) -> None:
     def answer(message: Message) -> Iterable[Message]:
         if isinstance(message, ParamRequestRead):
@@ -147,7 +141,6 @@ async def test_a_refusal_tells_its_reason(which: str | int, code: int, kind: typ
             assert caught.value.reason == ("read fail" if code != 77 else "error code 77")
 
 
-@virtual
 async def test_a_parameter_that_answers_by_its_index_only_is_read_by_that() -> None:
     vehicle = GenericVehicle(TABLE)
     endpoint = Tap(vehicle, up=lambda each: not isinstance(each, ParamRequestRead) or not each.param_id)
@@ -159,7 +152,6 @@ async def test_a_parameter_that_answers_by_its_index_only_is_read_by_that() -> N
         assert session.table.params["MC_ROLL_P"].value == 3.0
 
 
-@virtual
 async def test_an_ardupilot_takes_names_in_any_case_and_its_table_has_one_of_each() -> None:
     async with talking(ArduPilotVehicle()) as (conversation, session):
         assert (await read(session, "rtl_alt")).param_id == "RTL_ALT"

@@ -35,7 +35,7 @@ from paramclient.wire.messages import (
     ParamValue,
     encode,
 )
-from tests.conversations.virtual import converse, messages_in, talking, virtual
+from tests.conversations.virtual import converse, messages_in, talking
 from tests.recordings import DATA, NAMES, from_ground, from_vehicle
 from tests.recordings import read as records_of
 
@@ -180,7 +180,6 @@ async def named(session: Session, which: str | int) -> Param:
     return session.table.params[(await read(session, which)).param_id]
 
 
-@virtual
 async def test_px4s_list_is_complete_and_its_hash_is_proven() -> None:
     async with talking(Recorded("px4_full_download")) as (conversation, session):
         result = await fetch_all(session)
@@ -191,7 +190,6 @@ async def test_px4s_list_is_complete_and_its_hash_is_proven() -> None:
         assert result.notes == ()
 
 
-@virtual
 async def test_ardupilots_list_is_complete() -> None:
     async with talking(Recorded("ardupilot_full_download")) as (conversation, session):
         session.serves_file = False
@@ -201,7 +199,6 @@ async def test_ardupilots_list_is_complete() -> None:
         assert len(conversation.sent_of(ParamRequestList)) == 1
 
 
-@virtual
 async def test_ardupilots_file_with_its_defaults() -> None:
     async with talking(Recorded("ardupilot_ftp_download")) as (conversation, session):
         conversation.hear(AutopilotVersion(64495, 0x04060000, uid=7))
@@ -216,7 +213,6 @@ async def test_ardupilots_file_with_its_defaults() -> None:
         assert requests == [Opcode.OPEN_FILE_RO, Opcode.BURST_READ_FILE, Opcode.TERMINATE_SESSION]
 
 
-@virtual
 async def test_the_file_is_the_recorded_one_byte_by_byte() -> None:
     async with converse(Recorded("ardupilot_ftp_download")) as conversation:
         channel = (await conversation.node()).channel
@@ -224,7 +220,6 @@ async def test_the_file_is_the_recorded_one_byte_by_byte() -> None:
         assert content == (DATA / "ardupilot_param.pck").read_bytes()
 
 
-@virtual
 async def test_reads_and_sets_of_px4() -> None:
     async with talking(endpoint := Recorded("px4_get_set")) as (_, session):
         before = await named(session, "MPC_XY_VEL_MAX")
@@ -242,7 +237,6 @@ async def test_reads_and_sets_of_px4() -> None:
         assert endpoint.unanswered
 
 
-@virtual
 async def test_reads_and_sets_of_ardupilot() -> None:
     async with talking(Recorded("ardupilot_get_set")) as (_, session):
         assert (await named(session, "RTL_ALT")).index is None  # its answer has 65535
@@ -263,7 +257,6 @@ async def test_reads_and_sets_of_ardupilot() -> None:
 
 
 @pytest.mark.parametrize("name", ["ardupilot_30_sets", "px4_20_sets"])
-@virtual
 async def test_many_sets_at_once_are_acknowledged_as_they_were(name: str) -> None:
     async with talking(Recorded(name)) as (conversation, session):
         sets = [each.message for each in from_ground(name) if isinstance(each.message, ParamSet)]
@@ -287,7 +280,6 @@ async def test_many_sets_at_once_are_acknowledged_as_they_were(name: str) -> Non
 
 
 @pytest.mark.parametrize("name", NAMES)
-@virtual
 async def test_a_listener_takes_every_value_and_sends_nothing(name: str) -> None:
     sent: list[bytes] = []
     options = {"is_stream": False, "spawn": lambda *work: None, "listens_only": True}

@@ -54,7 +54,6 @@ from tests.conversations.virtual import (
     converse,
     messages_in,
     talking,
-    virtual,
     virtual_on_both,
 )
 
@@ -123,7 +122,6 @@ async def test_vehicles_are_identified(loss: float) -> None:
 
 
 @pytest.mark.parametrize("refuses", [True, False])
-@virtual
 async def test_a_vehicle_without_a_version_is_settled_within_seconds(refuses: bool) -> None:
     def answer(message: Message) -> Iterable[Message]:
         if isinstance(message, CommandLong) and refuses:
@@ -140,7 +138,6 @@ async def test_a_vehicle_without_a_version_is_settled_within_seconds(refuses: bo
         assert len(conversation.of("identified")) == 1
 
 
-@virtual
 async def test_values_received_before_the_encoding_is_known_are_decoded_again_and_then_reported() -> None:
     async with converse(Nothing()) as conversation:
         raw = encode_value(1500, ParamType.INT32, Encoding.C_CAST)
@@ -155,7 +152,6 @@ async def test_values_received_before_the_encoding_is_known_are_decoded_again_an
         ]
 
 
-@virtual
 async def test_the_heartbeat_of_a_vehicle_that_sends_other_messages_is_requested() -> None:
     async with converse(Nothing()) as conversation:
         for number in range(5):
@@ -165,7 +161,6 @@ async def test_the_heartbeat_of_a_vehicle_that_sends_other_messages_is_requested
         assert conversation.sent_of(CommandLong) == [CommandLong(7, 1, MAV_CMD_REQUEST_MESSAGE, 0.0)] * 2
 
 
-@virtual
 async def test_another_hardware_id_clears_the_table_and_the_first_one_does_not() -> None:
     async with converse(Nothing()) as conversation:
         conversation.hear(PX4)
@@ -178,7 +173,6 @@ async def test_another_hardware_id_clears_the_table_and_the_first_one_does_not()
         assert not node.plain.table.params
 
 
-@virtual
 async def test_ground_stations_are_asked_nothing_and_own_and_nameless_frames_are_ignored() -> None:
     async with converse(Nothing()) as conversation:
         for message, system, component in (
@@ -195,7 +189,6 @@ async def test_ground_stations_are_asked_nothing_and_own_and_nameless_frames_are
         assert not conversation.station.nodes[254, 190].identification.has_parameters
 
 
-@virtual
 async def test_our_heartbeat_is_sent_once_a_second_and_a_listener_sends_nothing() -> None:
     async with converse(PX4Vehicle()) as conversation:
         await anyio.sleep(9.5)
@@ -243,7 +236,6 @@ def test_the_heartbeat_timeout_follows_slow_heartbeats_and_satellites() -> None:
     assert presence.timeout == 12.0
 
 
-@virtual
 async def test_a_vehicle_on_a_satellite_link_is_lost_later() -> None:
     async with converse(Nothing()) as conversation:
         conversation.hear(PX4)
@@ -276,7 +268,6 @@ def test_a_clock_that_goes_back_shows_a_reboot(clock: list[tuple[float, int]], r
     assert [now for now, boot_ms in clock if presence.boot_clock(2, boot_ms, now)] == reboots
 
 
-@virtual
 async def test_clocks_of_different_messages_are_not_compared_and_two_signs_are_one_reboot() -> None:
     async with converse(Nothing()) as conversation:
         conversation.hear(PX4)
@@ -297,7 +288,6 @@ async def test_clocks_of_different_messages_are_not_compared_and_two_signs_are_o
 
 
 @pytest.mark.parametrize("vehicle", [ArduPilotVehicle(), PX4Vehicle(telemetry=10.0)], ids=["AP", "PX4"])
-@virtual
 async def test_a_reboot_by_others_is_seen_by_the_clock_in_telemetry_or_requested(vehicle: Vehicle) -> None:
     async with talking(vehicle) as (conversation, session):
         name = vehicle.listed[0].name
@@ -316,7 +306,6 @@ MAKES = pytest.mark.parametrize(
 )
 
 
-@virtual
 async def test_a_vehicle_with_a_new_system_id_is_another_component_with_the_same_identity() -> None:
     vehicle = PX4Vehicle(uid=7)
     async with converse(vehicle) as conversation:
@@ -352,7 +341,6 @@ async def test_a_reboot_on_command_happens_once_and_returns_when_the_vehicle_is_
         assert len(conversation.of("rebooted")) == 1
 
 
-@virtual
 async def test_a_reboot_is_refused_by_an_armed_vehicle_and_waits_for_px4_to_save() -> None:
     vehicle = PX4Vehicle()
     async with converse(vehicle) as conversation:
@@ -372,7 +360,6 @@ async def test_a_reboot_is_refused_by_an_armed_vehicle_and_waits_for_px4_to_save
             await send_command(conversation.station.nodes[9, 1].channel, CommandLong(9, 1, 246, 1.0))
 
 
-@virtual
 async def test_commands_end_with_their_result_and_wait_while_one_is_in_progress() -> None:
     results = [CommandResult.IN_PROGRESS, CommandResult.ACCEPTED]
 
@@ -396,7 +383,6 @@ async def test_commands_end_with_their_result_and_wait_while_one_is_in_progress(
 # peers
 
 
-@virtual
 async def test_a_second_vehicle_with_the_same_ids_is_ignored_until_the_first_is_silent() -> None:
     async with converse(Nothing()) as conversation:
         conversation.hear(PX4, peer="a")
@@ -412,7 +398,6 @@ async def test_a_second_vehicle_with_the_same_ids_is_ignored_until_the_first_is_
         assert (node.plain.table.params["A"].value, node.peer) == (2, "b")
 
 
-@virtual
 async def test_the_same_hardware_id_proves_that_a_vehicle_has_moved() -> None:
     async with converse(Nothing()) as conversation:
         conversation.hear(PX4, peer="a")
@@ -424,7 +409,6 @@ async def test_the_same_hardware_id_proves_that_a_vehicle_has_moved() -> None:
         assert (node.peer, node.has_rival(anyio.current_time())) == ("b", False)
 
 
-@virtual
 async def test_a_vehicle_at_another_peer_may_be_another_one_until_it_is_identified() -> None:
     async with converse(Nothing()) as conversation:
         conversation.hear(HighLatency2(2, 12), peer="a")  # it counts as lost only after a minute
@@ -441,7 +425,6 @@ async def test_a_vehicle_at_another_peer_may_be_another_one_until_it_is_identifi
         assert (node.peer, len(conversation.of("replaced"))) == ("b", 1)
 
 
-@virtual
 async def test_split_peers_are_components_of_their_own() -> None:
     async with converse(Nothing(), split_peers=True) as conversation:
         for peer in (("10.0.0.1", 1), ("10.0.0.2", 1)):
@@ -454,7 +437,6 @@ async def test_split_peers_are_components_of_their_own() -> None:
             only_vehicle(nodes, 1, 1, 5.0, listening_since=0.0)
 
 
-@virtual
 async def test_a_stream_may_cut_frames_anywhere_for_each_peer() -> None:
     async with converse(Nothing()) as conversation:
         station = conversation.station
@@ -491,7 +473,6 @@ async def test_a_whole_session_in_mavlink_1(make: type[Vehicle]) -> None:
         }
 
 
-@virtual
 async def test_components_have_a_bound() -> None:
     async with converse(Nothing()) as conversation:
         for system in range(1, 6):
@@ -527,7 +508,6 @@ async def test_a_signed_session_takes_no_forged_and_no_replayed_value(make: type
 # the only vehicle, and hints
 
 
-@virtual
 async def test_hints_say_what_was_received() -> None:
     async with converse(Nothing()) as conversation:
         station = conversation.station

@@ -34,7 +34,7 @@ from paramclient.wire.messages import (
     ParamValue,
 )
 from tests.conversations.partial import EVERYTHING, TABLE, Partial
-from tests.conversations.virtual import QUIET, Puppet, Tap, converse, talking, virtual, virtual_on_both
+from tests.conversations.virtual import QUIET, Puppet, Tap, converse, talking, virtual_on_both
 
 ARDUPILOT = Heartbeat(2, 3, system_status=4)
 PX4 = Heartbeat(2, 12, system_status=4)
@@ -57,7 +57,6 @@ PARTS = [
 
 @pytest.mark.parametrize("parts", PARTS, ids="+".join)
 @pytest.mark.parametrize(("delay", "loss"), [(0.0, 0.0), (0.05, 0.1), (0.3, 0.0)])
-@virtual
 async def test_what_a_vehicle_serves_is_enough_to_read_and_to_prove_a_set(
     parts: tuple[str, ...], delay: float, loss: float
 ) -> None:
@@ -82,7 +81,6 @@ async def test_what_a_vehicle_serves_is_enough_to_read_and_to_prove_a_set(
 @pytest.mark.parametrize(
     "parts", [("list",), ("list", "names"), ("list", "acks"), ("names",), ("names", "acks")], ids="+".join
 )
-@virtual
 async def test_a_set_that_changes_nothing_is_told_as_that_within_a_dozen(parts: tuple[str, ...]) -> None:
     vehicle = Partial(serves=parts)
     async with talking(vehicle) as (_, session):
@@ -94,7 +92,6 @@ async def test_a_set_that_changes_nothing_is_told_as_that_within_a_dozen(parts: 
         assert vehicle.number_of(ParamSet) <= 12
 
 
-@virtual
 async def test_an_acknowledgement_in_another_type_changes_neither_the_type_nor_the_history() -> None:
     for kind in (ParamType.REAL32, ParamType.UINT32, ParamType.INT8):
         vehicle = Partial(ack_type=kind)
@@ -126,7 +123,6 @@ COUNTS: dict[str, Callable[[int], int]] = {
     [(EVERYTHING, 0.0), (EVERYTHING, 0.1), (("list",), 0.0), (("indices",), 0.0)],
     ids=["all", "all, loss", "list only", "reads by index only"],
 )
-@virtual
 async def test_odd_indices_and_counts_make_a_complete_table(
     serves: tuple[str, ...], loss: float, count: str, first: int, heartbeat: Heartbeat
 ) -> None:
@@ -145,7 +141,6 @@ async def test_odd_indices_and_counts_make_a_complete_table(
 
 @pytest.mark.parametrize("serves", [EVERYTHING, ("list",)], ids=["reads", "list only"])
 @pytest.mark.parametrize("loss", [0.1, 0.2])
-@virtual
 async def test_a_list_whose_count_grows_is_never_complete_without_its_end(
     loss: float, serves: tuple[str, ...]
 ) -> None:
@@ -159,7 +154,6 @@ async def test_a_list_whose_count_grows_is_never_complete_without_its_end(
 
 @pytest.mark.parametrize("interval", [0.3, 0.7, 1.0])
 @pytest.mark.parametrize("heartbeat", [QUIET, PX4], ids=["generic", "PX4"])
-@virtual
 async def test_a_slow_list_whose_count_grows_is_received_to_its_end(
     interval: float, heartbeat: Heartbeat
 ) -> None:
@@ -197,7 +191,6 @@ async def test_a_vehicle_without_list_is_read_by_its_indices(
 
 @pytest.mark.parametrize("size", [1, 8])
 @pytest.mark.parametrize("delay", [0.5, 1.25])
-@virtual
 async def test_the_end_of_a_list_without_a_count_is_not_sought_for_long(delay: float, size: int) -> None:
     table = {f"P{number}": (number, ParamType.REAL32) for number in range(size)}
     vehicle = Partial(table, count=lambda index: index + 1)
@@ -209,7 +202,6 @@ async def test_the_end_of_a_list_without_a_count_is_not_sought_for_long(delay: f
 
 
 @pytest.mark.parametrize("count", [9, 3_008, 30_000, 65_535])
-@virtual
 async def test_a_count_that_is_too_large_costs_seconds_and_no_value(count: int) -> None:
     async with talking(Partial(count=lambda index: count)) as (conversation, session):
         result = await fetch_all(session)
@@ -220,7 +212,6 @@ async def test_a_count_that_is_too_large_costs_seconds_and_no_value(count: int) 
         assert len(conversation.sent) < 1_000
 
 
-@virtual
 async def test_names_in_lower_case_are_found_whatever_the_autopilot() -> None:
     vehicle = Partial({"gain": (0.5, ParamType.REAL32), "mode": (5, ParamType.REAL32)}, heartbeat=ARDUPILOT)
     async with talking(vehicle) as (_, session):
@@ -231,7 +222,6 @@ async def test_names_in_lower_case_are_found_whatever_the_autopilot() -> None:
 
 
 @pytest.mark.parametrize("name", ["RC MAP", "A,B", "42", "\xff\x01"])
-@virtual
 async def test_a_name_that_no_file_can_hold_is_noted_and_not_missed(name: str) -> None:
     vehicle = Partial({**TABLE, name: (1.0, ParamType.REAL32)})
     async with converse(vehicle) as conversation:
@@ -242,7 +232,6 @@ async def test_a_name_that_no_file_can_hold_is_noted_and_not_missed(name: str) -
 
 @pytest.mark.parametrize("first", [0, 1])
 @pytest.mark.parametrize("too_many", [0, 2])
-@virtual
 async def test_a_name_that_is_not_in_the_list_of_an_ardupilot_without_reads_is_unknown(
     first: int, too_many: int
 ) -> None:
@@ -258,7 +247,6 @@ async def test_a_name_that_is_not_in_the_list_of_an_ardupilot_without_reads_is_u
 
 
 @pytest.mark.parametrize("serves", [EVERYTHING, ("list", "indices")], ids=["all reads", "by index"])
-@virtual
 async def test_an_unknown_name_of_a_px4_without_hash_is_told_as_what_it_is(serves: tuple[str, ...]) -> None:
     vehicle = Partial(serves=serves, heartbeat=PX4, count=lambda index: len(TABLE) + 2)
     async with talking(vehicle) as (_, session):
@@ -300,7 +288,6 @@ async def test_a_value_of_a_list_is_taken_without_its_end(
     ids=["AP", "AP with version", "generic", "PX4 with version"],
 )
 @pytest.mark.parametrize("name", ["MODE", "OFFSET", "ZERO"])
-@virtual
 async def test_integers_in_another_encoding_are_told_and_not_written(
     heartbeat: Heartbeat, capabilities: int | None, encoding: Encoding, name: str
 ) -> None:
@@ -321,7 +308,6 @@ async def test_integers_in_another_encoding_are_told_and_not_written(
         assert not session.encoding_doubt
 
 
-@virtual
 async def test_right_encodings_are_not_doubted() -> None:
     for heartbeat, encoding in ((ARDUPILOT, Encoding.C_CAST), (QUIET, Encoding.BYTEWISE)):
         table = {**TABLE, "LARGE": (2**31 - 1, ParamType.INT32), "ID": (1_310_988, ParamType.INT32)}
@@ -336,7 +322,6 @@ async def test_right_encodings_are_not_doubted() -> None:
 
 
 @pytest.mark.parametrize("maker", [PX4Vehicle, ArduPilotVehicle])
-@virtual
 async def test_the_encoding_is_looked_for_once_and_within_a_round_trip(maker: type[PX4Vehicle]) -> None:
     vehicle = maker()
     zeros = [each.name for each in vehicle.listed if each.type is ParamType.INT32 and not each.value][:20]
@@ -355,7 +340,6 @@ async def test_the_encoding_is_looked_for_once_and_within_a_round_trip(maker: ty
 
 @pytest.mark.parametrize("first", [0, 1])
 @pytest.mark.parametrize("serves", [EVERYTHING, ("list",), ("names", "indices"), ("indices",)], ids="+".join)
-@virtual
 async def test_a_component_without_heartbeat_is_asked_where_it_is_named_in_full(
     serves: tuple[str, ...], first: int
 ) -> None:
@@ -372,7 +356,6 @@ async def test_a_component_without_heartbeat_is_asked_where_it_is_named_in_full(
         assert writable is component
 
 
-@virtual
 async def test_values_under_another_id_are_named_and_can_be_read() -> None:
     vehicle = Partial(component=50, asked_as=1, heartbeat=None)
     beacon = Puppet(lambda message: ())
@@ -384,7 +367,6 @@ async def test_values_under_another_id_are_named_and_can_be_read() -> None:
         assert (result.complete, set(result.params)) == (True, set(TABLE))
 
 
-@virtual
 async def test_a_component_1_that_claims_no_autopilot_is_the_vehicle_where_no_other_is() -> None:
     vehicle = Partial(heartbeat=NO_AUTOPILOT)
     async with ParamClient(vehicle, cache=False) as client:
@@ -396,7 +378,6 @@ async def test_a_component_1_that_claims_no_autopilot_is_the_vehicle_where_no_ot
         assert (await client.only_component()).address == (1, 2)
 
 
-@virtual
 async def test_a_vehicle_with_system_id_0_is_named_as_that() -> None:
     async with ParamClient(Partial(system=0), cache=False) as client:
         with pytest.raises(NoReply, match="vehicle with system id 0"):
@@ -414,7 +395,6 @@ async def test_a_vehicle_with_system_id_0_is_named_as_that() -> None:
     ],
     ids=["companion", "camera", "gimbal", "gimbal by its id", "radio"],
 )
-@virtual
 async def test_a_part_of_a_vehicle_is_never_the_vehicle(heartbeat: Heartbeat, component: int) -> None:
     part = Partial(heartbeat=heartbeat, system=2, component=component)
     async with ParamClient(part, cache=False) as client:
@@ -428,7 +408,6 @@ async def test_a_part_of_a_vehicle_is_never_the_vehicle(heartbeat: Heartbeat, co
         assert (await client.only_component()).address == (1, 1)
 
 
-@virtual
 async def test_a_component_with_the_id_0_is_a_component() -> None:
     async with ParamClient(Partial(component=0, asked_as=0), cache=False) as client:
         component = await client.component(1, 0)

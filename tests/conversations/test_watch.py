@@ -14,7 +14,7 @@ from paramclient.protocol.session import Session
 from paramclient.protocol.watch import SyncState, Watch
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from paramclient.wire.messages import ParamRequestList, ParamRequestRead, ParamSet, encode
-from tests.conversations.virtual import Conversation, Tap, converse, virtual, virtual_on_both
+from tests.conversations.virtual import Conversation, Tap, converse, virtual_on_both
 
 REQUESTS = (ParamRequestList, ParamRequestRead, ParamSet)
 
@@ -64,7 +64,6 @@ async def watched(
             tasks.cancel_scope.cancel()
 
 
-@virtual
 async def test_an_armed_vehicle_is_asked_only_after_a_sign_of_change() -> None:
     vehicle = PX4Vehicle()
     async with watched(vehicle, interval=5.0) as found:
@@ -98,7 +97,6 @@ async def test_a_group_that_is_shown_or_hidden_is_found_by_the_count(ftp: bool) 
         assert len(found.resynced) == 2
 
 
-@virtual
 async def test_a_vehicle_that_confirms_no_table_is_watched_by_downloads_if_the_user_wants_it() -> None:
     vehicle = GenericVehicle({f"P{number}": float(number) for number in range(30)})
     async with watched(vehicle, interval=30.0) as found:
@@ -108,7 +106,6 @@ async def test_a_vehicle_that_confirms_no_table_is_watched_by_downloads_if_the_u
         assert found.resynced == [("P7",)]
 
 
-@virtual
 async def test_a_check_that_fails_is_repeated_and_none_runs_beside_a_hold() -> None:
     vehicle = PX4Vehicle()
     deaf = [False]
@@ -127,7 +124,6 @@ async def test_a_check_that_fails_is_repeated_and_none_runs_beside_a_hold() -> N
         assert found.session.table.params["MC_ROLL_P"].value == 3.25
 
 
-@virtual
 async def test_a_list_for_another_station_is_taken_and_restarts_nothing() -> None:
     vehicle = PX4Vehicle()
     async with watched(vehicle, interval=0.0) as found:

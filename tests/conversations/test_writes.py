@@ -39,7 +39,7 @@ from paramclient.wire.messages import (
     encode,
 )
 from tests.conversations.partial import Partial
-from tests.conversations.virtual import Silence, Tap, converse, talking, virtual, virtual_on_both
+from tests.conversations.virtual import Silence, Tap, converse, talking, virtual_on_both
 
 EVERY_TYPE = {
     ParamType.UINT8: 255,
@@ -79,7 +79,6 @@ async def test_values_of_every_type_are_set(loss: float) -> None:
         assert loss or vehicle.requests["PARAM_REQUEST_READ"] == reads  # and is known from then on
 
 
-@virtual
 @pytest.mark.parametrize(("make", "name"), [(PX4Vehicle, "MC_ROLL_P"), (ArduPilotVehicle, "ATC_ANG_RLL_P")])
 async def test_a_value_is_the_shortest_decimal_of_its_float(
     make: type[PX4Vehicle] | type[ArduPilotVehicle], name: str
@@ -91,7 +90,6 @@ async def test_a_value_is_the_shortest_decimal_of_its_float(
         assert str(result) == f"{name} = 6.1"
 
 
-@virtual
 async def test_ardupilot_truncates_a_fraction_which_is_an_adjustment() -> None:
     async with talking(ArduPilotVehicle()) as (_, session):
         await fetch_all(session)
@@ -103,7 +101,6 @@ async def test_ardupilot_truncates_a_fraction_which_is_an_adjustment() -> None:
         assert session.table.params["RTL_ALT"].index == index  # its acknowledgement has 65535
 
 
-@virtual
 async def test_ardupilots_acknowledgement_of_a_default_in_another_type_keeps_the_type() -> None:
     vehicle = ArduPilotVehicle()
     async with talking(vehicle) as (_, session):
@@ -120,7 +117,6 @@ async def test_ardupilots_acknowledgement_of_a_default_in_another_type_keeps_the
             assert result.attempts == 1
 
 
-@virtual
 async def test_an_integer_that_float32_cannot_hold_is_not_sent_to_ardupilot() -> None:
     vehicle = ArduPilotVehicle()
     name = next(param.name for param in vehicle.listed if param.type is ParamType.INT32)
@@ -131,7 +127,6 @@ async def test_an_integer_that_float32_cannot_hold_is_not_sent_to_ardupilot() ->
 
 
 @pytest.mark.parametrize(("name", "value"), [("MC_ROLL_P", math.nan), ("COM_RC_LOSS_T", math.inf)])
-@virtual
 async def test_nan_and_infinity_are_sent_to_px4_only_if_forced(name: str, value: float) -> None:
     vehicle = PX4Vehicle()
     async with talking(vehicle) as (conversation, session):
@@ -143,7 +138,6 @@ async def test_nan_and_infinity_are_sent_to_px4_only_if_forced(name: str, value:
         assert not math.isfinite(result.actual)
 
 
-@virtual
 async def test_px4_clamps_a_value_later_which_a_watched_write_reports() -> None:
     vehicle = PX4Vehicle()
     async with talking(vehicle) as (_, session):
@@ -159,7 +153,6 @@ async def test_px4_clamps_a_value_later_which_a_watched_write_reports() -> None:
 
 
 @pytest.mark.parametrize("param_error", [False, True])
-@virtual
 async def test_a_read_only_parameter_is_refused_with_its_reason(param_error: bool) -> None:
     vehicle = ArduPilotVehicle(param_error=param_error)
     async with talking(Air.symmetric([vehicle], delay=0.02)) as (conversation, session):
@@ -171,7 +164,6 @@ async def test_a_read_only_parameter_is_refused_with_its_reason(param_error: boo
         assert len(conversation.sent_of(ParamSet)) == 1
 
 
-@virtual
 async def test_an_unknown_name_and_values_that_do_not_fit_are_not_set() -> None:
     for vehicle in (PX4Vehicle(), ArduPilotVehicle(param_error=True)):
         async with talking(vehicle) as (conversation, session):
@@ -189,7 +181,6 @@ NUMBER = {"A": (5, ParamType.INT32)}
 
 
 @pytest.mark.parametrize(("value", "fits"), [(7, True), (300, False)])
-@virtual
 async def test_a_type_that_has_changed_is_taken_or_is_a_mismatch(value: int, fits: bool) -> None:
     def retyped(message: ParamSet) -> Iterable[Message]:
         if message.param_type == ParamType.UINT8:
@@ -216,7 +207,6 @@ async def test_a_type_that_has_changed_is_taken_or_is_a_mismatch(value: int, fit
     ],
 )
 @pytest.mark.parametrize("order", ["E", "VE", "EV"])
-@virtual
 async def test_a_refusal_counts_whether_the_old_value_comes_with_it(
     code: int, kind: type[ParamClientError], order: str
 ) -> None:
@@ -254,7 +244,6 @@ async def test_a_lost_acknowledgement_is_requested_again_and_a_lost_set_too() ->
             assert result.attempts >= (3 if what is ParamSet else 2)
 
 
-@virtual
 async def test_an_old_value_in_passing_proves_nothing_and_another_ones_is_no_adjustment() -> None:
     for passing, status in ((4.0, "accepted"), (9.0, "accepted")):
         vehicle = PX4Vehicle()
@@ -281,7 +270,6 @@ async def test_an_old_value_in_passing_proves_nothing_and_another_ones_is_no_adj
             assert vehicle.param("MC_ROLL_P").value == 3.5
 
 
-@virtual
 async def test_a_late_answer_with_an_old_value_undoes_no_acknowledged_write() -> None:
     """ArduPilot takes the value of a read when it queues it, and answers up to 100 ms later."""
     vehicle = ArduPilotVehicle(live_period=0.0)
@@ -305,7 +293,6 @@ async def test_a_late_answer_with_an_old_value_undoes_no_acknowledged_write() ->
         assert session.table.params["ATC_ANG_RLL_P"].value == 10.0
 
 
-@virtual
 async def test_no_set_is_sent_before_the_encoding_is_certain() -> None:
     vehicle = Partial(NUMBER, encoding=Encoding.C_CAST)
     endpoint = Tap(vehicle, up=lambda message: not isinstance(message, CommandLong))
@@ -315,7 +302,6 @@ async def test_no_set_is_sent_before_the_encoding_is_certain() -> None:
         assert not vehicle.number_of(ParamSet)
 
 
-@virtual
 async def test_silence_is_no_reply_within_7_s_and_a_cancelled_write_sends_no_more() -> None:
     for maker in (PX4Vehicle, ArduPilotVehicle):
         endpoint = Silence(maker(), at=1e9)
@@ -335,7 +321,6 @@ async def test_silence_is_no_reply_within_7_s_and_a_cancelled_write_sends_no_mor
             assert not session.writing
 
 
-@virtual
 async def test_writes_to_one_name_follow_each_other() -> None:
     vehicle = PX4Vehicle()
     async with talking(Air.symmetric([vehicle], delay=0.05)) as (conversation, session):
@@ -347,7 +332,6 @@ async def test_writes_to_one_name_follow_each_other() -> None:
         assert [each.new.value for each in conversation.changes if each.new][-3:] == [1.0, 2.0, 3.0]
 
 
-@virtual
 async def test_values_of_one_parameter_are_set_in_the_order_of_the_call() -> None:
     vehicle = ArduPilotVehicle()
     names = ["RTL_ALT", "rtl_alt"]
@@ -359,7 +343,6 @@ async def test_values_of_one_parameter_are_set_in_the_order_of_the_call() -> Non
         assert vehicle.param("RTL_ALT").value == values[-1]
 
 
-@virtual
 async def test_an_acknowledgement_to_another_station_changes_no_type() -> None:
     """ArduPilot acknowledges the set of a default as REAL32, whatever the type is."""
     vehicle = ArduPilotVehicle(live_period=0.0)
@@ -449,7 +432,6 @@ async def test_no_set_is_sent_to_another_vehicle_and_a_rebooted_one_gets_the_oth
         assert (first if is_same else other).param(names[-1]).value == 0.5
 
 
-@virtual
 async def test_no_set_is_sent_to_a_vehicle_that_does_not_say_again_which_one_it_is() -> None:
     async with talking(endpoint := Tap(PX4Vehicle())) as (conversation, session):
         await read(session, "MC_ROLL_P")
@@ -499,7 +481,6 @@ async def test_another_vehicle_behind_a_value_ends_a_write_and_no_read() -> None
 # authors
 
 
-@virtual
 async def test_a_change_has_the_author_whose_set_was_seen() -> None:
     vehicle = PX4Vehicle()
     async with talking(vehicle) as (conversation, session):
@@ -551,7 +532,6 @@ async def test_many_values_are_set_each_with_its_outcome(maker: type[PX4Vehicle]
             assert session.table.params[outcome.name].value == outcome.requested
 
 
-@virtual
 async def test_a_switch_and_the_parameters_behind_it_are_set_in_one_call() -> None:
     vehicle = ArduPilotVehicle()
     async with talking(vehicle) as (conversation, session):
@@ -571,7 +551,6 @@ async def test_a_switch_and_the_parameters_behind_it_are_set_in_one_call() -> No
         assert kinds[-1] == "removed"
 
 
-@virtual
 async def test_a_link_that_fails_ends_a_batch_and_the_others_are_not_tried() -> None:
     vehicle = PX4Vehicle()
     async with talking(Air.symmetric([vehicle], delay=0.3)) as (conversation, session):
@@ -591,7 +570,6 @@ async def test_a_link_that_fails_ends_a_batch_and_the_others_are_not_tried() -> 
 
 
 @pytest.mark.parametrize(("rate", "after"), [(2_000, 1.0), (4_000, 0.3), (8_000, 0.3)])
-@virtual
 async def test_sets_behind_a_list_that_fills_a_slow_link(rate: int, after: float) -> None:
     """Answers to reads from before the set arrive for seconds after it, and are no proof against it."""
     vehicle = PX4Vehicle()
