@@ -18,7 +18,7 @@ from paramclient.cli.metadata import (
     say_sources,
 )
 from paramclient.cli.options import ApplyFlags
-from paramclient.cli.output import LINE_NAMES_MAX, ExitCode, report, say
+from paramclient.cli.output import LINE_NAMES_MAX, report, say
 from paramclient.cli.param_names import check_given
 from paramclient.cli.read_commands import get_chosen
 from paramclient.cli.session import CommandSession
@@ -58,11 +58,9 @@ async def reset(
     if bool(names) + all_ + changed != 1:
         raise UsageError("reset takes names, or --all, or --changed")
     chosen = check_given(names)
-    is_part = False
 
     async def load(session: CommandSession) -> State:
-        nonlocal is_part
-        fetched = await session.fetch()
+        fetched, is_part = await session.fetch(), False
         params, errors = await get_chosen(session, chosen or ["*"], is_fetched=True)
         for error in errors.values():
             raise error
@@ -85,11 +83,10 @@ async def reset(
             for param, default in found.items()
             if default is not None
         }
-        return State(ParamSet(wanted, source="the firmware's defaults"))
+        return State(ParamSet(wanted, source="the firmware's defaults"), is_part=is_part)
 
     flags = replace(options, include=(*options.include, *(name.upper() for name in chosen)))
-    code = await run(url, flags, load, None, metadata, {"partial": True})
-    return max(code, ExitCode.INCOMPLETE if is_part else ExitCode.DONE)
+    return await run(url, flags, load, metadata=metadata)
 
 
 async def _known(session: CommandSession, choice: MetadataChoice, params: Sequence[Param]) -> Metadata | None:

@@ -227,7 +227,15 @@ class Shown(Protocol):
 
 
 class Sessions(list[CommandSession]):
-    """The vehicles that a subcommand works on: the one of --vehicle, or all of them."""
+    """The vehicles that a subcommand works on: the one of --vehicle, or all of them.
+
+    Attributes:
+        errors: the errors of vehicles whose work has failed; there is no further work on them.
+    """
+
+    def __init__(self, sessions: Iterable[CommandSession]) -> None:
+        super().__init__(sessions)
+        self.errors: dict[CommandSession, ParamClientError] = {}
 
     @property
     def is_all(self) -> bool:
@@ -246,8 +254,11 @@ class Sessions(list[CommandSession]):
 
         async def run(place: int, session: CommandSession) -> None:
             try:
+                if session in self.errors:
+                    raise self.errors[session]
                 done[place] = Done(session, result=await work(session))
             except ParamClientError as error:
+                self.errors[session] = error
                 done[place] = Done(session, error=error)
 
         async with anyio.create_task_group() as tasks:
@@ -255,14 +266,10 @@ class Sessions(list[CommandSession]):
                 tasks.start_soon(run, place, session)
         return [done[place] for place in sorted(done)]
 
-    def show(self, done: Sequence[Done[Shown]], *, errors: bool = True) -> int:
+    def show(self, done: Sequence[Done[Shown]]) -> int:
         """Print the results as one table or as JSON, then remarks and failures; return the exit code.
 
         If several vehicles are heard, and none was named, the table says which one it shows.
-
-        Args:
-            done: the outcomes.
-            errors: whether JSON of all vehicles has the failures; else each outcome has its own error.
         """
         self.report_others()
         found = [(each.session, each.result) for each in done if each.result is not None]
@@ -279,7 +286,7 @@ class Sessions(list[CommandSession]):
         elif self.is_all:
             vehicles = [session.ids | result.as_json() for session, result in found]
             failures = [session.ids | {"error": str(error)} for session, error in failed]
-            print_json({"vehicles": vehicles} | ({"errors": failures} if errors else {}))
+            print_json({"vehicles": vehicles, "errors": failures})
         else:
             print_json(found[0][1].as_json())
         codes = [result.report() for _, result in found]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Annotated, Final
 
 from cyclopts import Parameter
@@ -16,7 +17,7 @@ from paramclient.cli.output import can_ask, confirm, report
 from paramclient.cli.param_names import spelling
 from paramclient.cli.read_commands import get_chosen
 from paramclient.cli.session import CommandSession, sessions
-from paramclient.cli.writes import WriteJob, write_all
+from paramclient.cli.writes import SetJob, write_all
 from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
@@ -68,7 +69,8 @@ async def set_(
             receivers = ", ".join(job.session.receiver for job in jobs)
             if not await confirm(f"Write these values to {receivers} all the same?"):
                 raise UsageError("nothing was written")
-        return await write_all(found, jobs, settle=settle, force=force)
+        ready = {job.session: replace(job, settle=settle, force=force) for job in jobs}
+        return await write_all(found, ready)
 
 
 def _parse_pairs(words: Sequence[str]) -> dict[str, str]:
@@ -94,7 +96,7 @@ def _parse_pairs(words: Sequence[str]) -> dict[str, str]:
     return pairs
 
 
-async def _prepare(session: CommandSession, wanted: dict[str, str], choice: MetadataChoice) -> WriteJob:
+async def _prepare(session: CommandSession, wanted: dict[str, str], choice: MetadataChoice) -> SetJob:
     """Return names and values as the vehicle and its metadata have them.
 
     The types of extended parameters are read, as their texts have values only with them.
@@ -116,10 +118,10 @@ async def _prepare(session: CommandSession, wanted: dict[str, str], choice: Meta
             name: parse_ext_value(name, text, types[name]) if name in types else text
             for name, text in texts.items()
         }
-        return WriteJob(session, values, None)
+        return SetJob(session, values, None)
     named = [f"{name}: {text!r} is not a number" for name, text in texts.items() if not _is_number(text)]
     described = await known_of_session(session, choice, needed_for=named[0] if named else "")
-    return WriteJob(session, _values(texts, described), described)
+    return SetJob(session, _values(texts, described), described)
 
 
 def _values(texts: Mapping[str, str], described: Metadata | None) -> dict[str, Value]:
@@ -143,7 +145,7 @@ def _is_number(text: str) -> bool:
     return True  # beyond the range of a float
 
 
-async def _doubts(job: WriteJob) -> list[str]:
+async def _doubts(job: SetJob) -> list[str]:
     """Return sentences on values outside the range, and on fractions for integers."""
     doubts: list[str] = []
     component = job.session.component

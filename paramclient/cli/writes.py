@@ -1,4 +1,4 @@
-"""Writes of set: the values for each vehicle, one outcome for each, and what is printed of them."""
+"""Writes to vehicles, as of set and apply: one job for each, its outcomes, and those of set."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Protocol, Self
 
 import anyio
 
@@ -14,7 +14,7 @@ from paramclient.cli.json_output import JsonObject, outcome_json, vehicle_json
 from paramclient.cli.metadata import info_of, meaning_of
 from paramclient.cli.output import LINE_NAMES_MAX, Coloured, ExitCode, Status, code_of, report, say
 from paramclient.cli.param_names import suggest
-from paramclient.cli.session import CommandSession, Done, Sessions
+from paramclient.cli.session import CommandSession, Done, Sessions, Shown
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.names import counted, first_of
@@ -22,40 +22,84 @@ from paramclient.model.values import ParamType, Value, format_value
 from paramclient.protocol.fetch import Progress
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 
-_STYLES: Final = {
-    SetStatus.ACCEPTED: "green",
-    SetStatus.ADJUSTED: "yellow",
-    SetStatus.REFUSED: "red",
-    SetStatus.UNKNOWN: "bold red",
-    SetStatus.NOT_TRIED: "dim",
+STYLES: Final = {
+    **dict.fromkeys(("set", "accepted"), "green"),
+    **dict.fromkeys(("later", "adjusted", "unproven"), "yellow"),
+    **dict.fromkeys(("invalid", "unknown"), "bold red"),
+    **dict.fromkeys(("skipped", "not tried"), "dim"),
+    "refused": "red",
 }
-"""Styles of the outcomes."""
+"""Styles of the outcomes of a value, and of the planned actions."""
 
 
-@dataclass
-class WriteJob:
-    """The values for one vehicle in the order of the writes, and the outcomes so far.
+class WriteJob(Shown, Protocol):
+    """What is written to one vehicle."""
+
+    async def write(self) -> Self:
+        """Write the values, and return the job."""
+
+    @property
+    def open_count(self) -> int:
+        """The number of values whose outcome is not proven, after an interruption."""
+
+    @property
+    def to_continue(self) -> str:
+        """How to continue after an error, in words."""
+
+
+async def write_all(found: Sessions, jobs: Mapping[CommandSession, WriteJob]) -> int:
+    """Write to all vehicles; print the outcomes, also those so far after an interruption.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        ParamClientError: nothing was written to the only vehicle.
+    """
+    try:
+        return found.show(await found.work(lambda session: jobs[session].write()))
+    except anyio.get_cancelled_exc_class():
+        found.show([Done(*job) for job in jobs.items()])
+        not_proven = counted(sum(job.open_count for job in jobs.values()), "value")
+        to_continue = "; ".join(dict.fromkeys(job.to_continue for job in jobs.values()))
+        say(f"interrupted: {not_proven} not proven, and others may be in flight; {to_continue}")
+        raise
+
+
+@dataclass(eq=False)
+class SetJob:
+    """The values of set for one vehicle in the order of the writes, and the outcomes so far.
 
     Attributes:
         session: the vehicle.
         writes: the values by name.
         described: the metadata of the vehicle, or None.
+        settle, force: as in `Component.set_many`.
         arrived: the outcomes so far, by name.
-        began: the time of the event loop at which it was made.
+        began: when the writes began, as a time of the event loop.
     """
 
     columns: ClassVar[Sequence[str]] = ("name", "requested", "actual", "status")
+    to_continue: ClassVar[str] = "run it again to continue"
 
     session: CommandSession
     writes: Mapping[str, Value]
     described: Metadata | None
+    settle: float = 0.0
+    force: bool = False
     arrived: dict[str, SetOutcome] = field(default_factory=dict)
-    began: float = field(default_factory=anyio.current_time)
+    began: float = 0.0
 
-    async def write(self, *, settle: float, force: bool) -> None:
-        """Write the values as `Component.set_many` does; afterwards each has an outcome in any case."""
-        session = self.session
-        is_announced = False
+    async def write(self) -> Self:
+        """Write the values; afterwards each has an outcome in any case.
+
+        Raises:
+            AmbiguousVehicle, NoReply, LinkError: as from `CommandSession.check_only`; nothing was written.
+        """
+        session, label = self.session, self.session.label
+        if self.writes:
+            await session.check_only()
+        self.began, is_announced = anyio.current_time(), False
 
         def update(outcome: SetOutcome) -> None:
             nonlocal is_announced
@@ -67,11 +111,14 @@ class WriteJob:
             elapsed = anyio.current_time() - self.began
             status.update(Progress.after(len(self.arrived), len(self.writes), elapsed))
 
-        label = session.label
         with Status(f"waiting for {label} to acknowledge PARAM_SET", f"setting {label}") as status:
             try:
                 done = await session.component.set_many(
-                    self.writes, progress=update, timeout=session.deadline.left(), settle=settle, force=force
+                    self.writes,
+                    progress=update,
+                    timeout=session.deadline.left(),
+                    settle=self.settle,
+                    force=self.force,
                 )
                 outcomes = done.outcomes
             except ParamClientError as error:  # raised only if nothing was written
@@ -82,6 +129,7 @@ class WriteJob:
         self.arrived = {
             each.name: replace(each, error=better.get(each.name, each.error)) for each in outcomes
         }
+        return self
 
     @property
     def outcomes(self) -> list[SetOutcome]:
@@ -92,17 +140,9 @@ class WriteJob:
         ]
 
     @property
-    def summary(self) -> str:
-        """The numbers of outcomes in words: `2 of 4 set, 1 refused, 1 not tried on 1/1 PX4 … in 0.2 s, …`."""
-        counts = Counter(each.status for each in self.outcomes)
-        done = counts.pop(SetStatus.ACCEPTED, 0) + counts.pop(SetStatus.ADJUSTED, 0)
-        others = [f"{counts[status]} {status}" for status in SetStatus if status in counts]
-        session, client = self.session, self.session.client
-        what = f"{', '.join([f'{done} of {len(self.writes)} set', *others])} on {session.receiver}"
-        if session.choice.is_all:
-            return what
-        traffic = f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent"
-        return f"{what} in {anyio.current_time() - self.began:.2f} s, {traffic}"
+    def open_count(self) -> int:
+        """The number of values that the vehicle may have."""
+        return sum(each.status is SetStatus.UNKNOWN for each in self.outcomes)
 
     def as_json(self) -> JsonObject:
         """Return the JSON of the vehicle and the outcomes."""
@@ -123,15 +163,21 @@ class WriteJob:
                 name,
                 format_value(each.requested, requested),
                 f"{actual} ({meaning})" if meaning else actual,
-                Coloured(each.status, _STYLES[each.status]),
+                Coloured(each.status, STYLES[each.status]),
             )
 
     def report(self) -> int:
-        """Print a summary, remarks, and a line for the errors of each cause; return the exit code."""
-        prefix, errors = self.session.prefix, dict[object, list[SetOutcome]]()
-        code = ExitCode.DONE
-        if not self.session.options.json:
-            say(self.summary)
+        """Print counts, remarks and errors: one line for all values without a response, and for one cause."""
+        session, prefix = self.session, self.session.prefix
+        if not session.options.json:
+            counts = Counter(each.status for each in self.outcomes)
+            done = counts.pop(SetStatus.ACCEPTED, 0) + counts.pop(SetStatus.ADJUSTED, 0)
+            others = [f"{counts[status]} {status}" for status in SetStatus if status in counts]
+            words = ", ".join([f"{done} of {len(self.writes)} set", *others])
+            traffic = f"{session.client.bytes_received:,} bytes received, {session.client.bytes_sent:,} sent"
+            end = "" if session.choice.is_all else f" in {anyio.current_time() - self.began:.2f} s, {traffic}"
+            say(f"{words} on {session.receiver}{end}")
+        errors = dict[object, list[SetOutcome]]()
         for each in self.arrived.values():
             info = info_of(self.described, each.name)
             if each.is_set and info is not None and info.reboot_required:
@@ -139,7 +185,6 @@ class WriteJob:
             if each.result is not None and each.result.note:
                 say(f"{prefix}{each.name}: {each.result.note}")
             if each.error is not None:
-                code = max(code, code_of(each.error))
                 is_open = each.status in (SetStatus.UNKNOWN, SetStatus.NOT_TRIED)
                 cause = (each.status, type(each.error)) if is_open else str(each.error)
                 errors.setdefault(cause, []).append(each)
@@ -147,7 +192,8 @@ class WriteJob:
             names, text = [each.name for each in group], str(group[0].error)
             is_named = len(names) == 1 and names[0] in re.split(r"[ ,:;]", text)
             report(f"{prefix}{'' if is_named else first_of(names, LINE_NAMES_MAX) + ': '}{text}")
-        return code
+        codes = [code_of(each.error) for each in self.arrived.values() if each.error is not None]
+        return max(codes, default=ExitCode.DONE)
 
     def _type_of(self, outcome: SetOutcome) -> ParamType | int:
         """Return the vehicle's type of a parameter; REAL32 if it is not known."""
@@ -155,29 +201,3 @@ class WriteJob:
             return outcome.result.param.type
         known = self.session.component.params.get(outcome.name)
         return ParamType.REAL32 if known is None else known.type
-
-
-async def write_all(found: Sessions, jobs: Sequence[WriteJob], *, settle: float, force: bool) -> int:
-    """Write the values of all vehicles, and print the outcomes, also those so far after an interruption.
-
-    Returns:
-        The exit code.
-
-    Raises:
-        AmbiguousVehicle, NoReply, LinkError: as from `CommandSession.check_only`; nothing was written.
-    """
-    by_session, done = {job.session: job for job in jobs}, [Done(job.session, job) for job in jobs]
-    if any(job.writes for job in jobs):
-        for each in found:
-            await each.check_only()
-        try:
-            await found.work(lambda each: by_session[each].write(settle=settle, force=force))
-        except anyio.get_cancelled_exc_class():
-            found.show(done, errors=False)
-            unknown = sum(each.status is SetStatus.UNKNOWN for job in jobs for each in job.outcomes)
-            say(
-                f"interrupted: the outcome of {counted(unknown, 'value')} is not known, and the vehicle may "
-                "have them; run it again to continue"
-            )
-            raise
-    return found.show(done, errors=False)
