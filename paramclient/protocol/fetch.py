@@ -196,6 +196,8 @@ class _Fetch:
             return self._unconfirmed()
         answer = Answer()
         if self.table.is_complete or self.policy is Policy.HASH_ONLY:
+            with self.session.channel.gate.until_closed(or_failed=True), anyio.move_on_after(IDENTITY_TIME):
+                await self.session.identification.heard()
             answer = await ask(self.session, refresh=refresh)
         if answer.is_current:
             self._name_changes()

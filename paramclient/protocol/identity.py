@@ -156,6 +156,11 @@ class Identification:
         while not self.is_settled:
             await self._changed.wait()
 
+    async def heard(self) -> None:
+        """Wait for the first heartbeat."""
+        while self.autopilot is None:
+            await self._changed.wait()
+
     async def encoding_certain(self) -> None:
         """Wait until no further message can change the encoding."""
         while not self.is_encoding_certain:

@@ -25,6 +25,7 @@ from paramclient.sim import Air, ArduPilotVehicle
 from paramclient.wire.messages import (
     NO_INDEX,
     FileTransfer,
+    Heartbeat,
     Message,
     ParamRequestList,
     ParamRequestRead,
@@ -338,6 +339,23 @@ async def test_where_it_does_not_work_the_table_is_downloaded(kind: str) -> None
         assert reason in " ".join(result.notes)
         assert anyio.current_time() - began < 3.0
         check(vehicle, node, result)
+
+
+@virtual
+async def test_a_cached_table_is_proven_where_the_first_heartbeat_comes_behind_the_version() -> None:
+    vehicle = ArduPilotVehicle(live_period=0.0)
+    cached = vehicle.params
+
+    def passes(message: Message) -> bool:
+        return not isinstance(message, Heartbeat) or anyio.current_time() > 0.9
+
+    async with converse(Tap(vehicle, down=passes)) as conversation:
+        value = cached["ATC_RAT_RLL_P"].bits.to_bytes(4, "little")
+        conversation.hear(ParamValue("ATC_RAT_RLL_P", value, ParamType.REAL32, len(vehicle.listed), NO_INDEX))
+        node = await with_cached_table(conversation, cached)
+        assert node.identification.autopilot is None
+        result = await fetch_all(node.plain)
+        assert (result.source, result.notes) == ("cache", ())
 
 
 @virtual
