@@ -14,7 +14,7 @@ from paramclient import metadata, provision
 from paramclient.client import client, component, streams
 from paramclient.provision import inspection
 
-STUB = Path(__file__).parent.parent / "paramclient" / "sync" / "__init__.pyi"
+STUB = Path(__file__).parent.parent / "paramclient" / "sync.pyi"
 
 CLASSES: dict[ModuleType, list[str]] = {
     component: ["Component"],

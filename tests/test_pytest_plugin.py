@@ -13,7 +13,6 @@ import pytest
 from paramclient import ParamClient
 from paramclient.sim import Vehicle
 from paramclient.testing import SimVehicle, sim_ardupilot, sim_px4
-from tests.shell import in_simulated_time
 
 pytest_plugins = ("pytester",)
 

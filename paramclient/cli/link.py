@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict
 from typing import Final
 
 import anyio
@@ -16,7 +15,7 @@ from paramclient.cli.output import ExitCode, clear_screen, milliseconds, print_j
 from paramclient.cli.session import Deadline, listen, received_in_words
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
-from paramclient.client.traffic import ComponentTraffic, TrafficReport
+from paramclient.client.taps import ComponentTraffic, TrafficReport
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import rounded
@@ -139,7 +138,7 @@ def _component_json(client: ParamClient, now: float, each: ComponentTraffic) -> 
             }
             for message in each.messages
         },
-        "radio": None if each.radio is None else asdict(each.radio),
+        "radio": each.radio,
     }
 
 

@@ -17,10 +17,9 @@ from paramclient.client.cache_writer import CacheWriter, choose_cache
 from paramclient.client.component import Component
 from paramclient.client.core import ClientCore
 from paramclient.client.fleet_fetch import FetchedAll, fetch_components
-from paramclient.client.recording import Capture
 from paramclient.client.signing import Signing, refused_in_words
 from paramclient.client.streams import Stream, Subscribers
-from paramclient.client.traffic import Traffic, TrafficReport
+from paramclient.client.taps import Capture, Traffic, TrafficReport
 from paramclient.errors import AnotherVehicle, ClientClosed, NoReply, ParamClientError, UsageError
 from paramclient.links import Link, ReplayLink, SimLink, create_link
 from paramclient.model.names import counted

@@ -1,4 +1,4 @@
-"""Taps: receivers of all frames of a link, which one cutter finds in its bytes.
+"""Taps: receivers of all frames of a link, which one cutter finds in its bytes; the telemetry log, traffic.
 
 `Framer` returns proven frames of known messages and skips everything else as fast as it can. Here everything
 counts, and speed does not matter: this runs only for the receivers of all frames of a link.
@@ -6,11 +6,28 @@ counts, and speed does not matter: this runs only for the receivers of all frame
 
 from __future__ import annotations
 
+import logging
+import os
 import re
-from collections.abc import Hashable, Iterator, Sequence
-from typing import Final, NamedTuple
+import struct
+import time
+from collections import Counter, defaultdict, deque
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from io import FileIO
+from pathlib import Path
+from typing import Final, NamedTuple, TypeAlias
 
-from paramclient.wire.frames import Frame, checksum
+import anyio
+import anyio.to_thread
+
+from paramclient.errors import UsageError
+from paramclient.links.tlog import packed_time
+from paramclient.protocol.addresses import Address
+from paramclient.wire.frames import Frame, bears_key, checksum, unsign_frame
+from paramclient.wire.loss import SequenceCheck
+from paramclient.wire.messages import Heartbeat, decode
 from paramclient.wire.signing import SIGNATURE_LENGTH
 
 UNPROVEN_BYTES_MAX: Final = 4096
@@ -158,3 +175,272 @@ def _frame_at(data: bytes, at: int) -> SeenFrame:
     is_proven = is_known and end <= len(data) and crc == int.from_bytes(data[crc_at : crc_at + 2], "little")
     frame = Frame(number, system, component, sequence, data[payload_at:crc_at], version)
     return SeenFrame(frame, data[at:end], flags == _SIGNED, is_known, is_proven, end - at)
+
+
+# The telemetry log
+
+RECORDING_FLUSH_INTERVAL: Final = 0.25
+"""Seconds between two writes to the file: a killed process loses the frames of at most this time."""
+UNWRITTEN_BYTES_MAX: Final = 16 * 1024 * 1024
+"""Maximum number of bytes queued for the disk: 10 seconds of a link with 100 Mbit/s, an hour of a radio. A
+disk that falls further behind does not catch up, and the limit bounds memory."""
+
+logger = logging.getLogger(__name__)
+
+
+class Capture(Tap):
+    """Writes a `.tlog`: each frame follows its time, eight bytes, big-endian, in unix microseconds.
+
+    The file has complete frames of both directions, without signatures, in the order in which the client read
+    and sent them. The time is that of the read, up to 20 ms after the arrival. Damaged frames, other bytes,
+    and messages with a signing key are omitted.
+
+    A write error ends the capture with a warning in the log and has no other effect. The file then ends with
+    a complete frame.
+
+    Args:
+        path: file to create.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self._path = Path(path)
+        self._file: FileIO | None = None
+        self._unwritten = bytearray()
+        self._has_failed = False
+        self._something_to_write = anyio.Event()
+
+    async def open(self) -> None:
+        """Create the file.
+
+        Raises:
+            UsageError: the file exists, or cannot be created.
+        """
+        try:
+            self._file = await anyio.to_thread.run_sync(FileIO, self._path, "x")
+        except FileExistsError:
+            raise UsageError(
+                f"the log {self._path} exists and is not overwritten; name another file"
+            ) from None
+        except OSError as error:
+            raise UsageError(f"the log {self._path} cannot be created: {error.strerror}") from error
+
+    def received(self, frames: Sequence[SeenFrame], size: int, peer: Hashable) -> None:
+        """Queue received frames."""
+        for each in frames:
+            self.sent(each.data)
+
+    def sent(self, frame: bytes) -> None:
+        """Queue a frame."""
+        if self._has_failed or bears_key(frame):
+            return
+        self._unwritten += packed_time(time.time()) + unsign_frame(frame)
+        self._something_to_write.set()
+        if len(self._unwritten) > UNWRITTEN_BYTES_MAX:
+            self._fail("the disk is slower than the link")
+
+    async def run(self) -> None:
+        """Write the queued frames in batches, until cancelled or a write error."""
+        while not self._has_failed:
+            await self._something_to_write.wait()
+            self._something_to_write = anyio.Event()
+            await anyio.sleep(RECORDING_FLUSH_INTERVAL)
+            await self._flush()
+
+    async def close(self) -> None:
+        """Write the queued frames and close the file."""
+        try:
+            await self._flush()
+        finally:
+            if self._file is not None:
+                await anyio.to_thread.run_sync(self._file.close)
+
+    async def _flush(self) -> None:
+        batch, self._unwritten = self._unwritten, bytearray()
+        if self._has_failed or self._file is None or not batch:
+            return
+        try:
+            with anyio.CancelScope(shield=True):  # the batch is no longer queued
+                await anyio.to_thread.run_sync(_write, self._file, batch)
+        except OSError as error:
+            self._fail(error.strerror or str(error))
+
+    def _fail(self, why: str) -> None:
+        self._has_failed = True
+        self._unwritten.clear()
+        logger.warning("the telemetry log %s ends here: %s", self._path, why)
+
+
+def _write(file: FileIO, data: bytearray) -> None:
+    """Write a batch. After an error, truncate the file to its last complete batch.
+
+    Raises:
+        OSError: the batch cannot be written.
+    """
+    whole = file.tell()
+    try:
+        while data:
+            data = data[file.write(data) :]
+    except OSError:
+        file.truncate(whole)
+        raise
+
+
+# Traffic
+
+RATE_SLICES: Final = 10
+"""Slices over which rates and losses are measured, 5 s: several heartbeats, and short enough to adjust an
+antenna."""
+RATE_SLICE: Final = 0.5
+"""Seconds of a slice."""
+RATE_TIME_MIN: Final = 1.0
+"""Seconds, at least, over which a rate is computed."""
+RADIO_STATUS_IDS: Final = frozenset({109, 166})
+"""RADIO_STATUS, and RADIO from older firmware of SiK radios; both have the same layout."""
+
+RADIO_STATUS_FIELDS: Final = ("errors", "fixed", "rssi", "remote_rssi", "free", "noise", "remote_noise")
+"""Its fields, in a radio's own units (SiK: 0 to 254, about half a dB each): packets with errors and
+corrected ones; signal and noise at this end, and at the other; the free percentage of the transmit buffer."""
+
+_RADIO_STATUS = struct.Struct("<HHBBBBB")
+_What: TypeAlias = str | int  # a number is a message id
+
+
+@dataclass(slots=True)
+class ComponentTraffic:
+    """The traffic of one component. Times are of the event loop's clock.
+
+    Attributes:
+        system, component: its address.
+        version: the MAVLink version of its last frame, 1 or 2.
+        received_at: time of its last frame.
+        heartbeat, heartbeat_at: its last HEARTBEAT and the time of it, or None.
+        radio: the last status of a telemetry radio, by the names in `RADIO_STATUS_FIELDS`; None of others.
+        totals: since the link was opened: `frames`, `bytes`, `signed` (frames with a signature, which is not
+            verified), `lost` (by the gaps in the sequence numbers, see `SequenceCheck`), `repeated`, `late`
+            (received after a later frame); and frames by message id.
+        recent: the same per second, of the last seconds.
+    """
+
+    system: int
+    component: int
+    version: int = 1
+    received_at: float = 0.0
+    heartbeat: Heartbeat | None = None
+    heartbeat_at: float | None = None
+    radio: Mapping[str, int] | None = None
+    totals: Counter[_What] = field(default_factory=Counter)
+    recent: Mapping[_What, float] = field(default_factory=dict)
+
+    @property
+    def messages(self) -> list[int]:
+        """Ids of its messages, the most frequent one first."""
+        ids = [what for what in self.totals if isinstance(what, int)]
+        return sorted(ids, key=lambda each: (-self.recent[each], -self.totals[each], each))
+
+    @property
+    def loss(self) -> float | None:
+        """The share of its recent frames that was lost, 0 to 1; None without recent frames."""
+        received, lost = self.recent["frames"] - self.recent["repeated"], max(self.recent["lost"], 0.0)
+        return lost / (received + lost) if received > 0 else None
+
+
+@dataclass(frozen=True, slots=True)
+class TrafficReport:
+    """The traffic of a link.
+
+    Attributes:
+        at: when it was made, by the event loop's clock.
+        seconds: the observed time.
+        components: by address.
+        totals: since the link was opened: `received` and `sent` bytes, whole `frames` received, and those of
+            them with an `unknown` id.
+        recent: the same per second, of the last seconds.
+        damaged: frames with a wrong checksum.
+        other_bytes: received bytes outside of frames.
+    """
+
+    at: float
+    seconds: float
+    components: tuple[ComponentTraffic, ...]
+    totals: Counter[_What]
+    recent: Mapping[_What, float]
+    damaged: int
+    other_bytes: int
+
+
+class Traffic(Tap):
+    """Counts all traffic of a link, as a tap; on request only: an ordinary client does without."""
+
+    def __init__(self) -> None:
+        self._began = 0.0
+        self._counts: Counter[tuple[Address | None, _What]] = Counter()  # None: of the link
+        self._components: dict[Address, ComponentTraffic] = {}
+        self._checks: defaultdict[Hashable, SequenceCheck] = defaultdict(SequenceCheck)  # by address and peer
+        # the counts before each of the last slices in which something was counted
+        self._before: deque[tuple[int, Counter[tuple[Address | None, _What]]]] = deque(maxlen=RATE_SLICES)
+
+    async def open(self) -> None:
+        """Begin to observe."""
+        self._began = anyio.current_time()
+
+    def received(self, frames: Sequence[SeenFrame], size: int, peer: Hashable) -> None:
+        """Count a received chunk and its frames."""
+        now = self._count(None, received=size, frames=len(frames))
+        for seen in frames:
+            frame = seen.frame
+            address = (frame.system, frame.component)
+            self._count(None, unknown=not seen.is_known)
+            if not seen.is_known and address not in self._components:
+                continue  # an address that no checksum proves does not count
+            source = self._components.setdefault(address, ComponentTraffic(*address))
+            source.received_at, source.version = now, frame.version
+            check = self._checks[address, peer]
+            lost, repeated, late = check.lost, check.repeated, check.late
+            check.receive(frame.sequence, now)
+            self._count(address, lost=check.lost - lost, repeated=check.repeated - repeated)
+            self._count(address, late=check.late - late, frames=1, bytes=seen.size, signed=seen.is_signed)
+            self._counts[address, frame.message_id] += 1
+            if frame.message_id in RADIO_STATUS_IDS:
+                payload = frame.payload.ljust(_RADIO_STATUS.size, b"\0")
+                status = _RADIO_STATUS.unpack_from(payload)
+                source.radio = dict(zip(RADIO_STATUS_FIELDS, status, strict=True))
+            elif seen.is_known and isinstance(message := decode(frame), Heartbeat):
+                source.heartbeat, source.heartbeat_at = message, now
+
+    def sent(self, frame: bytes) -> None:
+        """Count a sent frame."""
+        self._count(None, sent=len(frame))
+
+    def report(self, now: float, cutter: FrameCutter) -> TrafficReport:
+        """Return the present counts, and those of the cutter of the received data."""
+        first = int(now / RATE_SLICE) - RATE_SLICES + 1
+        window = max(now - max(first * RATE_SLICE, self._began), RATE_TIME_MIN)
+        before = next((counts for number, counts in self._before if number >= first), self._counts)
+        totals: defaultdict[Address | None, Counter[_What]] = defaultdict(Counter)
+        recent: defaultdict[Address | None, defaultdict[_What, float]]
+        recent = defaultdict(partial(defaultdict, float))
+        for (whose, what), count in self._counts.items():
+            totals[whose][what] = count
+            recent[whose][what] = (count - before[whose, what]) / window
+        return TrafficReport(
+            at=now,
+            seconds=now - self._began,
+            components=tuple(
+                replace(each, totals=totals[address], recent=recent[address])
+                for address, each in sorted(self._components.items())
+            ),
+            totals=totals[None],
+            recent=recent[None],
+            damaged=cutter.damaged,
+            other_bytes=cutter.other_bytes,
+        )
+
+    def _count(self, whose: Address | None, **increases: int) -> float:
+        """Increase counts of a component or of the link. Return the time."""
+        now = anyio.current_time()
+        number = int(now / RATE_SLICE)
+        if not self._before or self._before[-1][0] != number:
+            self._before.append((number, self._counts.copy()))
+        for what, increase in increases.items():
+            self._counts[whose, what] += increase
+        return now

@@ -14,7 +14,7 @@ import pytest
 
 from paramclient import UsageError
 from paramclient.cli import run
-from paramclient.client import recording
+from paramclient.client import taps
 from paramclient.client.taps import FrameCutter
 from paramclient.links.tlog import TIME_MAX, TIME_STEP_MAX, Record, packed_time, read_records
 from paramclient.sim import ArduPilotVehicle
@@ -178,7 +178,7 @@ def test_the_command_writes_logs_too(tmp_path: Path, capsys: pytest.CaptureFixtu
 async def test_a_clock_that_was_never_set_ends_nothing(
     now: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("paramclient.client.recording.time.time", lambda: now)
+    monkeypatch.setattr("paramclient.client.taps.time.time", lambda: now)
     path = tmp_path / "flight.tlog"
     async with a_client(small_px4(), tlog=path) as client:
         assert (await (await client.component()).get("PARAM_07")).value == VALUES["PARAM_07"]
@@ -227,7 +227,7 @@ async def test_a_full_disk_ends_the_log_and_nothing_else(
             assert (await component.fetch_all()).complete
             await anyio.sleep(5.0)
             assert (await component.get("PARAM_01")).value == 1
-    assert [record.name for record in caplog.records] == ["paramclient.client.recording"], caplog.text
+    assert [record.name for record in caplog.records] == ["paramclient.client.taps"], caplog.text
     assert f"the telemetry log {path} ends here: File too large" in caplog.text
     assert recorded(path)  # whole frames, and nothing behind them
 
@@ -235,7 +235,7 @@ async def test_a_full_disk_ends_the_log_and_nothing_else(
 async def test_a_disk_that_falls_behind_ends_the_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(recording, "UNWRITTEN_BYTES_MAX", 1000)
+    monkeypatch.setattr(taps, "UNWRITTEN_BYTES_MAX", 1000)
     path = tmp_path / "flight.tlog"
     async with a_client(small_px4(), tlog=path) as client:
         assert (await (await client.component()).fetch_all()).complete

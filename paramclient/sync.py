@@ -10,17 +10,18 @@ all other classes are those of `paramclient`::
 The functions have the arguments and the results of those in `paramclient.provision` and
 `paramclient.metadata`; the call of `for_each` blocks.
 
-- `proxy`: the one class behind all of them.
-
-`tests/sync_stub.py` writes the types into `__init__.pyi` (`make sync`).
+`tests/sync_stub.py` writes the types into `sync.pyi` (`make sync`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from typing import Any
+
 from paramclient import metadata, provision
+from paramclient.client.blocking import Changes, Component, Events, ParamClient, blocking, call_each
 from paramclient.client.client import Event
 from paramclient.provision.inspection import Wanted
-from paramclient.sync.proxy import Changes, Component, Events, ParamClient, blocking, for_each
 
 __all__ = [
     "Changes",
@@ -40,3 +41,8 @@ plan = blocking(provision.plan)
 apply = blocking(provision.apply)
 restore = blocking(provision.restore)
 metadata_of = blocking(metadata.metadata_of)
+
+
+def for_each(components: Iterable[Any], call: Callable[[Any], Any]) -> provision.FleetResult[Any]:
+    """Make a call for each vehicle, each in a thread; see `paramclient.provision.for_each`."""
+    return provision.FleetResult(*call_each(components, call))

@@ -10,7 +10,7 @@ from paramclient.client.client import COMPONENT_TIMEOUT
 from paramclient.client.component import REBOOT_TIMEOUT, ComponentState
 from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.signing import Signing
-from paramclient.client.traffic import TrafficReport
+from paramclient.client.taps import TrafficReport
 from paramclient.links import Link
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.store import MetadataStore

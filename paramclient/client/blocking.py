@@ -1,4 +1,4 @@
-"""Proxies: the objects of an asynchronous client, which runs in its own thread, with calls that block."""
+"""The blocking client: proxies of the objects of an asynchronous client, which runs in its own thread."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from anyio.from_thread import BlockingPortal, start_blocking_portal
 import paramclient.client.client as asynchronous
 from paramclient.client import component, streams
 from paramclient.errors import ClientClosed, ParamClientError, UsageError
-from paramclient.provision.apply_restore import FleetResult
+from paramclient.protocol.addresses import Address
 
 THREAD_NAME: Final = "paramclient blocking client"
 """Name of the thread of a client, in debuggers."""
@@ -261,10 +261,11 @@ def blocking(function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def for_each(components: Iterable[Any], call: Callable[[Any], Any]) -> FleetResult[Any]:
-    """Make a call for each vehicle, each in a thread; see `paramclient.provision.for_each`."""
+def call_each(components: Iterable[Any], call: Callable[[Any], Any]) -> tuple[dict[Address, Any], ...]:
+    """Make a call for each vehicle, each in a thread. Return the results and the errors by address."""
     vehicles = {(each.system, each.component): each for each in components}
-    results, errors = {}, {}
+    results: dict[Address, Any] = {}
+    errors: dict[Address, Any] = {}
     with ThreadPoolExecutor(max(len(vehicles), 1)) as threads:
         calls = {address: threads.submit(call, vehicle) for address, vehicle in vehicles.items()}
         try:
@@ -277,7 +278,7 @@ def for_each(components: Iterable[Any], call: Callable[[Any], Any]) -> FleetResu
             for vehicle in vehicles.values():
                 vehicle._session.cancel()
             raise
-    return FleetResult(results, errors)
+    return results, errors
 
 
 def _target_of(value: Any) -> Any:
