@@ -76,7 +76,7 @@ SHARED_NAMES = {
 the public one, a message and a set of parameters."""
 
 COMMAND = ("cli", "__main__")
-JSON = {"cli.json_output", "cli.json_apply"}
+JSON = {"cli.json_output"}
 """What the command prints and the service sends."""
 NAMEDTUPLE_METHODS = {"_make", "_replace", "_asdict", "_fields"}
 """Names that begin with an underscore and are public nevertheless, so that no field can have them."""

@@ -2,15 +2,15 @@
 
 - `app`: all subcommands, the main function, signals and errors.
 - Subcommands: `read_commands` (fetch, get, watch), `set_command` with `writes`, `reset_command`,
-  `show` (show, search, info), `cached` (cache, history), `logs` (import), `apply` (apply, restore),
+  `show` (show, search, info), `cached` (cache, import, history), `apply` (apply, restore),
   `save`, `diff`, `metadata`, `link`, `check`, `ports`, `signing`, `serve` (serve, token) and `simulate`
   (sim).
 - `session`: open links with the vehicles of --vehicle, on which a subcommand works. `options`: options.
-- `sources`: the parameters that an argument names: of a file, a link or the cache. `time_arguments`: times.
+- `sources`: the parameters that an argument names: of a file, a link or the cache.
 - `param_names`: names and patterns of parameters, and suggestions.
 - `metadata`: descriptions and defaults that a subcommand uses.
-- `output`: tables, lines, the status line, exit codes. `file_output`: sets of parameters in words.
-- `json_output`, `json_apply`: JSON.
+- `output`: tables, lines, the status line, exit codes.
+- `json_output`: JSON.
 """
 
 from __future__ import annotations

@@ -213,7 +213,7 @@ _add(
     _app, "apply:apply", "URL FILE", "sim:px4 quad.params --dry-run", "sim:px4 '{system}.param' --vehicle all"
 )
 _add(_app, "apply:restore", "URL [WHEN|FILE]", "sim:px4 --dry-run", "udpin:0.0.0.0:14550 '2h ago'")
-_add(_app, "logs:import_", "FILE [FILE...]", "flight.tlog")
+_add(_app, "cached:import_", "FILE [FILE...]", "flight.tlog")
 _add(_app, "serve:serve", "LINK [LINK...]", "serial:/dev/ttyACM0:57600 --listen 127.0.0.1:0")
 _add(_app, "serve:token", None, "anna --file tokens", "wall-display --file tokens --read")
 _add(_app, "ports:ports")

@@ -14,9 +14,8 @@ from typing import ClassVar, Final, Self, TypeAlias
 import anyio
 import anyio.to_thread
 
-from paramclient.cli.file_output import described
-from paramclient.cli.json_apply import apply_json, plan_json, rows_json
-from paramclient.cli.json_output import JsonObject
+from paramclient.cli.cached import parse_when
+from paramclient.cli.json_output import JsonObject, apply_json, plan_json, rows_json
 from paramclient.cli.metadata import MetadataChoice, known_of_session
 from paramclient.cli.options import ApplyFlags
 from paramclient.cli.output import (
@@ -32,8 +31,7 @@ from paramclient.cli.output import (
     say,
 )
 from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
-from paramclient.cli.sources import check_pattern, fill_pattern, is_pattern_name, resolve_all
-from paramclient.cli.time_arguments import parse_when
+from paramclient.cli.sources import check_pattern, described, fill_pattern, is_pattern_name, resolve_all
 from paramclient.cli.writes import STYLES, write_all
 from paramclient.errors import CacheError, FileError, NoReply, NotInCache, UnknownVehicle, UsageError
 from paramclient.files import FileFormat, ParamFile

@@ -1,23 +1,70 @@
-"""The subcommands cache (list, remove) and history, which need no link."""
+"""The subcommands cache (list, remove), import and history, which need no link; times in arguments."""
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from datetime import date, datetime, timedelta, tzinfo
+from datetime import time as time_of_day
+from pathlib import Path
 from typing import Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache, SnapshotSummary
-from paramclient.cli.json_output import history_json, snapshot_json
+from paramclient.cli.json_output import history_json, known_members, snapshot_json, taken
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import ExitCode, local_time, print_json, print_line, say, show
+from paramclient.cli.output import (
+    ExitCode,
+    code_of,
+    local_time,
+    print_json,
+    print_line,
+    report,
+    say,
+    show,
+)
 from paramclient.cli.param_names import check_given
-from paramclient.cli.time_arguments import parse_time
-from paramclient.errors import UsageError
+from paramclient.errors import FileError, LinkError, ParamClientError, UsageError
+from paramclient.files.conversion import kind_of
+from paramclient.logs.imports import ImportedTable, import_log, import_onboard_log
+from paramclient.logs.onboard import is_onboard_log
 from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import hash_text, time_or_none
 from paramclient.model.values import Param, format_value
 from paramclient.provision.sources import component_of, tables_in
+
+WHEN: Final = (
+    "a time is written as 2026-11-20T14:00Z, '2026-11-20 14:00' (of this computer's time zone), 14:00, "
+    "'yesterday 14:00', yesterday, or '2h 30min ago'"
+)
+"""The accepted formats of a time, for messages."""
+
+_UNITS: Final = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
+    **dict.fromkeys(("m", "min", "mins", "minute", "minutes"), 60.0),
+    **dict.fromkeys(("h", "hour", "hours"), 3600.0),
+    **dict.fromkeys(("d", "day", "days"), 86400.0),
+    **dict.fromkeys(("w", "week", "weeks"), 604800.0),
+}
+"""Seconds of each unit of time."""
+_LENGTH: Final = rf"([0-9]{{1,9}}(?:\.[0-9]{{1,9}})?) ?({'|'.join(_UNITS)})(?![a-z])"
+"""A number with a unit, such as `30min`."""
+_AGO: Final = re.compile(rf"{_LENGTH}(?: ?{_LENGTH})*(?: ago)?", re.ASCII)
+"""A time before now, such as `2h 30min ago`."""
+_MOMENT: Final = re.compile(
+    r"(?:(?P<day>today|yesterday|[0-9]{4}-[0-9]{2}-[0-9]{2})(?:[t ](?=.)|$))?"
+    r"(?:(?P<hour>[0-9]{1,2})(?P<minutes>:[0-9]{2}(?::[0-9]{2}(?:\.[0-9]{1,6})?)?)"
+    r"(?P<zone> ?(?:z|utc|[+-][0-9]{2}:?[0-9]{2}))?)?",
+    re.ASCII,
+)
+"""A day, a time of day, or both, with or without a time zone."""
+_SNAPSHOT: Final = re.compile(r"[0-9]{1,18}", re.ASCII)
+"""The id of a snapshot."""
+KIND_BYTES: Final = 4096
+"""Bytes at the beginning of a file that identify its format."""
 
 _DEFAULTS: Final = CacheOptions()
 
@@ -57,34 +104,28 @@ def show_summaries(
     """Print a line for each table, with the number of extended parameters."""
     rows, components = [], []
     for each in summaries:
-        extended = sizes.get((each.key, each.component))
-        components.append(_summary_json(each, extended))
-        synced = None if each.synced_at is None else local_time(each.synced_at)
-        row = [f"{each.system}/{each.component}", autopilot_name(each.autopilot), each.size]
-        rows.append([*row, extended, hash_text(each.hash), synced, each.key])
+        extended, autopilot = sizes.get((each.key, each.component)), autopilot_name(each.autopilot)
+        hash_, synced_at = hash_text(each.hash), each.synced_at
+        components.append(
+            {
+                **taken(each, "key", "system", "component"),
+                "autopilot": autopilot,
+                "uid": each.identity.uid,
+                **taken(each, "size", "count", "complete"),
+                "hash": hash_,
+                "synced_at": time_or_none(synced_at),
+                "updated_at": time_or_none(each.updated_at),
+                **known_members(extended=extended),
+            }
+        )
+        synced = None if synced_at is None else local_time(synced_at)
+        address = f"{each.system}/{each.component}"
+        rows.append([address, autopilot, each.size, extended, hash_, synced, each.key])
     columns = ["component", "autopilot", "params", "extended", "hash", "synced", "key"]
     found = {"path": cache.place, "components": components}
     show(found, columns, rows, json=json, right="params extended", empty="no table is in the cache")
     if not json:
         say(f"the cache is {cache.place}")
-
-
-def _summary_json(summary: CachedSummary, extended: int | None) -> dict[str, object]:
-    """Return a table without its parameters, with the number of its extended ones or None."""
-    return {
-        "key": summary.key,
-        "system": summary.system,
-        "component": summary.component,
-        "autopilot": autopilot_name(summary.autopilot),
-        "uid": summary.identity.uid,
-        "size": summary.size,
-        "count": summary.count,
-        "complete": summary.complete,
-        "hash": hash_text(summary.hash),
-        "synced_at": time_or_none(summary.synced_at),
-        "updated_at": time_or_none(summary.updated_at),
-        **({} if extended is None else {"extended": extended}),
-    }
 
 
 def extended_sizes(cache: ParamCache) -> dict[tuple[str, int], int]:
@@ -98,6 +139,70 @@ def load_tables(
     """Load tables; another process may have removed one."""
     loaded = (cache.load(each.key, each.component, extended=extended) for each in summaries)
     return [table for table in loaded if table is not None]
+
+
+# import
+
+
+async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS) -> ExitCode:
+    """Import logs into the cache: vehicles, tables and changes, with the times of the logs.
+
+    Later values in the cache are kept, so neither order nor repetition matters. All files are tried even if
+    one cannot be read.
+
+    Args:
+        file: A telemetry log (.tlog), or an on-board log of ArduPilot (.bin) or PX4 (.ulg).
+        files: Further logs.
+    """
+    code, found = ExitCode.DONE, []
+    with ParamCache(options.cache) as cache:
+        for each in (file, *files):
+            try:
+                tables = await _import(each, cache)
+            except ParamClientError as error:
+                report(str(error))
+                code = max(code, code_of(error))
+                continue
+            for table in tables:
+                autopilot = None if table.autopilot is None else autopilot_name(table.autopilot)
+                more = {"autopilot": autopilot, "hash": hash_text(table.hash)}
+                found.append({"file": str(each)} | asdict(table) | more)
+                for note in table.notes:
+                    report(f"{each.name}, {table.system}/{table.component}: {note}")
+            if not tables:
+                report(f"{each} has no parameters")
+    if found or options.json:
+        columns = ["file", "component", "autopilot", "params", "complete", "hash", "key"]
+        rows = [
+            {
+                **each,
+                "file": Path(each["file"]).name,
+                "component": f"{each['system']}/{each['component']}",
+                "complete": "yes" if each["complete"] else "no",
+            }
+            for each in found
+        ]
+        cells = ([row[name] for name in columns] for row in rows)
+        show({"tables": found}, columns, cells, json=options.json, right="params")
+    return code
+
+
+async def _import(path: Path, cache: ParamCache) -> tuple[ImportedTable, ...]:
+    """Import one log.
+
+    Raises:
+        FileError: it is no log, or cannot be read.
+        CacheError: the cache cannot be written.
+    """
+    if is_onboard_log(path):
+        return (await import_onboard_log(path, cache),)
+    try:
+        return await import_log(path, cache)
+    except LinkError as error:
+        with suppress(OSError), path.open("rb") as file:
+            kind = kind_of(file.read(KIND_BYTES)) or "neither a telemetry log (.tlog) nor one of .bin or .ulg"
+            raise FileError(f"not imported: {kind}", source=str(path)) from error
+        raise FileError(str(error).partition(": ")[2]) from error
 
 
 # history
@@ -173,3 +278,65 @@ def _snapshot_cells(each: SnapshotSummary) -> Sequence[object]:
 
 def _value(param: Param | None) -> str | None:
     return None if param is None else format_value(param.settable, param.type)
+
+
+# Times
+
+
+def parse_when(text: str, now: float, zone: tzinfo | None = None) -> float | int:
+    """Parse an argument of `ParamCache.state_at`: a time in the past, or the id of a snapshot.
+
+    Args:
+        text: a number alone is the id of a snapshot; for all other texts see `parse_time`.
+        now: the current time in unix seconds.
+        zone: the time zone of times that name none; None for that of this computer.
+
+    Raises:
+        UsageError: the text is neither, or the time is in the future.
+    """
+    if _SNAPSHOT.fullmatch(text.strip()):
+        return int(text)
+    return parse_time(text, now, zone)
+
+
+def parse_time(text: str, now: float, zone: tzinfo | None = None) -> float:
+    """Parse a time in the past; return it in unix seconds.
+
+    A day without a time is its midnight, a time without a day is today's. `yesterday` is the calendar day
+    before, `1d ago` is 24 hours ago. The times that paramclient prints are accepted.
+
+    Args:
+        text: see `WHEN`.
+        now: the current time in unix seconds.
+        zone: the time zone of times that name none; None for that of this computer.
+
+    Raises:
+        UsageError: the text is not a time, or the time is in the future.
+    """
+    words = " ".join(text.lower().split())
+    try:
+        at = _before(words, now) if _AGO.fullmatch(words) else _moment(words, now, zone)
+    except (ValueError, OverflowError, OSError):  # the 30th of February; the year 0
+        at = None
+    if at is None or at < 0:
+        raise UsageError(f"{text!r} is not a time: {WHEN}")
+    if at > now:
+        raise UsageError(f"{text!r} is in the future")
+    return at
+
+
+def _before(words: str, now: float) -> float:
+    return now - sum(float(number) * _UNITS[unit] for number, unit in re.findall(_LENGTH, words))
+
+
+def _moment(words: str, now: float, zone: tzinfo | None) -> float | None:
+    found = _MOMENT.fullmatch(words)
+    if not (words and found):
+        return None
+    mark = (found["zone"] or "").strip().upper().replace("UTC", "Z")
+    clock = time_of_day.fromisoformat(f"{int(found['hour'] or 0):02}{found['minutes'] or ':00'}{mark}")
+    zone = clock.tzinfo or zone
+    today = datetime.fromtimestamp(now, zone).date()
+    days = {"": today, "today": today, "yesterday": today - timedelta(days=1)}
+    day = found["day"] or ""
+    return datetime.combine(days.get(day) or date.fromisoformat(day), clock, zone).timestamp()

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
-from paramclient.cli.file_output import described, value_text
-from paramclient.cli.json_apply import diff_json
+from paramclient.cli.json_output import diff_json
 from paramclient.cli.metadata import (
     METADATA_HINT,
     MetadataFile,
@@ -18,7 +17,7 @@ from paramclient.cli.metadata import (
 )
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Coloured, ExitCode, print_json, print_table, say
-from paramclient.cli.sources import resolve_all
+from paramclient.cli.sources import described, resolve_all, value_text
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.comparison import ChangedSide, Comparison, Difference, DifferenceStatus, compare
@@ -86,11 +85,12 @@ async def diff(
         except UsageError as error:
             raise UsageError(f"{error}; {METADATA_HINT}") from None
         known.append(known[0] or known[1])
+    known = [*known, None][:3]
     outcome = compare(first, second, base=before, names=only or None)
     if options.json:
-        print_json(diff_json(outcome, *known, has_defaults=base == DEFAULTS))
+        print_json(diff_json(outcome, known, has_defaults=base == DEFAULTS))
     else:
-        _print(outcome, [*known, None][:3])
+        _print(outcome, known)
         hint = "" if partial else _partial_hint(outcome, left, right)
         for line in [*_summary(outcome), *filter(None, [hint])]:
             say(line)

@@ -1,14 +1,15 @@
-"""JSON of parameters, sets, fetches, writes and history: the command prints it, and the service sends it.
+"""JSON of parameters, sets, fetches, writes, plans and history: printed by the command, sent by the service.
 
 Each function returns one object that `json.dumps` accepts; docs/json.md describes them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
+from paramclient.model.comparison import ChangedSide, DifferenceStatus
 from paramclient.model.identity import autopilot_name, version_text
 from paramclient.model.notation import (
     Scalar,
@@ -18,20 +19,23 @@ from paramclient.model.notation import (
     rounded,
     time_or_none,
     time_text,
+    typed,
     value_json,
     value_written,
 )
-from paramclient.model.paramset import add_default, default_of
-from paramclient.model.values import Param, ParamType, format_value
+from paramclient.model.paramset import DefaultSource, add_default, default_of
+from paramclient.model.values import Param, ParamType, Value, format_value
 from paramclient.protocol.identity import kind_in_words
 
 if TYPE_CHECKING:
     from paramclient.cache import HistoryEntry, SnapshotSummary
     from paramclient.client.component import Component
     from paramclient.metadata import Metadata, ParamInfo
+    from paramclient.model.comparison import Comparison, Difference
     from paramclient.model.paramset import ParamSet, WrittenParam
     from paramclient.protocol.fetch import FetchResult
     from paramclient.protocol.set_results import SetOutcome
+    from paramclient.provision import ApplyResult, ApplyRow, Plan
 
 JsonObject: TypeAlias = dict[str, Any]
 """An object of JSON."""
@@ -213,6 +217,127 @@ def outcome_json(outcome: SetOutcome, kind: ParamType | int, info: ParamInfo | N
         text=None if info is None or actual is None else info.text(actual) or None,
         reboot_required=info and (info.reboot_required or None),
     )
+
+
+# Comparisons
+
+
+def diff_json(
+    outcome: Comparison, known: Sequence[Metadata | None], *, has_defaults: bool = False
+) -> JsonObject:
+    """Return a comparison.
+
+    Args:
+        outcome: the comparison.
+        known: the metadata of left, right and base.
+        has_defaults: whether the base are the firmware's defaults.
+    """
+
+    def entry_json(entry: Difference) -> JsonObject:
+        params = {"left": entry.left, "right": entry.right, "base": entry.base}
+        sides = {
+            side: param and compared_json(param, metadata)
+            for (side, param), metadata in zip(params.items(), known, strict=True)
+        }
+        described = [metadata.find(entry.name) for metadata in known[:2] if metadata is not None]
+        units = next((info.units for info in described if info is not None and info.units), None)
+        is_given = any(each and each.default is not None for each in (entry.left, entry.right))
+        source = DefaultSource.VEHICLE if is_given else DefaultSource.METADATA
+        return {
+            "is": entry.status,
+            "types_differ": entry.types_differ,
+            "rounding": entry.is_rounding,
+            **sides,
+            **known_members(default_source=source if has_defaults and entry.base else None),
+            "changed_side": entry.changed_side,
+            **known_members(units=short_text(units)),
+        }
+
+    base = outcome.base
+    return {
+        "same": outcome.is_same,
+        "left": origin_json(outcome.left),
+        "right": origin_json(outcome.right),
+        "base": None if base is None else origin_json(base),
+        "counts": {status: outcome.counts[status] for status in DifferenceStatus},
+        "changed_sides": base and {side: outcome.changed_sides[side] for side in ChangedSide},
+        "params": {each.name: entry_json(each) for each in outcome.entries if each.is_shown},
+    }
+
+
+# Plans and results of apply and restore
+
+
+def rows_json(rows: Iterable[ApplyRow]) -> JsonObject:
+    """Return what is planned for parameters, or what became of them, by name in the file."""
+
+    def row_json(row: ApplyRow) -> JsonObject:
+        def value(given: Value | None) -> Scalar | None:
+            return None if given is None else value_json(*typed(given, row.type))
+
+        return {
+            "status": row.status,
+            "type": None if row.type is None else ParamType(row.type).name,
+            "before": value(row.before),
+            "wanted": value(row.wanted.settable),
+            "actual": value(row.actual),
+            **taken(row, "category", "reason", "nearest"),
+        }
+
+    return {row.name: row_json(row) for row in rows}
+
+
+def plan_json(plan: Plan, component: Component) -> JsonObject:
+    """Return the plan for a vehicle, without unchanged parameters."""
+
+    def step_json(row: ApplyRow) -> JsonObject:
+        value, kind = typed(row.wanted.settable, row.type)
+        assert row.before is not None, "only parameters that the vehicle has are set"
+        return {
+            "name": row.name,
+            "value": value_json(value, kind),
+            "type": ParamType(kind).name,
+            "before": value_json(row.before, kind),
+            "needs_reboot": row.needs_reboot,
+        }
+
+    stages = [
+        {**taken(stage, "purpose", "reboot_first"), "steps": [step_json(row) for row in stage.rows]}
+        for stage in plan.stages
+    ]
+    found: JsonObject = {
+        **taken(component, "system", "component"),
+        "dry_run": True,
+        "counts": plan.counts,
+        "stages": stages,
+        "params": rows_json(row for row in plan.rows.values() if row.status != "unchanged"),
+        "extra": len(plan.extra),
+        "unchecked": len(plan.unchecked),
+        "reboot_for": plan.reboot_for,
+    }
+    if plan.firmware_note:
+        file, vehicle = (version_text(each.firmware) for each in plan.firmware)
+        found["firmware"] = {"file": file, "vehicle": vehicle}
+    return found
+
+
+def apply_json(result: ApplyResult, component: Component) -> JsonObject:
+    """Return the result for a vehicle; its first address is that at the start, `now` the one at the end.
+
+    Unchanged parameters, and left-out ones that do not differ, are not included.
+    """
+    return {
+        **taken(component, "system", "component"),
+        "vehicle": vehicle_json(component),
+        "now": taken(result, "system", "component"),
+        **taken(result, "complete", "counts"),
+        "params": rows_json(result.shown_rows),
+        "extra": len(result.extra),
+        "unchecked": len(result.plan.unchecked),
+        **taken(result, "reboots", "reboot_required"),
+        "error": None if result.error is None else str(result.error),
+        "elapsed_s": round(result.elapsed, 3),
+    }
 
 
 # The cache

@@ -12,7 +12,6 @@ from typing import Annotated, Final
 import anyio.to_thread
 from cyclopts import Parameter
 
-from paramclient.cli.file_output import noun_of
 from paramclient.cli.metadata import (
     METADATA_HINT,
     MetadataFile,
@@ -23,7 +22,7 @@ from paramclient.cli.metadata import (
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import ExitCode, print_json, report, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
-from paramclient.cli.sources import check_link, filled, whole_table
+from paramclient.cli.sources import check_link, filled, noun_of, whole_table
 from paramclient.errors import UsageError, VehicleError
 from paramclient.files import FileFormat, writable, write_file
 from paramclient.files.formats import address, format_of_name

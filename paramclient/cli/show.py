@@ -8,7 +8,6 @@ from typing import Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
 from paramclient.cli.cached import extended_sizes, load_tables, show_summaries
-from paramclient.cli.file_output import described, value_text
 from paramclient.cli.json_output import (
     JsonObject,
     info_json,
@@ -31,7 +30,7 @@ from paramclient.cli.metadata import (
 from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import ExitCode, local_time, print_json, print_line, print_table, report, say
 from paramclient.cli.param_names import check_given
-from paramclient.cli.sources import check_link
+from paramclient.cli.sources import check_link, described, value_text
 from paramclient.errors import UsageError
 from paramclient.files.formats import address
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo

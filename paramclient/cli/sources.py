@@ -1,4 +1,4 @@
-"""Sources of parameters in arguments (see `provision.sources`), and file names for several vehicles."""
+"""Sources of parameters in arguments (see `provision.sources`), sets in words, file names with ids."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ from pathlib import Path, PurePath
 from typing import Final
 
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import report
+from paramclient.cli.output import local_time, report
 from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
 from paramclient.errors import UsageError
-from paramclient.files.formats import ENDINGS
+from paramclient.files.formats import ENDINGS, address
 from paramclient.links import FORMS, parse_link
-from paramclient.model.paramset import ParamSet
+from paramclient.model.identity import autopilot_name
+from paramclient.model.names import counted
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import ParamType, format_value
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.sources import fetched_set, is_file, is_offline, link_of, resolve
 
@@ -115,6 +118,30 @@ def _nearest_file(text: str) -> str:
         return f"; there is no folder {folder} here"
     similar = difflib.get_close_matches(Path(text).name, [each.name for each in folder.iterdir()], n=1)
     return f" (did you mean {folder / similar[0]}?)" if similar else ""
+
+
+# Sets in words
+
+
+def described(params: ParamSet) -> str:
+    """Return a set in words: `903 parameters of 1/1 px4 from link sim:px4, 2026-11-20T18:00:00.000Z`."""
+    origin = [
+        "" if params.component is None and params.system is None else f"of {address(params)}",
+        "" if params.identity is None else autopilot_name(params.identity.autopilot),
+        f"from {params.source}" if params.source else "",
+    ]
+    at = "" if params.at is None else f", {local_time(params.at)}"
+    return " ".join(filter(None, [counted(len(params), noun_of(params)), *origin])) + at
+
+
+def noun_of(params: ParamSet) -> str:
+    """Return the parameters of a set in words, in the singular."""
+    return "extended parameter" if params.is_extended else "parameter"
+
+
+def value_text(param: WrittenParam) -> str:
+    """Return a parameter's value as text."""
+    return format_value(param.settable, ParamType.REAL32 if param.type is None else param.type)
 
 
 # File names for several vehicles

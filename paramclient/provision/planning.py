@@ -175,8 +175,9 @@ class Rows:
 
     @property
     def counts(self) -> Mapping[ApplyStatus, int]:
-        """The number of rows with each status, 0 for those that do not occur."""
-        return Counter(row.status for row in self.rows.values())
+        """The number of rows with each status that occurs, in the order of the statuses."""
+        found = Counter(row.status for row in self.rows.values())
+        return Counter({status: found[status] for status in ApplyStatus if found[status]})
 
     @property
     def summary(self) -> str:

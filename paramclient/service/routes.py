@@ -25,8 +25,7 @@ from pydantic import StrictInt as Whole
 
 from paramclient.cache import ParamCache
 from paramclient.cli import json_output
-from paramclient.cli.json_apply import apply_json, plan_json
-from paramclient.cli.json_output import JsonObject
+from paramclient.cli.json_output import JsonObject, apply_json, plan_json
 from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.files import FileFormat, ParamFile, dumps, loads, writable

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from paramclient.cache import BY_US, ParamCache, TableState
-from paramclient.cli.time_arguments import parse_time, parse_when
+from paramclient.cli.cached import parse_time, parse_when
 from paramclient.errors import UsageError
 from paramclient.model.notation import time_text
 from tests.caches import NOW, PX4, stored, update

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from paramclient.cli.cached import parse_time
 from paramclient.cli.output import local_time, print_line, print_table, say
-from paramclient.cli.time_arguments import parse_time
 from paramclient.sim import PX4Vehicle
 from tests.commands import Command, Put
 

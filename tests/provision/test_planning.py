@@ -67,7 +67,7 @@ def test_every_wanted_parameter_gets_a_status() -> None:
     assert (row.name, row.wanted.settable, row.type, row.before) == ("PITCH_P", 6.5, ParamType.REAL32, 4.0)
     assert made.extra == ("OTHER",)
     assert not made.complete
-    assert repr(made) == "<Plan 1 unchanged, 1 set, 2 skipped, 1 invalid in 1 stages>"
+    assert repr(made) == "<Plan 1 set, 1 invalid, 1 unchanged, 2 skipped in 1 stages>"
     assert str(row) == "PITCH_P 4.0 -> 6.5, set"
     assert str(made.rows["PICTH_P"]) == "PICTH_P = 1, skipped: not on this vehicle"
     assert str(made.rows["ROLL_P"]) == "ROLL_P = 4, unchanged"
