@@ -137,11 +137,7 @@ def param_values(items: Iterable[tuple[float, messages.Message]]) -> list[messag
 
 
 def replay(
-    vehicle: Vehicle,
-    name: str,
-    *,
-    phase: float = 0.0,
-    on_board: Iterable[tuple[float, str, Value]] = (),
+    vehicle: Vehicle, name: str, *, phase: float = 0.0, on_board: Iterable[tuple[float, str, Value]] = ()
 ) -> Messages:
     """Send the vehicle the ground station's frames of a log; return its messages that `wire` decodes.
 

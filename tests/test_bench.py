@@ -44,9 +44,7 @@ def test_links_prints_the_row_of_exactly_this_name() -> None:
     assert all(0.3 < float(figure) < 60 for figure in figures.groups()), text  # simulated seconds
 
 
-def test_the_oracle_by_file_waits_one_round_trip_for_what_was_lost(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_oracle_by_file_waits_one_round_trip_for_what_was_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without loss it takes two round trips, the second to close the session, and the burst. What is lost
     then costs whole round trips."""
     monkeypatch.syspath_prepend(ROOT / "bench")

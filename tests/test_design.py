@@ -68,10 +68,7 @@ LIBRARIES = {
 }
 """The rooms or modules that may import a library: few know an event loop."""
 
-SHARED_NAMES = {
-    *("ParamClient", "Component", "Events", "Changes", "ParamInfo"),
-    *("Stream", "ParamSet"),
-}
+SHARED_NAMES = {*("ParamClient", "Component", "Events", "Changes", "ParamInfo"), *("Stream", "ParamSet")}
 """Constants and classes that may have one name in two modules: blocking twins, an event of a component and
 the public one, a message and a set of parameters."""
 

@@ -6,50 +6,30 @@ import pytest
 from pymavlink.dialects.v20 import all as dialect
 
 from paramclient import errors
-from paramclient.errors import (
-    CacheError,
-    ClientClosed,
-    FileError,
-    FileErrorCode,
-    FileTransferError,
-    InvalidParameters,
-    LinkError,
-    NoReply,
-    PackError,
-    ParamClientError,
-    ParamErrorCode,
-    Refused,
-    TypeMismatch,
-    UnknownParameter,
-    UsageError,
-    ValueNotApplied,
-    VehicleArmed,
-    VehicleError,
-)
 
 
 @pytest.mark.parametrize(
     ("kind", "base"),
     [
-        (UsageError, ValueError),
-        (FileError, UsageError),
-        (UnknownParameter, VehicleError),
-        (Refused, VehicleError),
-        (TypeMismatch, VehicleError),
-        (ValueNotApplied, VehicleError),
-        (FileTransferError, VehicleError),
-        (NoReply, TimeoutError),
-        (LinkError, OSError),
-        (ClientClosed, LinkError),
-        (InvalidParameters, UsageError),
-        (VehicleArmed, VehicleError),
-        (PackError, ParamClientError),
-        (CacheError, ParamClientError),
+        (errors.UsageError, ValueError),
+        (errors.FileError, errors.UsageError),
+        (errors.UnknownParameter, errors.VehicleError),
+        (errors.Refused, errors.VehicleError),
+        (errors.TypeMismatch, errors.VehicleError),
+        (errors.ValueNotApplied, errors.VehicleError),
+        (errors.FileTransferError, errors.VehicleError),
+        (errors.NoReply, TimeoutError),
+        (errors.LinkError, OSError),
+        (errors.ClientClosed, errors.LinkError),
+        (errors.InvalidParameters, errors.UsageError),
+        (errors.VehicleArmed, errors.VehicleError),
+        (errors.PackError, errors.ParamClientError),
+        (errors.CacheError, errors.ParamClientError),
     ],
 )
 def test_base_classes_of_errors(kind: type[Exception], base: type[Exception]) -> None:
     assert issubclass(kind, base)
-    assert issubclass(kind, ParamClientError)
+    assert issubclass(kind, errors.ParamClientError)
 
 
 def test_all_lists_every_error() -> None:
@@ -67,15 +47,15 @@ def test_param_error_codes_match_pymavlink() -> None:
         if name.startswith("MAV_PARAM_ERROR_") and not name.endswith("ENUM_END")
     }
     assert len(names) >= 6
-    assert names.items() <= {code.name: code.value for code in ParamErrorCode}.items()
+    assert names.items() <= {code.name: code.value for code in errors.ParamErrorCode}.items()
 
 
 @pytest.mark.parametrize(
     ("code", "words"), [(5, "read only"), (2, "value out of range"), (99, "error code 99")]
 )
 def test_param_error_code_names(code: int, words: str) -> None:
-    assert ParamErrorCode.name_of(code) == words
-    refused = Refused("no", system=1, component=2, code=code, name="A", index=3)
+    assert errors.ParamErrorCode.name_of(code) == words
+    refused = errors.Refused("no", system=1, component=2, code=code, name="A", index=3)
     assert (refused.code, refused.reason) == (code, words)
     assert (refused.system, refused.component, refused.name, refused.index) == (1, 2, "A", 3)
     assert str(refused) == "no"
@@ -88,4 +68,4 @@ def test_file_error_codes_match_pymavlink() -> None:
         if name.startswith("MAV_FTP_ERR_") and not name.endswith("ENUM_END")
     }
     spelled = {name.replace("_", ""): value for name, value in names.items()}
-    assert spelled == {code.name.replace("_", ""): code.value for code in FileErrorCode}
+    assert spelled == {code.name.replace("_", ""): code.value for code in errors.FileErrorCode}

@@ -26,14 +26,7 @@ from paramclient import (
     UsageError,
     Value,
 )
-from paramclient.sync import (
-    Component,
-    ParamClient,
-    apply,
-    for_each,
-    plan,
-    restore,
-)
+from paramclient.sync import Component, ParamClient, apply, for_each, plan, restore
 from tests.sync_stub import STUB, meaning, stub
 
 NAME = "MC_ROLL_P"

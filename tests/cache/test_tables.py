@@ -39,12 +39,7 @@ def hashed_table(*bits: int, at: float = NOW) -> TableUpdate:
         volatile_known=True,
         synced_at=at,
     )
-    return update(
-        *(StoredParam.of(each, at, False) for each in params),
-        at=at,
-        table=state,
-        replace=True,
-    )
+    return update(*(StoredParam.of(each, at, False) for each in params), at=at, table=state, replace=True)
 
 
 # what is stored

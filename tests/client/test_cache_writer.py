@@ -380,10 +380,7 @@ async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_befor
         await component.set("PARAM_01", 100, author="anna")
         await component.fetch_all()
         await component.set("PARAM_02", 200)
-    assert history(path) == [
-        ("PARAM_01", before, 100, "us for anna"),
-        ("PARAM_02", vehicle_had, 200, "us"),
-    ]
+    assert history(path) == [("PARAM_01", before, 100, "us for anna"), ("PARAM_02", vehicle_had, 200, "us")]
 
 
 @pytest.mark.parametrize("author", ["", "x" * 129, "a\nb", "Änne", "\x7f"])

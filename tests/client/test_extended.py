@@ -46,10 +46,7 @@ async def test_the_next_session_knows_the_table(tmp_path: Path) -> None:
         assert (await ext.fetch_all()).complete
         change = await anext(changes)
         assert (change.name, change.old and change.old.value, change.kind) == ("CAM_ISO", 100, "changed")
-    assert history(path) == [
-        ("CAM_NAME", "Front", "Rear", "us for anna"),
-        ("CAM_ISO", 100, 400, "vehicle"),
-    ]
+    assert history(path) == [("CAM_NAME", "Front", "Rear", "us for anna"), ("CAM_ISO", 100, 400, "vehicle")]
 
 
 async def test_a_removed_parameter_leaves_the_cache(tmp_path: Path) -> None:

@@ -8,12 +8,7 @@ import anyio
 import anyio.abc
 import pytest
 
-from paramclient import (
-    AmbiguousVehicle,
-    NoReply,
-    ParamClient,
-    UsageError,
-)
+from paramclient import AmbiguousVehicle, NoReply, ParamClient, UsageError
 from paramclient.client.client import COMPONENT_TIMEOUT, VEHICLES_LISTENING_TIME
 from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.sim import Air, ArduPilotVehicle

@@ -9,16 +9,7 @@ from pathlib import Path
 import anyio
 import pytest
 
-from paramclient import (
-    NoReply,
-    ParamCache,
-    ParamClient,
-    ParamType,
-    Policy,
-    SyncState,
-    Trust,
-    UsageError,
-)
+from paramclient import NoReply, ParamCache, ParamClient, ParamType, Policy, SyncState, Trust, UsageError
 from paramclient.cli import run
 from paramclient.client.component import PASSIVE_TIMEOUT
 from paramclient.model.values import Encoding, encode_value

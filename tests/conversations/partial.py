@@ -7,17 +7,7 @@ from typing import Any
 
 from paramclient import Encoding, ParamType
 from paramclient.model.values import encode_value
-from paramclient.wire.messages import (
-    COMP_ID_ALL,
-    AutopilotVersion,
-    CommandAck,
-    CommandLong,
-    Message,
-    ParamRequestList,
-    ParamRequestRead,
-    ParamSet,
-    ParamValue,
-)
+from paramclient.wire import messages
 from tests.conversations.virtual import Puppet
 
 TABLE: dict[str, tuple[float, ParamType]] = {
@@ -54,8 +44,8 @@ class Partial(Puppet):
         count: Callable[[int], int] | None = None,
         encoding: Encoding = Encoding.BYTEWISE,
         ack_type: ParamType | None = None,
-        on_set: Callable[[ParamSet], Iterable[Message]] | None = None,
-        version: AutopilotVersion | None = None,
+        on_set: Callable[[messages.ParamSet], Iterable[messages.Message]] | None = None,
+        version: messages.AutopilotVersion | None = None,
         asked_as: int | None = None,
         **options: Any,
     ) -> None:
@@ -70,32 +60,35 @@ class Partial(Puppet):
         self._version = version
         self._target = options.get("component", 1) if asked_as is None else asked_as
 
-    def number_of(self, kind: type[Message]) -> int:
+    def number_of(self, kind: type[messages.Message]) -> int:
         """Return the number of received messages of a kind."""
         return sum(isinstance(each, kind) for each in self.received)
 
-    def _value(self, name: str, kind: ParamType | None = None) -> ParamValue:
+    def _value(self, name: str, kind: ParamType | None = None) -> messages.ParamValue:
         index = self._first + list(self.values).index(name)
         kind = self.types[name] if kind is None else kind
-        return ParamValue(name, self.values[name], kind, self._count(index), index)
+        return messages.ParamValue(name, self.values[name], kind, self._count(index), index)
 
-    def _answers(self, message: Message) -> Iterable[Message]:
-        if getattr(message, "target_component", COMP_ID_ALL) not in (COMP_ID_ALL, self._target):
+    def _answers(self, message: messages.Message) -> Iterable[messages.Message]:
+        if getattr(message, "target_component", messages.COMP_ID_ALL) not in (
+            messages.COMP_ID_ALL,
+            self._target,
+        ):
             return
         match message:
-            case ParamRequestList() if "list" in self._serves:
+            case messages.ParamRequestList() if "list" in self._serves:
                 yield from map(self._value, self.values)
-            case ParamRequestRead(param_index=index, param_id=name):
+            case messages.ParamRequestRead(param_index=index, param_id=name):
                 by_index = dict(enumerate(self.values, self._first)) if "indices" in self._serves else {}
                 name = by_index.get(index, "") if index >= 0 else name if "names" in self._serves else ""
                 if name in self.values:
                     yield self._value(name)
-            case ParamSet() if self._on_set is not None:
+            case messages.ParamSet() if self._on_set is not None:
                 yield from self._on_set(message)
-            case ParamSet(param_id=name, raw=raw) if name in self.values:
+            case messages.ParamSet(param_id=name, raw=raw) if name in self.values:
                 if "sets" in self._serves:
                     self.values[name] = raw
                 if "acks" in self._serves:
                     yield self._value(name, self._ack_type)
-            case CommandLong(command=command) if "commands" in self._serves:
-                yield CommandAck(command, 3) if self._version is None else self._version
+            case messages.CommandLong(command=command) if "commands" in self._serves:
+                yield messages.CommandAck(command, 3) if self._version is None else self._version

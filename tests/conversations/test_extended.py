@@ -8,14 +8,7 @@ from contextlib import asynccontextmanager
 import anyio
 import pytest
 
-from paramclient.errors import (
-    ExtAckResult,
-    NoReply,
-    SetFailed,
-    UnknownParameter,
-    UsageError,
-    ValueUnsupported,
-)
+from paramclient import errors
 from paramclient.model.values import Value
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read
@@ -23,14 +16,7 @@ from paramclient.protocol.session import Session
 from paramclient.protocol.set_results import SetResult, SetStatus
 from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, Camera, Endpoint, PX4Vehicle
-from paramclient.wire.messages import (
-    Message,
-    ParamExtAck,
-    ParamExtRequestList,
-    ParamExtSet,
-    ParamExtValue,
-    ParamRequestList,
-)
+from paramclient.wire import messages
 from tests.conversations.virtual import Conversation, Silence, Tap, converse, virtual_on_both
 
 CAMERA = (1, 100)
@@ -76,14 +62,14 @@ async def test_a_set_sends_nothing_that_does_not_fit_and_reports_every_refusal()
     camera = Camera(supported={"CAM_ISO": [100, 200]}, failing=["CAM_EV"])
     async with filming(camera) as (conversation, session):
         for name, value in (("CAM_TILT", 128), ("CAM_MODE", "text")):
-            with pytest.raises(UsageError):
+            with pytest.raises(errors.UsageError):
                 await write(session, name, value)
-        assert not conversation.sent_of(ParamExtSet)
-        with pytest.raises(ValueUnsupported, match="CAM_ISO"):
+        assert not conversation.sent_of(messages.ParamExtSet)
+        with pytest.raises(errors.ValueUnsupported, match="CAM_ISO"):
             await write(session, "CAM_ISO", 150)
-        with pytest.raises(SetFailed):
+        with pytest.raises(errors.SetFailed):
             await write(session, "CAM_EV", 1.0)
-        with pytest.raises(UnknownParameter):
+        with pytest.raises(errors.UnknownParameter):
             await write(session, "CAM_ISSO", 1)
         assert camera.ext_values["CAM_ISO"] == 100
         assert session.table.params["CAM_ISO"].value == 100
@@ -101,8 +87,8 @@ async def test_progress_extends_the_wait_and_a_lost_result_is_requested_again(se
     camera = Camera(slow={"CAM_MODE": seconds})
     lost = [0]
 
-    def lose_result(message: Message) -> bool:
-        if isinstance(message, ParamExtAck) and message.param_result == 0 and not lost[0]:
+    def lose_result(message: messages.Message) -> bool:
+        if isinstance(message, messages.ParamExtAck) and message.param_result == 0 and not lost[0]:
             lost[0] += 1
             return False
         return True
@@ -132,14 +118,14 @@ async def test_a_camera_that_is_lost_while_it_reports_progress_ends_the_set(afte
         result = await write_many(session, [("CAM_MODE", 2), ("CAM_ISO", 200)])
         assert anyio.current_time() - endpoint.at < 6.0
         assert [each.status for each in result.outcomes] == [SetStatus.UNKNOWN, SetStatus.ACCEPTED]
-        assert isinstance(result.error, NoReply)
+        assert isinstance(result.error, errors.NoReply)
 
 
 async def test_a_change_by_another_station_is_seen_by_its_acknowledgement() -> None:
     async with filming(Camera()) as (conversation, session):
         await fetch_all(session)
-        conversation.hear(ParamExtSet(*CAMERA, "CAM_ISO", b"\x90\x01", 5), system=254, component=190)
-        conversation.hear(ParamExtAck("CAM_ISO", b"\x90\x01".ljust(128, b"\0"), 5, 0), component=100)
+        conversation.hear(messages.ParamExtSet(*CAMERA, "CAM_ISO", b"\x90\x01", 5), system=254, component=190)
+        conversation.hear(messages.ParamExtAck("CAM_ISO", b"\x90\x01".ljust(128, b"\0"), 5, 0), component=100)
         assert session.table.params["CAM_ISO"].value == 400
         assert conversation.changes[-1].by == "station 254/190"
 
@@ -156,7 +142,7 @@ async def test_the_refusal_of_another_stations_set_is_not_taken_for_ours() -> No
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(set_mode)
             await anyio.sleep(0.02)
-            refusal = ParamExtAck("CAM_MODE", bytes(128), 5, ExtAckResult.VALUE_UNSUPPORTED)
+            refusal = messages.ParamExtAck("CAM_MODE", bytes(128), 5, errors.ExtAckResult.VALUE_UNSUPPORTED)
             conversation.hear(refusal, component=100)
         assert (results[0].status, results[0].actual) == ("accepted", 2)
         assert session.table.params["CAM_MODE"].value == 2
@@ -200,17 +186,17 @@ async def test_a_component_may_have_both_kinds_or_none() -> None:
         assert {session.dialect.has_ack for session in node.sessions} == {False, True}
         px4 = await conversation.node(1, 1)
         began = anyio.current_time()
-        with pytest.raises(NoReply, match="list of 1/1"):
+        with pytest.raises(errors.NoReply, match="list of 1/1"):
             await fetch_all(px4.extended)
         assert anyio.current_time() - began < 25.0
         assert not px4.extended.table.params
-        assert len(conversation.sent_of(ParamExtRequestList)) < 15
-        assert len(conversation.sent_of(ParamRequestList)) == 1
+        assert len(conversation.sent_of(messages.ParamExtRequestList)) < 15
+        assert len(conversation.sent_of(messages.ParamRequestList)) == 1
 
 
 async def test_what_other_stations_request_is_taken_too() -> None:
     async with converse(Camera()) as conversation:
         node = await conversation.node(*CAMERA)
-        value = ParamExtValue("CAM_ISO", b"\x64".ljust(128, b"\0"), 5, 16, 3)
+        value = messages.ParamExtValue("CAM_ISO", b"\x64".ljust(128, b"\0"), 5, 16, 3)
         conversation.hear(value, component=100)
         assert node.extended.table.params["CAM_ISO"].value == 100

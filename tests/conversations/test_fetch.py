@@ -13,16 +13,7 @@ from paramclient.errors import NoReply, ParamErrorCode
 from paramclient.model.values import ParamType, Trust
 from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle, px4_table
-from paramclient.wire.messages import (
-    HASH_CHECK,
-    AutopilotVersion,
-    FileTransfer,
-    Heartbeat,
-    Message,
-    ParamError,
-    ParamRequestRead,
-    ParamValue,
-)
+from paramclient.wire import messages
 from tests.conversations.virtual import Silence, Tap, converse, run, talking, virtual_on_both
 
 BACKENDS = pytest.mark.parametrize("backend", ["trio", "asyncio"])
@@ -216,11 +207,15 @@ async def test_a_first_fetch_waits_for_the_identity_of_the_vehicle_but_not_for_l
     """A value is received first: only the heartbeat says that there is a file."""
     vehicle = ArduPilotVehicle()
 
-    def down(message: Message) -> bool:
-        return anyio.current_time() >= known_at or not isinstance(message, Heartbeat | AutopilotVersion)
+    def down(message: messages.Message) -> bool:
+        return anyio.current_time() >= known_at or not isinstance(
+            message, messages.Heartbeat | messages.AutopilotVersion
+        )
 
     async with converse(Tap(vehicle, down=down)) as conversation:
-        conversation.hear(ParamValue("RTL_ALT", struct.pack("<f", 1500), ParamType.INT16, 1382, 65535))
+        conversation.hear(
+            messages.ParamValue("RTL_ALT", struct.pack("<f", 1500), ParamType.INT16, 1382, 65535)
+        )
         result = await fetch_all((await conversation.node()).plain)
         check_right(vehicle, result)
         assert result.source == source
@@ -250,9 +245,9 @@ async def test_a_list_that_stops_is_completed() -> None:
             check_right(vehicle, await fetch_all(session))
 
 
-def is_no_file(message: Message) -> bool:
+def is_no_file(message: messages.Message) -> bool:
     """Return whether a link that drops MAVFTP passes a message."""
-    return not isinstance(message, FileTransfer)
+    return not isinstance(message, messages.FileTransfer)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.05, 0.15, 0.25, 0.5, 1.25])
@@ -273,17 +268,17 @@ async def test_silent_mavftp_is_learnt_on_a_lossy_link() -> None:
     async with talking(Air.symmetric([tap], loss=0.2, delay=0.05, seed=2)) as (conversation, session):
         for _ in range(3):
             assert (await fetch_all(session, refresh=True)).complete
-        requests = len(conversation.sent_of(FileTransfer))
+        requests = len(conversation.sent_of(messages.FileTransfer))
         assert (await fetch_all(session)).source == "stream"
-        assert len(conversation.sent_of(FileTransfer)) == requests > 0
+        assert len(conversation.sent_of(messages.FileTransfer)) == requests > 0
 
 
 @pytest.mark.parametrize("code", ParamErrorCode)
 async def test_a_hash_that_is_refused_for_any_reason_is_no_hash(code: ParamErrorCode) -> None:
-    def up(message: Message) -> bool:
-        is_hash = isinstance(message, ParamRequestRead) and message.param_id == HASH_CHECK
+    def up(message: messages.Message) -> bool:
+        is_hash = isinstance(message, messages.ParamRequestRead) and message.param_id == messages.HASH_CHECK
         if is_hash:
-            conversation.hear(ParamError(255, 190, HASH_CHECK, -1, code))
+            conversation.hear(messages.ParamError(255, 190, messages.HASH_CHECK, -1, code))
         return not is_hash
 
     vehicle = PX4Vehicle(hash_check=False)
@@ -296,8 +291,8 @@ async def test_a_value_outside_the_hash_that_is_not_received_is_missing() -> Non
     vehicle = PX4Vehicle()
     secret = vehicle.param(next(row.name for row in px4_table() if row.volatile))
 
-    def up(message: Message) -> bool:
-        return not (isinstance(message, ParamRequestRead) and message.param_id == secret.name)
+    def up(message: messages.Message) -> bool:
+        return not (isinstance(message, messages.ParamRequestRead) and message.param_id == secret.name)
 
     async with talking(Tap(vehicle, up=up)) as (_, session):
         await fetch_all(session)

@@ -13,12 +13,7 @@ from hypothesis import strategies as st
 
 from paramclient.errors import PackError
 from paramclient.model.values import ParamType
-from paramclient.protocol.param_pck import (
-    Pack,
-    PackedParam,
-    decode,
-    encode,
-)
+from paramclient.protocol.param_pck import Pack, PackedParam, decode, encode
 from paramclient.sim import ardupilot_table
 from tests.recordings import DATA
 

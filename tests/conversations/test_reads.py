@@ -121,11 +121,7 @@ async def test_one_value_answers_both_a_read_by_name_and_one_by_index_and_others
 @pytest.mark.parametrize("which", ["A", 7])
 @pytest.mark.parametrize(
     ("code", "kind"),
-    [
-        (ParamErrorCode.DOES_NOT_EXIST, UnknownParameter),
-        (ParamErrorCode.READ_FAIL, Refused),
-        (77, Refused),
-    ],
+    [(ParamErrorCode.DOES_NOT_EXIST, UnknownParameter), (ParamErrorCode.READ_FAIL, Refused), (77, Refused)],
 )
 async def test_a_refusal_tells_its_reason(which: str | int, code: int, kind: type[Exception]) -> None:
     def answer(message: Message) -> Iterable[Message]:

@@ -21,20 +21,7 @@ from paramclient.protocol.session import Session
 from paramclient.protocol.station import Station
 from paramclient.protocol.writes import write
 from paramclient.sim import ardupilot_table, px4_table
-from paramclient.wire.messages import (
-    HASH_CHECK,
-    NO_INDEX,
-    AutopilotVersion,
-    CommandAck,
-    CommandLong,
-    FileTransfer,
-    Message,
-    ParamRequestList,
-    ParamRequestRead,
-    ParamSet,
-    ParamValue,
-    encode,
-)
+from paramclient.wire import messages
 from tests.conversations.virtual import converse, messages_in, talking
 from tests.recordings import DATA, NAMES, from_ground, from_vehicle
 from tests.recordings import read as records_of
@@ -42,33 +29,33 @@ from tests.recordings import read as records_of
 PX4_HASH = 0xCF579589
 
 
-def kinds_of(message: Message) -> list[Hashable]:
+def kinds_of(message: messages.Message) -> list[Hashable]:
     """Return the kinds of requests that a message of a vehicle may answer, the likeliest first."""
     match message:
-        case ParamValue(param_id=name, param_index=index):
+        case messages.ParamValue(param_id=name, param_index=index):
             return [("name", name), ("index", index), "list"]
-        case CommandAck() | AutopilotVersion():
+        case messages.CommandAck() | messages.AutopilotVersion():
             return ["command"]
-        case FileTransfer():
+        case messages.FileTransfer():
             packet = Packet.unpack(message.payload)
             return [("file", packet.requested, (packet.sequence - 1) & 0xFFFF), ("file", packet.requested)]
     return []
 
 
-def kind_of(message: Message, path: bytes) -> Hashable:
+def kind_of(message: messages.Message, path: bytes) -> Hashable:
     """Return the kind of a request; of one of MAVFTP, with the file that was opened last."""
     match message:
-        case ParamRequestRead(param_index=index) if index >= 0:
+        case messages.ParamRequestRead(param_index=index) if index >= 0:
             return "index", index
-        case ParamRequestRead(param_id=name):
+        case messages.ParamRequestRead(param_id=name):
             return "name", name
-        case ParamSet(param_id=name, raw=raw):
+        case messages.ParamSet(param_id=name, raw=raw):
             return "set", name, raw
-        case ParamRequestList():
+        case messages.ParamRequestList():
             return "list"
-        case CommandLong():
+        case messages.CommandLong():
             return "command"
-        case FileTransfer():
+        case messages.FileTransfer():
             packet = Packet.unpack(message.payload)
             return "file", packet.opcode, packet.offset, path
     return None
@@ -81,12 +68,12 @@ class Recorded:
     """
 
     def __init__(self, name: str) -> None:
-        self.unanswered: list[Message] = []
-        self._answers: defaultdict[Hashable, list[list[tuple[float, Message]]]] = defaultdict(list)
-        self._due: list[tuple[float, int, Message]] = []
+        self.unanswered: list[messages.Message] = []
+        self._answers: defaultdict[Hashable, list[list[tuple[float, messages.Message]]]] = defaultdict(list)
+        self._due: list[tuple[float, int, messages.Message]] = []
         self._number = 0
         self._path = b""
-        requests: dict[Hashable, list[tuple[float, Message]]] = {}
+        requests: dict[Hashable, list[tuple[float, messages.Message]]] = {}
         began: dict[int, float] = {}
         ground = [(each.time, each.message) for each in from_ground(name) if each.message is not None]
         merged = [*((*each, True) for each in ground), *((*each, False) for each in from_vehicle(name))]
@@ -96,13 +83,13 @@ class Recorded:
         )
         for time, message, is_request in merged:
             if is_request:
-                answers: list[tuple[float, Message]] = []
+                answers: list[tuple[float, messages.Message]] = []
                 self._answers[self._kind_of(message)].append(answers)
                 began[id(answers)] = time
                 requests[self._kind_of(message)] = answers
-                if isinstance(message, ParamSet):
+                if isinstance(message, messages.ParamSet):
                     requests["name", message.param_id] = answers
-                if isinstance(message, FileTransfer):
+                if isinstance(message, messages.FileTransfer):
                     packet = Packet.unpack(message.payload)
                     requests["file", packet.opcode] = answers
                     answers.append((-1.0, message))
@@ -124,25 +111,27 @@ class Recorded:
                 if delay >= 0:
                     self._say(now + delay, self._renumbered(answer, message, answers[0][1]))
 
-    def _kind_of(self, message: Message) -> Hashable:
-        if isinstance(message, FileTransfer):
+    def _kind_of(self, message: messages.Message) -> Hashable:
+        if isinstance(message, messages.FileTransfer):
             packet = Packet.unpack(message.payload)
             self._path = packet.data if packet.opcode == Opcode.OPEN_FILE_RO else self._path
         return kind_of(message, self._path)
 
-    def _renumbered(self, answer: Message, request: Message, recorded: Message) -> Message:
+    def _renumbered(
+        self, answer: messages.Message, request: messages.Message, recorded: messages.Message
+    ) -> messages.Message:
         """Return an answer of MAVFTP with the numbers of our request."""
-        if not isinstance(answer, FileTransfer):
+        if not isinstance(answer, messages.FileTransfer):
             return answer
-        assert isinstance(request, FileTransfer)
-        assert isinstance(recorded, FileTransfer)
+        assert isinstance(request, messages.FileTransfer)
+        assert isinstance(recorded, messages.FileTransfer)
         ours, theirs = Packet.unpack(request.payload), Packet.unpack(recorded.payload)
         packet = Packet.unpack(answer.payload)
         sequence = ours.sequence + packet.sequence - theirs.sequence
         payload = packet._replace(sequence=sequence & 0xFFFF, session=ours.session).pack()
         return replace(answer, payload=payload)
 
-    def _say(self, at: float, message: Message) -> None:
+    def _say(self, at: float, message: messages.Message) -> None:
         self._number += 1
         heappush(self._due, (at, self._number, message))
 
@@ -162,7 +151,7 @@ class Recorded:
         out = []
         while self._due and self._due[0][0] <= self._now:
             _, number, message = heappop(self._due)
-            out.append(encode(message, system=1, component=1, sequence=number & 0xFF))
+            out.append(messages.encode(message, system=1, component=1, sequence=number & 0xFF))
         return out
 
 
@@ -186,7 +175,7 @@ async def test_px4s_list_is_complete_and_its_hash_is_proven() -> None:
         assert (result.source, result.count, result.hash) == ("stream", 903, PX4_HASH)
         assert bits(dict(result.params)) == PX4_TABLE
         assert session.table.volatile == {row.name for row in px4_table() if row.volatile}
-        assert len(conversation.sent_of(ParamRequestList)) == 1
+        assert len(conversation.sent_of(messages.ParamRequestList)) == 1
         assert result.notes == ()
 
 
@@ -196,12 +185,12 @@ async def test_ardupilots_list_is_complete() -> None:
         result = await fetch_all(session)
         assert (result.source, result.count, result.hash) == ("stream", 1382, None)
         assert bits(dict(result.params)) == ARDUPILOT_TABLE
-        assert len(conversation.sent_of(ParamRequestList)) == 1
+        assert len(conversation.sent_of(messages.ParamRequestList)) == 1
 
 
 async def test_ardupilots_file_with_its_defaults() -> None:
     async with talking(Recorded("ardupilot_ftp_download")) as (conversation, session):
-        conversation.hear(AutopilotVersion(64495, 0x04060000, uid=7))
+        conversation.hear(messages.AutopilotVersion(64495, 0x04060000, uid=7))
         result = await fetch_all(session)
         assert (result.source, result.count) == ("ftp", 1382)
         assert bits(dict(result.params)) == ARDUPILOT_TABLE
@@ -209,7 +198,9 @@ async def test_ardupilots_file_with_its_defaults() -> None:
             sum(each.default is not None and each.default != each.value for each in result.params.values())
             == 41
         )
-        requests = [Packet.unpack(each.payload).opcode for each in conversation.sent_of(FileTransfer)]
+        requests = [
+            Packet.unpack(each.payload).opcode for each in conversation.sent_of(messages.FileTransfer)
+        ]
         assert requests == [Opcode.OPEN_FILE_RO, Opcode.BURST_READ_FILE, Opcode.TERMINATE_SESSION]
 
 
@@ -228,9 +219,11 @@ async def test_reads_and_sets_of_px4() -> None:
         for unknown in ("NO_SUCH_PARAM", 5000):
             with pytest.raises(UnknownParameter):
                 await read(session, unknown)
-        digest = await read(session, HASH_CHECK)
+        digest = await read(session, messages.HASH_CHECK)
         assert (digest.param_type, digest.param_count) == (ParamType.UINT32, 903)
-        sets = [each.message for each in from_ground("px4_get_set") if isinstance(each.message, ParamSet)]
+        sets = [
+            each.message for each in from_ground("px4_get_set") if isinstance(each.message, messages.ParamSet)
+        ]
         (wanted,) = struct.unpack("<f", sets[0].raw)
         result = await write(session, "MPC_XY_VEL_MAX", wanted)
         assert (result.status, result.actual, result.attempts) == ("accepted", wanted, 1)
@@ -245,7 +238,9 @@ async def test_reads_and_sets_of_ardupilot() -> None:
             with pytest.raises(UnknownParameter):
                 await read(session, unknown)
         sets = [
-            each.message for each in from_ground("ardupilot_get_set") if isinstance(each.message, ParamSet)
+            each.message
+            for each in from_ground("ardupilot_get_set")
+            if isinstance(each.message, messages.ParamSet)
         ]
         for request, status in zip(sets[:2], ("adjusted", "accepted"), strict=True):
             (wanted,) = struct.unpack("<f", request.raw)
@@ -259,12 +254,12 @@ async def test_reads_and_sets_of_ardupilot() -> None:
 @pytest.mark.parametrize("name", ["ardupilot_30_sets", "px4_20_sets"])
 async def test_many_sets_at_once_are_acknowledged_as_they_were(name: str) -> None:
     async with talking(Recorded(name)) as (conversation, session):
-        sets = [each.message for each in from_ground(name) if isinstance(each.message, ParamSet)]
+        sets = [each.message for each in from_ground(name) if isinstance(each.message, messages.ParamSet)]
         first = {request.param_id: request for request in reversed(sets)}
-        values = [each for _, each in from_vehicle(name) if isinstance(each, ParamValue)]
+        values = [each for _, each in from_vehicle(name) if isinstance(each, messages.ParamValue)]
         types = {each.param_id: each.param_type for each in reversed(values)}
         for param_id in first:  # the types, which the recording does not have reads for
-            conversation.hear(ParamValue(param_id, bytes(4), types[param_id], 10, NO_INDEX))
+            conversation.hear(messages.ParamValue(param_id, bytes(4), types[param_id], 10, messages.NO_INDEX))
         async with anyio.create_task_group() as tasks:
             for request in first.values():
                 encoding = session.table.encoding
@@ -287,7 +282,7 @@ async def test_a_listener_takes_every_value_and_sends_nothing(name: str) -> None
     last: dict[str, bytes] = {}
     for record in records_of(name):
         station.receive(record.data, "peer", record.time)
-        if isinstance(record.message, ParamValue) and record.message.param_id != HASH_CHECK:
+        if isinstance(record.message, messages.ParamValue) and record.message.param_id != messages.HASH_CHECK:
             last[record.message.param_id.upper()] = record.message.raw  # one read was of rtl_alt
     session = station.nodes[1, 1].plain
     assert not sent

@@ -9,14 +9,7 @@ from functools import partial
 import anyio
 import pytest
 
-from paramclient.errors import (
-    AmbiguousVehicle,
-    CommandRefused,
-    CommandResult,
-    LinkError,
-    NoReply,
-    VehicleArmed,
-)
+from paramclient import errors
 from paramclient.model.values import Encoding, ParamType, Trust, encode_value
 from paramclient.protocol.commands import reboot, request_message, send_command
 from paramclient.protocol.fetch import fetch_all
@@ -27,40 +20,15 @@ from paramclient.protocol.selection import find, hint_of_link, hint_of_node, onl
 from paramclient.protocol.watch import Watch
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
+from paramclient.wire import messages
 from paramclient.wire.frames import build_frame
-from paramclient.wire.messages import (
-    CAPABILITY_PARAM_ENCODE_BYTEWISE,
-    CAPABILITY_PARAM_ENCODE_C_CAST,
-    MAV_AUTOPILOT_INVALID,
-    MAV_CMD_REQUEST_MESSAGE,
-    MAV_STATE_BOOT,
-    MAV_TYPE_GCS,
-    AutopilotVersion,
-    CommandAck,
-    CommandLong,
-    Heartbeat,
-    HighLatency2,
-    Message,
-    ParamValue,
-    StatusText,
-    SystemTime,
-    encode,
-    message_id,
-)
 from paramclient.wire.signing import Refusal, Signer, SigningKey, Verifier
-from tests.conversations.virtual import (
-    Puppet,
-    Silence,
-    converse,
-    messages_in,
-    talking,
-    virtual_on_both,
-)
+from tests.conversations.virtual import Puppet, Silence, converse, messages_in, talking, virtual_on_both
 
-PX4 = Heartbeat(2, 12, system_status=4)
-ARDUPILOT = Heartbeat(10, 3, system_status=4)
-GCS = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, system_status=4)
-CAMERA = Heartbeat(30, MAV_AUTOPILOT_INVALID, system_status=4)
+PX4 = messages.Heartbeat(2, 12, system_status=4)
+ARDUPILOT = messages.Heartbeat(10, 3, system_status=4)
+GCS = messages.Heartbeat(messages.MAV_TYPE_GCS, messages.MAV_AUTOPILOT_INVALID, system_status=4)
+CAMERA = messages.Heartbeat(30, messages.MAV_AUTOPILOT_INVALID, system_status=4)
 KEY = SigningKey(bytes(range(32)))
 NOW = 36_000_000_000_000
 
@@ -78,9 +46,9 @@ class Nothing(Puppet):
 @pytest.mark.parametrize(
     ("chosen", "capabilities", "autopilot", "expected", "reason"),
     [
-        (Encoding.C_CAST, CAPABILITY_PARAM_ENCODE_BYTEWISE, 12, Encoding.C_CAST, "user"),
-        (None, CAPABILITY_PARAM_ENCODE_BYTEWISE, 3, Encoding.BYTEWISE, "PARAM_ENCODE_BYTEWISE"),
-        (None, CAPABILITY_PARAM_ENCODE_C_CAST, 12, Encoding.C_CAST, "PARAM_ENCODE_C_CAST"),
+        (Encoding.C_CAST, messages.CAPABILITY_PARAM_ENCODE_BYTEWISE, 12, Encoding.C_CAST, "user"),
+        (None, messages.CAPABILITY_PARAM_ENCODE_BYTEWISE, 3, Encoding.BYTEWISE, "PARAM_ENCODE_BYTEWISE"),
+        (None, messages.CAPABILITY_PARAM_ENCODE_C_CAST, 12, Encoding.C_CAST, "PARAM_ENCODE_C_CAST"),
         (None, 64495, 3, Encoding.C_CAST, "ArduPilot"),
         (None, None, 12, Encoding.BYTEWISE, "PX4"),
         (None, 2, 0, Encoding.BYTEWISE, "standard"),
@@ -114,24 +82,24 @@ async def test_vehicles_are_identified(loss: float) -> None:
             )
             assert session.identification.identity.link == "sim:test"
             assert conversation.of("identified")
-            asked = len(conversation.sent_of(CommandLong))
+            asked = len(conversation.sent_of(messages.CommandLong))
             await anyio.sleep(20.0)
-            further = conversation.sent_of(CommandLong)[asked:]
-            assert {each.param1 for each in further} <= {message_id(SystemTime)}
+            further = conversation.sent_of(messages.CommandLong)[asked:]
+            assert {each.param1 for each in further} <= {messages.message_id(messages.SystemTime)}
             assert loss or len(further) == 2 * (name == "ardupilot")
 
 
 @pytest.mark.parametrize("refuses", [True, False])
 async def test_a_vehicle_without_a_version_is_settled_within_seconds(refuses: bool) -> None:
-    def answer(message: Message) -> Iterable[Message]:
-        if isinstance(message, CommandLong) and refuses:
-            yield CommandAck(message.command, CommandResult.UNSUPPORTED, 255, 190)
+    def answer(message: messages.Message) -> Iterable[messages.Message]:
+        if isinstance(message, messages.CommandLong) and refuses:
+            yield messages.CommandAck(message.command, errors.CommandResult.UNSUPPORTED, 255, 190)
 
     async with talking(Puppet(answer)) as (conversation, session):
         began = anyio.current_time()
         await session.identification.settled()
         assert anyio.current_time() - began < (2.5 if refuses else 45.0)
-        assert {each.command for each in conversation.sent_of(CommandLong)} == {512, 520}
+        assert {each.command for each in conversation.sent_of(messages.CommandLong)} == {512, 520}
         assert session.identification.capabilities is None
         assert session.identification.encoding is Encoding.BYTEWISE
         await anyio.sleep(0.01)
@@ -141,7 +109,7 @@ async def test_a_vehicle_without_a_version_is_settled_within_seconds(refuses: bo
 async def test_values_received_before_the_encoding_is_known_are_decoded_again_and_then_reported() -> None:
     async with converse(Nothing()) as conversation:
         raw = encode_value(1500, ParamType.INT32, Encoding.C_CAST)
-        conversation.hear(ParamValue("RTL_ALT", raw, 6, 10, 0))
+        conversation.hear(messages.ParamValue("RTL_ALT", raw, 6, 10, 0))
         table = conversation.station.nodes[1, 1].plain.table
         assert table.params["RTL_ALT"].value != 1500
         assert not conversation.changes
@@ -158,16 +126,19 @@ async def test_the_heartbeat_of_a_vehicle_that_sends_other_messages_is_requested
             await anyio.sleep(0.1)
             attitude = build_frame(30, bytes(range(28)), system=7, component=1, sequence=number)
             conversation.station.receive(attitude, "peer", anyio.current_time())
-        assert conversation.sent_of(CommandLong) == [CommandLong(7, 1, MAV_CMD_REQUEST_MESSAGE, 0.0)] * 2
+        assert (
+            conversation.sent_of(messages.CommandLong)
+            == [messages.CommandLong(7, 1, messages.MAV_CMD_REQUEST_MESSAGE, 0.0)] * 2
+        )
 
 
 async def test_another_hardware_id_clears_the_table_and_the_first_one_does_not() -> None:
     async with converse(Nothing()) as conversation:
         conversation.hear(PX4)
-        conversation.hear(ParamValue("A", bytes(4), 6, 10, 0))
+        conversation.hear(messages.ParamValue("A", bytes(4), 6, 10, 0))
         node = conversation.station.nodes[1, 1]
         for uid, replaced in ((0, 0), (7, 0), (7, 0), (8, 1)):
-            conversation.hear(AutopilotVersion(0, uid=uid))
+            conversation.hear(messages.AutopilotVersion(0, uid=uid))
             assert len(conversation.of("replaced")) == replaced
         assert node.identification.identity.uid == "0000000000000008"
         assert not node.plain.table.params
@@ -179,21 +150,25 @@ async def test_ground_stations_are_asked_nothing_and_own_and_nameless_frames_are
             (GCS, 254, 190),
             (GCS, 255, 190),
             (PX4, 0, 1),
-            (StatusText(6, "x"), 3, 1),
+            (messages.StatusText(6, "x"), 3, 1),
         ):
             conversation.hear(message, system=system, component=component)
-        conversation.hear(ParamValue("A", bytes(4), 6, 1, 0), system=4)
+        conversation.hear(messages.ParamValue("A", bytes(4), 6, 1, 0), system=4)
         await anyio.sleep(3.0)
         assert list(conversation.station.nodes) == [(254, 190), (4, 1)]
-        assert {each.target_system for each in conversation.sent_of(CommandLong)} == {4}
+        assert {each.target_system for each in conversation.sent_of(messages.CommandLong)} == {4}
         assert not conversation.station.nodes[254, 190].identification.has_parameters
 
 
 async def test_our_heartbeat_is_sent_once_a_second_and_a_listener_sends_nothing() -> None:
     async with converse(PX4Vehicle()) as conversation:
         await anyio.sleep(9.5)
-        beats = conversation.sent_of(Heartbeat)
-        assert beats == [Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, system_status=4)] * 10
+        beats = conversation.sent_of(messages.Heartbeat)
+        assert (
+            beats
+            == [messages.Heartbeat(messages.MAV_TYPE_GCS, messages.MAV_AUTOPILOT_INVALID, system_status=4)]
+            * 10
+        )
     async with converse(PX4Vehicle(), listens_only=True) as conversation:
         await conversation.node()
         await anyio.sleep(10.0)
@@ -218,7 +193,7 @@ async def test_nothing_is_requested_from_a_lost_component() -> None:
             conversation.sent.clear()
             await anyio.sleep(60.0)
             tasks.cancel_scope.cancel()
-        assert len(conversation.sent) == len(conversation.sent_of(Heartbeat)) == 60
+        assert len(conversation.sent) == len(conversation.sent_of(messages.Heartbeat)) == 60
 
 
 def test_the_heartbeat_timeout_follows_slow_heartbeats_and_satellites() -> None:
@@ -239,7 +214,7 @@ def test_the_heartbeat_timeout_follows_slow_heartbeats_and_satellites() -> None:
 async def test_a_vehicle_on_a_satellite_link_is_lost_later() -> None:
     async with converse(Nothing()) as conversation:
         conversation.hear(PX4)
-        conversation.hear(HighLatency2(2, 12))
+        conversation.hear(messages.HighLatency2(2, 12))
         await anyio.sleep(50.0)
         assert not conversation.of("lost")
         await anyio.sleep(15.0)
@@ -278,11 +253,11 @@ async def test_clocks_of_different_messages_are_not_compared_and_two_signs_are_o
                 node.boot_clock(number, boot_ms, anyio.current_time())
             await anyio.sleep(1.0)
         assert not conversation.of("rebooted")
-        conversation.hear(ParamValue("A", bytes(4), 6, 10, 0))
-        conversation.hear(Heartbeat(2, 12, system_status=MAV_STATE_BOOT))
+        conversation.hear(messages.ParamValue("A", bytes(4), 6, 10, 0))
+        conversation.hear(messages.Heartbeat(2, 12, system_status=messages.MAV_STATE_BOOT))
         node.boot_clock(30, 500, anyio.current_time())
-        conversation.hear(SystemTime(0, 700))
-        conversation.hear(Heartbeat(2, 12, system_status=MAV_STATE_BOOT))
+        conversation.hear(messages.SystemTime(0, 700))
+        conversation.hear(messages.Heartbeat(2, 12, system_status=messages.MAV_STATE_BOOT))
         assert len(conversation.of("rebooted")) == 1
         assert str(node.plain.table.params["A"].trust) == "cached"
 
@@ -349,35 +324,35 @@ async def test_a_reboot_is_refused_by_an_armed_vehicle_and_waits_for_px4_to_save
         await write(node.plain, "MC_ROLL_P", 3.0)
         vehicle.armed = True
         await anyio.sleep(1.5)
-        with pytest.raises(VehicleArmed):
+        with pytest.raises(errors.VehicleArmed):
             await reboot(node)
         vehicle.armed = False
         await anyio.sleep(1.5)
         await reboot(node)
         assert vehicle.param("MC_ROLL_P").value == 3.0
         conversation.hear(PX4, system=9)
-        with pytest.raises(NoReply):  # it answers nothing
-            await send_command(conversation.station.nodes[9, 1].channel, CommandLong(9, 1, 246, 1.0))
+        with pytest.raises(errors.NoReply):  # it answers nothing
+            await send_command(conversation.station.nodes[9, 1].channel, messages.CommandLong(9, 1, 246, 1.0))
 
 
 async def test_commands_end_with_their_result_and_wait_while_one_is_in_progress() -> None:
-    results = [CommandResult.IN_PROGRESS, CommandResult.ACCEPTED]
+    results = [errors.CommandResult.IN_PROGRESS, errors.CommandResult.ACCEPTED]
 
-    def answer(message: Message) -> Iterable[Message]:
-        if isinstance(message, CommandLong) and message.command == 400:
-            yield from (CommandAck(400, result, 255, 190) for result in results)
+    def answer(message: messages.Message) -> Iterable[messages.Message]:
+        if isinstance(message, messages.CommandLong) and message.command == 400:
+            yield from (messages.CommandAck(400, result, 255, 190) for result in results)
 
     async with converse(Puppet(answer)) as conversation:
         channel = (await conversation.node()).channel
-        await send_command(channel, CommandLong(1, 1, 400))
-        results[:] = [CommandResult.DENIED]
-        with pytest.raises(CommandRefused) as caught:
-            await send_command(channel, CommandLong(1, 1, 400))
-        assert caught.value.code == CommandResult.DENIED
+        await send_command(channel, messages.CommandLong(1, 1, 400))
+        results[:] = [errors.CommandResult.DENIED]
+        with pytest.raises(errors.CommandRefused) as caught:
+            await send_command(channel, messages.CommandLong(1, 1, 400))
+        assert caught.value.code == errors.CommandResult.DENIED
     async with converse(PX4Vehicle()) as conversation:
         channel = (await conversation.node()).channel
-        assert isinstance(await request_message(channel, Heartbeat), Heartbeat)
-        assert await request_message(channel, HighLatency2) is None
+        assert isinstance(await request_message(channel, messages.Heartbeat), messages.Heartbeat)
+        assert await request_message(channel, messages.HighLatency2) is None
 
 
 # peers
@@ -386,42 +361,42 @@ async def test_commands_end_with_their_result_and_wait_while_one_is_in_progress(
 async def test_a_second_vehicle_with_the_same_ids_is_ignored_until_the_first_is_silent() -> None:
     async with converse(Nothing()) as conversation:
         conversation.hear(PX4, peer="a")
-        conversation.hear(ParamValue("A", b"\1\0\0\0", 6, 10, 0), peer="a")
+        conversation.hear(messages.ParamValue("A", b"\1\0\0\0", 6, 10, 0), peer="a")
         node = conversation.station.nodes[1, 1]
         await anyio.sleep(1.0)
-        conversation.hear(ParamValue("A", b"\2\0\0\0", 6, 10, 0), peer="b")
+        conversation.hear(messages.ParamValue("A", b"\2\0\0\0", 6, 10, 0), peer="b")
         now = anyio.current_time()
         assert (node.plain.table.params["A"].value, node.peer, node.has_rival(now)) == (1, "a", True)
         await anyio.sleep(5.5)
         assert not node.has_rival(anyio.current_time())
-        conversation.hear(ParamValue("A", b"\2\0\0\0", 6, 10, 0), peer="b")
+        conversation.hear(messages.ParamValue("A", b"\2\0\0\0", 6, 10, 0), peer="b")
         assert (node.plain.table.params["A"].value, node.peer) == (2, "b")
 
 
 async def test_the_same_hardware_id_proves_that_a_vehicle_has_moved() -> None:
     async with converse(Nothing()) as conversation:
         conversation.hear(PX4, peer="a")
-        conversation.hear(AutopilotVersion(0, uid=7), peer="a")
+        conversation.hear(messages.AutopilotVersion(0, uid=7), peer="a")
         node = conversation.station.nodes[1, 1]
-        conversation.hear(AutopilotVersion(0, uid=8), peer="b")
+        conversation.hear(messages.AutopilotVersion(0, uid=8), peer="b")
         assert node.peer == "a"
-        conversation.hear(AutopilotVersion(0, uid=7), peer="b")
+        conversation.hear(messages.AutopilotVersion(0, uid=7), peer="b")
         assert (node.peer, node.has_rival(anyio.current_time())) == ("b", False)
 
 
 async def test_a_vehicle_at_another_peer_may_be_another_one_until_it_is_identified() -> None:
     async with converse(Nothing()) as conversation:
-        conversation.hear(HighLatency2(2, 12), peer="a")  # it counts as lost only after a minute
-        conversation.hear(AutopilotVersion(0, uid=7), peer="a")
-        conversation.hear(ParamValue("A", b"\1\0\0\0", 6, 10, 0), peer="a")
+        conversation.hear(messages.HighLatency2(2, 12), peer="a")  # it counts as lost only after a minute
+        conversation.hear(messages.AutopilotVersion(0, uid=7), peer="a")
+        conversation.hear(messages.ParamValue("A", b"\1\0\0\0", 6, 10, 0), peer="a")
         node = conversation.station.nodes[1, 1]
         await anyio.sleep(5.5)
-        asked = len(conversation.sent_of(CommandLong))
-        conversation.hear(HighLatency2(2, 12), peer="b")
+        asked = len(conversation.sent_of(messages.CommandLong))
+        conversation.hear(messages.HighLatency2(2, 12), peer="b")
         await anyio.sleep(0.1)
         assert node.plain.table.params["A"].trust is Trust.CACHED
-        assert len(conversation.sent_of(CommandLong)) > asked
-        conversation.hear(AutopilotVersion(0, uid=8), peer="b")
+        assert len(conversation.sent_of(messages.CommandLong)) > asked
+        conversation.hear(messages.AutopilotVersion(0, uid=8), peer="b")
         assert (node.peer, len(conversation.of("replaced"))) == ("b", 1)
 
 
@@ -429,18 +404,20 @@ async def test_split_peers_are_components_of_their_own() -> None:
     async with converse(Nothing(), split_peers=True) as conversation:
         for peer in (("10.0.0.1", 1), ("10.0.0.2", 1)):
             conversation.hear(PX4, peer=peer)
-            conversation.hear(ParamValue("A", bytes((peer[0] == "10.0.0.1", 0, 0, 0)), 6, 1, 0), peer=peer)
+            conversation.hear(
+                messages.ParamValue("A", bytes((peer[0] == "10.0.0.1", 0, 0, 0)), 6, 1, 0), peer=peer
+            )
         nodes = list(conversation.station.nodes.values())
         assert [each.plain.table.params["A"].value for each in nodes] == [1, 0]
         assert find(nodes, 1, 1, "10.0.0.2") is nodes[1]
-        with pytest.raises(AmbiguousVehicle, match=r"10\.0\.0\.1:1"):
+        with pytest.raises(errors.AmbiguousVehicle, match=r"10\.0\.0\.1:1"):
             only_vehicle(nodes, 1, 1, 5.0, listening_since=0.0)
 
 
 async def test_a_stream_may_cut_frames_anywhere_for_each_peer() -> None:
     async with converse(Nothing()) as conversation:
         station = conversation.station
-        stream = encode(PX4, system=1, component=1, sequence=0)
+        stream = messages.encode(PX4, system=1, component=1, sequence=0)
         station.receive(stream[:5], "a", 0.0)
         station.receive(stream[5:], "a", 0.0)
         assert not station.nodes  # datagrams are never joined
@@ -449,7 +426,7 @@ async def test_a_stream_may_cut_frames_anywhere_for_each_peer() -> None:
         other = type(conversation.station)(
             link="x", is_stream=True, send=lambda data, peer: sent.append(data), spawn=lambda *work: None
         )
-        two = encode(PX4, system=2, component=1, sequence=0)
+        two = messages.encode(PX4, system=2, component=1, sequence=0)
         other.receive(stream[:5], "a", 0.0)
         other.receive(two[:7], "b", 0.0)
         other.receive(stream[5:], "a", 0.0)
@@ -468,9 +445,9 @@ async def test_a_whole_session_in_mavlink_1(make: type[Vehicle]) -> None:
         assert {name: each.bits for name, each in result.params.items()} == {
             name: each.bits for name, each in vehicle.params.items()
         }
-        assert {data[0] for data in conversation.sent if not isinstance(messages_in(data)[0], Heartbeat)} == {
-            0xFE
-        }
+        assert {
+            data[0] for data in conversation.sent if not isinstance(messages_in(data)[0], messages.Heartbeat)
+        } == {0xFE}
 
 
 async def test_components_have_a_bound() -> None:
@@ -496,7 +473,7 @@ async def test_a_signed_session_takes_no_forged_and_no_replayed_value(make: type
         result = await fetch_all(session)
         name = vehicle.listed[0].name
         assert not result.missing
-        conversation.hear(ParamValue(name, b"\x9a\x02\0\0", vehicle.listed[0].type, 903, 0))
+        conversation.hear(messages.ParamValue(name, b"\x9a\x02\0\0", vehicle.listed[0].type, 903, 0))
         assert session.table.params[name].same_value(vehicle.listed[0])
         report = verifier.report()
         assert report.signed > 5
@@ -513,7 +490,7 @@ async def test_hints_say_what_was_received() -> None:
         station = conversation.station
         assert hint_of_link(station, 0) == "Nothing was received on sim:test."
         assert "no valid MAVLink frame" in hint_of_link(station, 1500)
-        conversation.hear(StatusText(6, "x"), system=9)
+        conversation.hear(messages.StatusText(6, "x"), system=9)
         assert hint_of_link(station, 60) == "1 MAVLink frame arrived on sim:test, but no heartbeat."
         conversation.hear(GCS, system=252, component=190)
         assert "only 252/190 ground station, and no vehicle" in hint_of_link(station, 60)
@@ -525,4 +502,4 @@ async def test_hints_say_what_was_received() -> None:
         assert hint_of_node(station, node, anyio.current_time()) == "Nothing was received of 1/1 for 7.0 s."
         station.interrupt()
         assert hint_of_link(station, 60) == "sim:test is down at present."
-        station.fail(LinkError("gone", link="x"), for_good=True)
+        station.fail(errors.LinkError("gone", link="x"), for_good=True)

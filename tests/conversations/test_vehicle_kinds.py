@@ -23,25 +23,16 @@ from paramclient.protocol.reads import read
 from paramclient.protocol.set_results import SetStatus
 from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
-from paramclient.wire.messages import (
-    CAPABILITY_FTP,
-    CAPABILITY_PARAM_ENCODE_BYTEWISE,
-    AutopilotVersion,
-    Heartbeat,
-    ParamRequestList,
-    ParamRequestRead,
-    ParamSet,
-    ParamValue,
-)
+from paramclient.wire import messages
 from tests.conversations.partial import EVERYTHING, TABLE, Partial
 from tests.conversations.virtual import QUIET, Puppet, Tap, converse, talking, virtual_on_both
 
-ARDUPILOT = Heartbeat(2, 3, system_status=4)
-PX4 = Heartbeat(2, 12, system_status=4)
-RADIO = Heartbeat(49, 0, system_status=4)
-NO_AUTOPILOT = Heartbeat(2, 8, system_status=4)
-ONBOARD_COMPUTER = Heartbeat(18, 0, system_status=4)
-CAMERA = Heartbeat(30, 0, system_status=4)
+ARDUPILOT = messages.Heartbeat(2, 3, system_status=4)
+PX4 = messages.Heartbeat(2, 12, system_status=4)
+RADIO = messages.Heartbeat(49, 0, system_status=4)
+NO_AUTOPILOT = messages.Heartbeat(2, 8, system_status=4)
+ONBOARD_COMPUTER = messages.Heartbeat(18, 0, system_status=4)
+CAMERA = messages.Heartbeat(30, 0, system_status=4)
 
 PARTS = [
     ("list", "sets", "acks", "commands"),
@@ -69,7 +60,7 @@ async def test_what_a_vehicle_serves_is_enough_to_read_and_to_prove_a_set(
         assert (result.status, result.actual) == ("accepted", 4)
         assert vehicle.values["MODE"] == struct.pack("<i", 4)
         assert anyio.current_time() - began < 15.0
-        assert vehicle.number_of(ParamSet) <= 12
+        assert vehicle.number_of(messages.ParamSet) <= 12
         if "list" in parts or "names" in parts:
             await read(session, "OFFSET")
             assert session.table.params["OFFSET"].value == -7
@@ -89,7 +80,7 @@ async def test_a_set_that_changes_nothing_is_told_as_that_within_a_dozen(parts: 
             await write(session, "MODE", 4)
         assert (caught.value.requested, caught.value.actual) == (4, 5)
         assert anyio.current_time() - began < 15.0
-        assert vehicle.number_of(ParamSet) <= 12
+        assert vehicle.number_of(messages.ParamSet) <= 12
 
 
 async def test_an_acknowledgement_in_another_type_changes_neither_the_type_nor_the_history() -> None:
@@ -124,7 +115,7 @@ COUNTS: dict[str, Callable[[int], int]] = {
     ids=["all", "all, loss", "list only", "reads by index only"],
 )
 async def test_odd_indices_and_counts_make_a_complete_table(
-    serves: tuple[str, ...], loss: float, count: str, first: int, heartbeat: Heartbeat
+    serves: tuple[str, ...], loss: float, count: str, first: int, heartbeat: messages.Heartbeat
 ) -> None:
     table = {f"P{number:02}": (number, ParamType.INT32) for number in range(40)}
     vehicle = Partial(table, serves=serves, count=COUNTS[count], first=first, heartbeat=heartbeat)
@@ -135,7 +126,9 @@ async def test_odd_indices_and_counts_make_a_complete_table(
             f"P{number:02}": (number, number + first) for number in range(40)
         }
         assert bool(result.lost) <= bool(loss)
-        conversation.hear(ParamValue("P02", bytes(4), ParamType.INT32, COUNTS[count](2 + first), 2 + first))
+        conversation.hear(
+            messages.ParamValue("P02", bytes(4), ParamType.INT32, COUNTS[count](2 + first), 2 + first)
+        )
         assert session.table.is_complete
 
 
@@ -155,15 +148,17 @@ async def test_a_list_whose_count_grows_is_never_complete_without_its_end(
 @pytest.mark.parametrize("interval", [0.3, 0.7, 1.0])
 @pytest.mark.parametrize("heartbeat", [QUIET, PX4], ids=["generic", "PX4"])
 async def test_a_slow_list_whose_count_grows_is_received_to_its_end(
-    interval: float, heartbeat: Heartbeat
+    interval: float, heartbeat: messages.Heartbeat
 ) -> None:
     async with talking(Puppet(lambda message: (), heartbeat=heartbeat)) as (conversation, session):
 
         async def send_list() -> None:
-            while not conversation.sent_of(ParamRequestList):  # noqa: ASYNC110 - in virtual time
+            while not conversation.sent_of(messages.ParamRequestList):  # noqa: ASYNC110 - in virtual time
                 await anyio.sleep(0.01)
             for index in range(12):
-                conversation.hear(ParamValue(f"P{index}", bytes(4), ParamType.REAL32, index + 1, index))
+                conversation.hear(
+                    messages.ParamValue(f"P{index}", bytes(4), ParamType.REAL32, index + 1, index)
+                )
                 await anyio.sleep(interval)
 
         async with anyio.create_task_group() as tasks:
@@ -178,7 +173,7 @@ async def test_a_slow_list_whose_count_grows_is_received_to_its_end(
 )
 @virtual_on_both
 async def test_a_vehicle_without_list_is_read_by_its_indices(
-    heartbeat: Heartbeat, serves: tuple[str, ...]
+    heartbeat: messages.Heartbeat, serves: tuple[str, ...]
 ) -> None:
     table = {f"P{number:02}": (number / 2, ParamType.REAL32) for number in range(60)}
     async with talking(Partial(table, serves=serves, heartbeat=heartbeat)) as (_, session):
@@ -253,7 +248,7 @@ async def test_an_unknown_name_of_a_px4_without_hash_is_told_as_what_it_is(serve
         with pytest.raises(UnknownParameter) as caught:
             await read(session, "NOPE")
         assert "answers no reads" not in str(caught.value)
-        assert vehicle.number_of(ParamRequestList) == (serves is not EVERYTHING)
+        assert vehicle.number_of(messages.ParamRequestList) == (serves is not EVERYTHING)
         assert anyio.current_time() < 15.0
 
 
@@ -261,7 +256,7 @@ async def test_an_unknown_name_of_a_px4_without_hash_is_told_as_what_it_is(serve
 @pytest.mark.parametrize("parts", [("list", "sets"), ("list", "sets", "acks")], ids="+".join)
 @virtual_on_both
 async def test_a_value_of_a_list_is_taken_without_its_end(
-    heartbeat: Heartbeat, parts: tuple[str, ...]
+    heartbeat: messages.Heartbeat, parts: tuple[str, ...]
 ) -> None:
     count = len(TABLE) + 3_000
     table = {name: (value, ParamType.REAL32) for name, (value, _) in TABLE.items()}
@@ -281,29 +276,29 @@ async def test_a_value_of_a_list_is_taken_without_its_end(
     ("heartbeat", "capabilities", "encoding"),
     [
         (ARDUPILOT, None, Encoding.BYTEWISE),
-        (ARDUPILOT, CAPABILITY_FTP, Encoding.BYTEWISE),
+        (ARDUPILOT, messages.CAPABILITY_FTP, Encoding.BYTEWISE),
         (QUIET, None, Encoding.C_CAST),
-        (PX4, CAPABILITY_PARAM_ENCODE_BYTEWISE, Encoding.C_CAST),
+        (PX4, messages.CAPABILITY_PARAM_ENCODE_BYTEWISE, Encoding.C_CAST),
     ],
     ids=["AP", "AP with version", "generic", "PX4 with version"],
 )
 @pytest.mark.parametrize("name", ["MODE", "OFFSET", "ZERO"])
 async def test_integers_in_another_encoding_are_told_and_not_written(
-    heartbeat: Heartbeat, capabilities: int | None, encoding: Encoding, name: str
+    heartbeat: messages.Heartbeat, capabilities: int | None, encoding: Encoding, name: str
 ) -> None:
     table = {"ZERO": (0, ParamType.INT32), **TABLE}
-    version = None if capabilities is None else AutopilotVersion(capabilities, uid=7)
+    version = None if capabilities is None else messages.AutopilotVersion(capabilities, uid=7)
     vehicle = Partial(table, heartbeat=heartbeat, encoding=encoding, version=version)
     async with talking(vehicle) as (_, session):
         with pytest.raises(UsageError, match=rf"was not written.*--encoding {encoding}"):
             await write(session, name, 9)
         assert (await write(session, "GAIN_1", 2.5)).status == "accepted"
-        assert vehicle.number_of(ParamSet) == 1
+        assert vehicle.number_of(messages.ParamSet) == 1
         assert any(f"--encoding {encoding}" in note for note in (await fetch_all(session)).notes)
     async with talking(vehicle, encoding=encoding) as (_, session):
-        asked = vehicle.number_of(ParamRequestRead)
+        asked = vehicle.number_of(messages.ParamRequestRead)
         assert (await write(session, name, 9)).status == "accepted"
-        assert vehicle.number_of(ParamRequestRead) == asked + 1
+        assert vehicle.number_of(messages.ParamRequestRead) == asked + 1
         assert (await fetch_all(session)).params["NODE_ID"].value == 3
         assert not session.encoding_doubt
 
@@ -389,13 +384,15 @@ async def test_a_vehicle_with_system_id_0_is_named_as_that() -> None:
     [
         (ONBOARD_COMPUTER, 191),
         (CAMERA, 100),
-        (Heartbeat(26, 3, system_status=4), 1),
+        (messages.Heartbeat(26, 3, system_status=4), 1),
         (QUIET, 154),
         (RADIO, 68),
     ],
     ids=["companion", "camera", "gimbal", "gimbal by its id", "radio"],
 )
-async def test_a_part_of_a_vehicle_is_never_the_vehicle(heartbeat: Heartbeat, component: int) -> None:
+async def test_a_part_of_a_vehicle_is_never_the_vehicle(
+    heartbeat: messages.Heartbeat, component: int
+) -> None:
     part = Partial(heartbeat=heartbeat, system=2, component=component)
     async with ParamClient(part, cache=False) as client:
         for choose in (client.component, client.only_component):

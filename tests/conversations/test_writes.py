@@ -10,17 +10,7 @@ from dataclasses import replace
 import anyio
 import pytest
 
-from paramclient.errors import (
-    AnotherVehicle,
-    LinkError,
-    NoReply,
-    ParamClientError,
-    ParamErrorCode,
-    Refused,
-    TypeMismatch,
-    UnknownParameter,
-    UsageError,
-)
+from paramclient import errors
 from paramclient.model.values import Encoding, ParamType, Trust, Value
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read, read_many, read_param
@@ -121,7 +111,7 @@ async def test_an_integer_that_float32_cannot_hold_is_not_sent_to_ardupilot() ->
     vehicle = ArduPilotVehicle()
     name = next(param.name for param in vehicle.listed if param.type is ParamType.INT32)
     async with talking(vehicle) as (conversation, session):
-        with pytest.raises(UsageError, match="cannot be sent exactly"):
+        with pytest.raises(errors.UsageError, match="cannot be sent exactly"):
             await write(session, name, 2**24 + 1)
         assert not conversation.sent_of(ParamSet)
 
@@ -130,7 +120,7 @@ async def test_an_integer_that_float32_cannot_hold_is_not_sent_to_ardupilot() ->
 async def test_nan_and_infinity_are_sent_to_px4_only_if_forced(name: str, value: float) -> None:
     vehicle = PX4Vehicle()
     async with talking(vehicle) as (conversation, session):
-        with pytest.raises(UsageError, match="was not sent to 1/1"):
+        with pytest.raises(errors.UsageError, match="was not sent to 1/1"):
             await write(session, name, value)
         assert not conversation.sent_of(ParamSet)
         result = await write(session, name, value, force=True)
@@ -157,9 +147,9 @@ async def test_a_read_only_parameter_is_refused_with_its_reason(param_error: boo
     vehicle = ArduPilotVehicle(param_error=param_error)
     async with talking(Air.symmetric([vehicle], delay=0.02)) as (conversation, session):
         began = anyio.current_time()
-        with pytest.raises(Refused, match="read only") as caught:
+        with pytest.raises(errors.Refused, match="read only") as caught:
             await write(session, "BARO1_GND_PRESS", 5.0)
-        assert (caught.value.code, caught.value.name) == (ParamErrorCode.READ_ONLY, "BARO1_GND_PRESS")
+        assert (caught.value.code, caught.value.name) == (errors.ParamErrorCode.READ_ONLY, "BARO1_GND_PRESS")
         assert anyio.current_time() - began < 3.0
         assert len(conversation.sent_of(ParamSet)) == 1
 
@@ -167,11 +157,11 @@ async def test_a_read_only_parameter_is_refused_with_its_reason(param_error: boo
 async def test_an_unknown_name_and_values_that_do_not_fit_are_not_set() -> None:
     for vehicle in (PX4Vehicle(), ArduPilotVehicle(param_error=True)):
         async with talking(vehicle) as (conversation, session):
-            with pytest.raises(UnknownParameter):
+            with pytest.raises(errors.UnknownParameter):
                 await write(session, "NO_SUCH", 1)
             name = next(param.name for param in vehicle.listed if param.type is ParamType.INT32)
             for value in (2**31, "text"):
-                with pytest.raises(UsageError):
+                with pytest.raises(errors.UsageError):
                     await write(session, name, value)
             assert not conversation.sent_of(ParamSet)
             assert not session.writing
@@ -194,21 +184,21 @@ async def test_a_type_that_has_changed_is_taken_or_is_a_mismatch(value: int, fit
             result = await write(session, "A", value)
             assert (result.status, result.param.type) == ("accepted", ParamType.UINT8)
         else:
-            with pytest.raises(TypeMismatch, match="UINT8"):
+            with pytest.raises(errors.TypeMismatch, match="UINT8"):
                 await write(session, "A", value)
 
 
 @pytest.mark.parametrize(
     ("code", "kind"),
     [
-        (ParamErrorCode.VALUE_OUT_OF_RANGE, Refused),
-        (ParamErrorCode.DOES_NOT_EXIST, UnknownParameter),
-        (99, Refused),
+        (errors.ParamErrorCode.VALUE_OUT_OF_RANGE, errors.Refused),
+        (errors.ParamErrorCode.DOES_NOT_EXIST, errors.UnknownParameter),
+        (99, errors.Refused),
     ],
 )
 @pytest.mark.parametrize("order", ["E", "VE", "EV"])
 async def test_a_refusal_counts_whether_the_old_value_comes_with_it(
-    code: int, kind: type[ParamClientError], order: str
+    code: int, kind: type[errors.ParamClientError], order: str
 ) -> None:
     answers: dict[str, Message] = {
         "V": ParamValue("A", struct.pack("<i", 5), ParamType.INT32, 1, 0),
@@ -314,7 +304,7 @@ async def test_silence_is_no_reply_within_7_s_and_a_cancelled_write_sends_no_mor
             sent = len(conversation.sent_of(ParamSet))
             await anyio.sleep(0.5)
             assert len(conversation.sent_of(ParamSet)) == sent > 0
-            with pytest.raises(NoReply, match=f"acknowledgement of {name} by 1/1"):
+            with pytest.raises(errors.NoReply, match=f"acknowledgement of {name} by 1/1"):
                 await write(session, name, 2.5)
             assert anyio.current_time() - began < 8.5
             assert not session.channel.inboxes
@@ -424,7 +414,7 @@ async def test_no_set_is_sent_to_another_vehicle_and_a_rebooted_one_gets_the_oth
             assert all(first.param(name).value == 0.125 for name in names)
             return
         assert not other.requests["PARAM_SET"]
-        assert isinstance(result.error, NoReply if said == "never" else AnotherVehicle)
+        assert isinstance(result.error, errors.NoReply if said == "never" else errors.AnotherVehicle)
         assert result.counts[SetStatus.ACCEPTED] + result.counts[SetStatus.UNKNOWN] <= 80
         assert result.counts[SetStatus.NOT_TRIED] >= 70
         assert all(each.is_set or each.error is not None for each in result.outcomes)
@@ -440,7 +430,7 @@ async def test_no_set_is_sent_to_a_vehicle_that_does_not_say_again_which_one_it_
         conversation.station.interrupt()
         conversation.station.resume(anyio.current_time())
         began = anyio.current_time()
-        with pytest.raises(NoReply, match="the identity of 1/1"):
+        with pytest.raises(errors.NoReply, match="the identity of 1/1"):
             await write(session, "MC_ROLL_P", 3.5)
         assert anyio.current_time() - began < 10.0
         assert not conversation.sent_of(ParamSet)
@@ -464,7 +454,7 @@ async def test_another_vehicle_behind_a_value_ends_a_write_and_no_read() -> None
         async def run_call(call: Callable[[Session], Awaitable[object]]) -> None:
             try:
                 outcomes.append(type(await call(session)).__name__)
-            except ParamClientError as error:
+            except errors.ParamClientError as error:
                 outcomes.append(type(error).__name__)
 
         for uid, (_, call) in enumerate(calls, start=20):
@@ -496,12 +486,7 @@ async def test_a_change_has_the_author_whose_set_was_seen() -> None:
         vehicle.set_param("MC_ROLL_P", 7.0)
         await anyio.sleep(1.0)
         changes = [(each.new.value, each.by) for each in conversation.changes if each.old and each.new]
-        assert changes == [
-            (3.0, "station 254/190"),
-            (5.0, "us"),
-            (6.0, "us for pilot"),
-            (7.0, "vehicle"),
-        ]
+        assert changes == [(3.0, "station 254/190"), (5.0, "us"), (6.0, "us for pilot"), (7.0, "vehicle")]
 
 
 # several
@@ -525,7 +510,7 @@ async def test_many_values_are_set_each_with_its_outcome(maker: type[PX4Vehicle]
         assert anyio.current_time() - began < (30.0 if loss else 8.0)
         assert [each.name for each in outcomes] == [name for name, _ in pairs]
         refused = outcomes.pop(70)
-        assert (refused.status, type(refused.error)) == (SetStatus.REFUSED, UnknownParameter)
+        assert (refused.status, type(refused.error)) == (SetStatus.REFUSED, errors.UnknownParameter)
         for outcome in outcomes:
             assert outcome.status is SetStatus.ACCEPTED
             assert vehicle.param(outcome.name).value == outcome.requested
@@ -564,8 +549,8 @@ async def test_a_link_that_fails_ends_a_batch_and_the_others_are_not_tried() -> 
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(set_all)
             await anyio.sleep(2.0)
-            conversation.station.fail(LinkError("gone", link="x"), for_good=True)
-        assert isinstance(results[0].error, LinkError)
+            conversation.station.fail(errors.LinkError("gone", link="x"), for_good=True)
+        assert isinstance(results[0].error, errors.LinkError)
         assert {each.status for each in results[0].outcomes} >= {SetStatus.UNKNOWN, SetStatus.NOT_TRIED}
 
 

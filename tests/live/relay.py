@@ -181,10 +181,7 @@ class RealVehicle:
         )
         reply = messages.FileTransfer(0, frame.system, frame.component, answer.pack())
         return messages.encode(
-            reply,
-            system=message.target_system,
-            component=message.target_component,
-            sequence=self._sequence,
+            reply, system=message.target_system, component=message.target_component, sequence=self._sequence
         )
 
 

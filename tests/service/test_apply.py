@@ -60,8 +60,7 @@ async def test_a_file_with_a_name_that_no_vehicle_can_have_is_shown_and_not_appl
 
 
 @pytest.mark.parametrize(
-    "body",
-    [{"text": "not\0a file of parameters"}, {"text": "{", "format": "json"}, {"base64": "###"}],
+    "body", [{"text": "not\0a file of parameters"}, {"text": "{", "format": "json"}, {"base64": "###"}]
 )
 async def test_an_invalid_file_is_a_problem(body: dict[str, Any]) -> None:
     async with service(generic()) as (_, browser):

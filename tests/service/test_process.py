@@ -26,9 +26,7 @@ END_TIME = 30.0
 
 
 @asynccontextmanager
-async def served(
-    *words: str,
-) -> AsyncIterator[tuple[asyncio.subprocess.Process, httpx.AsyncClient]]:
+async def served(*words: str) -> AsyncIterator[tuple[asyncio.subprocess.Process, httpx.AsyncClient]]:
     """The command in a process of its own, and a client of it."""
     process = await asyncio.create_subprocess_exec(
         sys.executable,

@@ -248,9 +248,7 @@ def test_a_mavlink_2_frame_is_pymavlinks(ours: Message, theirs: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("ours", "theirs"),
-    [pair for pair in MESSAGES if not isinstance(pair[0], MAVLINK_2_ONLY)],
-    ids=kind_of,
+    ("ours", "theirs"), [pair for pair in MESSAGES if not isinstance(pair[0], MAVLINK_2_ONLY)], ids=kind_of
 )
 def test_a_mavlink_1_frame_is_pymavlinks_without_extension_fields(ours: Message, theirs: Any) -> None:
     number = theirs.get_msgId()
